@@ -1,6 +1,6 @@
 """Methods that lower a functional over tensor fields, or move vertices, one per module.
 
-The package builds on `solver.field` and `energies`. Start reading in `base`, which says what a method is, then
+The package builds on `solver.field` and `energies`. Start reading in `base`, which defines a method, then
 `vector_adam`.
 """
 

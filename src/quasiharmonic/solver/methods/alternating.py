@@ -1,7 +1,7 @@
-"""The greedy alternation of §9.2: the best tensor for the map, the best map for the tensor, and again.
+"""The greedy alternation of §9.2: alternate between the best tensor for the map and the best map for the tensor.
 
-This is the total unsigned area of Xu et al. (2011) in another dress. It gets stuck at once from afar (§7.1), and often
-rights the last few tiny triangles.
+It is equivalent to lowering the total unsigned area of Xu et al. (2011). Far from a solution it stalls at once (§7.1),
+but it often untangles the last few tiny triangles.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Alternating(TensorDescent):
     word: ClassVar[str] = "alternating"
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`."""
+        """See `Descent`."""
         here = start
         for _ in range(self.iterations):
             best = objective.parameterisation.invert(own_tensor(here.dw.p, here.dw.q))

@@ -1,7 +1,7 @@
-"""What every way to descend is: a few settings, and a generator of maps.
+"""Base classes of descent methods: settings, and a generator of maps.
 
-A method is one file with one frozen class. Its fields are its settings, `Descent.iterates` yields map after map, and
-whoever runs it (`quasiharmonic.solver.search`) looks at each and stops when it has seen enough.
+A method is one module with one frozen class. Its fields are its settings, and `Descent.iterates` yields one map after
+another. The search (`quasiharmonic.solver.search`) examines each map and decides when to stop.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ Iterates: TypeAlias = Generator[Iterate, None, bool]
 
 @dataclass(frozen=True)
 class SearchState:
-    """What a search has found before a stage begins.
+    """State of a search before a stage begins.
 
     Attributes
     ----------
     given : (n,) complex128 or None
-        The caller's first map, for the very first stage.
+        The caller's initial map, for the very first stage only.
     best_map : (n,) complex128
-        The map of the fewest inverted triangles.
+        The map with the fewest inverted triangles.
     lowest_energy : Iterate or None
-        The one of the lowest V₃ among those that tensors were descended to.
+        The iterate of lowest V₃ among those of tensor descents.
     """
 
     given: ComplexArray | None
@@ -44,45 +44,45 @@ class SearchState:
 
 
 class StageRunner(Protocol):
-    """What a stage asks of the search that runs it. Either call says how the search stands after the stage."""
+    """Operations of a search that a stage may call. Each returns the status of the search after the stage."""
 
     def attempt(self, stage: Descent, before: Status) -> Status:
-        """Descend on the mesh itself; ``before`` is how the search stood."""
+        """Descend on the mesh itself; ``before`` is the status before the stage."""
 
     def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
-        """Search on a coarse mesh, beginning with what the stage ``begins_with``, and carry the map to the mesh."""
+        """Search on a coarse mesh, starting with ``stage.begins_with``, and transfer the map to the fine mesh."""
 
     def attempt_tentatively(self, stage: Descent, before: Status) -> Status:
-        """Descend on the mesh itself; where that finds no map, later stages go on from where this one began."""
+        """Descend on the mesh itself; if that finds no map, later stages continue from the state before."""
 
     def attempt_where_many(self, stage: Descent, before: Status) -> Status:
         """Descend on the mesh itself if many triangles are inverted."""
 
     def take_over(self, begun: Any) -> Status:
-        """Go on from what was found elsewhere by the stage that the search would begin with."""
+        """Continue from the state of a stage that ran elsewhere."""
 
 
 class SearchStage(ABC):
-    """What a strategy is a list of."""
+    """One stage of a strategy."""
 
-    #: Whether it searches on a coarse mesh, and not on the mesh itself.
+    #: Whether the stage searches on a coarse mesh instead of the mesh itself.
     coarse: ClassVar[bool] = False
-    #: Whether it takes no longer than finding out whether there is a map at all, which is put off until after it.
+    #: Whether the stage is no slower than a diagnosis, which is therefore deferred until after the stage.
     quick: ClassVar[bool] = False
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """How reports call this stage."""
+        """Name of this stage in reports."""
 
     @property
     @abstractmethod
     def begins_with(self) -> Descent:
-        """The first descent, on whichever mesh."""
+        """The first descent of the stage, on the coarse mesh or the mesh itself."""
 
     @abstractmethod
     def run(self, search: StageRunner, before: Status) -> Status:
-        """Have a search run this stage; how the search stands afterwards."""
+        """Run this stage in a search; return the status afterwards."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,55 +92,56 @@ class Descent(SearchStage):
     Attributes
     ----------
     resume : bool
-        Start from the best so far instead of ξ = 0.
+        Start from the best map so far instead of ξ = 0.
 
     Raises
     ------
     ValueError
-        When a setting has no such value.
+        If a setting is invalid.
     """
 
     resume: bool = False
 
-    #: How reports call the method.
+    #: Name of the method in reports.
     word: ClassVar[str]
-    #: Whether positions are what moves, and tensors only follow.
+    #: Whether the method moves vertices and derives the tensors from them.
     moves_vertices: ClassVar[bool] = False
 
     @property
     def name(self) -> str:
-        """How reports call this stage."""
+        """Name of this stage in reports."""
         return self.word
 
     @property
     def begins_with(self) -> Descent:
-        """Itself."""
+        """The stage itself."""
         return self
 
     def run(self, search: StageRunner, before: Status) -> Status:
-        """As of `SearchStage`."""
+        """See `SearchStage`."""
         return search.attempt(self, before)
 
     @property
     def patience(self) -> tuple[int, float] | None:
-        """The stage has settled when within so many iterates none was righted and the objective fell by less.
+        """Number of iterates and relative decrease that define a stall.
 
-        As a fraction of itself. None for methods that know by themselves when to end.
+        The stage has stalled if within that many iterates no triangle is untangled and the objective falls by less than
+        that fraction. None for methods that detect the end themselves.
         """
         return None
 
     def objective(self, problem: Problem, linear_solver: str) -> Objective:
-        """What is descended, or what the maps are judged by."""
+        """Return the objective that is descended, or that measures the maps."""
         return Objective(problem, linear_solver=linear_solver)
 
     @abstractmethod
     def start(self, objective: Objective, found: SearchState) -> Iterate:
-        """Where the stage begins.
+        """Return the iterate at which the stage begins.
 
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
-            When rounding leaves no positive definite Laplacian.
+            If the Laplacian is not positive definite after rounding.
         """
 
     @abstractmethod
@@ -155,28 +156,28 @@ class Descent(SearchStage):
         Yields
         ------
         Iterate
-            Every map on the way, ``start`` excepted. One of the same ``w`` as the last says that what took as long as
-            an iteration was of no use: a search counts these apart.
+            Every map on the way, without ``start``. An iterate with the same ``w`` object as the previous one reports
+            failed work worth one iteration; a search counts these separately.
 
         Returns
         -------
         bool
-            Whether the method has come to rest, and not to the end of its iterations.
+            True if the method converged or stalled, False if its iterations are used up.
 
         Raises
         ------
         quasiharmonic.linsolve.NotPositiveDefinite
-            When even short steps leave no positive definite Laplacian.
+            If even short steps do not give a positive definite Laplacian.
         """
 
 
 class Patience:
-    """How long a stage has made no progress.
+    """Counter of consecutive steps without progress.
 
     Parameters
     ----------
     limits : (int, float) or None
-        As of `Descent.patience`.
+        See `Descent.patience`.
     """
 
     def __init__(self, limits: tuple[int, float] | None) -> None:
@@ -185,7 +186,7 @@ class Patience:
         self._flipped, self._value, self._low_enough, self._in_vain = np.inf, np.inf, np.inf, 0
 
     def is_over(self, inverted: int, value: float) -> bool:
-        """Whether too many steps in a row have righted no triangle and lowered the objective by too little."""
+        """Whether too many consecutive steps untangled no triangle and lowered the objective too little."""
         if inverted < self._flipped or value < self._low_enough:
             self._flipped, self._value = min(inverted, self._flipped), min(value, self._value)
             # V₄ may be negative.
@@ -198,11 +199,12 @@ class Patience:
 
 
 class Steps:
-    """The iterates of a descent, and when they have ended whether it came to rest.
+    """Iterates of a descent; after the last one, ``at_rest`` is the return value of the generator.
 
     Attributes
     ----------
     at_rest : bool
+        Whether the descent converged or stalled.
     """
 
     def __init__(self, iterates: Iterates) -> None:
@@ -215,20 +217,20 @@ class Steps:
 
 @dataclass(frozen=True, kw_only=True)
 class TensorDescent(Descent):
-    """A stage that descends an objective over ξ.
+    """Stage that descends an objective over ξ.
 
     Attributes
     ----------
     parameterisation : str
-        A name of `quasiharmonic.solver.field.tensor.PARAMETERISATIONS`: how ξ becomes a tensor (§8.2); ``"tanh"`` is
-        fast, ``"si-log"`` keeps angles.
+        A name of `quasiharmonic.solver.field.tensor.PARAMETERISATIONS`: the function from ξ to a tensor (§8.2).
+        ``"tanh"`` is fast, ``"si-log"`` preserves angles.
     reference : {"equilateral", "rest", "corrected"}
-        Shape of the triangles, unless the problem itself names one.
+        Reference triangles. A reference set in the problem takes precedence.
     iterations : int
-        Steps to take at most.
+        Maximum number of steps.
     resume : bool
-        Start from the tensors of the lowest V₃ so far instead of ξ = 0. (Not from those of the map of the fewest
-        inverted triangles, which may have been passed by early on, far from any solution.)
+        Start from the tensors of the lowest V₃ so far instead of ξ = 0. (The map with the fewest inverted triangles may
+        be an early one that is far from any solution.)
     """
 
     parameterisation: str = "tanh"
@@ -242,20 +244,20 @@ class TensorDescent(Descent):
 
     @property
     def name(self) -> str:
-        """How reports call this stage."""
+        """Name of this stage in reports."""
         return f"{self.word}, {self.parameterisation}"
 
     @property
     def patience(self) -> tuple[int, float] | None:
-        """As of `Descent`."""
+        """See `Descent`."""
         return 300, 1e-3
 
     def objective(self, problem: Problem, linear_solver: str) -> Objective:
-        """What is descended: V₃."""
+        """Return the objective V₃."""
         return Objective(problem, "dirichlet", self.parameterisation, self.reference, linear_solver)
 
     def start(self, objective: Objective, found: SearchState) -> Iterate:
-        """At the caller's map if there is one, at the tensors of the lowest V₃ so far, or at ξ = 0."""
+        """Start at the caller's map if given, at the tensors of the lowest V₃ so far, or at ξ = 0."""
         best = found.lowest_energy if self.resume else None
         if found.given is not None:
             return objective.near_map(found.given)
@@ -270,12 +272,12 @@ class TensorDescent(Descent):
 
 @dataclass(frozen=True, kw_only=True)
 class FunctionalDescent(TensorDescent):
-    """A stage that descends any of the functionals.
+    """Stage that descends any of the functionals.
 
     Attributes
     ----------
     functional : str
-        A name of `quasiharmonic.solver.field.functionals.FUNCTIONALS`: what is descended (§7.3).
+        A name of `quasiharmonic.solver.field.functionals.FUNCTIONALS`: the functional to descend (§7.3).
     """
 
     functional: str = "dirichlet"
@@ -286,17 +288,17 @@ class FunctionalDescent(TensorDescent):
 
     @property
     def name(self) -> str:
-        """How reports call this stage."""
+        """Name of this stage in reports."""
         return f"{self.word}, {self.parameterisation}, {self.functional}"
 
     def objective(self, problem: Problem, linear_solver: str) -> Objective:
-        """What is descended."""
+        """Return the objective of the chosen functional."""
         return Objective(problem, self.functional, self.parameterisation, self.reference, linear_solver)
 
 
 @dataclass(frozen=True, kw_only=True)
 class VertexDescent(Descent):
-    """A stage that moves vertices, tensors following; it knows by itself when to end.
+    """Stage that moves vertices and derives the tensors from them; it detects its end itself.
 
     Attributes
     ----------
@@ -307,7 +309,7 @@ class VertexDescent(Descent):
     moves_vertices: ClassVar[bool] = True
 
     def start(self, objective: Objective, found: SearchState) -> Iterate:
-        """At the map of the fewest inverted triangles, or at Tutte's embedding."""
+        """Start at the map with the fewest inverted triangles, or at Tutte's embedding."""
         if self.resume and found.lowest_energy is not None:
             return objective.of_map(self.resumed(found.best_map, found.lowest_energy))
         if found.given is not None:
@@ -315,5 +317,5 @@ class VertexDescent(Descent):
         return objective.evaluate(np.zeros(len(objective.problem.F), dtype=np.complex128))
 
     def resumed(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
-        """Which of two maps to go on from."""
+        """Return which of two maps to continue from."""
         return best_map

@@ -1,15 +1,14 @@
-"""The composite of two maps through a disk, as a place to begin.
+"""Initial map composed of two maps through a disk.
 
     mesh ──Tutte──▶ disk of chords ◀──same triangles── target, triangulated between its boundary vertices
 
-Tutte's embedding onto a convex outline is injective. A triangulation of the target that has no vertices but those of
-the boundary is one of any convex polygon with as many corners too: corner by corner it is a bijective map of the disk
-onto the target, affine on every triangle. Every vertex goes through both. Were the mesh's triangles ever smaller, that
-would be an injective map; what is inverted are triangles across which the second map bends, few as a rule, and a
-descent from the tensors of this map has not far to go. (Weber and Zorin 2014 compose such maps for injectivity
-itself, and split the mesh for it.)
+Tutte's embedding onto a convex outline is injective. A triangulation of the target without interior vertices is also a
+triangulation of any convex polygon with as many corners. It therefore defines a bijective map of the disk onto the
+target, affine on every triangle. Every vertex is mapped through both. For ever finer meshes this would be an injective
+map. The inverted triangles are among those across which the second map bends; they are usually few, so a descent from
+this map's tensors is short. (Weber and Zorin 2014 compose such maps for injectivity itself, and split the mesh for it.)
 
-It takes a single boundary loop, whose image is simple.
+The method requires a single boundary loop with a simple image.
 """
 
 from __future__ import annotations
@@ -29,26 +28,25 @@ from quasiharmonic.solver.methods.base import Iterates
 from quasiharmonic.solver.methods.vector_adam import VectorAdam
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
 
-# Corners of the disk are spread half by the target's arc length and half evenly: none come too close to each other.
+# Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
 _EVENLY = 0.5
-# Room around the target for the box that it is triangulated in, as a fraction of its extent.
+# Margin between the target and the box of its triangulation, as a fraction of its extent.
 _MARGIN = 0.1
-# Up to so many corners it is triangulated by itself: that takes no longer, and SciPy's Qhull need not be loaded for it,
-# which takes longer than all else that is done with so small a mesh.
+# Up to this number of corners a direct triangulation is as fast and avoids loading SciPy's Qhull. For so small a mesh,
+# loading takes longer than all other work.
 _FEW = 100
-# From the composite short steps suffice, and long ones would lead away from it.
+# Schedule after the composite: short steps suffice, and long ones would leave its neighbourhood.
 NEARBY_STEPS = ((0, 0.2), (39, 0.2), (40, 0.05))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Composite(VectorAdam):
-    """Descend by VectorAdam, after a few steps anew from the composite of two maps through a disk, if there is one.
+    """Descend by VectorAdam: a few steps, then again from the composite of two maps through a disk, if it exists.
 
     Attributes
     ----------
     direct : int
-        Steps before, from where any descent begins; easy maps need no more, and the composite takes as long as some 5
-        to 15 of them.
+        Number of steps before the composite. Easy maps need no more, and the composite costs as much as 5 to 15 steps.
     """
 
     direct: int = 6
@@ -61,17 +59,17 @@ class Composite(VectorAdam):
 
     @property
     def patience(self) -> tuple[int, float]:
-        """From near a solution it is found soon; what is left are triangles for local repair."""
+        """A short patience: close to a solution it is found soon; the rest is for local repair."""
         return 10, 0.5
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`; without a composite all steps are as `VectorAdam` has them."""
+        """See `Descent`; without a composite all steps are those of `VectorAdam`."""
         steps = super().iterates(objective, start)
         yield from islice(steps, self.direct)
         left = self.iterations - self.direct - 1
         w = composite_map(objective) if left > 0 else None
         if w is None:
-            # None where the steps before were all.
+            # The result is None if the iterator was used up before.
             return bool((yield from steps))
         there = objective.near_map(w)
         yield there
@@ -87,18 +85,18 @@ class Composite(VectorAdam):
 
 
 def composite_map(objective: Objective) -> ComplexArray | None:
-    """Every vertex by way of a disk to the target.
+    """Map every vertex through a disk to the target.
 
     Parameters
     ----------
     objective : Objective
-        Its problem's loop, target and Laplacian are what counts.
+        Only its problem's loop, target and Laplacian are used.
 
     Returns
     -------
     (n,) complex128 or None
-        In the problem's frame, fixed vertices in their places. None where there are several loops or pins, or where
-        the target's outline meets itself or is too narrow for doubles.
+        In the problem's frame, fixed vertices at their target positions. None if there are several loops or pins, or if
+        the target's outline intersects itself or is too narrow for doubles.
     """
     problem = objective.problem
     if len(problem.domain.loops) != 1 or problem.domain.pins.size:
@@ -125,7 +123,7 @@ def composite_map(objective: Objective) -> ComplexArray | None:
 
 
 def polygon_triangles(outline: ComplexArray) -> IntArray | None:
-    """Triangulate a simple polygon without further vertices.
+    """Triangulate a simple polygon without additional vertices.
 
     Parameters
     ----------
@@ -135,7 +133,7 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
     Returns
     -------
     (k - 2, 3) int64 or None
-        Strictly positive triangles. None where the polygon meets itself, or runs clockwise.
+        Strictly positive triangles. None if the polygon intersects itself or runs clockwise.
     """
     k = len(outline)
     ring = np.arange(k)
@@ -152,13 +150,13 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
         F = constrained_delaunay(np.concatenate([points, box]), sides, k + np.arange(4))
     except (BlockedError, ValueError):
         return None
-    # To the left of what runs clockwise lies the rest of the box, of k + 4 triangles.
+    # If the polygon runs clockwise, the rest of the box is to its left, and the number of triangles differs.
     F = F[_within(F, k)]
     return F if len(F) == k - 2 else None
 
 
 def _within(F: IntArray, k: int) -> BoolArray:
-    """Which triangles lie to the left of the sides 0→1→…→k−1→0: those that no side parts from one that does."""
+    """Select the triangles to the left of the sides 0→1→…→k−1→0 and all triangles connected to them across other edges."""
     tails, heads, owner = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.repeat(np.arange(len(F)), 3)
     corners = (tails < k) & (heads < k)
     forward, backward = corners & (heads == (tails + 1) % k), corners & (tails == (heads + 1) % k)
@@ -174,7 +172,7 @@ def _within(F: IntArray, k: int) -> BoolArray:
 
 
 def _corners_of_disk(outline: ComplexArray) -> ComplexArray:
-    """Points of the unit circle for the corners of an outline."""
+    """Return points of the unit circle for the corners of an outline."""
     k = len(outline)
     length = np.abs(np.roll(outline, -1) - outline)
     share = (1 - _EVENLY) * length / length.sum() + _EVENLY / k

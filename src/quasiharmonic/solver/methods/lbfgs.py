@@ -1,8 +1,8 @@
-"""L-BFGS, in units of one's own for every triangle if need be, with steps that never raise the objective (§9.1).
+"""L-BFGS with optional units per triangle, whose steps never raise the objective (§9.1).
 
-What a step of ξ does differs by many orders of magnitude between triangles, and plain L-BFGS spends itself on finding
-that out. Each triangle's ξ may be measured in given units, and an objective may be infinite: steps that lead there
-are shortened.
+The effect of a step in ξ differs by many orders of magnitude between triangles, and plain L-BFGS needs many steps to
+learn that. Each triangle's ξ may therefore be measured in given units. The objective may be infinite; steps that lead
+there are shortened.
 """
 
 from __future__ import annotations
@@ -19,30 +19,29 @@ from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import FunctionalDescent, Iterates
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
 
-# Pairs of steps and changes of gradient that are remembered.
+# Number of pairs of steps and gradient changes in memory.
 _MEMORY = 10
-# No triangle's ξ moves farther in a step than so many times 1 + |ξ|; the latter in steps from a gradient alone. With
-# si-log |μ| = 0.9 is 8,102 away.
+# Maximum step of a triangle's ξ as a multiple of 1 + |ξ|; the second value is for steps along a gradient alone. With
+# si-log, |μ| = 0.9 is at |ξ| = 8,102.
 _LONGEST, _FIRST = 1.0, 0.1
-# A step is shortened this often before the direction is given up.
+# Maximum number of trial steps per direction.
 _TRIES = 20
-# The descent is at rest when so many steps together have lowered the objective by less than the tolerance.
+# Number of steps whose total decrease is compared with the tolerance.
 _WINDOW = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class LBFGS(FunctionalDescent):
-    """Descend by limited-memory BFGS; the objective has a finite value at the start.
+    """Descend by limited-memory BFGS; the objective must be finite at the start.
 
     Attributes
     ----------
     iterations : int
-        Evaluations at most, those of the line search included.
+        Maximum number of evaluations, including those of the line search.
     stiffness : (f,) float64, optional
-        The diagonal that stands for the second derivative until something better is known, up to a factor; positive,
-        and all alike by default.
+        Diagonal of the initial Hessian approximation, up to a factor; positive. Default: all equal.
     tolerance : float
-        Ten steps that lower the objective by less than this fraction of it are the end.
+        Converged if ten steps lower the objective by less than this fraction of it.
     """
 
     stiffness: FloatArray | None = None
@@ -51,7 +50,7 @@ class LBFGS(FunctionalDescent):
     word: ClassVar[str] = "l-bfgs"
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`, each of less value than the one before; at rest also where no step lowers it any more."""
+        """See `Descent`; values decrease strictly. Converged also if no step lowers the value."""
         stiffness = np.ones(start.xi.size) if self.stiffness is None else self.stiffness
         here, left = start, self.iterations
         pairs: deque[tuple[ComplexArray, ComplexArray, float]] = deque(maxlen=_MEMORY)
@@ -78,7 +77,7 @@ class LBFGS(FunctionalDescent):
                 return there.value, there if there.value < bound else None
 
             def shorter(t: float, after: float, before: float = before, slope: float = slope) -> float:
-                """By how much: to the minimum of the parabola through what is known, within reason."""
+                """Return the factor that leads to the minimum of the interpolating parabola, within 0.1 to 0.5."""
                 if not np.isfinite(after):
                     return 0.25
                 return float(np.clip(-0.5 * slope * t / (after - before - slope * t), 0.1, 0.5))
@@ -107,7 +106,7 @@ class LBFGS(FunctionalDescent):
 def _direction(
     gradient: ComplexArray, pairs: deque[tuple[ComplexArray, ComplexArray, float]], stiffness: FloatArray
 ) -> ComplexArray:
-    """The two-loop recursion (Nocedal and Wright 2006, algorithm 7.4) from the diagonal ``stiffness``."""
+    """Apply the two-loop recursion (Nocedal and Wright 2006, algorithm 7.4) with the diagonal ``stiffness``."""
     direction = -gradient
     shares = []
     for step, change, curvature in reversed(pairs):

@@ -1,19 +1,19 @@
-"""Combing: all vertices glide along parallel lines at once, as far as a linear programme says.
+"""Line shift: move all vertices along parallel lines at once by a linear programme.
 
-With every vertex confined to its line of one direction, the signed area of each triangle is *linear* in where on the
-lines its corners are. So the least inverted area that can be reached along that direction is the solution of a linear
-programme, whatever folds and walls are in between: no step length, no local minimum. A vertex slips past another one
-without coming near it, and a fold of many triangles moves as a whole. Directions are drawn at random, one after the
-other, and patches around inverted triangles are combed, large and small.
+If every vertex moves only along a line of one direction, the signed area of each triangle is *linear* in the positions
+on the lines. A linear programme therefore gives the least inverted area that can be reached along that direction,
+whatever obstacles lie in between. It needs no step length and has no local minima. A vertex can pass another without
+coming close to it, and a fold of many triangles moves as a whole. Directions are drawn at random, one after another,
+for large and small patches around inverted triangles.
 
-With ``s`` the places along the lines in units of the triangles' widths there, and a triangle's row ``A`` scaled to a
+With ``s`` the positions along the lines in units of the triangles' widths there, and a triangle's row ``A`` scaled to a
 largest entry of one,
 
-    least Σ z      where  A (s + d) + z ≥ δ,   z ≥ 0,
+    minimise Σ z      subject to  A (s + d) + z ≥ δ,   z ≥ 0.
 
-δ is a fraction of what a positive triangle has, so that it stays positive, and a little for an inverted one.
-Directions are drawn after an affine map has made the patch as wide as it is long: orientations do not mind, and a
-target that is flat or a limb that is thin is like any other.
+δ is a fraction of a positive triangle's value, so that it stays positive, and a small value for an inverted triangle.
+Before directions are drawn, an affine map makes the patch as wide as it is long. It preserves orientations, so flat
+targets and thin limbs need no special treatment.
 """
 
 from __future__ import annotations
@@ -32,31 +32,32 @@ from quasiharmonic.util.progress import heartbeat
 
 Generator = np.random.Generator
 
-# Rings around an inverted triangle, one of them drawn for every patch; triangles of a patch at most, and of one of the
-# fewest rings, which has many where a vertex has very many neighbours.
+# Rings around an inverted triangle, one drawn per patch. Maximum number of triangles of a patch, and of a patch with
+# the fewest rings, which is large around a vertex with very many neighbours.
 _RINGS = 3, 8, 24
 _MOST_TRIANGLES, _MOST_NEAR = 2000, 20000
-# What a positive triangle keeps of its height over its widest side at the least, as a fraction and in widths; what an
-# inverted one is to get.
+# Least value δ. For a positive triangle: a fraction of its height over its widest side, at most the given number of
+# widths. For an inverted triangle: the last value.
 _KEPT, _ENOUGH, _RIGHTED = 0.1, 1.0, 1e-3
-# How far a vertex may move, in widths of the triangles around it.
+# Maximum move of a vertex, in widths of the triangles around it.
 _REACH = 20.0
-# Steps of the simplex method at most, each of which takes time like the triangles: a tenth of a second or two in all.
+# Maximum number of simplex steps times triangles: each step takes time proportional to the triangles. The total is
+# about 0.1 to 0.2 CPU seconds.
 _PIVOTS_TIMES_TRIANGLES = 4_000_000
-# A programme takes about as long as so many steps of untangling the patch.
+# Cost of a programme, in steps of untangling the patch.
 _STEPS_A_PROGRAMME = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineShift(VertexDescent):
-    """Right inverted triangles by linear programmes along random directions.
+    """Untangle inverted triangles by linear programmes along random directions.
 
-    The directions are drawn from a generator of its own, always the same.
+    The directions come from a generator with a fixed seed.
 
     Attributes
     ----------
     in_vain : int
-        So many programmes in a row may right no triangle.
+        Maximum number of consecutive programmes that untangle no triangle.
     """
 
     in_vain: int = 5
@@ -68,7 +69,7 @@ class LineShift(VertexDescent):
         whole_number("in_vain", self.in_vain, least=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`; a map after every programme that left fewer inverted triangles."""
+        """See `Descent`; yields a map after every programme that reduces the number of inverted triangles."""
         problem, effort = objective.problem, Effort(len(objective.problem.F))
         rng = np.random.default_rng(0)
 
@@ -87,7 +88,7 @@ class LineShift(VertexDescent):
 
 
 def combed(rng: Generator, F: IntArray, w: ComplexArray, held: BoolArray) -> ComplexArray:
-    """A map with the least inverted area, as defined above, along one direction.
+    """Return a map with the least inverted area, as defined above, along one random direction.
 
     Parameters
     ----------
@@ -98,12 +99,12 @@ def combed(rng: Generator, F: IntArray, w: ComplexArray, held: BoolArray) -> Com
     w : (v,) complex128
         Its map.
     held : (v,) bool
-        Vertices that stay.
+        Fixed vertices.
 
     Returns
     -------
     (v,) complex128
-        ``w`` where the programme has no solution that it can find.
+        ``w`` if the solver finds no solution.
     """
     places = frame_along(w, rng.uniform(0, np.pi))
     if places is None:
@@ -114,29 +115,29 @@ def combed(rng: Generator, F: IntArray, w: ComplexArray, held: BoolArray) -> Com
 
 
 def frame_along(w: ComplexArray, angle: float) -> tuple[FloatArray, FloatArray, complex] | None:
-    """Coordinates along a direction and across it, in which points are as wide as they are long.
+    """Return coordinates along a direction and across it, in which the points are as wide as they are long.
 
     Parameters
     ----------
     w : (v,) complex128
     angle : float
-        Of the direction, in those coordinates.
+        Angle of the direction in those coordinates.
 
     Returns
     -------
     x, y : (v,) float64
-        Of the points' orientation.
+        With the same orientation as the points.
     along : complex
         The step that adds one to ``x``.
 
-    None where the points lie on a line.
+    None if the points lie on a line.
     """
     centred = np.stack([w.real, w.imag], axis=1)
     centred -= centred.mean(axis=0)
     _, size, axes = np.linalg.svd(centred, full_matrices=False)
     if not size[1] > 0:
         return None
-    # A reflection would turn all triangles over.
+    # A reflection would invert all triangles.
     axes[1] *= np.sign(np.linalg.det(axes))
     size /= np.sqrt(len(w))
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -146,18 +147,19 @@ def frame_along(w: ComplexArray, angle: float) -> tuple[FloatArray, FloatArray, 
 
 
 def best_shift(F: IntArray, x: FloatArray, y: FloatArray, held: BoolArray) -> FloatArray | None:
-    """Steps along x that leave the least inverted area.
+    """Return the steps along x that leave the least inverted area.
 
     Parameters
     ----------
     F : (p, 3) int64
     x, y : (v,) float64
     held : (v,) bool
+        Fixed vertices.
 
     Returns
     -------
     (v,) float64 or None
-        Zero where ``held``. None where the solver finds no solution.
+        Zero for fixed vertices. None if the solver finds no solution.
     """
     from scipy.optimize import linprog
     from scipy.sparse import csr_array

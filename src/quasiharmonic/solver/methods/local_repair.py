@@ -1,8 +1,8 @@
-"""Local repair: only a patch around the last inverted triangles is solved again.
+"""Local repair: solve only a patch around the last inverted triangles again.
 
-What is left at the end is typically a triangle or two against the boundary whose room is a millionth of a triangle's.
-Everything outside a few rings around them stays, and the inside is untangled
-(`quasiharmonic.solver.methods.untangling`). A patch that fails is grown.
+At the end of a search typically one or two triangles at the boundary are inverted, with a millionth of a triangle's
+area available. All vertices outside a few rings around them are fixed, and the interior is untangled
+(`quasiharmonic.solver.methods.untangling`). If a patch fails, a larger one is tried.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from quasiharmonic.solver.methods.base import Iterates, VertexDescent
 from quasiharmonic.solver.methods.untangling import untangled
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
 
-# Inverted triangles at most for local repair to begin at all.
+# Maximum number of inverted triangles for which local repair begins.
 MOST_FLIPS = 50
-# Triangles of a patch at most,
+# Maximum number of triangles of a patch,
 MOST_TRIANGLES = 1000
-# and at most as a fraction of the mesh's: above it untangling the whole mesh takes no longer.
+# and maximum as a fraction of the mesh: above it, untangling the whole mesh is as fast.
 _MOST_SHARE = 0.25
-# Rings of triangles around an inverted one, tried in turn.
+# Rings of triangles around an inverted one, tried in this order.
 _RINGS = 2, 4, 8, 16
-# To how many triangles the time amounts that a step on a patch takes besides, and that an iteration on a mesh does;
-# and the most triangles that a mesh's iteration is counted with: patches do not grow with the mesh.
+# Overhead of a step on a patch and of an iteration on a mesh, as an equivalent number of triangles. The last value is
+# the maximum mesh size in the cost of an iteration, because patches do not grow with the mesh.
 _BESIDES, _BESIDES_AN_ITERATION, _LARGE = 400, 200, 4 * MOST_TRIANGLES
 
 
 class Patch(NamedTuple):
-    """Some triangles of a mesh, with vertices numbered anew.
+    """Some triangles of a mesh, with their own vertex indices.
 
     Attributes
     ----------
     F : (p, 3) int64
         The triangles.
     vertices : (v,) int64
-        The mesh's number of each vertex.
+        The mesh's index of each vertex.
     held : (v,) bool
-        Vertices that stay: fixed ones, and those on the patch's boundary.
+        Fixed vertices: those of the problem and those on the patch's boundary.
     """
 
     F: IntArray
@@ -53,14 +53,14 @@ class Patch(NamedTuple):
 
 
 class Effort:
-    """What tries at patches cost, in iterations on the whole mesh.
+    """Cost of patch repairs, in units of iterations on the whole mesh.
 
-    It is counted in steps and triangles and not in seconds, so that a search ends at the same map every time.
+    The cost is counted in steps and triangles and not in seconds, so that a search is reproducible.
 
     Parameters
     ----------
     triangles : int
-        Of the whole mesh.
+        Number of triangles of the whole mesh.
     """
 
     def __init__(self, triangles: int) -> None:
@@ -68,28 +68,28 @@ class Effort:
         self._spent = 0.0
 
     def count(self, triangles: int, steps: int = 1) -> None:
-        """Count steps on a patch of so many triangles."""
+        """Add the cost of steps on a patch with this number of triangles."""
         self._spent += steps * (triangles + _BESIDES) / self._iteration
 
     def due(self) -> int:
-        """Whole iterations that were spent and not yet asked for."""
+        """Return the whole iterations spent since the last call."""
         whole = int(self._spent)
         self._spent -= whole
         return whole
 
 
-#: From a map and its inverted triangles to a patch and another map of it.
+#: Function from a map and its inverted triangles to a patch and another map of it.
 Attempt: TypeAlias = Callable[[ComplexArray, IntArray], tuple[Patch, ComplexArray] | None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocalRepair(VertexDescent):
-    """Right the last inverted triangles one patch at a time.
+    """Untangle the last inverted triangles one patch at a time.
 
     Attributes
     ----------
     tries : int
-        Patches to try at most; those of no use yield nothing.
+        Maximum number of patches; failed ones yield nothing.
     """
 
     tries: int = 30
@@ -101,7 +101,7 @@ class LocalRepair(VertexDescent):
         whole_number("tries", self.tries, least=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`; a map after every patch that left fewer inverted triangles."""
+        """See `Descent`; yields a map after every patch that reduces the number of inverted triangles."""
         problem, solver = objective.problem, objective.laplacian.solver.name
         w, tries = start.w, self.tries
         left = inverted_triangles(problem.F, problem.positions(w))
@@ -124,12 +124,13 @@ class LocalRepair(VertexDescent):
 
 
 def patch_around(problem: Problem, triangle: int, rings: int, most: int) -> Patch | None:
-    """Triangles within some rings of one, or None where those are too many or have no vertex that may move."""
+    """Return the triangles within some rings of one; None if they are too many or have no free vertex."""
     inside = np.zeros(problem.n, dtype=bool)
     inside[problem.F[triangle]] = True
     for _ in range(rings):
         inside[problem.F[inside[problem.F].any(axis=1)]] = True
-        # Triangles that hang together have at most two vertices each, and one more: a hub's need not all be seen.
+        # Connected triangles have at most two vertices each, plus one; this bound avoids visiting all triangles at a
+        # hub.
         if np.count_nonzero(inside) > 2 * most + 1:
             return None
     F = problem.F[inside[problem.F].all(axis=1)]
@@ -151,31 +152,31 @@ def remapped(
     tries: int | None = None,
     effort: Effort | None = None,
 ) -> Iterator[Iterate]:
-    """Take other maps of patches, one after the other, as long as they leave no more inverted triangles.
+    """Accept other maps of patches, one after another, if they do not increase the number of inverted triangles.
 
     Parameters
     ----------
     objective : Objective
     w : (n,) complex128
-        The map to begin with.
+        Initial map.
     left : (k,) int64
         Its inverted triangles.
     other : callable
-        From a map and what is left inverted to a patch and another map (v,) complex128 of it, or None.
+        Function from a map and its inverted triangles to a patch and another map (v,) complex128 of it, or None.
     patience : int
-        So many in a row may right no triangle.
+        Maximum number of consecutive patches that untangle no triangle.
     most : int, optional
-        Inverted triangles at most for it to be worth a try.
+        Maximum number of inverted triangles.
     tries : int, optional
-        Patches at most.
+        Maximum number of patches.
     effort : Effort, optional
-        What ``other`` counts its steps in.
+        Cost account of ``other``.
 
     Yields
     ------
     Iterate
-        A map after every patch that left fewer inverted triangles, and the last of them (or else that of ``w``) again
-        for every iteration that the tries amount to.
+        A map after every patch that reduces the number of inverted triangles. The last such map (or that of ``w``) is
+        yielded again for every iteration that the cost amounts to.
     """
     problem, effort = objective.problem, effort or Effort(len(objective.problem.F))
     first, here = w, None
@@ -207,12 +208,12 @@ def last_untangled(
     weights: FloatArray | None = None,
     effort: Effort | None = None,
 ) -> ComplexArray:
-    """Where untangling a map of a patch (v,) complex128 ends, some vertices (v,) bool held, triangles weighed (p,)."""
+    """Untangle a map of a patch (v,) complex128 with fixed vertices (v,) bool and weights (p,); return the last map."""
     last, stay, steps = w, np.flatnonzero(held), 1
     for step in untangled(patch.F, w, stay, grading=grading, linear_solver=linear_solver, weights=weights):
         last = step
         steps += 1
     if effort is not None:
-        # To begin takes as long as a step.
+        # The setup costs as much as a step.
         effort.count(len(patch.F), steps)
     return last

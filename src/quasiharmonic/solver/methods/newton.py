@@ -1,17 +1,17 @@
-"""Newton's method in the joint space of map and tensor (§F.2), for the last flips.
+"""Newton's method in the joint space of map and tensor (§F.2), for the last inverted triangles.
 
-The energy ``P(u, v, ξ) = Σ m [c (|p|² + |q|²) − 2 Re(t p q̄)]`` with ``c(|ξ|)`` and ``t = s(|ξ|) ξ/|ξ|`` couples ξ
-to the map triangle by triangle. In the directions along ξ and across it, ``δξ = (α + iβ) ξ/|ξ|``:
+The energy ``P(u, v, ξ) = Σ m [c (|p|² + |q|²) − 2 Re(t p q̄)]`` with ``c(|ξ|)`` and ``t = s(|ξ|) ξ/|ξ|`` couples ξ and
+the map triangle by triangle. In the directions along and across ξ, ``δξ = (α + iβ) ξ/|ξ|``:
 
-    ⎡ H   B ⎤ ⎡ d ⎤      ⎡ 0 ⎤       H, B, K: one 4×4, 4×2 and 2×2 block a triangle; H is the Laplacian for u
+    ⎡ H   B ⎤ ⎡ d ⎤      ⎡ 0 ⎤       H, B, K: one 4×4, 4×2 and 2×2 block per triangle; H is the Laplacian for u
     ⎣ Bᵀ  K ⎦ ⎣ δξ⎦ = −  ⎣ g ⎦       and v. The map is quasi-harmonic, so its own gradient vanishes.
 
-K is eliminated on each triangle, which leaves ``H − B K⁻¹ Bᵀ`` of the size and sparsity of planar elasticity.
-After the step the map is made quasi-harmonic again, which can only lower the energy further; so this is also
-Newton's method for V₃ as a function of ξ alone.
+K is eliminated on each triangle, which leaves ``H − B K⁻¹ Bᵀ`` with the size and sparsity of planar elasticity. After
+the step the map is made quasi-harmonic again, which only lowers the energy. The method is therefore also Newton's
+method for V₃ as a function of ξ alone.
 
-The trust region has Levenberg's form: ``K + λ m (|p|² + |q|²) I``. As λ grows the step shrinks towards the
-gradient's, and ``H − B K⁻¹ Bᵀ`` towards the positive definite H.
+The trust region has Levenberg's form: ``K + λ m (|p|² + |q|²) I``. As λ grows, the step shrinks towards the gradient's
+direction, and ``H − B K⁻¹ Bᵀ`` tends to the positive definite H.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from quasiharmonic.util.arrays import ComplexArray
 
 _FIRST_DAMPING = 1e-2
 _MOST_DAMPING = 1e12
-# Least eigenvalue of a triangle's block K, as a fraction of the largest of all: the block of a triangle that has
-# shrunk to a point is zero and could not be inverted.
+# Least eigenvalue of a triangle's block K, as a fraction of the largest of all. The block of a triangle that has shrunk
+# to a point is zero and not invertible.
 _LEAST = 1e-100
 
 
@@ -42,25 +42,25 @@ class Newton(TensorDescent):
     Attributes
     ----------
     iterations : int
-        Steps to try at most; those that are rejected yield nothing.
+        Maximum number of steps tried; rejected steps yield nothing.
     """
 
     word: ClassVar[str] = "newton"
 
     @property
     def patience(self) -> tuple[int, float] | None:
-        """Newton's steps are dear, and where they lead anywhere they do so at once."""
+        """A short patience: Newton steps are expensive, and if they succeed they do so early."""
         return 40, 0.1
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`; at rest where no step lowers the energy any more."""
+        """See `Descent`; converged when no step lowers the energy."""
         mesh, problem = objective.mesh, objective.problem
         system = NewtonSystem(problem.F, 0.5 * mesh.gamma, problem.n, problem.fixed, objective.laplacian.solver.name)
         here, damping = start, _FIRST_DAMPING
         model = SecondOrderModel(here)
         for _ in range(self.iterations):
             try:
-                # Where all curvatures underflow there is none to divide by, and what is no number is not factored.
+                # If all curvatures underflow, a division by zero gives NaN, and matrices with NaN are rejected.
                 with np.errstate(divide="ignore", invalid="ignore"):
                     step, predicted = model.step(system, damping)
                 there = objective.evaluate(objective.bounded(here.xi + step))
@@ -90,11 +90,11 @@ class SecondOrderModel:
     Attributes
     ----------
     K : three of (f,) float64
-        Entries 11, 12, 22 of each triangle's block, along ξ and across it.
+        Entries 11, 12, 22 of each triangle's block, in the directions along and across ξ.
     B : two of two of (f,) complex128
-        By p and by q, of the direction along ξ and of that across it.
+        Mixed derivatives by p and by q, for the directions along and across ξ.
     g : two of (f,) float64
-        The gradient along ξ and across it.
+        The gradient along and across ξ.
     unit : (f,) complex128
         ``ξ/|ξ|``.
     """
@@ -109,7 +109,7 @@ class SecondOrderModel:
         r = field.ratio * field.rho
         D, slope, bend = field.defect, field.slope, here.objective.parameterisation.bend(field.rho)
         rho = np.where(field.rho > 0, field.rho, 1.0)
-        # c and s by |ξ|, through r.
+        # Derivatives of c and s by |ξ|, through r.
         c1 = 4 * r / D**2 * slope
         c2 = 4 * (1 + 3 * r**2) / D**3 * slope**2 + 4 * r / D**2 * bend
         s1 = 2 * (1 + r**2) / D**2 * slope
@@ -132,16 +132,16 @@ class SecondOrderModel:
         self.H = QuadraticForm(2 * m * c, 2 * m * c, zero, zero, zero, -4 * m * t)
 
     def step(self, system: NewtonSystem, damping: float) -> tuple[ComplexArray, float]:
-        """Step in ξ and the decrease of the energy that the model predicts for it."""
+        """Return the step in ξ and the decrease of the energy that the model predicts."""
         m = self.here.objective.mesh.m
         ridge = damping * m * self.size
         k11, k12, k22 = self.K[0] + ridge, self.K[1], self.K[2] + ridge
-        # An inverted triangle may have a concave block: reflect it, and keep it away from zero.
+        # An inverted triangle may have a concave block: take absolute eigenvalues and bound them away from zero.
         mean, half = 0.5 * (k11 + k22), np.hypot(0.5 * (k11 - k22), k12)
         high, low = np.abs(mean + half), np.abs(mean - half)
         floor = 1e-10 * np.maximum(high, low) + _LEAST * high.max()
         high, low = np.maximum(high, floor), np.maximum(low, floor)
-        # The eigenvectors stay: the deviator is scaled to the new half difference, of either sign.
+        # Keep the eigenvectors: scale the deviator to the new half difference, which may have either sign.
         swapped = np.abs(mean - half) > np.abs(mean + half)
         stretch = np.divide(
             np.where(swapped, -1, 1) * 0.5 * np.abs(high - low), half, out=np.zeros_like(half), where=half > 0
@@ -172,7 +172,7 @@ class SecondOrderModel:
         return (alpha + 1j * beta) * self.unit, predicted
 
     def gather(self, by_p: ComplexArray, by_q: ComplexArray) -> ComplexArray:
-        """Derivatives by p and q as derivatives by the vertices' positions; (n,) complex128."""
+        """Convert derivatives by p and q to derivatives by the vertices' positions; (n,) complex128."""
         mesh = self.here.objective.mesh
         g = 0.5 * mesh.gamma
         parts = (by_p * g + by_q * g.conj()).ravel()
@@ -181,7 +181,7 @@ class SecondOrderModel:
 
 
 def _less_squares(form: QuadraticForm, *vectors: tuple[ComplexArray, ComplexArray]) -> QuadraticForm:
-    """The form less the squares ``Re(conj(b_p) dp + conj(b_q) dq)²``."""
+    """Return the form minus the squares ``Re(conj(b_p) dp + conj(b_q) dq)²``."""
     pp, qq, p2, q2, pq, pqc = form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc
     for bp, bq in vectors:
         cp, cq = bp.conj(), bq.conj()

@@ -1,13 +1,15 @@
-"""Local repair from random starts, for what is left when a descent from any sensible start ends in front of a wall.
+"""Local repair from random starts, for inverted triangles that no descent from a regular start untangles.
 
-A free vertex lies to the left of every fixed edge that it forms a triangle with: in the intersection of their
-half-planes. Where the target folds back that may be a wedge, a millionth as wide as it is long, that begins at the
-fold and opens away from it. A vertex on the near side of the fold misses it by next to nothing, and no descent leads
-around the fold. So a patch around an inverted triangle is started anew, again and again: from a quasi-harmonic map of
-random tensors, or with a vertex of that triangle put somewhere into its intersection and held there while the others
-make room. Where it is not one vertex but a chain of them that must go around, its inverted triangles come to weigh
-more (`quasiharmonic.solver.methods.reweighting`). A patch is taken on if no more triangles are inverted than before;
-this lets the map drift until it falls into place.
+A free vertex must lie to the left of every fixed edge with which it forms a triangle, in the intersection of their
+half-planes. If the target folds back, the intersection may be a wedge a millionth as wide as long, which begins at the
+fold and opens away from it. A vertex on the near side of the fold misses it narrowly, and no descent leads around the
+fold.
+
+A patch around an inverted triangle is therefore restarted many times. One kind of start is a quasi-harmonic map of
+random tensors. Another moves a vertex of that triangle into its intersection and fixes it while the other vertices
+make space. If a chain of vertices must go around the fold, the inverted triangles get more weight
+(`quasiharmonic.solver.methods.reweighting`). A patch is accepted if it does not increase the number of inverted
+triangles, so the map may drift until all triangles fit.
 """
 
 from __future__ import annotations
@@ -41,31 +43,32 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, whole_n
 
 Generator: TypeAlias = np.random.Generator
 
-# Rings around an inverted triangle, and sizes of the random ξ; one of them is drawn.
+# Rings around an inverted triangle, and sizes of the random ξ; one of each is drawn.
 _RINGS = 2, 3, 4, 6, 8, 12
 _SPREADS = 0.0, 0.5, 1.5
-# V₃ over the target's area below which a problem is worth more tries. Of ten thousand generated ones, those that have
-# no solution end above 1e-4, and those that have one and need many tries below 1e-6.
+# V₃ over the target's area below which a problem gets more tries, and their factor. Of ten thousand generated problems,
+# those without a solution end above 1e-4. Those with a solution that needs many tries end below 1e-6.
 _NEXT_TO_NOTHING, _DILIGENCE = 1e-5, 10
-# How many of the tries weigh triangles: these last several times as long as the others.
+# Fraction of tries that use weights; these take several times as long as the others.
 _REWEIGHTED = 0.5
-# Placed vertices lie this much of the way from a corner of the intersection to its middle, in powers of ten.
+# A moved vertex lies at a fraction of the way from a corner of the intersection to its centre; range of its decimal
+# logarithm.
 _DEPTHS = -3.5, 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomRestarts(VertexDescent):
-    """Right the last inverted triangles by solving patches around them from random starts.
+    """Untangle the last inverted triangles by solving patches around them from random starts.
 
-    The numbers are drawn from a generator of its own, always the same. If the inverted triangles are too many for
-    local repair, all of the mesh is untangled first.
+    The random numbers come from a generator with a fixed seed. If too many triangles are inverted for local repair, the
+    whole mesh is untangled first.
 
     Attributes
     ----------
     in_vain : int
-        So many patches in a row may be of no use; ten times as many where next to nothing is left to be righted.
+        Maximum number of consecutive patches without progress; ten times as many if V₃ is almost zero.
     tries : int, optional
-        Patches at most, of use or not.
+        Maximum number of patches.
     """
 
     in_vain: int = 30
@@ -79,13 +82,13 @@ class RandomRestarts(VertexDescent):
             whole_number("tries", self.tries, least=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`; a map after every patch that left fewer inverted triangles."""
+        """See `Descent`; yields a map after every patch that reduces the number of inverted triangles."""
         problem, solver = objective.problem, objective.laplacian.solver.name
         rng = np.random.default_rng(0)
         w = start.w
         left = inverted_triangles(problem.F, problem.positions(w))
         if left.size > MOST_FLIPS:
-            # Untangling all of the mesh is cut short where it gets nowhere.
+            # End untangling of the whole mesh if it makes no progress.
             whole = Patience((self.in_vain, 0.0))
             whole.is_over(start.inverted, start.value)
             for w in untangled(problem.F, start.w, problem.fixed, grading=0.0, linear_solver=solver):
@@ -117,7 +120,7 @@ class RandomRestarts(VertexDescent):
 def _restarted(
     rng: Generator, problem: Problem, patch: Patch, w: ComplexArray, solver: str, effort: Effort
 ) -> ComplexArray:
-    """Another map of a patch."""
+    """Return another map of a patch, found from a random start."""
     if rng.random() < _REWEIGHTED:
         return reweighted(rng, patch, w, solver, effort)
     grading = float(rng.choice(GRADINGS))
@@ -134,7 +137,7 @@ def _restarted(
 
 
 def _random_map(rng: Generator, patch: Patch, w: ComplexArray, held: BoolArray, linear_solver: str) -> ComplexArray:
-    """A quasi-harmonic map of random tensors with ``held`` vertices where ``w`` has them."""
+    """Return a quasi-harmonic map of random tensors with the ``held`` vertices at their positions in ``w``."""
     xi = rng.choice(_SPREADS) * (rng.standard_normal(len(patch.F)) + 1j * rng.standard_normal(len(patch.F)))
     mesh = ReferenceMesh(np.zeros((len(w), 2)), patch.F, "equilateral")
     laplacian = Laplacian(patch.F, len(w), np.flatnonzero(held), linear_solver)
@@ -142,8 +145,9 @@ def _random_map(rng: Generator, patch: Patch, w: ComplexArray, held: BoolArray, 
 
 
 def _place(rng: Generator, problem: Problem, patch: Patch, w: ComplexArray) -> tuple[int, complex] | None:
-    """A free vertex of an inverted triangle, or next to one, and a random place to the left of the fixed edges
-    around it; None where there is no such place.
+    """Choose a free vertex near an inverted triangle and a random position to the left of its opposite fixed edges.
+
+    None if there is no such vertex or position.
     """
     near = np.zeros(len(w), dtype=bool)
     near[patch.F[signed_areas(patch.F, w) <= 0]] = True
@@ -170,7 +174,7 @@ def _place(rng: Generator, problem: Problem, patch: Patch, w: ComplexArray) -> t
 
 
 def left_of(area: ComplexArray, tail: complex, head: complex) -> ComplexArray:
-    """Corners of the part of a convex polygon to the left of a line."""
+    """Return the corners of the part of a convex polygon to the left of a line."""
     side = (np.conj(head - tail) * (area - tail)).imag
     kept = []
     for p, q, s, t in zip(area, np.roll(area, -1), side, np.roll(side, -1), strict=True):
@@ -182,7 +186,7 @@ def left_of(area: ComplexArray, tail: complex, head: complex) -> ComplexArray:
 
 
 def nearest(area: ComplexArray, point: complex) -> complex:
-    """The point of a convex polygon's outline that is nearest to another."""
+    """Return the point of a convex polygon's outline that is nearest to a given point."""
     side = np.roll(area, -1) - area
     square = np.maximum(np.abs(side) ** 2, np.finfo(np.float64).tiny)
     along = np.clip((np.conj(side) * (point - area)).real / square, 0, 1)

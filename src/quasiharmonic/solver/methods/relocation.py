@@ -1,15 +1,14 @@
-"""Placing: the vertices of the last inverted triangles, each where the triangles around it have most room.
+"""Relocation: move each vertex of the last inverted triangles to where its triangles have the largest least height.
 
-With all other vertices held, the signed height of a triangle over the edge opposite to a corner is linear in where that
-corner lies, and so the place at which the least height around a vertex is greatest solves a linear programme of three
-unknowns, the place and that height. (The local untangling of Freitag and Plassmann 2000 does so with areas; heights
-leave maps that are less distorted.) At its solution three heights are alike: for the six triangles or so around a
-vertex all places where three are alike are looked at, and the best is taken. Vertices that share no triangle are
-placed at the same time.
+If all other vertices are fixed, the signed height of a triangle over the edge opposite to a corner is linear in the
+position of that corner. The position that maximises the least height around a vertex therefore solves a linear
+programme with three unknowns, the position and that height. (The local untangling of Freitag and Plassmann 2000 uses
+areas; heights give less distorted maps.) At its solution three heights are equal. For the six or so triangles around a
+vertex, all positions with three equal heights are computed, and the best is chosen. Vertices that share no triangle are
+moved at the same time.
 
-Where a descent has come so far that few triangles are inverted this often does what it would take many more steps
-for, in no more time than two or three of them. It is tried in passing: where it leaves anything inverted, nothing has
-happened.
+If a descent has few inverted triangles left, relocation often replaces many more steps, at the cost of two or three of
+them. It is tentative: if any triangle stays inverted, the result is discarded.
 """
 
 from __future__ import annotations
@@ -25,32 +24,32 @@ from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
 from quasiharmonic.util.kernels import compiled
 
-# Inverted triangles at most for a try: with more it mostly fails, and takes longer than a step where it is not
-# compiled. The first map, from which the way may be far, is tried with more.
+# Maximum number of inverted triangles for a try: with more it usually fails, and without compiled kernels it is slower
+# than a step. The second value is for the first map, from which the descent may be long.
 _MOST_FLIPS, _MOST_AT_FIRST = 12, 100
-# After a try in vain the next is made when so large a part of the inverted triangles is left, or after as many steps
-# again and two more.
+# After a failed try, the next is made when the number of inverted triangles has fallen to this fraction, or when the
+# number of steps has doubled plus two.
 _FEWER = 0.75
-# Times that the vertices of what is inverted are placed anew at most, and how often in a row that may be in vain.
+# Maximum number of sweeps over the vertices of inverted triangles, and of consecutive sweeps without progress.
 _SWEEPS, _IN_VAIN = 8, 3
-# Times that what has been righted is placed once more, with its neighbours, so that the room is shared.
+# Number of sweeps over moved vertices and their neighbours after success, to even out the heights.
 _SHARING = 2
-# Triangles around a vertex that is placed at most: of 16 there are 560 threes.
+# Maximum number of triangles around a vertex: 16 have 560 triples.
 _MOST_AROUND = 16
-# So many vertices are parted by how many triangles are around them, up to these numbers (6 have 20 threes, 12 have
-# 220), and so that there are so many heights at once: their arrays stay in the processor's cache.
+# If a group has at least this many vertices, it is divided by the number of triangles around them, at these sizes (6
+# have 20 triples, 12 have 220). The last value limits the heights computed at once, so that arrays stay in the cache.
 _MANY, _SIZES, _HEIGHTS = 16, (6, 8), 30_000
 
 
 class RetrySchedule:
-    """When it is time for a try, while a descent goes on."""
+    """Schedule of tries during a descent."""
 
     def __init__(self) -> None:
         self._seen = self._next = 0
         self._few_enough = 0.0
 
     def due(self, inverted: int) -> bool:
-        """Whether to try the next map of the descent, of which so many triangles are inverted."""
+        """Whether to try the next map of the descent, given its number of inverted triangles."""
         seen, self._seen = self._seen, self._seen + 1
         if not 0 < inverted <= (_MOST_FLIPS if seen else _MOST_AT_FIRST):
             return False
@@ -61,39 +60,39 @@ class RetrySchedule:
 
 
 def placed(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None:
-    """Place the vertices of inverted triangles until none is left.
+    """Relocate the vertices of inverted triangles until none is inverted.
 
     Parameters
     ----------
     F : (f, 3) int64
     w : (n,) complex128
     fixed : (k,) int64
-        Vertices that stay; all those of the boundary are among them.
+        Fixed vertices, including the whole boundary.
 
     Returns
     -------
     (n,) complex128 or None
-        A map without inverted triangles, in floating point; None where some stay inverted.
+        A map without inverted triangles, in floating point; None if some stay inverted.
     """
     moved, righted = placed_each(F, w, fixed, np.zeros(len(F), dtype=np.int64))
     return moved if righted.all() else None
 
 
 def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -> tuple[ComplexArray, BoolArray]:
-    """As `placed`, for many meshes side by side.
+    """Apply `placed` to many meshes in a batch.
 
     Parameters
     ----------
     F, w, fixed
-        Of all meshes, none joined to another.
+        Of all meshes, which share no vertices.
     mesh : (f,) int64
-        Which mesh a triangle belongs to, ascending.
+        The mesh of each triangle, ascending.
 
     Returns
     -------
     w : (n,) complex128
     righted : (m,) bool
-        Of which meshes no triangle is inverted any more.
+        Which meshes have no inverted triangle.
     """
     moves = np.ones(len(w), dtype=bool)
     moves[fixed] = False
@@ -106,7 +105,7 @@ def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -
 def place_inverted(
     F: IntArray, moves: BoolArray, mesh: IntArray, given: ComplexArray, w: ComplexArray, righted: BoolArray
 ) -> None:
-    """Fill in what `placed_each` returns; moves: which vertices may (n,)."""
+    """Fill in the results of `placed_each`; ``moves`` (n,) marks the free vertices."""
     w[:] = given
     fewest, in_vain = np.full(righted.size, len(F) + 1), np.zeros(righted.size, dtype=np.int64)
     vertices, groups = np.empty(0, dtype=np.int64), list[_Stars]()
@@ -127,14 +126,14 @@ def place_inverted(
         _place(w, groups)
     np.equal(fewest, 0, out=righted)
     if righted.any():
-        # What has moved is placed again, together with its neighbours.
+        # Relocate the moved vertices again, together with their neighbours.
         near = np.zeros(len(w), dtype=bool)
         T, of = F[righted[mesh]], mesh[righted[mesh]]
         near[T[_any_corner((w != given)[T])]] = True
         groups, there = _apart(T, np.flatnonzero(near & moves), len(w)), w.copy()
         for _ in range(_SHARING):
             _place(there, groups)
-        # No height falls below the least of those around it, but for rounding.
+        # Except for rounding, no height falls below the least of those around it.
         spoilt = np.bincount(of[~(signed_areas(T, there) > 0)], minlength=righted.size) > 0
         back = T[spoilt[of]]
         there[back] = w[back]
@@ -142,19 +141,19 @@ def place_inverted(
 
 
 def _any_corner(marked: BoolArray) -> BoolArray:
-    """Which triangles have a corner that is marked, (f, 3) bool; many times as fast as NumPy's any."""
+    """Which triangles have a marked corner, (f,) bool; many times faster than NumPy's any."""
     some: BoolArray = marked[:, 0] | marked[:, 1] | marked[:, 2]
     return some
 
 
 def _place(w: ComplexArray, groups: list[_Stars]) -> None:
-    """Place vertices, in their array, group after group."""
+    """Relocate vertices in place, group by group."""
     for some in groups:
         w[some.vertices] = roomiest(w[some.vertices], w[some.tails], w[some.heads])
 
 
 class _Stars(NamedTuple):
-    """Some vertices and the edges opposite to each, (m,) and twice (m, k) int64; shorter rows repeat their last."""
+    """Vertices (m,) and the opposite edges of their triangles, two (m, k) int64; shorter rows repeat their last edge."""
 
     vertices: IntArray
     tails: IntArray
@@ -162,7 +161,7 @@ class _Stars(NamedTuple):
 
 
 def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
-    """Interior vertices, in ascending order, in groups of such as share no triangle."""
+    """Divide interior vertices, in ascending order, into groups whose vertices share no triangle."""
     number = np.full(n, -1)
     number[vertices] = np.arange(vertices.size)
     around = F[_any_corner(number[F] >= 0)]
@@ -173,9 +172,9 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     tails, heads = around[triangle, (corner + 1) % 3], around[triangle, (corner + 2) % 3]
     count = np.bincount(own, minlength=vertices.size)
     first = np.cumsum(count) - count
-    # In each of the triangles around a vertex the next corner is another neighbour: they are all neighbours.
+    # In each triangle around a vertex, the next corner is another neighbour; together these are all neighbours.
     neighbours, start = number[tails].tolist(), [*first.tolist(), own.size]
-    # A group is a bit; what has none, or is none of the vertices and so has the last place, has no bit.
+    # Each group is a bit. Vertices without a group have no bit; index -1 stands for vertices outside the list.
     group = [0] * (vertices.size + 1)
     for vertex in np.flatnonzero(count <= _MOST_AROUND).tolist():
         taken = 0
@@ -192,7 +191,7 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
 
 
 def _alike(members: IntArray, count: IntArray) -> list[IntArray]:
-    """Members of a group, where they are many by how many triangles are around them, and not too many at once."""
+    """Divide a large group by the number of triangles around its vertices, and into parts of limited size."""
     if members.size < _MANY:
         return [members]
     size, some = np.searchsorted(_SIZES, count[members]), list[IntArray]()
@@ -205,24 +204,24 @@ def _alike(members: IntArray, count: IntArray) -> list[IntArray]:
 
 
 def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> ComplexArray:
-    """Where the least signed height of the triangles around a vertex is greatest, for many vertices.
+    """Return the positions that maximise the least signed height of the triangles around each vertex.
 
     Parameters
     ----------
     w : (m,) complex128
-        Where the vertices are.
+        Positions of the vertices.
     tails, heads : (m, k) complex128
-        The edges opposite to each of them, which make a closed loop; some may be there twice.
+        The edges opposite to each vertex, which form a closed loop; some may be repeated.
 
     Returns
     -------
     (m,) complex128
-        ``w`` where rounding leaves no such place.
+        ``w`` if rounding leaves no such position.
     """
     height = np.empty((3, *tails.shape))
     with np.errstate(all="ignore"):
         along = (heads - tails) / np.abs(heads - tails)
-        # The height of (x, y) is the first times x and the second times y less the third.
+        # The height of (x, y) is the first component times x plus the second times y minus the third.
         height[0], height[1] = -along.imag, along.real
         height[2] = height[0] * tails.real + height[1] * tails.imag
         three = height[:, :, _threes(tails.shape[1])]
@@ -231,13 +230,13 @@ def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> Compl
         least = (height[:2].transpose(1, 2, 0) @ place - height[2][:, :, None]).min(axis=1)
     least[~np.isfinite(least)] = -np.inf
     best, rows = least.argmax(axis=1), np.arange(len(w))
-    # Built from its parts: times 1j, infinity would be no number.
+    # Built from real and imaginary parts, because infinity times 1j gives NaN.
     found = np.stack([place[rows, 0, best], place[rows, 1, best]], axis=1).view(np.complex128)[:, 0]
     return np.where(np.isfinite(least[rows, best]), found, w)
 
 
 @cache
 def _threes(count: int) -> IntArray:
-    """All threes out of so many; (3, …) int64."""
+    """Return all triples of ``count`` indices; (3, …) int64."""
     threes: IntArray = np.array(list(combinations(range(count), 3)), dtype=np.int64).T
     return threes

@@ -1,9 +1,9 @@
-"""Untangling again and again, what stays inverted counting ever more.
+"""Untangle a patch repeatedly with growing weights of the inverted triangles.
 
-Untangling starts with a large ε, at which its energy has hardly more than one minimum: however a patch is started, it
-ends in the same few maps. What leads elsewhere is another energy. So triangles that stay inverted are given more
-weight, round after round, as constraints are in searches for satisfying assignments: they are righted at the expense
-of others, which become heavier in turn, until a map is found that has room for all.
+Untangling starts with a large ε, for which its energy has hardly more than one minimum. From any start a patch
+therefore ends in one of the same few maps, and another result needs another energy. Triangles that stay inverted get
+more weight in every round, as constraints do in searches for satisfying assignments. They are untangled at the expense
+of others, which gain weight in turn, until all triangles fit.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from quasiharmonic.util.arrays import ComplexArray
 
 Generator = np.random.Generator
 
-# Factors that an inverted triangle's weight may be multiplied by after each round; one is drawn for all rounds.
+# Possible factors of an inverted triangle's weight per round; one is drawn for all rounds.
 _FACTORS = 3.0, 10.0
-# Rounds at most.
+# Maximum number of rounds.
 _ROUNDS = 15
-# A map with this many more inverted triangles than the first does not recover: the rounds end.
+# If a map has this many more inverted triangles than the first, it does not recover, and the rounds end.
 _WILD = 15
 
 
 def reweighted(
     rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str, effort: Effort | None = None
 ) -> ComplexArray:
-    """Another map of a patch, by weighing its inverted triangles.
+    """Return another map of a patch, found by weighting its inverted triangles.
 
     Parameters
     ----------
     rng : Generator
-        Draws the factor and every round's grading.
+        Draws the factor and the grading of every round.
     patch : Patch
     w : (v,) complex128
         Its map.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
     effort : Effort, optional
-        What steps are counted in.
+        Cost account of the steps.
 
     Returns
     -------
     (v,) complex128
-        The first map without inverted triangles, or else the last that has no more of them than ``w``.
+        The first map without inverted triangles, or else the last one with no more of them than ``w``.
     """
     factor = float(rng.choice(_FACTORS))
     weights = np.ones(len(patch.F))

@@ -1,16 +1,15 @@
-"""Untangling: Newton's method for the positions themselves, when a search over tensors has left triangles inverted.
+"""Untangling: Newton's method for the positions, if a search over tensors has left triangles inverted.
 
 The regularised energy of Garanzha et al. (2021),
 
     φ = (|p|² + |q|² + λ (D² + 1)) / χ(D),      D = |p|² − |q|²,      χ(D) = (D + √(ε² + D²)) / 2,
 
-is finite for inverted triangles, and becomes a barrier against them as ε falls. A triangle or two against the
-boundary with a millionth of a triangle's room are a small part of V₃, which hardly sees them; here they come to
-outweigh all others.
+is finite for inverted triangles and becomes a barrier against them as ε falls. A triangle at the boundary with a
+millionth of a triangle's area hardly affects V₃, but it dominates this energy.
 
-Reference triangles are equilateral, their sides as long as the target's boundary edges near them to some power: with
-1 a limb that shrinks is as good as one that does not, with 0 all triangles are to be alike. Either gets past what
-stops the other.
+Reference triangles are equilateral, with sides proportional to a power of the lengths of nearby target boundary edges.
+With power 1 a limb may shrink without cost; with power 0 all triangles tend to equal size. Either may succeed where the
+other stalls.
 """
 
 from __future__ import annotations
@@ -32,24 +31,25 @@ from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, whole_number
 
-# Powers of the boundary edges' lengths, tried in turn.
+# Powers of the boundary edges' lengths, tried in this order.
 GRADINGS = 0.5, 0.0, 1.0
-# Weight of areas against angles.
+# Weight of areas relative to angles.
 _LAMBDA = 1e-4
-# The first ε, as a fraction of the least determinant; and what is done at each ε: so many steps, or as many as
-# lower the energy by such a fraction.
+# First ε, as a fraction of the absolute least determinant; maximum number of steps at each ε; relative decrease of the
+# energy below which ε is reduced.
 _FIRST, _STEPS, _WORTHWHILE = 0.2, 20, 1e-3
-# With ε this far below the least determinant hardly a triangle has ever been righted.
+# If ε falls below this fraction of the least determinant, hardly any triangle is untangled any more.
 _HOPELESS = 5e-3
-# Determinants below are those of triangles as small as positions are rounded; one of zero has no ε below it.
+# Smaller determinants belong to triangles as small as the rounding of positions. A determinant of zero would never end
+# the loop over ε.
 _FLAT = 1e-30
-# From a map without inverted triangles: an ε so small that the energy is a barrier; and what a step is to bring.
+# For `opened`: an ε so small that the energy is a barrier; the least relative decrease per step.
 _BARRIER, _NOTICEABLE = 1e-9, 1e-2
-# Smallest reference triangle, relative to the largest, and of all: squared areas must stay within the numbers' range.
+# Smallest reference triangle, relative to the largest, and absolute: squared areas must not underflow.
 _SMALLEST, _LEAST = 1e-70, 1e-140
-# Raised diagonals, one after the other until a factorisation exists.
+# Shifts of the diagonal, tried in this order until a factorisation exists.
 _SHIFTS = 0.0, 1e-10, 1e-6, 1e-3
-# How often a step is halved.
+# Maximum number of halvings of a step.
 _HALVINGS = 24
 
 
@@ -59,25 +59,25 @@ class Regularised(Isotropic):
     Parameters
     ----------
     epsilon : float
-        ε > 0: at a determinant of −ε and below, an inverted triangle is dear.
+        ε > 0: inverted triangles with a determinant of −ε or below have a high energy.
     """
 
     def __init__(self, epsilon: float) -> None:
         self.epsilon = epsilon
 
     def density(self, d: Deformation) -> FloatArray:
-        """``N/χ`` with ``N = a + b + λ (D² + 1)``."""
+        """Return ``N/χ`` with ``N = a + b + λ (D² + 1)``."""
         _, chi, numerator = self._parts(d)
         return numerator / chi
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
-        """``(1 ± G)/χ`` with ``G = 2λD − N/ρ``, since ``χ' = χ/ρ`` with ``ρ = √(ε² + D²)``."""
+        """Return ``(1 ± G)/χ`` with ``G = 2λD − N/ρ``, since ``χ' = χ/ρ`` with ``ρ = √(ε² + D²)``."""
         root, chi, numerator = self._parts(d)
         by_det = 2 * _LAMBDA * d.det - numerator / root
         return (1 + by_det) / chi, (1 - by_det) / chi
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """By ``S = a + b`` and D: ``φ_SD = −1/(χρ)``, ``φ_DD = 2λ (1 − 2D/ρ)/χ + 2N/ρ³``, and φ_SS = 0."""
+        """Return the Hessian; by ``S = a + b`` and D: ``φ_SD = −1/(χρ)``, ``φ_DD = 2λ (1 − 2D/ρ)/χ + 2N/ρ³``, φ_SS = 0."""
         root, chi, numerator = self._parts(d)
         mixed = -1 / (chi * root)
         pure = 2 * _LAMBDA * (1 - 2 * d.det / root) / chi + 2 * numerator / root**3
@@ -92,14 +92,14 @@ class Regularised(Isotropic):
 
 @dataclass(frozen=True, kw_only=True)
 class Untangling(VertexDescent):
-    """Right inverted triangles by moving all vertices.
+    """Untangle inverted triangles by moving all vertices.
 
     Attributes
     ----------
     iterations : int
-        Steps to take at most, over all gradings.
+        Maximum number of steps over all gradings.
     resume : bool
-        Start from the map of the lowest V₃ so far.
+        Start from the map of lowest V₃ so far.
     """
 
     iterations: int = 300
@@ -110,11 +110,11 @@ class Untangling(VertexDescent):
         whole_number("iterations", self.iterations, least=1)
 
     def resumed(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
-        """All of the mesh is moved: what matters is how far it is from a map on the whole."""
+        """Return the map of lowest V₃: the whole mesh moves, so its overall closeness to a solution matters."""
         return lowest_energy.w
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`."""
+        """See `Descent`."""
         problem, solver = objective.problem, objective.laplacian.solver.name
         left = self.iterations
         for grading in GRADINGS:
@@ -136,34 +136,34 @@ def untangled(
     weights: FloatArray | None = None,
     rest: FloatArray | None = None,
 ) -> Iterator[ComplexArray]:
-    """Newton steps down the regularised energy, ε falling.
+    """Yield the maps of Newton steps down the regularised energy with falling ε.
 
     Parameters
     ----------
     F : (f, 3) int64
         Triangles; every vertex belongs to one.
     w : (n,) complex128
-        A map.
+        Initial map.
     held : (k,) int64
-        Vertices that stay.
+        Fixed vertices.
     grading : float
         Power of the boundary edges' lengths.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
     weights : (f,) float64, optional
-        How much triangles count; all alike by default.
+        Weights of the triangles; equal by default.
     rest : (n, 2) float64, optional
-        Where the triangles have the shapes that they should have; equilateral ones by default. They may overlap then.
+        Positions at which the triangles have their reference shapes, which may overlap. Default: equilateral triangles.
 
     Yields
     ------
     (n,) complex128
-        The map after every step, until no triangle is inverted in floating point, or no more will be righted.
+        The map after every step, until no triangle is inverted in floating point or no further progress is expected.
     """
     references = _even(F, w, grading, linear_solver) if rest is None else _References.at(rest, F)
     if references is None:
         return
-    # Around what is computed, and not around a yield, which would carry the state to the caller.
+    # Enclose only the computation: around a yield, the setting would affect the caller.
     with np.errstate(all="ignore"):
         descent = RegularisedDescent(F, w, held, references, linear_solver, 1.0 if weights is None else weights)
     least = descent.least
@@ -191,14 +191,14 @@ def untangled(
 def opened(
     F: IntArray, w: ComplexArray, held: IntArray, *, grading: float, linear_solver: str = "auto", steps: int = 10
 ) -> ComplexArray:
-    """Newton steps from a map without inverted triangles towards one whose triangles are shaped and sized evenly.
+    """Take Newton steps from a map without inverted triangles towards triangles of even shape and size.
 
     Parameters
     ----------
     F, w, held, grading, linear_solver
-        As of `untangled`.
+        See `untangled`.
     steps : int
-        At most; fewer where they no longer lower the energy noticeably.
+        Maximum number; fewer if they no longer lower the energy noticeably.
 
     Returns
     -------
@@ -224,13 +224,13 @@ def opened(
 
 
 class _References(NamedTuple):
-    """What triangles should look like.
+    """Reference triangles.
 
     Attributes
     ----------
     corners : (f, 3, 2) float64
     areas : (f,) float64
-        But for a factor that all have in common.
+        Up to a common factor.
     """
 
     corners: FloatArray
@@ -238,15 +238,15 @@ class _References(NamedTuple):
 
     @classmethod
     def at(cls, rest: FloatArray, F: IntArray) -> _References:
-        """Triangles as they are where vertices are at rest, (n, 2)."""
+        """Return the triangles at the rest positions (n, 2)."""
         return cls(rest[F], signed_areas(F, rest.view(np.complex128).ravel()))
 
 
 def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _References | None:
-    """Equilateral triangles, or None where the map has no extent, or none whose square doubles hold.
+    """Return equilateral reference triangles; None if the map has no extent or squares would underflow.
 
-    The logarithms of the boundary edges' lengths, carried inwards as by Tutte's embedding; in all, the references
-    have the area of the map, inverted triangles counted as positive.
+    The logarithms of the boundary edges' lengths are extended to the interior as in Tutte's embedding. The total area
+    of the reference triangles equals the total unsigned area of the map.
     """
     n = len(w)
     area = float(np.abs(signed_areas(F, w)).sum())
@@ -254,7 +254,7 @@ def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _
     length = np.abs(w[rim[:, 1]] - w[rim[:, 0]])
     if not (0 < area < np.inf and np.all(length > 0)):
         return None
-    # At a boundary vertex the mean over the edges that leave it and arrive; one each, but where a patch is pinched.
+    # At a boundary vertex: the mean over its boundary edges; two edges, except where a patch is pinched.
     ends = np.bincount(rim.ravel(), minlength=n)
     log = np.zeros(n, dtype=np.complex128)
     log += np.bincount(rim.ravel(), np.repeat(np.log(length), 2), n) * (grading / np.maximum(ends, 1))
@@ -263,7 +263,7 @@ def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _
         unit = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
         log = laplacian.factor(ReferenceMesh(np.zeros((n, 2)), F, "equilateral").edge_stiffness(unit)).extend(log)
     sizes: FloatArray = np.exp(log.real[F].mean(axis=1))
-    # Of magnitude about one, so that no square underflows.
+    # Scale to a magnitude of about one, so that no square underflows.
     sizes = np.ldexp(sizes, -int(np.frexp(sizes.max())[1]))
     sizes = np.maximum(sizes, _SMALLEST * sizes.max())
     sizes = sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
@@ -274,7 +274,7 @@ def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _
 
 
 class RegularisedDescent:
-    """A map, and steps down its energy at the present ε."""
+    """A map and Newton steps that lower its energy at the current ε."""
 
     def __init__(
         self,
@@ -287,7 +287,7 @@ class RegularisedDescent:
     ) -> None:
         self.energy = Regularised(1.0)
         rest = references.corners.reshape(-1, 2)
-        # All triangles of one weight count alike, however small.
+        # Triangles of equal weight contribute equally, whatever their size.
         weights = weights * references.areas.mean() / references.areas
         self._deformed = DeformationEnergy(
             rest, F, self.energy, weights=weights, rest_F=np.arange(3 * len(F)).reshape(-1, 3)
@@ -298,16 +298,16 @@ class RegularisedDescent:
 
     @property
     def least(self) -> float:
-        """The least determinant."""
+        """Least determinant."""
         return float(self._at.det.min())
 
     def value(self) -> float:
-        """The energy."""
+        """Energy of the map."""
         with np.errstate(all="ignore"):
             return self._deformed.value_of(self._at)
 
     def step(self, before: float) -> float | None:
-        """Take a step from where the energy is ``before``; the energy there, or None where no step lowers it."""
+        """Take a step from energy ``before``; return the new energy, or None if no step lowers it."""
         system = self._system
         gradient = self._deformed.gradient_of(self._at, self.w.size)[system.free]
         system.assemble(self._deformed.curvature_of(self._at))

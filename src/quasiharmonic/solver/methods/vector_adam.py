@@ -1,7 +1,7 @@
-"""VectorAdam (Ling et al. 2022): Adam whose step is normalised by each triangle's complex modulus (§9.4, §F.1).
+"""VectorAdam (Ling et al. 2022): Adam with steps normalised by each triangle's complex modulus (§9.4, §F.1).
 
-The normalisation makes every triangle move at the same pace in ξ, however small its area, and makes
-the path independent of the frames in which the triangles' ξ are expressed.
+The normalisation gives every triangle steps of similar length in ξ, however small its area. It also makes the path
+independent of the frames in which the triangles' ξ are expressed.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from quasiharmonic.solver.methods.relocation import RetrySchedule, placed
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.kernels import compiled
 
-# Less momentum than Adam's usual 0.9 / 0.999 is the largest single gain: the landscape changes as fast as
-# the map unfolds, and old gradients point to where the folds were.
+# Less momentum than Adam's usual 0.9 / 0.999 gives the largest single gain. The objective changes as fast as the map
+# unfolds, and old gradients point to folds that no longer exist.
 MOMENTA = 0.6, 0.9
-# Long steps unfold a map in few iterations, short ones get through where it is tight. Chosen on letters and
-# on random pairs of surface and outline.
+# Long steps unfold a map in few iterations; short ones are needed in narrow regions. Chosen on letters and on random
+# pairs of surface and outline.
 TANH_STEPS = ((0, 0.5), (10, 0.2), (39, 0.2), (40, 0.05))
-# The longer way that si-log's ξ has to go to the same tensor wants longer steps.
+# With si-log, ξ has farther to go to the same tensor, so steps are longer.
 SI_LOG_STEPS = ((0, 0.5),)
 
 
@@ -36,15 +36,15 @@ class VectorAdam(FunctionalDescent):
     Attributes
     ----------
     schedule : sequence of (int, float)
-        Step lengths at given iterations, linear in between and constant after the last. Empty for those that suit the
-        parameterisation.
+        Step lengths at given iterations, linear in between and constant after the last. Default (empty): a schedule for
+        the parameterisation.
     momenta : (float, float)
-        Of the mean gradient and of its mean square, Adam's β₁ and β₂; at least 0 and below 1. The paper names none;
-        Adam's own are 0.9 and 0.999. With those and the paper's steps it is
+        Decay rates of the mean gradient and of its mean square, Adam's β₁ and β₂; at least 0 and below 1. The paper
+        names none; Adam's usual ones are 0.9 and 0.999. With these and the paper's steps the method is
         ``VectorAdam(schedule=[(0, 0.1)], momenta=(0.9, 0.999))``.
     placing : bool
-        Try now and then to right the last inverted triangles at once, by moving their vertices
-        (`quasiharmonic.solver.methods.relocation`); where that fails the descent goes on as if it had not been tried.
+        From time to time, try to untangle the last inverted triangles at once by moving their vertices
+        (`quasiharmonic.solver.methods.relocation`). A failed try does not affect the descent.
     """
 
     schedule: Sequence[tuple[int, float]] = ()
@@ -76,12 +76,12 @@ class VectorAdam(FunctionalDescent):
         return self.schedule or (TANH_STEPS if self.parameterisation == "tanh" else SI_LOG_STEPS)
 
     def pace(self, triangles: int) -> AdamState:
-        """What the method remembers of so many triangles, to be asked for one step after another."""
+        """Return the Adam state for this number of triangles."""
         times, lengths = zip(*self._steps, strict=True)
         return AdamState(triangles, self.momenta, times, lengths)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`; a step that leaves no positive definite Laplacian is shortened."""
+        """See `Descent`; a step is shortened if the Laplacian is not positive definite after it."""
         pace = self.pace(start.xi.size)
         problem, tries, here = objective.problem, RetrySchedule(), start
         for _ in range(self.iterations):
@@ -95,15 +95,15 @@ class VectorAdam(FunctionalDescent):
 
 
 class AdamState:
-    """The mean gradient and the mean square of it, triangle by triangle, and the steps that follow from them.
+    """Mean gradient and mean square per triangle, and the resulting steps.
 
-    No triangle knows of another, so the triangles may be of one mesh or of many.
+    Triangles do not interact, so they may belong to one mesh or several.
 
     Parameters
     ----------
     triangles : int
     momenta, times, lengths
-        As `VectorAdam` has them.
+        See `VectorAdam`.
     """
 
     def __init__(
@@ -115,25 +115,25 @@ class AdamState:
         self._steps = 0
 
     def part(self, triangles: IntArray | slice) -> AdamState:
-        """What is remembered of some of the triangles, for these to go on by themselves."""
+        """Return the state of some of the triangles, to continue separately."""
         return self._with(self._mean[triangles], self._square[triangles])
 
     @staticmethod
     def joined(paces: Sequence[AdamState]) -> AdamState:
-        """One for the triangles of several, one after another, which have made as many steps each."""
+        """Concatenate states that have made equally many steps."""
         return paces[0]._with(
             np.concatenate([pace._mean for pace in paces]), np.concatenate([pace._square for pace in paces])
         )
 
     def _with(self, mean: ComplexArray, square: FloatArray) -> AdamState:
-        """Of the same method after as many steps."""
+        """Return a state with the same settings and step count."""
         other = AdamState(0, self._momenta, self._times, self._lengths)
-        # What is taken from another one's is changed at every step.
+        # Copy the arrays, because every step changes them.
         other._mean, other._square, other._steps = np.array(mean), np.array(square), self._steps
         return other
 
     def step(self, gradient: ComplexArray) -> ComplexArray:
-        """The step in ξ that a gradient calls for, after those before it; (f,) complex128."""
+        """Return the step in ξ for the next gradient; (f,) complex128."""
         first, second = self._momenta
         length = float(np.interp(self._steps, self._times, self._lengths))
         self._steps += 1
@@ -153,7 +153,7 @@ def adam_step(
     square: FloatArray,
     step: ComplexArray,
 ) -> None:
-    """Take a gradient into its mean and mean square, and fill in the step of this length."""
+    """Update the mean and the mean square with a gradient, and fill in the step of this length."""
     for part in blocks(step.size):
         g, average, squares = gradient[part], mean[part], square[part]
         average *= first
@@ -161,6 +161,6 @@ def adam_step(
         squares *= second
         squares += (1 - second) * (g.real**2 + g.imag**2)
         root = np.sqrt(squares)
-        # A triangle whose gradient has never differed from zero stays where it is.
+        # A triangle whose gradients were all zero does not move.
         root[root == 0] = np.inf
         np.multiply(average, -length / root, out=step[part])
