@@ -1,6 +1,6 @@
-"""A sequence of targets → a sequence of maps: the road.
+"""Compute a sequence of maps for a sequence of targets.
 
-targets ──▶ each frame from the map before it ──▶ none? told why, or bridged ──▶ lowered without leaps ──▶ certified
+targets ──▶ each frame from the previous map ──▶ no map: report why, or bridge ──▶ smooth polishing ──▶ certify
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import FloatArray, check_callback, kind_of, true_or_false, whole_number
 from quasiharmonic.util.progress import reports_progress
 
-# How many times as far as the boundary vertices may move, unless the caller says so.
+# Default maximum vertex displacement, relative to the maximum boundary displacement.
 _LIMIT = 3.0
 
 
@@ -41,27 +41,26 @@ def animate(
     linear_solver: str = "auto",
     callback: Callable[[FrameStep], object] | None = None,
 ) -> Animation:
-    """Map a surface to a sequence of targets, each frame certified and near to the one before.
+    """Map a surface to a sequence of targets; each map is certified and close to the previous one.
 
     Parameters
     ----------
     problem : Problem
-        The surface and its held vertices; its own target does not matter.
+        The surface and its fixed vertices; its own target is not used.
     targets : iterable of (k, 2) array
-        Where these go, frame by frame.
+        Target positions of the fixed vertices, frame by frame.
     polish : str or Energy, optional
-        Lower this distortion energy in every frame, as `quasiharmonic.polish` has it, without leaps from one local
-        minimum to another.
+        Distortion energy to lower in every frame, without jumps between local minima; see `quasiharmonic.polish`.
     max_motion_ratio : float, optional
-        For ``polish``: as many times as far as the boundary moves at most, a vertex may; 3 by default. 1 at the least,
-        where no more is possible in general; the result says what was reached.
+        Requires ``polish``. Maximum vertex displacement, relative to the maximum boundary displacement; at least 1,
+        default 3. The limit may not be reached; the result has the value that was.
     fill_gaps : bool
-        Where a target allows no map, or none is found, have the boundary halfway between the frames around it, or
-        however many there are to go past. Frames at the ends stay without.
+        If a target has no map, or none is found, interpolate its target between the neighbouring frames with a map.
+        Frames at the ends stay without a map.
     start : (n, 2) array, optional
-        A map to begin the first frame with.
+        Initial map for the first frame.
     max_iterations : int
-        Linear solves to spend at most on finding a frame's map, where the few from the map before it do not do.
+        Maximum number of linear solves per frame, if the short steps from the previous map fail.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
@@ -71,19 +70,19 @@ def animate(
     Returns
     -------
     Animation
-        Ctrl-C ends it with the frames so far, lowered or not.
+        After Ctrl-C: the frames so far, polished or not.
 
     Raises
     ------
     TypeError
-        When ``problem`` is no `Problem`, or there is no going through ``targets``.
+        If ``problem`` is not a `Problem` or ``targets`` is not iterable.
     ValueError
-        When a target has another size, or what is no finite number (the message names the frame), when an option has no
-        such value, or ``max_motion_ratio`` is given and nothing to polish with.
+        If a target has another size or a non-finite value (the message names the frame), an option is invalid, or
+        ``max_motion_ratio`` is given without ``polish``.
 
     Examples
     --------
-    A disk whose outline becomes a star:
+    Deform a disk into a star:
 
     >>> import numpy as np
     >>> from quasiharmonic import Problem, animate
@@ -135,12 +134,12 @@ def _smoothed(
     Returns
     -------
     energies : (t,) float64
-        Their mean energies, NaN of the others.
+        Their mean energies; NaN for other frames.
     interrupted : bool
     """
     began = time.perf_counter()
     frames = following.frames
-    # Frames with one target after another are one.
+    # Consecutive frames with the same target share one map.
     of = np.full(len(frames), -1)
     which: list[int] = []
 
@@ -154,7 +153,8 @@ def _smoothed(
             if not frames[t].injective:
                 continue
             if not which or not np.array_equal(targets[t], targets[which[-1]]):
-                # The last map is another than when this frame was searched for, since it has been lowered.
+                # The previous map has been polished since this frame was searched, so search again from the polished
+                # map.
                 uv = frames[t].uv
                 if which:
                     near = following.found(targets[t], smoothing.maps[-1], targets[which[-1]])

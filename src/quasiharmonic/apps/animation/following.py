@@ -1,8 +1,8 @@
-"""Frames, each searched for from the map of the one before, and what becomes of those that have none.
+"""Search for the map of each frame, starting from the previous frame's map, and fill gaps.
 
-A search that goes far finds a map far from the last one: vertices leap though the boundary has hardly moved. So each
-frame is first tried by a few short steps of the tensors from those of the last map, then by way of boundaries halfway
-to it, and only then by whatever finds a map (`quasiharmonic.solve`).
+A long search finds a map far from the previous one, and vertices jump although the boundary hardly moves. Each frame is
+therefore first tried with a few short steps from the tensors of the previous map. If that fails, intermediate
+boundaries are tried, and only then a general search (`quasiharmonic.solve`).
 """
 
 from __future__ import annotations
@@ -21,30 +21,31 @@ from quasiharmonic.solver.search.solving import solve
 from quasiharmonic.solver.search.stages import Stages
 from quasiharmonic.util.arrays import BoolArray, FloatArray
 
-# Iterations that a frame near to the last hardly ever needs: if they do not do, it is asked first whether any could.
+# Maximum number of short steps. A frame close to the previous one hardly ever needs more; if they fail, a diagnosis
+# follows.
 _SOON = 6
-# How long steps are, a fifth of those with which a search begins: where these do not do, short ones lead less far away.
+# Step length, a fifth of the usual first steps: if these fail, short ones lead less far away.
 _SHORT = ((0, 0.1),)
-# How often the way from the last boundary to the next is halved.
+# Maximum number of halvings of the way from the last boundary to the next.
 _HALVINGS = 3
 
 
 class Following:
-    """Frames, each from the map of the last that has one.
+    """Search for the frames in order, each from the last injective map.
 
     Parameters
     ----------
     problem : Problem
     targets : (t, k, 2) float64
     max_iterations, linear_solver, callback
-        As of `animate`.
+        See `animate`.
 
     Attributes
     ----------
     frames : list of MapResult
-        As far as they are found.
+        The results so far.
     interrupted : bool
-        Whether that has ended early.
+        Whether Ctrl-C ended the work early.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class Following:
         self.interrupted = False
 
     def follow(self, start: ArrayLike | None) -> list[MapResult]:
-        """Find every frame's map, as far as there is one."""
+        """Search for the map of every frame and return the results."""
         last = start
         move = 0.0
         before: int | None = None
@@ -84,20 +85,24 @@ class Following:
         return self.frames
 
     def found(self, target: FloatArray, start: ArrayLike | None, last: FloatArray | None = None) -> MapResult:
-        """The map for a target.
+        """Search for the map of a target.
 
         Parameters
         ----------
         target : (k, 2) float64
         start : (n, 2) array, optional
-            A map to begin with.
+            Initial map.
         last : (k, 2) float64, optional
-            The target whose map, an injective one, ``start`` is.
+            The target of ``start`` if that is an injective map.
+
+        Returns
+        -------
+        MapResult
 
         Raises
         ------
         KeyboardInterrupt
-            When the search is interrupted.
+            If the search is interrupted.
         """
         problem = self._problem.with_target(target)
         if start is not None:
@@ -112,7 +117,7 @@ class Following:
         return self._solve(problem, start, self._max_iterations)
 
     def _by_halves(self, target: FloatArray, start: ArrayLike, last: FloatArray, times: int) -> MapResult | None:
-        """The map for a target by way of that for the boundary halfway from the last, if short steps find both."""
+        """Search for the map of a target via the boundary halfway from the last, by short steps; None if that fails."""
         if times == 0:
             return None
         between = target / 2 + last / 2
@@ -124,9 +129,9 @@ class Following:
         return end if end.injective else self._by_halves(target, middle.uv, between, times - 1)
 
     def _nearby(self, problem: Problem, start: ArrayLike) -> MapResult:
-        """What a few short steps from a map come to."""
+        """Return the result of a few short steps from a map."""
         few = min(_SOON, self._max_iterations)
-        # As in any search, pins want si-log.
+        # As in the default strategy, pins need si-log.
         parameterisation = "si-log" if problem.domain.pins.size else "tanh"
         short = VectorAdam(parameterisation=parameterisation, schedule=_SHORT, iterations=few)
         return self._solve(problem, start, few, [short])
@@ -142,7 +147,7 @@ class Following:
         return result
 
     def fill_gaps(self) -> tuple[FloatArray, BoolArray]:
-        """Give frames without a map a target between those around them; the targets, and which have changed."""
+        """Interpolate the targets of frames without a map; return the targets and which have changed."""
         targets = self._targets.copy()
         found = np.array([frame.injective for frame in self.frames])
         bridged = np.zeros(len(found), dtype=bool)

@@ -1,4 +1,4 @@
-"""What a sequence of targets becomes: its frames, and how far vertices move from one to the next."""
+"""Result of an animation: its frames, and the displacement of vertices between them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, check_finite, count
 
 @dataclass(frozen=True)
 class FrameStep:
-    """How far an animation is; what its callback gets.
+    """Progress of an animation, as passed to its callback.
 
     Attributes
     ----------
     frame : int
-        The frame at hand, from 0 on.
+        Index of the current frame, from 0.
     frames : int
-        How many there are.
+        Number of frames.
     sweep : int
-        0 while maps are found, and then the number of the sweep that keeps them from leaping.
+        0 during the search for maps, then the number of the smoothing sweep.
     move : float
-        The largest move of a vertex between two frames so far, over that of the boundary; 0 before there are two.
+        Maximum vertex displacement between frames so far, relative to that of the boundary; 0 before there are two
+        frames.
     """
 
     frame: int
@@ -42,18 +43,19 @@ class Animation:
     Attributes
     ----------
     frames : list of MapResult
-        One for each target: its status and certificate, and what forbids a map where there is none. Shorter where
-        the work was interrupted before each had one.
+        One result per target, with status, certificate, and a diagnosis if there is no map. Shorter than the targets if
+        the work was interrupted.
     targets : (t, k, 2) float64
-        Where the boundary and pins are in each; as asked for, but where a frame has been bridged.
+        Target positions of the fixed vertices per frame; as given, except for bridged frames.
     bridged : (t,) bool
-        Frames whose target allows no map or none was found, and which lie between their neighbours instead.
+        Frames without a map for the given target, whose target was interpolated between their neighbours.
     energies : (t,) float64
-        The mean energy of each polished frame; NaN of all others.
+        Mean energy of each polished frame; NaN for others.
     max_motion_ratio : float or None
-        How many times as far as the boundary a vertex was to move at most; None where the frames were not polished.
+        Requested maximum vertex displacement between frames, relative to that of the boundary. None if the frames were
+        not polished.
     interrupted : bool
-        Whether Ctrl-C ended the work before all was done that was asked for.
+        Whether Ctrl-C ended the work before completion.
     """
 
     frames: list[MapResult]
@@ -69,27 +71,27 @@ class Animation:
 
     @property
     def uv(self) -> FloatArray:
-        """Every frame's map; (t, n, 2) float64, of no vertices where there is no frame."""
+        """The maps of all frames; (t, n, 2) float64, or (0, 0, 2) without frames."""
         return np.stack([frame.uv for frame in self.frames]) if self.frames else np.empty((0, 0, 2))
 
     @property
     def found(self) -> BoolArray:
-        """Which frames have no inverted triangle, decided exactly; (t,) bool."""
+        """Which frames have no inverted triangle, verified exactly; (t,) bool."""
         return np.array([frame.injective for frame in self.frames], dtype=bool)
 
     @property
     def bijective(self) -> BoolArray:
-        """Which frames besides overlap nowhere, decided exactly; (t,) bool."""
+        """Which frames are bijective, verified exactly; (t,) bool."""
         return np.array([bool(frame.certificate.bijective) for frame in self.frames], dtype=bool)
 
     @property
     def moves(self) -> FloatArray:
-        """How far a vertex moves at most from a frame to the next, over what the boundary and pins do at most.
+        """Maximum vertex displacement between successive frames, relative to that of the boundary and pins.
 
         Returns
         -------
         (t - 1,) float64
-            NaN where the boundary rests, or one of the two frames has no map.
+            NaN if the boundary does not move or one of the two frames has no map.
         """
         found = self.found
         ratio = np.full(max(len(self.frames) - 1, 0), np.nan)
@@ -101,12 +103,12 @@ class Animation:
 
     @property
     def largest_move(self) -> float:
-        """The largest of ``moves``; 0 where there is none."""
+        """The largest of ``moves``; 0 if there are none."""
         moves = self.moves
         return float(moves[np.isfinite(moves)].max(initial=0.0))
 
     def summary(self) -> str:
-        """Say how many frames are certified, which are not and why, and how far vertices move."""
+        """Return a text with the number of certified frames, the reasons for missing ones, and the largest move."""
         found, count = self.found, counted("frame", "frames", len(self.frames))
         lines = [f"{count}: {np.count_nonzero(found)} with every triangle strictly positive, decided exactly"]
         if self.interrupted:
@@ -127,7 +129,7 @@ class Animation:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: everything but the maps."""
+        """Return all data except the maps, for JSON."""
         return {
             "frames": len(self.frames),
             "certified": int(np.count_nonzero(self.found)),
@@ -148,20 +150,19 @@ class Animation:
 
 
 def farthest(moved: FloatArray) -> float:
-    """The length of the longest of some displacements (k, 2)."""
+    """Return the length of the longest displacement (k, 2)."""
     return float(np.hypot(*moved.T).max(initial=0.0))
 
 
 def checked_targets(targets: Iterable[ArrayLike], count: int) -> FloatArray:
-    """A sequence of targets as one array (t, k, 2), each with so many rows.
+    """Check a sequence of targets with ``count`` rows each and return it as one array (t, k, 2).
 
     Raises
     ------
     TypeError
-        When there is no going through them.
+        If the targets are not iterable.
     ValueError
-        When there is none, or one has another shape, no real numbers or a place that is not finite: names the first
-        such frame.
+        If there are no targets, or one has another shape, is not real or is not finite; names the first such frame.
     """
     if not isinstance(targets, Iterable) or isinstance(targets, str | bytes):
         raise TypeError(f"targets must be a sequence of arrays ({count}, 2), not {kind_of(targets)}")

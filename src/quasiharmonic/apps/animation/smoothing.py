@@ -1,14 +1,14 @@
-"""Frames of low distortion that do not leap.
+"""Frames of low distortion whose vertices move continuously.
 
-The least distorted map for a boundary is one of many local minima, and as the boundary moves, the one that a frame's
-own polish ends in changes: vertices leap by thirty times what the boundary does. So frames are lowered one after
-another, each near to the one before (`quasiharmonic.energies.newton.proximal`), which keeps to a branch of minima and
-leaves it slowly where it ends. What has to go further than is allowed is spread over the frames around it then: sweeps
-lower the frames at both ends of too long a move once more, near to the one before and to the one after, with a weight
-that grows, until no move is too long.
+The least distorted map for a boundary is one of many local minima. If every frame is polished separately, successive
+frames may end in different minima, and vertices jump by up to thirty times the motion of the boundary. The frames are
+therefore polished in order, each with a proximal term to the previous frame
+(`quasiharmonic.energies.newton.proximal`). This follows a branch of minima and leaves it slowly at its end. If a move
+is still too long, sweeps spread it over neighbouring frames. They polish the frames at both ends again with proximal
+terms to the previous and the next frame. The weight grows until no move is too long.
 
-    forward   t = 0, 1, 2, …     E(wₜ) + near(wₜ₋₁), soft
-    sweeps    ↓↑ where it leaps  E(wₜ) + near(wₜ₋₁) + near(wₜ₊₁), hard
+    forward   t = 0, 1, 2, …       E(wₜ) + near(wₜ₋₁), soft
+    sweeps    ↓↑ at long moves     E(wₜ) + near(wₜ₋₁) + near(wₜ₊₁), hard
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from quasiharmonic.energies.polishing import at_own_scale
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import FloatArray
 
-# What nearness weighs on the way forward, as a share of the mean energy, which is taken to be _LEAST at the least; and
-# how many lengths of the boundary vertices go for nothing.
+# Weight of the proximal term in the forward pass, as a fraction of the mean energy, which is at least ``_LEAST``. Moves
+# of up to the last factor times the boundary's motion cost nothing.
 _SOFT, _LEAST, _FREELY = 0.5, 1.0, 1.5
-# So much harder it is in the first sweep, and again in each further one; vertices then go this share of the limit for
-# nothing.
+# Factor of the weight in the first sweep, and for each further sweep. Moves within the last fraction of the limit then
+# cost nothing.
 _HARD, _HARDER, _WITHIN = 300.0, 1.5, 0.9
 _SWEEPS = 40
-# Newton steps for a frame on the way forward, and in a sweep.
+# Newton steps per frame in the forward pass, and in a sweep.
 _STEPS, _AGAIN = 60, 20
 _TOLERANCE = 1e-4
 
 
 class Smoothing:
-    """Frames whose distortion is lowered without leaps.
+    """Polishing of frames with a limit on the motion of vertices.
 
     Parameters
     ----------
     domain : Domain
     energy : Energy
     max_motion_ratio : float
-        As many times as far as the boundary a vertex may move at most.
+        Maximum vertex displacement between frames, relative to the maximum boundary displacement.
     linear_solver : str
 
     Attributes
@@ -61,16 +61,16 @@ class Smoothing:
         self.domain = domain
         self._energy, self._limit, self._linear_solver = energy, max_motion_ratio, linear_solver
         self._system: NewtonSystem | None = None
-        # From a frame to the next: what the boundary moves, and what any vertex does over that.
+        # Per pair of successive frames: the boundary displacement, and the vertex displacement relative to it.
         self._lengths: list[float] = []
         self._moves: list[float] = []
         self.maps: list[FloatArray] = []
         self.energies: list[float] = []
 
     def append(self, uv: FloatArray) -> None:
-        """Lower a further frame, an injective map, near to the last.
+        """Polish a further frame, given as an injective map, close to the last one.
 
-        Its fixed vertices are elsewhere than the last one's.
+        Its target positions must differ from those of the last frame.
         """
         before = []
         if self.maps:
@@ -86,26 +86,26 @@ class Smoothing:
             self._measure(len(self._moves) - 1)
 
     def largest_move(self) -> float:
-        """How far a vertex moves at most from a frame to the next, over what the boundary does."""
+        """Return the maximum vertex displacement between frames, relative to that of the boundary."""
         return max(self._moves, default=0.0)
 
     def _measure(self, t: int) -> None:
-        """Take down how far vertices move from a frame to the next."""
+        """Store the maximum vertex displacement between frames t and t + 1, relative to that of the boundary."""
         self._moves[t] = farthest(self.maps[t + 1] - self.maps[t]) / self._lengths[t]
 
     def sweep(self, told: Callable[[int, int], object]) -> None:
-        """Spread the moves that are too long over the frames around them.
+        """Spread moves that are too long over the neighbouring frames.
 
         Parameters
         ----------
         told : callable
-            Is called with each sweep's number, from 1 on, and frame.
+            Called with the number of the sweep, from 1, and the frame.
         """
         weight = _SOFT * _HARD * max(_LEAST, sum(self.energies) / max(len(self.energies), 1))
         for sweep in range(1, _SWEEPS + 1):
             if self.largest_move() <= self._limit:
                 return
-            # What a frame gives way is the next one's to take up.
+            # Alternate the direction, so that the next frame takes up the change of the previous one.
             order = range(len(self.maps))
             for t in order if sweep % 2 else reversed(order):
                 beside = range(max(t - 1, 0), min(t + 1, len(self._moves)))
@@ -125,7 +125,7 @@ class Smoothing:
     def _lowered(
         self, uv: FloatArray, around: Sequence[Neighbour], nearness: Nearness, steps: int
     ) -> tuple[FloatArray, float]:
-        """A frame after Newton's steps, and its mean energy."""
+        """Return a frame after Newton steps, and its mean energy."""
         domain = self.domain
         # As in a polish: overflow gives inf or NaN, and a step with either is never accepted.
         with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""Simulation meshes after their boundary has moved: elements of three, four and six nodes.
+"""Motion of simulation meshes with their boundary: elements of three, four and six nodes.
 
 The package builds on `energies` and `solver`. Start reading in `morphing`, then `moving` for many steps.
 """

@@ -1,4 +1,4 @@
-"""Where the mid-side nodes of six-node triangles go: along with their sides, and aside where an element needs it."""
+"""Positions of the mid-side nodes of six-node triangles: they follow their sides and move aside if an element needs it."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from quasiharmonic.geometry.mesh.elements import MIDDLES, SIDES
 from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# What is aimed at where an element is inverted: its least control value over that of the triangle of its corners.
+# Required least control value of an inverted element, relative to that of the triangle of its corners.
 _MARGIN = 0.1
-# How dear it is to bend, at first and at each further try, and how many steps a try has.
+# Weight of displacements in the first try; maximum number of tries, each with a tenth of the weight; steps per try.
 _DEAR, _TRIES, _STEPS = 1e-2, 8, 30
-# Tried in turn: the rings of elements around inverted ones whose nodes move, None for no more than their mid-side
-# nodes; and where these begin, as a part of the way from where they should be to where the search has left them. Then
-# the best of that is gone on from.
+# Attempts in order. First value: rings of elements around inverted ones whose nodes move; None moves only mid-side
+# nodes of inverted elements. Second value: initial positions, as a fraction of the way from ``straight`` to
+# ``searched``. Further attempts start from the best result.
 _ATTEMPTS = (None, 0.0), (0, 0.0), (1, 0.0), (3, 0.0), (3, 0.5), (3, 1.0)
 _FURTHER = 1, 2, 4, 8
 
 
 def sides(F: IntArray) -> tuple[IntArray, IntArray]:
-    """The mid-side nodes of six-node triangles (f, 6), (s,) ascending, and the ends of the side of each, (s, 2)."""
+    """Return the mid-side nodes of six-node triangles (f, 6), (s,) ascending, and the ends of their sides, (s, 2)."""
     middle, first = np.unique(F[:, MIDDLES], return_index=True)
     return middle, F[:, SIDES].reshape(-1, 2)[first]
 
 
 def carried(before: FloatArray, after: FloatArray, middle: IntArray, ends: IntArray) -> FloatArray:
-    """Where mid-side nodes come to that go along with their sides, turned and scaled as these are; (s, 2) float64.
+    """Return positions of mid-side nodes that follow their sides with the same rotation and scaling; (s, 2) float64.
 
-    Those of straight sides stay in the same place of them, and where both ends stay so does the node, to the last bit.
+    Nodes of straight sides keep their relative position. If both ends are unchanged, the node is exactly unchanged.
     """
     z, w = (np.ascontiguousarray(points).view(np.complex128).ravel() for points in (before, after))
     (a, b), (p, q) = z[ends].T, w[ends].T
@@ -43,15 +43,15 @@ def carried(before: FloatArray, after: FloatArray, middle: IntArray, ends: IntAr
 
 
 def followed(F: IntArray, rest: FloatArray, points: FloatArray, held: IntArray) -> FloatArray:
-    """Put the mid-side nodes that are not held where they are on their sides at rest; (n, 2) float64.
+    """Move the free mid-side nodes to their relative position on their sides at rest; (n, 2) float64.
 
     Parameters
     ----------
     F : (f, 6) int64
     rest, points : (n, 2) float64
-        The mesh at rest, and now.
+        The rest mesh and the current mesh.
     held : (k,) int64
-        Nodes that stay where they are.
+        Fixed nodes.
     """
     middle, ends = sides(F)
     free = ~np.isin(middle, held)
@@ -61,18 +61,18 @@ def followed(F: IntArray, rest: FloatArray, points: FloatArray, held: IntArray) 
 
 
 def centred(F: IntArray, points: FloatArray, slid: IntArray, curves: Sequence[Curve]) -> FloatArray:
-    """Put mid-side nodes that have slid along curves into the middle of their sides again; (n, 2) float64.
+    """Move mid-side nodes that have slid along curves to the middle of their sides; (n, 2) float64.
 
-    Off the middle half of a straight side such a node turns its element over, wherever the others are.
+    A mid-side node outside the middle half of a straight side inverts its element, whatever the other nodes.
 
     Parameters
     ----------
     F : (f, 6) int64
     points : (n, 2) float64
     slid : (k,) int64
-        Nodes, of which others than mid-side ones are passed over.
+        Nodes that have slid; only mid-side nodes are used.
     curves : sequence of Curve
-        Each node stays on the one nearest to it.
+        Each node stays on its nearest curve.
     """
     middle, ends = sides(F)
     of = np.isin(middle, slid)
@@ -85,22 +85,22 @@ def centred(F: IntArray, points: FloatArray, slid: IntArray, curves: Sequence[Cu
 
 
 def settled(F: IntArray, straight: FloatArray, searched: FloatArray, held: IntArray) -> FloatArray:
-    """Move nodes aside where elements are inverted, by as little as it takes.
+    """Move nodes around inverted elements as little as possible until no element is inverted.
 
     Parameters
     ----------
     F : (f, 6) int64
     straight : (n, 2) float64
-        The mesh with its mid-side nodes where they should be.
+        The mesh with its mid-side nodes at their preferred positions.
     searched : (n, 2) float64
-        The mesh with these elsewhere, perhaps at better places.
+        The mesh with mid-side nodes at other, perhaps better positions.
     held : (k,) int64
-        Nodes that stay where they are.
+        Fixed nodes.
 
     Returns
     -------
     (n, 2) float64
-        Elements may be inverted still.
+        Some elements may still be inverted.
     """
     best, bad = straight, inverted_elements(F, straight)
     for rings, share in (*_ATTEMPTS, *((rings, None) for rings in _FURTHER)):
@@ -117,24 +117,24 @@ def settled(F: IntArray, straight: FloatArray, searched: FloatArray, held: IntAr
 
 
 def _righted(F: IntArray, points: FloatArray, rings: int | None, held: IntArray) -> FloatArray:
-    """Move nodes around inverted elements, within so many rings of elements; None for their mid-side nodes only."""
+    """Move nodes within some rings of inverted elements; None moves only their mid-side nodes."""
     bad = inverted_elements(F, points)
     movable = F[bad][:, MIDDLES] if rings is None else F[_around(F, bad, rings)]
     return _bent(F, points, np.setdiff1d(movable, held))
 
 
 def _around(F: IntArray, which: IntArray, rings: int) -> IntArray:
-    """Elements within some rings of others."""
+    """Return the elements within some rings of others."""
     for _ in range(rings):
         which = np.flatnonzero(np.isin(F[:, :3], F[which, :3]).any(axis=1))
     return which
 
 
 def _bent(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
-    """Move nodes as little as it takes for control values to be positive.
+    """Move nodes as little as possible so that control values become positive.
 
-    Lowers ``μ Σ |xᵢ − x̂ᵢ|²/h² + Σ max(0, margin − cᵢⱼ/c₀)²``, with x̂ the places at first, by Levenberg and Marquardt's
-    steps, μ falling.
+    Minimise ``μ Σ |xᵢ − x̂ᵢ|²/h² + Σ max(0, margin − cᵢⱼ/c₀)²`` with initial positions x̂ by Levenberg–Marquardt steps
+    with falling μ.
     """
     if not free.size:
         return points
@@ -159,14 +159,14 @@ def _bent(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
 
 
 def _chords(F: IntArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Coordinates of the nodes as if all sides were straight, relative to the first."""
+    """Return coordinates of the nodes as if all sides were straight, relative to the first node."""
     corners = points[F[:, :3]] - points[F[:, :1]]
     nodes = np.concatenate([corners, 0.5 * corners[:, SIDES].sum(axis=2)], axis=1)
     return nodes[..., 0], nodes[..., 1]
 
 
 def _lacking(F: IntArray, points: FloatArray, unit: FloatArray) -> FloatArray:
-    """By how much control values are short of the margin; (f, 6)."""
+    """Return how far control values are below the margin; (f, 6)."""
     x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)
     return np.maximum(_MARGIN - jacobian_coefficients(x, y) / unit[:, None], 0.0)
 
@@ -180,7 +180,7 @@ def _step(
     size: float,
     dear: float,
 ) -> FloatArray | None:
-    """One step of Levenberg and Marquardt's, (k, 2), or None where none lowers what is to be lowered."""
+    """Return one Levenberg–Marquardt step (k, 2), or None if no step lowers the objective."""
     from scipy.sparse import csr_array, dia_array
     from scipy.sparse.linalg import splu
 
@@ -207,7 +207,7 @@ def _step(
     matrix = jacobian.T @ jacobian + dia_array((np.full((1, unknowns), dear), [0]), shape=(unknowns, unknowns))
     try:
         direction = splu(matrix.tocsc()).solve(load).reshape(-1, 2)
-    except RuntimeError:  # singular: elements so bad that being dear is rounded away
+    except RuntimeError:  # singular: in very bad elements the weight ``dear`` is lost to rounding
         return None
     there = now.copy()
     for halving in range(6):

@@ -1,4 +1,4 @@
-"""Quadrilaterals that stay convex: the triangles at all four of their corners are kept positive, by both diagonals."""
+"""Keep quadrilaterals convex: the triangles at all four corners, from both diagonals, must be positive."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from quasiharmonic.problem.result import MapResult, Stage, Status
 from quasiharmonic.solver.methods.untangling import untangled
 from quasiharmonic.util.arrays import IntArray
 
-# Steps of untangling at most; where it succeeds a few dozen do.
+# Maximum number of untangling steps; successful runs need a few dozen.
 _STEPS = 300
 
 
 def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linear_solver: str) -> MapResult:
-    """Go on from a map of triangles that halve quadrilaterals to one in which these are convex.
+    """Continue from a map of triangles that halve quadrilaterals to one in which these are convex.
 
     Parameters
     ----------
     problem : Problem
-        The surface at rest, where the quadrilaterals are convex, and what is held.
+        The rest mesh, in which the quadrilaterals are convex, and the fixed vertices.
     result : MapResult
-        Of the triangles on either side of one diagonal.
+        A map of the triangles on either side of one diagonal.
     corners : (t, 3) int64
         The triangles at all corners.
     linear_solver : str
@@ -35,8 +35,8 @@ def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     Returns
     -------
     MapResult
-        With a stage more where steps were taken; `Status.STALLED` where corners stay inverted after all, as few as were
-        found.
+        With an additional stage if steps were taken. The status is `Status.STALLED` if corners stay inverted; the map
+        then has the fewest inverted corners found.
     """
     before = inverted_triangles(corners, result.uv).size
     if not before:

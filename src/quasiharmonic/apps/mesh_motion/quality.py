@@ -1,4 +1,4 @@
-"""How well elements are shaped."""
+"""Quality of the shapes of elements."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
 
 
 def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
-    """One number for every element, 1 at best and not positive where it is inverted somewhere.
+    """Return the shape quality of every element: at most 1, not positive if it is inverted somewhere.
 
     Parameters
     ----------
@@ -23,15 +23,14 @@ def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
     Returns
     -------
     (f,) float64
-        Of triangles `quasiharmonic.energies.measures.mean_ratio`. Of quadrilaterals the least over the corners of
-        ``2 a b sin φ / (a² + b²)``, with sides a and b at an angle φ: 1 for a square, and its sign is exact. Of
-        six-node triangles the mean ratio of the corners' triangle times the least Jacobian determinant over its mean.
+        Triangles: `quasiharmonic.energies.measures.mean_ratio`. Quadrilaterals: the least over the corners of
+        ``2 a b sin φ / (a² + b²)`` with sides a and b at an angle φ, which is 1 for a square and has an exact sign.
+        Six-node triangles: the mean ratio of the corners' triangle times the least Jacobian determinant over its mean.
 
     Raises
     ------
     ValueError
-        When an array has the wrong shape or dtype, ``F`` refers to nodes that there are not, or a node is not at a
-        finite place.
+        If an array has the wrong shape or dtype, ``F`` has indices out of range, or a node is not finite.
     """
     points = map_array("points", points)
     F = element_rows(F, len(points))
@@ -40,7 +39,7 @@ def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
     if F.shape[1] == 4:
         return _of_quadrilaterals(F, points)
     place = points[F] - points[F[:, :1]]
-    # Products of coordinates: each element at a scale of its own.
+    # Scale each element separately, because coordinates are multiplied.
     place = np.ldexp(place, -np.frexp(np.abs(place).max(axis=(1, 2)))[1][:, None, None])
     x, y = place.transpose(2, 0, 1)
     values = jacobian_coefficients(x, y)

@@ -1,4 +1,4 @@
-"""A mesh after edges were split one at a time, told as `Refined` has it."""
+"""Relation of a mesh, after splitting edges one at a time, to the original mesh, as a `Refined`."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def as_refined(V: FloatArray, F: IntArray, triangles: IntArray, shares: Sequence[dict[int, float]]) -> Refined:
-    """Tell where vertices and triangles of a refined mesh lie in the old one.
+    """Return the relation of the vertices and triangles of a refined mesh to the original mesh.
 
     Parameters
     ----------
     V : (n, d) float64
-        The old mesh's vertices.
+        The original mesh's vertices.
     F : (f, 3) int64
         Its triangles.
     triangles : (t, 3) int64
-        The new triangles, each within an old one, in any order.
+        The new triangles, each within an original one, in any order.
     shares : sequence of dict
-        Of each added vertex, in order, the old ones that it lies between and their shares in it.
+        For each added vertex, in order, the original vertices that it lies between and their weights.
 
     Returns
     -------
@@ -39,7 +39,7 @@ def as_refined(V: FloatArray, F: IntArray, triangles: IntArray, shares: Sequence
     further = np.setdiff1d(np.arange(len(parent)), first)
     order = np.concatenate([first, further])
     triangles, parent = triangles[order], parent[order]
-    # What was not split stays as it was, its first corner included.
+    # Unsplit triangles keep their order of corners.
     whole = (np.sort(triangles, axis=1) == np.sort(F[parent], axis=1)).all(axis=1)
     triangles[whole] = F[parent[whole]]
     parents = np.array([(*sorted(row), max(row), max(row))[:3] for row in shares], dtype=np.int64).reshape(-1, 3)
@@ -49,7 +49,7 @@ def as_refined(V: FloatArray, F: IntArray, triangles: IntArray, shares: Sequence
 
 
 def midpoints(n: int, parents: Sequence[tuple[int, int]]) -> list[dict[int, float]]:
-    """The shares of old vertices in vertices each of which lies in the middle between two that were there before it."""
+    """Return the weights of original vertices in vertices that are midpoints of two earlier vertices each."""
     shares: list[dict[int, float]] = []
     for pair in parents:
         total: dict[int, float] = {}
@@ -61,6 +61,6 @@ def midpoints(n: int, parents: Sequence[tuple[int, int]]) -> list[dict[int, floa
 
 
 def shares_of(refined: Refined) -> list[dict[int, float]]:
-    """The shares of old vertices in the added ones of a refinement."""
+    """Return the weights of original vertices in the added vertices of a refinement."""
     rows = zip(refined.parents.tolist(), refined.weights.tolist(), strict=True)
     return [{old: share for old, share in zip(*row, strict=True) if share} for row in rows]

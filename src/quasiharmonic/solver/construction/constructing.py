@@ -1,4 +1,4 @@
-"""A map of a refined mesh onto a simple target: constructed, certified, and thinned out."""
+"""A map of a refined mesh onto a simple target: constructed, certified and thinned."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from quasiharmonic.solver.construction.opening import thinned
 from quasiharmonic.solver.construction.simplicity import is_simple
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Vertices added for each of the mesh's, at which another way to cut is tried first; and so many at which cutting ends
-# where none is left, for walks around many pins that lie elsewhere in the mesh can grow without bound.
+# Maximum number of added vertices per mesh vertex before another way to cut is tried, and the final maximum: walks
+# around many displaced pins can grow without bound.
 _MANY, _MOST = 50, 60_000
 
 
@@ -30,15 +30,15 @@ class Construction:
     Attributes
     ----------
     refined : Refined
-        How the mesh came from the problem's.
+        Relation of the refined mesh to the problem's mesh.
     uv : (n + s, 2) float64
-        The map, fixed vertices exactly at their target.
+        The map, with fixed vertices exactly at their target positions.
     certificate : Certificate
-        The exact verdict on it: bijective, or else doubles have no room where triangles are not positive.
+        Its exact certificate. If triangles are not positive, double precision is insufficient there.
     crowded : (c,) int64
-        Fixed vertices nearest to these, none if there are none.
+        Fixed vertices nearest to those triangles; empty if there are none.
     cut : bool
-        Whether the mesh could be cut with as many vertices as are allowed; if not, the map is one of the mesh as it is.
+        False if cutting needs more vertices than allowed; the map is then one of the original mesh.
     """
 
     refined: Refined
@@ -49,23 +49,25 @@ class Construction:
 
 
 def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Construction]:
-    """Constructions near a map at hand and without one, each better than those before: the last adds fewest vertices.
+    """Yield constructions near a given map and without one, each better than the previous ones.
+
+    The last construction adds the fewest vertices.
 
     Parameters
     ----------
     problem : Problem
-        With a target that `is_simple`.
+        Its target satisfies `is_simple`.
     best_map : (n, 2) float64
-        The best map known, though it inverts triangles.
+        The best map known, with inverted triangles.
 
     Yields
     ------
     Construction
-        One at least. A map is there as soon as it is certified, before what it can do without is taken out. Where no
-        way to cut does with as many vertices as are allowed, the map at hand, and that it was not cut.
+        At least one. A certified map is yielded before it is thinned. If every way to cut needs too many vertices, the
+        given map with ``cut`` False.
     """
     least = None
-    # Around a bad map walks may grow without end, each along those before it.
+    # Near a bad map walks may grow without end, because each runs along the previous ones.
     most = _MANY * (problem.n + _MANY)
     for guide, limit in ((best_map, most), (None, most), (best_map, max(most, _MOST))):
         if least is not None and (limit > most or not least[1]):
@@ -90,32 +92,32 @@ def construct(problem: Problem, guide: FloatArray | None = None, *, thin: bool =
     Parameters
     ----------
     problem : Problem
-        With a target that `is_simple`.
+        Its target satisfies `is_simple`.
     guide : (n, 2) array, optional
-        A map, whatever it inverts, near which the mesh is to be cut. Without it the mesh is cut open near Tutte's
-        embedding, and then near the map of the disk that it has become into a circle.
+        A map near which the mesh is cut; it may have inverted triangles. Without it, the mesh is cut open near Tutte's
+        embedding. Once it is a disk, it is cut near its map into a circle.
     thin : bool
-        Take out again what vertices the map can do without.
+        Remove added vertices that the map does not need.
 
     Returns
     -------
     Construction
-        What the proof says exists; where rounding leaves inverted triangles, with these. Where the target's coordinates
-        span so much that no scale bears products of all of them: the mesh as it is.
+        The map whose existence is proved; rounding may leave inverted triangles. If the target's coordinates span too
+        many orders of magnitude for their products at any scale, the original mesh.
     """
     *_, made = islice(_constructions(problem, guide), None if thin else 1)
     return made
 
 
 def _constructions(problem: Problem, guide: FloatArray | None, *, most: int | None = None) -> Iterator[Construction]:
-    """A construction as it comes, and, if it is certified, once more with what it can do without taken out.
+    """Yield a construction and, if it is certified, its thinned version.
 
     Raises
     ------
     TooManyError
-        When more vertices would be added than ``most``.
+        If more than ``most`` vertices would be added.
     """
-    # Of magnitude about one, so that no product overflows.
+    # Scale to a magnitude of about one, so that no product overflows.
     exponent = int(np.frexp(np.abs(problem.target).max())[1])
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent), reference="equilateral")
 
@@ -138,7 +140,7 @@ def _constructions(problem: Problem, guide: FloatArray | None, *, most: int | No
 
 
 def _embedded(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArray]:
-    """The mesh as cutting has left it, in one piece again, and the map of its pieces into convex polygons."""
+    """Return the cut mesh joined again, and the map of its pieces into convex polygons."""
     sheet = cutting.sheet
     triangles = np.array(sheet.vertex)[sheet.rows()]
     refined = as_refined(problem.V, problem.F, triangles, midpoints(problem.n, sheet.parents))
@@ -153,13 +155,13 @@ def _embedded(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArray]:
 
 
 def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certificate) -> IntArray:
-    """The fixed vertices nearest to triangles that are not positive, ascending."""
+    """Return the fixed vertices nearest to triangles that are not positive, ascending."""
     from scipy.spatial import cKDTree
 
     bad = np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
     if not bad.size:
         return bad
-    # Of magnitude about one, so that distances neither over- nor underflow.
+    # Scale to a magnitude of about one, so that distances neither overflow nor underflow.
     scale = -int(np.frexp(np.abs(problem.target).max())[1])
     middles = np.nan_to_num(np.ldexp(uv[F[bad]], scale)).mean(axis=1)
     _, nearest = cKDTree(np.ldexp(problem.target, scale)).query(middles)
@@ -167,5 +169,5 @@ def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certifi
 
 
 def refined_problem(problem: Problem, refined: Refined) -> Problem:
-    """A problem on a refinement of its mesh, whose triangles may be as thin as they like at rest."""
+    """Return a problem on a refinement of its mesh; rest triangles may be arbitrarily thin."""
     return Problem.on(Domain(refined.V, refined.F, problem.fixed), problem.target, reference=problem.reference)

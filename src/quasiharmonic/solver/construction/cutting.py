@@ -1,4 +1,4 @@
-"""Mesh and target cut alike, until every piece of the target is convex."""
+"""Cut a mesh and its target in the same way, until every piece of the target is convex."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from quasiharmonic.util.progress import heartbeat
 
 
 class TooManyError(Exception):
-    """More vertices would have to be added than were allowed."""
+    """More vertices are needed than allowed."""
 
 
 class Cutting:
-    """A mesh and its target, cut alike.
+    """A mesh and its target, cut in the same way.
 
     Parameters
     ----------
     problem : Problem
-        Its target is of magnitude about one, its loops are simple, disjoint and nested, and wound as the mesh's; the
-        surface has no handles.
+        Its target has magnitude about one; its loops are simple, disjoint, nested and wound as the mesh's. The surface
+        has no handles.
     guide : (n,) complex128, optional
-        A map near which the mesh is to be cut. Without it the mesh, once it is a disk, is laid into a circle.
+        A map that determines the path of cuts. Without it, the mesh is mapped into a circle as soon as it is a disk.
     most : int, optional
-        Vertices to add at most.
+        Maximum number of added vertices.
 
     Raises
     ------
     TooManyError
-        When that is not enough.
+        If more vertices are needed.
 
     Attributes
     ----------
     sheet : Sheet
-        The mesh, cut, and split where that was needed.
+        The mesh, cut, and split if needed.
     regions : Regions
         The target.
     places : dict
-        The place of every vertex on a cut.
+        The position of every vertex on a cut.
     """
 
     def __init__(self, problem: Problem, guide: ComplexArray | None = None, most: int | None = None) -> None:
@@ -56,7 +56,7 @@ class Cutting:
         self.sheet = Sheet(problem.F, problem.n, domain.pins.tolist())
         self.places: dict[int, complex] = {}
         self._target = (problem.target @ np.array([1, 1j])).tolist()
-        # The copy at each corner of the target's triangles, by the half-edge that begins there.
+        # The copy at each corner of the target's triangles, keyed by the half-edge that begins there.
         fixed = problem.fixed.tolist()
         self._at = {(a, b): fixed[a] for a, b in self.regions.apex}
         self._closed = set[Edge]()
@@ -73,7 +73,7 @@ class Cutting:
             self.sheet.split(a, b)
 
     def _cut(self, a: int, b: int) -> None:
-        """Cut target and sheet from one point of the target to another."""
+        """Cut the target and the sheet between two points of the target."""
         heartbeat()
         if self._most is not None and len(self.sheet.parents) > self._most:
             raise TooManyError
@@ -83,7 +83,8 @@ class Cutting:
         self._spread(way, self._target[a], self._target[b])
         right = self.sheet.cut(way)
         self._place += [self._place[copy] for copy in way[: len(self.sheet.vertex) - len(self._place)]]
-        # To the right of the cut, corners are at the copies on its right: around a clockwise, around b the other way.
+        # To the right of the cut, corners use the right copies: iterate clockwise around a and counterclockwise around
+        # b.
         apex = self.regions.apex
         head = apex[b, a]
         self._at[a, head] = right[0]
@@ -97,7 +98,7 @@ class Cutting:
                 self._at[b, head] = right[-1]
 
     def _spread(self, way: list[int], start: complex, end: complex) -> None:
-        """Give the vertices of a walk places on the segment: half as they lie now, half evenly."""
+        """Assign positions on the segment to the vertices of a walk: half by their current spacing, half evenly."""
         steps = np.abs(np.diff([self._place[copy] for copy in way]))
         steps = steps / (steps.sum() or 1.0) + 1 / len(steps)
         share = np.cumsum(steps)[:-1] / steps.sum()
@@ -106,14 +107,14 @@ class Cutting:
 
 
 def _harmonic(problem: Problem) -> ComplexArray:
-    """Tutte's embedding, wherever that inverts triangles."""
+    """Return Tutte's embedding of the problem, which may have inverted triangles."""
     w = np.zeros(problem.n, dtype=np.complex128)
     w[problem.fixed] = problem.target @ np.array([1, 1j])
     return tutte(problem.F, w, problem.fixed)
 
 
 def _on_circle(sheet: Sheet) -> list[complex]:
-    """The places of copies when a disk's boundary is laid evenly along a circle."""
+    """Return positions of the copies of a disk whose boundary is spread evenly along a circle."""
     (loop,) = sheet.loops()
     w = np.zeros(len(sheet.vertex), dtype=np.complex128)
     w[loop] = np.exp(2j * np.pi * np.arange(len(loop)) / len(loop))

@@ -1,4 +1,4 @@
-"""Tutte's embedding of the pieces of a cut mesh, and what is done where doubles do not bear it."""
+"""Tutte's embedding of the pieces of a cut mesh, and repairs if double precision is insufficient."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import LocalRepair, RandomRestarts, Untangling
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# How often weights are renewed: as the areas to this power, and no further from each other than by this factor.
+# Number of weight updates; exponent of the areas in the weights; maximum ratio of weights in one update.
 _RENEWALS, _POWER, _SPAN = 4, 0.5, 1e6
-# What rights the last triangles, where vertices on cuts may move too; each has its limit, for doubles may have no room.
+# Methods that untangle the last triangles and may also move vertices on cuts. Each is limited, because double precision
+# may be insufficient.
 _REPAIRS = LocalRepair(tries=30), Untangling(iterations=200), RandomRestarts(in_vain=20, tries=20)
 
 
 def tutte(F: IntArray, w: ComplexArray, held: IntArray, weights: FloatArray | float = 1.0) -> ComplexArray:
-    """Put every free vertex into the weighted middle of its neighbours.
+    """Place every free vertex at the weighted mean of its neighbours.
 
     Parameters
     ----------
     F : (f, 3) int64
     w : (n,) complex128
-        Places; only those of held vertices are read.
+        Positions; only those of fixed vertices are read.
     held : (k,) int64
-        Vertices that stay, on every part of the mesh.
+        Fixed vertices, at least one on every component of the mesh.
     weights : (f,) float64
-        Positive; an edge weighs as much as the triangles beside it together.
+        Positive; the weight of an edge is the sum over its triangles.
 
     Returns
     -------
@@ -42,7 +43,7 @@ def tutte(F: IntArray, w: ComplexArray, held: IntArray, weights: FloatArray | fl
     Raises
     ------
     quasiharmonic.linsolve.NotPositiveDefinite
-        When rounding leaves no positive definite system.
+        If the system is not positive definite after rounding.
     """
     if len(np.unique(held)) == len(w):
         return w
@@ -52,20 +53,20 @@ def tutte(F: IntArray, w: ComplexArray, held: IntArray, weights: FloatArray | fl
 
 
 def embedded(problem: Problem, w: ComplexArray, held: IntArray) -> ComplexArray:
-    """Embed convex pieces into their polygons, and right what rounding has inverted.
+    """Embed convex pieces into their polygons, and untangle triangles that rounding has inverted.
 
     Parameters
     ----------
     problem : Problem
     w : (n,) complex128
-        Places of the held vertices in the problem's frame.
+        Positions of the fixed vertices in the problem's frame.
     held : (k,) int64
         Vertices on the boundaries of pieces.
 
     Returns
     -------
     (n,) complex128
-        The map of the fewest inverted triangles that was met, by the positions that it stands for.
+        The map with the fewest inverted triangles found, counted at its final positions.
     """
     best, least = w, len(problem.F) + 1
     for now in _candidates(problem, w, held):
@@ -78,7 +79,7 @@ def embedded(problem: Problem, w: ComplexArray, held: IntArray) -> ComplexArray:
 
 
 def _candidates(problem: Problem, w: ComplexArray, held: IntArray) -> Iterator[ComplexArray]:
-    """Embeddings by ever other weights, then what is righted of the best of them."""
+    """Yield embeddings with different weights, then maps from untangling the best of them."""
     weights, best, least = np.ones(len(problem.F)), w, np.inf
     for _ in range(1 + _RENEWALS):
         try:
@@ -89,7 +90,7 @@ def _candidates(problem: Problem, w: ComplexArray, held: IntArray) -> Iterator[C
         inverted = inverted_triangles(problem.F, problem.positions(w)).size
         if inverted < least:
             best, least = w, inverted
-        # What is crowded gets softer springs.
+        # Small triangles get smaller weights.
         areas = np.abs(signed_areas(problem.F, w))
         weights = weights * np.clip(areas / areas.max(), 1 / _SPAN, 1.0) ** _POWER
     objective = Objective(problem)

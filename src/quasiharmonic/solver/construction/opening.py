@@ -1,4 +1,4 @@
-"""A constructed map opened up, and thinned out as it gets room."""
+"""Even out a constructed map and thin it as its triangles gain area."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from quasiharmonic.solver.methods.local_repair import Patch
 from quasiharmonic.solver.methods.untangling import GRADINGS, opened, untangled
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
-# Opened and thinned at most so often; what does not go even then is tried harder, so many vertices at most, the map
-# around each untangled within so many rings, in so many steps.
+# Maximum number of rounds of evening out and thinning. Then more expensive tries: maximum number of vertices, rings
+# around each that are untangled, and steps.
 _ROUNDS, _TRIES, _RINGS, _STEPS = 6, 30, 2, 20
 
 
 def thinned(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined, FloatArray]:
-    """Take vertices out of a refinement as long as its map stays bijective.
+    """Remove vertices from a refinement as long as its map stays bijective.
 
     Parameters
     ----------
     problem : Problem
-        On the old mesh.
+        On the original mesh.
     refined : Refined
     uv : (n + s, 2) float64
         A bijective map of it.
@@ -37,13 +37,13 @@ def thinned(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined
     refined : Refined
         With as many vertices or fewer.
     uv : (n + s, 2) float64
-        A bijective map of it, to the last bit where it was if no vertex went.
+        A bijective map of it; exactly the given one if no vertex was removed.
     """
-    # Of magnitude about one, so that no product overflows.
+    # Scale to a magnitude of about one, so that no product overflows.
     exponent = int(np.frexp(np.abs(problem.target).max())[1])
     given, uv = uv, np.ldexp(uv, -exponent)
     if not np.array_equal(np.ldexp(uv, exponent), given):
-        # Coordinates that span so much stay as they are: what is left of them may fold.
+        # Leave coordinates with too large a span unchanged: scaling would round them and could invert triangles.
         return refined, given
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent))
     gradings = cycle(GRADINGS)
@@ -59,14 +59,14 @@ def thinned(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined
 
 
 def _opened(problem: Problem, refined: Refined, uv: FloatArray, grading: float) -> FloatArray:
-    """The map with its triangles evened out, or as it was where rounding would invert one."""
+    """Return the map with evened out triangles, or the given map if rounding would invert one."""
     loose = problem.frame.outward(opened(refined.F, problem.frame.inward(uv), problem.fixed, grading=grading))
     loose[problem.fixed] = problem.target
     return loose if is_injective(refined.F, loose) else uv
 
 
 def _taken_out(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 0) -> tuple[Refined, FloatArray]:
-    """Take out what can be taken out, and with so many tries what can be made to go."""
+    """Remove vertices by thinning, and by untangling around up to ``tries`` of the rest."""
     shares = shares_of(refined)
     thinning = Thinning(problem.F, problem.fixed, refined.F, shares, uv @ np.array([1, 1j]))
     thinning.thin()
@@ -85,7 +85,7 @@ def _taken_out(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 
 
 
 def _untangled(frame: Frame, patch: Patch, w: ComplexArray) -> ComplexArray:
-    """Where untangling a map of a patch ends, in the units of the target."""
+    """Untangle a map of a patch, in units of the target; return the last map."""
     inward = frame.inward(w.view(np.float64).reshape(-1, 2))
     steps = untangled(patch.F, inward, np.flatnonzero(patch.held), grading=GRADINGS[0])
     *_, last = inward, *islice(steps, _STEPS)

@@ -1,7 +1,7 @@
-"""A target cut into convex regions without further points, and the order in which the cuts are made.
+"""Partition of a target into convex regions without additional points, and the order of the cuts.
 
-Constrained Delaunay triangles, of which neighbours are joined as long as what comes out is convex [1]_. What is left of
-their edges, the *cuts*, connects all loops and pins, since a convex region surrounds none.
+Constrained Delaunay triangles are joined with neighbours as long as the result is convex [1]_. The remaining interior
+edges, the *cuts*, connect all loops and pins, because a convex region surrounds none of them.
 
 References
 ----------
@@ -21,28 +21,28 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.solver.construction.halfedges import Edge
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# A turn at a point is none when the point is off the line by no more than so many roundings of the largest coordinate.
+# A turn counts as straight if the point is off the line by at most this many roundings of the largest coordinate.
 _ROUNDINGS = 4.0
 
 
 class Regions:
-    """A region of the plane within loops, around points, and how it is cut into convex regions.
+    """A planar region bounded by loops, with interior points, and its partition into convex regions.
 
     Parameters
     ----------
     points : (k, 2) float64
-        Places, pairwise distinct, of magnitude about one.
+        Positions, pairwise distinct, of magnitude about one.
     loops : sequence of (l,) int64
         Loops of points, the region to their left; simple, disjoint and nested.
     pins : (p,) int64
-        Points strictly inside. All points are on a loop or a pin.
+        Points strictly inside. Every point is on a loop or a pin.
 
     Attributes
     ----------
     apex : dict
-        The third corner of the triangle to the left of a half-edge of the triangulation, inside the loops.
+        The third corner of the triangle to the left of a half-edge of the triangulation.
     kept : set of (int, int)
-        The cuts, by half-edges, each both ways.
+        The cuts as half-edges, in both directions.
     """
 
     def __init__(self, points: FloatArray, loops: Sequence[IntArray], pins: IntArray) -> None:
@@ -61,25 +61,25 @@ class Regions:
         self._number_of_loops = len(loops) + len(pins)
 
     def turn(self, a: int, b: int, c: int) -> int:
-        """The sign of the turn at b from a to c: 0 where it is none as far as rounded places can tell."""
+        """Sign of the turn at b from a to c; 0 if it is straight up to rounding."""
         x, y = self._x, self._y
         ux, uy, vx, vy = x[c] - x[a], y[c] - y[a], x[b] - x[a], y[b] - y[a]
         cross = vx * uy - vy * ux
-        # Straight on, and not back.
+        # Straight ahead, not back.
         if abs(cross) <= self._off * np.hypot(ux, uy) and vx * (ux - vx) + vy * (uy - vy) > 0:
             return 0
         return self.exact_turn(a, b, c)
 
     def exact_turn(self, a: int, b: int, c: int) -> int:
-        """The sign of the turn at b from a to c."""
+        """Exact sign of the turn at b from a to c."""
         return int(orientation(self.points[a], self.points[b], self.points[c]))
 
     def length(self, a: int, b: int) -> float:
-        """The distance of two points."""
+        """Distance between two points."""
         return float(np.hypot(self._x[b] - self._x[a], self._y[b] - self._y[a]))
 
     def bridges(self) -> list[Edge]:
-        """Cuts that make one loop of all: each from what is connected with the first loop to one that is not yet."""
+        """Return cuts that connect all loops, each from the part connected to the first loop to another loop."""
         at: dict[int, list[tuple[float, int, int]]] = {}
         for a, b in sorted(self.kept):
             if self._loop[a] != self._loop[b]:
@@ -99,7 +99,7 @@ class Regions:
         return found
 
     def diagonals(self, bridges: Sequence[Edge]) -> list[Edge]:
-        """The other cuts, each so that what it parts is of about the same size, as the earlier ones have left it."""
+        """Return the other cuts, ordered so that each divides its remaining part into halves of similar size."""
         closed = set(bridges) | {(b, a) for a, b in bridges}
         region = self._numbered()
         beside: dict[int, list[tuple[int, Edge]]] = {}
@@ -111,10 +111,10 @@ class Regions:
         return _halving(weight, beside)
 
     def _join(self) -> None:
-        """Join neighbouring triangles and what came of them where that is convex, across the longest edges first."""
+        """Join neighbouring triangles and regions if the result is convex, across the longest edges first."""
         after: dict[int, dict[int, int]] = {}
         before: dict[int, dict[int, int]] = {}
-        # Around each point the edges in order, the next one counterclockwise; of all to begin with.
+        # Around each point, the edges in counterclockwise order; initially all edges.
         for (a, b), c in self.apex.items():
             after.setdefault(a, {})[b] = c
             before.setdefault(a, {})[c] = b
@@ -127,7 +127,7 @@ class Regions:
                     after[at][low], before[at][high] = high, low
 
     def _may_go(self, at: int, low: int, high: int) -> bool:
-        """Whether the angle from one edge counterclockwise to another is at most straight."""
+        """Whether the counterclockwise angle between two edges is at most straight."""
         return low != high and self.turn(low, at, high) <= 0 and not self._folded(at, low, high)
 
     def _folded(self, at: int, low: int, high: int) -> bool:
@@ -137,7 +137,7 @@ class Regions:
         return bool(flat) and along > 0
 
     def _numbered(self) -> dict[Edge, int]:
-        """The number of the region to the left of each half-edge."""
+        """Number of the region to the left of each half-edge."""
         region: dict[Edge, int] = {}
         for count, first in enumerate(sorted(self.apex)):
             waiting = [first] if first not in region else []
@@ -154,7 +154,7 @@ class Regions:
 
 
 def _triangles_within(points: FloatArray, rim: IntArray) -> IntArray:
-    """Constrained Delaunay triangles to the left of directed edges that make loops."""
+    """Return the constrained Delaunay triangles to the left of directed edges that form loops."""
     low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
     frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     k = len(points)
@@ -175,12 +175,12 @@ def _triangles_within(points: FloatArray, rim: IntArray) -> IntArray:
 
 
 def _halving(weight: dict[int, int], beside: dict[int, list[tuple[int, Edge]]]) -> list[Edge]:
-    """The edges of a tree in an order in which each parts the tree that the earlier ones left about in halves.
+    """Return the edges of a tree, ordered so that each divides its remaining part into two of similar weight.
 
     Parameters
     ----------
     weight : dict
-        Of every node.
+        Weight of every node.
     beside : dict
         Neighbours of a node, with the name of the edge as seen from it.
     """

@@ -1,7 +1,7 @@
-"""A surface that is cut along walks, and whose inner edges are split.
+"""A surface that is cut along walks and whose interior edges are split.
 
-A vertex that a cut passes through becomes two *copies*, one on either side. All here is by copies, and each copy knows
-the vertex that it is of; vertices beyond the mesh's own were made by splitting an edge in the middle.
+A vertex on a cut becomes two *copies*, one on either side. All indices are of copies, and ``vertex`` maps each copy to
+its vertex. Vertices beyond the original mesh are midpoints of split edges.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from quasiharmonic.util.arrays import IntArray
 
 
 class Sheet(HalfEdges):
-    """An oriented surface with boundary, to be cut.
+    """An oriented surface with boundary that can be cut.
 
     Parameters
     ----------
     F : (f, 3) int64
-        Its triangles, before anything is cut.
+        Its triangles before any cut.
     n : int
         Number of vertices.
     pins : iterable of int
-        Inner vertices that are as loops of one vertex until a cut ends in them.
+        Interior vertices that act as loops of one vertex until a cut ends there.
 
     Attributes
     ----------
     vertex : list of int
-        The vertex that each copy is of.
+        The vertex of each copy.
     parents : list of (int, int)
-        The vertices between which each added one lies, in the order in which they were added.
+        The two vertices whose midpoint each added vertex is, in order of addition.
     preceding : dict
-        The last copy along the boundary.
+        The previous copy along the boundary.
     """
 
     def __init__(self, F: IntArray, n: int, pins: Iterable[int] = ()) -> None:
@@ -46,11 +46,11 @@ class Sheet(HalfEdges):
         self.preceding = {b: a for a, b in self.following.items()}
 
     def is_held(self, copy: int) -> bool:
-        """Whether a copy lies on the boundary, or is a pin."""
+        """Whether a copy is on the boundary or is a pin."""
         return copy in self.following or copy in self._pins
 
     def loops(self) -> list[list[int]]:
-        """The boundary's copies in order, loop by loop, the surface to the left."""
+        """Return the boundary copies in order, loop by loop, with the surface to the left."""
         found: list[list[int]] = []
         seen = set[int]()
         for start in sorted(self.following):
@@ -63,7 +63,7 @@ class Sheet(HalfEdges):
         return found
 
     def split(self, a: int, b: int) -> int:
-        """Put a vertex onto the middle of an inner edge; its copy."""
+        """Add a vertex at the midpoint of an interior edge; return its copy."""
         middle = len(self.vertex)
         self.vertex.append(self._n + len(self.parents))
         self.parents.append((self.vertex[a], self.vertex[b]))
@@ -73,17 +73,17 @@ class Sheet(HalfEdges):
         return middle
 
     def cut(self, walk: Sequence[int]) -> list[int]:
-        """Cut along inner edges, from a copy on the boundary to another, or to a pin that is none yet.
+        """Cut along interior edges, from a copy on the boundary to another, or to a pin that is still uncut.
 
         Parameters
         ----------
         walk : sequence of int
-            Copies, each once; those between the ends are inner ones.
+            Copies, each once; all but the ends are interior.
 
         Returns
         -------
         list of int
-            The copies to the right of the walk; to its left stay the old ones. A pin inside is not doubled.
+            The copies to the right of the walk; the old copies stay to its left. A pin at the end is not duplicated.
         """
         doubled = walk if walk[-1] in self.following else walk[:-1]
         right = dict(zip(doubled, range(len(self.vertex), len(self.vertex) + len(doubled)), strict=True))
@@ -108,7 +108,7 @@ class Sheet(HalfEdges):
         return back
 
     def _mend_boundary(self, walk: Sequence[int], right: Sequence[int]) -> None:
-        """Let the boundary run along both sides of a cut: from its start on the left, back to it on the right."""
+        """Update the boundary: from the start of a cut along its left side, and back along its right side."""
         after, before = self.following[walk[0]], self.preceding.get(walk[-1])
         pairs = [*pairwise(walk), *zip(right[:0:-1], right[-2::-1], strict=True)]
         pairs.append((right[0], after))
@@ -119,5 +119,5 @@ class Sheet(HalfEdges):
             self.preceding[head] = tail
 
     def rows(self) -> IntArray:
-        """All triangles by copies, (t, 3) int64."""
+        """Return all triangles as copies, (t, 3) int64."""
         return np.array(self.triangles(), dtype=np.int64).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The straight sides of convex pieces, along which no inner edge may lie."""
+"""Straight sides of convex pieces, along which no interior edge may lie."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from quasiharmonic.solver.construction.sheet import Sheet
 
 
 def along_sides(sheet: Sheet, regions: Regions, point: Sequence[int]) -> list[Edge]:
-    """Inner edges whose ends lie on one side of their piece, so that a straight map would flatten what is beyond them.
+    """Return interior edges with both ends on one side of their piece, behind which triangles would be degenerate.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def along_sides(sheet: Sheet, regions: Regions, point: Sequence[int]) -> list[Ed
     Returns
     -------
     list of (int, int)
-        By copies. Sides that are straight only up to rounding count.
+        Pairs of copies. Sides that are straight only up to rounding are included.
     """
     side: dict[int, set[int]] = {}
     count = 0
@@ -38,14 +38,14 @@ def along_sides(sheet: Sheet, regions: Regions, point: Sequence[int]) -> list[Ed
             if k % len(loop) in bends:
                 count += 1
                 side[copy].add(count)
-        # The last side ends in the first corner.
+        # The last side ends at the first corner.
         side[loop[first]].add(count)
         count += 1
     return [(a, b) for a, b in sheet.inner_edges() if not side.get(a, set()).isdisjoint(side.get(b, ()))]
 
 
 def _corners(marks: list[tuple[int, int]], regions: Regions) -> list[int]:
-    """Places in a loop at which it bends; of points as given, where rounding leaves fewer than three."""
+    """Return the positions in a loop at which it bends; exactly determined if rounding leaves fewer than three."""
     bends: list[int] = []
     for turn in (regions.turn, regions.exact_turn):
         around = zip([marks[-1], *marks[:-1]], marks, [*marks[1:], marks[0]], strict=True)

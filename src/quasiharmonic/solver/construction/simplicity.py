@@ -1,4 +1,4 @@
-"""Which problems the construction is for."""
+"""Test whether the construction applies to a problem."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def is_simple(problem: Problem) -> bool:
-    """Whether a surface can be mapped onto a target bijectively, if only its mesh is fine enough.
+    """Whether a surface can be mapped bijectively onto its target if its mesh is fine enough.
 
     Parameters
     ----------
@@ -20,8 +20,9 @@ def is_simple(problem: Problem) -> bool:
     Returns
     -------
     bool
-        Whether the surface has no handles; the target's loops are simple, disjoint and nested as an outer one around
-        all others, and wound as the mesh's; and pins are apart from each other and strictly inside. Decided exactly.
+        True if the surface has no handles and the target is simple, determined exactly. Its loops must be simple,
+        disjoint, nested as an outer one around all others, and wound as the mesh's. Pins must be distinct and strictly
+        inside.
     """
     domain = problem.domain
     edges = len(domain.edges.interior) + len(domain.edges.boundary)
@@ -47,5 +48,5 @@ def _strictly_inside(point: FloatArray, uv: FloatArray, rim: IntArray) -> bool:
     across = (np.minimum(low[:, 0], high[:, 0]) <= point[0]) & (point[0] <= np.maximum(low[:, 0], high[:, 0]))
     if np.any((side == 0) & across):
         return False
-    # A ray to the left meets what has the point on its right, an end of an edge counted for the one above it.
+    # A ray to the left intersects edges with the point to their right; an endpoint counts for the edge above it.
     return bool(np.count_nonzero((side < 0) & (high[:, 1] > point[1])) % 2)

@@ -1,8 +1,8 @@
-"""Added vertices taken out of a map again, wherever it stays injective.
+"""Remove added vertices from a map as long as it stays injective.
 
-What is left where a vertex was, a polygon, is triangulated so that every triangle is positive in the map and lies
-within a triangle of the old mesh; where that can be done the choice of the best worst shape is found by dynamic
-programming [1]_. Where it cannot, the triangulation that is best at rest is taken, and the map untangled around it.
+The polygon left by a removed vertex is triangulated so that every triangle is positive in the map and lies within a
+triangle of the original mesh. If possible, dynamic programming finds the triangulation with the best worst shape [1]_.
+Otherwise the best triangulation at rest is used, and the map is untangled around it.
 
 References
 ----------
@@ -22,34 +22,34 @@ from quasiharmonic.solver.methods.local_repair import Patch
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-# Rounding of a determinant relative to the sum of its terms' magnitudes, with room.
+# Rounding of a determinant relative to the sum of its terms' magnitudes, with a margin.
 _FLAT = 1e-15
-# Around vertices of more neighbours nothing is tried.
+# Vertices with more neighbours are not removed.
 _MOST = 24
 
 
 class Thinning:
-    """A refined mesh, its map, and where its vertices lie in the old mesh.
+    """A refined mesh, its map, and the positions of its vertices in the original mesh.
 
     Parameters
     ----------
     F : (f, 3) int64
-        The old mesh.
+        The original mesh.
     fixed : (k,) int64
-        Vertices that stay.
+        Fixed vertices.
     triangles : (t, 3) int64
         The refined mesh.
     shares : sequence of dict
-        Of each added vertex the old ones that it lies between, with their shares.
+        For each added vertex, the original vertices that it lies between, with their weights.
     w : (n + s,) complex128
         An injective map.
 
     Attributes
     ----------
     mesh : HalfEdges
-        By the numbers that vertices had, also after some were taken out.
+        With the original indices, also after removals.
     left : set of int
-        The added vertices that are still there.
+        The added vertices that remain.
     w : (n + s,) complex128
     """
 
@@ -70,8 +70,8 @@ class Thinning:
         self._shares = [*({vertex: 1.0} for vertex in range(n)), *shares]
 
     def thin(self) -> None:
-        """Take out what can be taken out, the last added first, and again until nothing can."""
-        # Whether a vertex can go is a matter of its star, which changes only as a neighbour goes.
+        """Remove vertices, the last added first, until none can be removed."""
+        # Whether a vertex can be removed depends on its star, which changes only if a neighbour is removed.
         waiting = set(self.left)
         while waiting:
             for vertex in sorted(waiting, reverse=True):
@@ -84,21 +84,21 @@ class Thinning:
                     waiting |= beside & self.left
 
     def try_hard(self, vertex: int, untangle: Callable[[Patch, ComplexArray], ComplexArray], rings: int) -> bool:
-        """Take a vertex out if the map can be untangled around where it was.
+        """Remove a vertex if the map can be untangled around its former position.
 
         Parameters
         ----------
         vertex : int
             One of ``left``.
         untangle : callable
-            From a patch and its map to another map of it.
+            Function from a patch and its map to another map of it.
         rings : int
-            How far around it vertices move.
+            Number of rings around it whose vertices may move.
 
         Returns
         -------
         bool
-            Whether it was taken out; if not all is as before.
+            Whether the vertex was removed; if not, nothing has changed.
         """
         heartbeat()
         cut = self._without(vertex, self._bent)
@@ -121,18 +121,18 @@ class Thinning:
         return False
 
     def _take_out(self, vertex: int, cut: list[Triangle]) -> None:
-        """Put other triangles in the place of a vertex's."""
+        """Replace the triangles around a vertex by others."""
         self.mesh.remove([(vertex, a, b) for a, b in self.mesh.link(vertex)])
         self.mesh.add(cut)
         self.left.remove(vertex)
 
     def _without(self, vertex: int, worth: Callable[[int, int, int], float]) -> list[Triangle] | None:
-        """Triangles that cover the star of an added vertex, or None where none are worth anything."""
+        """Triangulate the star of an added vertex without it; None if no triangulation has positive worth."""
         ring = [tail for tail, _ in self.mesh.link(vertex)]
         polygons = [ring]
         edge = self._shares[vertex].keys()
         if len(edge) == 2:
-            # On either side of the old edge that it is on.
+            # One polygon on either side of the original edge that contains the vertex.
             i, j = (k for k, other in enumerate(ring) if self._shares[other].keys() <= edge)
             polygons = [ring[i : j + 1], ring[j:] + ring[: i + 1]]
         found = []
@@ -144,18 +144,18 @@ class Thinning:
         return found
 
     def _in_map(self, a: int, b: int, c: int) -> float:
-        """The worse of the shapes of a triangle in the map and in the old one that it is a part of."""
+        """Return the worse of a triangle's shape in the map and in the original triangle that contains it."""
         there = shape(*(complex(self.w[vertex]) for vertex in (a, b, c)))
         return min(there, self._at_rest(a, b, c)) if there > 0 else there
 
     def _bent(self, a: int, b: int, c: int) -> float:
-        """As `_in_map`, where an inverted triangle of the map is worth something too, though less than any other."""
+        """As `_in_map`, but positive for triangles that are inverted in the map, and lower than for any others."""
         rest = self._at_rest(a, b, c)
         there = shape(*(complex(self.w[vertex]) for vertex in (a, b, c)))
         return 1.0 + there if rest > 0 else rest
 
     def _at_rest(self, a: int, b: int, c: int) -> float:
-        """The shape of a triangle within the old one that it is a part of, drawn as half a square."""
+        """Return the shape of a triangle within its original triangle, drawn as half a square; 0 if there is none."""
         rows = [self._shares[vertex] for vertex in (a, b, c)]
         old = self._old.get(frozenset().union(*rows))
         if old is None:
@@ -163,7 +163,7 @@ class Thinning:
         return shape(*(complex(row.get(old[1], 0.0), row.get(old[2], 0.0)) for row in rows))
 
     def _patch(self, ring: list[int], rings: int) -> Patch | None:
-        """Triangles within some rings of some vertices; None where none of their vertices may move."""
+        """Return the triangles within some rings of some vertices; None if no vertex of them is free."""
         inside = set(ring)
         for _ in range(rings):
             inside |= {end for vertex in inside for side in self.mesh.link(vertex) for end in side}
@@ -181,20 +181,20 @@ class Thinning:
 
 
 def shape(p: complex, q: complex, r: complex) -> float:
-    """Twice the signed area of a triangle over the sum of its squared sides, up to 0.58; its sign is exact."""
+    """Return twice a triangle's signed area over the sum of its squared sides, up to 0.58; the sign is exact."""
     left = (p.real - r.real) * (q.imag - r.imag)
     right = (p.imag - r.imag) * (q.real - r.real)
     sides = abs(q - p) ** 2 + abs(r - q) ** 2 + abs(p - r) ** 2
     if abs(left - right) > _FLAT * (abs(left) + abs(right)) + 1e-300:
         return (left - right) / sides
-    # For a single triangle fractions are far quicker than the predicates of many.
+    # For a single triangle fractions are much faster than the vectorised predicates.
     (px, py), (qx, qy), (rx, ry) = ((Fraction(z.real), Fraction(z.imag)) for z in (p, q, r))
     difference = (px - rx) * (qy - ry) - (py - ry) * (qx - rx)
     return 1e-300 * ((difference > 0) - (difference < 0))
 
 
 def best_triangles(polygon: list[int], worth: Callable[[int, int, int], float]) -> list[Triangle] | None:
-    """The triangulation of a polygon whose worst triangle is worth most; None where that is nothing or less."""
+    """Return the triangulation of a polygon with the best worst triangle; None if its worth is not positive."""
     k = len(polygon)
     best = {(i, i + 1): (float("inf"), -1) for i in range(k - 1)}
     for span in range(2, k):

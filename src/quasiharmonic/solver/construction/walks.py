@@ -1,8 +1,8 @@
-"""Shortest walks through the inner vertices of a sheet, from one boundary vertex to another.
+"""Shortest walks through the interior vertices of a sheet, from one boundary vertex to another.
 
-A walk may also pass through the middle of an inner edge, which is then split. With the middles of edges between two
-boundary vertices alone every two of these have a walk between them, unless they are neighbours: that is a part of the
-proof in `quasiharmonic.solver.construction`. The others let it stay near where it should be.
+A walk may also pass through the midpoint of an interior edge, which is then split. With only the midpoints of edges
+between two boundary vertices, any two boundary vertices that are not neighbours are joined by a walk. This is a part of
+the proof in `quasiharmonic.solver.construction`. The other midpoints let the walk stay closer to its segment.
 """
 
 from __future__ import annotations
@@ -14,37 +14,38 @@ from itertools import pairwise
 from quasiharmonic.solver.construction.halfedges import Edge
 from quasiharmonic.solver.construction.sheet import Sheet
 
-# A node of a walk is a copy, or an inner edge that is yet to be split.
+# A node of a walk: a copy, or an interior edge to be split.
 Node = int | Edge
 
-# How much longer a walk seems as far off the segment as that is long; and in the segment's lengths what a step costs, a
-# split of an edge that will have to be split some time, and one of another.
+# Factor on length per distance from the segment, relative to its length. Then costs in lengths of the segment: a step,
+# a split of an edge that must be split at some point, and another split.
 _STRAY, _STEP, _SPLIT, _SPLIT_MORE = 8.0, 1e-3, 0.5, 1.0
-# A shorter segment is taken for one of this length, so that no cost overflows.
+# Minimum length of a segment in costs, to avoid overflow.
 _SHORTEST = 1e-60
 
 
 def walk(sheet: Sheet, place: list[complex], start: int, end: int) -> list[int]:
-    """Find a walk near the segment between two vertices, and split what it has to pass through.
+    """Find a walk near the segment between two vertices, and split the edges that it passes through.
 
     Parameters
     ----------
     sheet : Sheet
     place : list of complex
-        Where each copy is in a plane in which walks are to be short and straight. Those of added copies are appended.
+        Position of each copy in a plane in which walks should be short and straight. Positions of added copies are
+        appended.
     start : int
         A copy on the boundary.
     end : int
-        Another, or an inner one that is the end of no other walk.
+        Another one, or an interior copy at which no other walk ends.
 
     Returns
     -------
     list of int
-        The walk's copies, all but the ends inside.
+        The walk's copies, all interior except the ends.
     """
     copies: list[int] = []
-    # Of three middles in one triangle two are not joined when all are there, and another walk has to be found. Where
-    # all ways are measured alike, the middle one of the three is a detour.
+    # If a walk uses three midpoints in one triangle, two are not joined after splitting, and another walk is needed. If
+    # all directions cost the same, the second of the three is a detour.
     for stray in (_STRAY, _STRAY, 0.0):
         nodes = _shortest(sheet, place, start, end, stray)
         copies = [node if isinstance(node, int) else _split(sheet, place, node) for node in nodes]
@@ -59,7 +60,7 @@ def _split(sheet: Sheet, place: list[complex], edge: Edge) -> int:
 
 
 def _shortest(sheet: Sheet, place: list[complex], start: int, end: int, weight: float) -> list[Node]:
-    """The cheapest nodes from a copy to another (Dijkstra)."""
+    """Return the cheapest path of nodes between two copies (Dijkstra)."""
     chord = place[end] - place[start]
     axis = chord / (abs(chord) or 1.0)
     size = max(abs(chord), _SHORTEST)
@@ -102,7 +103,7 @@ def _shortest(sheet: Sheet, place: list[complex], start: int, end: int, weight: 
 
 
 def _neighbours(sheet: Sheet, node: Node, start: int, end: int) -> Iterator[Node]:
-    """What a walk may go on to: inner copies, middles of inner edges, and the end."""
+    """Yield the nodes that a walk may visit next: interior copies, midpoints of interior edges, and the end."""
     if isinstance(node, tuple):
         for a, b in (node, node[::-1]):
             c = sheet.apex[a, b]
@@ -122,7 +123,7 @@ def _neighbours(sheet: Sheet, node: Node, start: int, end: int) -> Iterator[Node
 
 
 def _middles(sheet: Sheet, *sides: Edge) -> Iterator[Edge]:
-    """Those of some edges that are inside, the smaller end first."""
+    """Yield the interior ones of some edges, the smaller end first."""
     for a, b in sides:
         if sheet.is_inner(a, b):
             yield (a, b) if a < b else (b, a)

@@ -156,7 +156,7 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
 
 
 def _within(F: IntArray, k: int) -> BoolArray:
-    """Select the triangles to the left of the sides 0→1→…→k−1→0 and all triangles connected to them across other edges."""
+    """Select the triangles to the left of the sides 0→1→…→k−1→0, and those connected to them across other edges."""
     tails, heads, owner = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.repeat(np.arange(len(F)), 3)
     corners = (tails < k) & (heads < k)
     forward, backward = corners & (heads == (tails + 1) % k), corners & (tails == (heads + 1) % k)

@@ -153,7 +153,7 @@ def _place(w: ComplexArray, groups: list[_Stars]) -> None:
 
 
 class _Stars(NamedTuple):
-    """Vertices (m,) and the opposite edges of their triangles, two (m, k) int64; shorter rows repeat their last edge."""
+    """Vertices (m,) and the opposite edges of their triangles, two (m, k) int64; short rows repeat their last edge."""
 
     vertices: IntArray
     tails: IntArray

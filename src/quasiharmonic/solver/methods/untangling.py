@@ -77,7 +77,7 @@ class Regularised(Isotropic):
         return (1 + by_det) / chi, (1 - by_det) / chi
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the Hessian; by ``S = a + b`` and D: ``φ_SD = −1/(χρ)``, ``φ_DD = 2λ (1 − 2D/ρ)/χ + 2N/ρ³``, φ_SS = 0."""
+        """Return the Hessian: ``φ_SD = −1/(χρ)``, ``φ_DD = 2λ (1 − 2D/ρ)/χ + 2N/ρ³``, φ_SS = 0 with ``S = a + b``."""
         root, chi, numerator = self._parts(d)
         mixed = -1 / (chi * root)
         pure = 2 * _LAMBDA * (1 - 2 * d.det / root) / chi + 2 * numerator / root**3

@@ -1,12 +1,12 @@
-"""The ladder: the mesh as it is; edges split that a diagnosis names; more around what stays inverted; the construction.
+"""Solve a problem with refinement: the given mesh, edges of the diagnosis, edges at inverted triangles, construction.
 
     as given, shortly ──▶ constructed, if no vertex has to be added
-                      ──▶ as given ──▶ named edges ──▶ around what is inverted ──▶ constructed
+                      ──▶ as given ──▶ named edges ──▶ around inverted triangles ──▶ constructed
 
-A rung is climbed where those below have not led to a map. The construction takes little time, where a whole search that
-finds nothing takes much: so it is made as soon as the first stages of the search have failed, if the target is one that
-it is for. What it adds says whether the rungs between are worth their time, of which they then get a part only; it is
-taken where they come to nothing, or to more.
+An attempt is made only if those before it found no map. The construction takes little time, while a failing search
+takes much. The construction is therefore made as soon as the first stages of the search fail, if the target is simple.
+The number of vertices that it adds determines whether the attempts in between are worth their time. If they are, they
+get a reduced budget. The construction is used if they fail or add more vertices.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ AS_GIVEN, NAMED, AROUND, CONSTRUCTED = (
 )
 _Choice = Callable[[Stages], Stages]
 _Search = Callable[[Problem, ArrayLike | None, int, _Choice], MapResult]
-# Iterations of a search while a construction is there to be taken, and on large meshes so many triangles' iterations;
-# how often edges are split around what such a search leaves inverted; the latter where there is no construction.
+# Iteration limit of a search if a construction exists, and its limit in triangles times iterations for large meshes.
+# Then the rounds of splitting around inverted triangles with a construction, and without one.
 _FEW_ITERATIONS, _FEW_TRIANGLES, _FEW_ROUNDS, _ROUNDS = 600, 1_500_000, 1, 3
-# A construction that adds so few vertices is taken as soon as no map of the mesh as given was found.
+# A construction with at most this many added vertices is used as soon as the given mesh has no map.
 _LEAST = 1
 
 
@@ -66,23 +66,23 @@ def solve_refining(
     record_every: int = 0,
     slide: bool | BoundaryCurves = False,
 ) -> MapResult:
-    """Solve a problem, on a finer mesh where that is needed.
+    """Solve a problem, with refinement if needed.
 
     Parameters
     ----------
     problem : Problem
     strategy, polish, start, max_iterations, linear_solver, callback, record_every, slide
-        As of `injective_map`; those of the search are for the mesh as given.
+        See `injective_map`. ``start`` and ``record_every`` apply to the given mesh.
 
     Returns
     -------
     MapResult
-        As of `injective_map` with ``refine``.
+        See `injective_map` with ``refine``.
 
     Raises
     ------
     ValueError, ImportError
-        As `solve`.
+        See `solve`.
     """
     began = time.perf_counter()
     lower = None if polish is None else energy_named(polish)
@@ -110,27 +110,27 @@ def solve_refining(
 
 
 def on_refinement(problem: Problem, refined: Refined | None) -> Problem:
-    """The problem that a result is of, if its mesh was refined."""
+    """Return the problem on the refined mesh, or the problem itself without refinement."""
     return problem if refined is None else refined_problem(problem, refined)
 
 
 class _Ladder:
-    """A problem, how it is searched, and what was tried so far."""
+    """A problem, its search function, and the attempts so far."""
 
     def __init__(self, problem: Problem, search: _Search) -> None:
         self._problem = problem
         self._search = search
-        # Of a strategy's stages those that are run.
+        # Selects the stages of a strategy to run.
         self._some: _Choice = list
-        # Inner edges that a straight side of the target flattens.
+        # Interior edges that a straight side of the target makes degenerate.
         self._flat = flattened_edges(problem.F, problem.fixed, problem.target)
         self._rungs: list[RefinementAttempt] = []
-        # The latest result, with the stages and the history of all before it; and the best.
+        # The latest result, with the stages and the history of all attempts so far, and the best result.
         self._last: MapResult | None = None
         self._best: MapResult | None = None
 
     def solve_refining(self, start: ArrayLike | None, budget: int) -> MapResult:
-        """The result of the rung that adds the fewest vertices; where none leads to a map, of the last."""
+        """Return the map that adds the fewest vertices; if no attempt finds one, the result of the last attempt."""
         try:
             return replace(self._climb(start, budget), refinement_attempts=self._rungs)
         except KeyboardInterrupt:
@@ -144,9 +144,9 @@ class _Ladder:
         problem = self._problem
         few = min(budget, _FEW_ITERATIONS, 1 + _FEW_TRIANGLES // len(problem.F))
         if not is_simple(problem):
-            # What a straight side flattens seldom has a map, and then by little more than a rounding error.
+            # If a straight side makes edges degenerate, a map seldom exists, and then only by a rounding error.
             first = self._searched(AS_GIVEN, None, start, few if len(self._flat) else budget)
-            # Where a finer mesh is no better, what is told is about the one given.
+            # If refinement does not help, report the result on the given mesh.
             return first if first.injective else self._between(first, budget, _ROUNDS) or first
         self._some = soonest
         first = self._searched(AS_GIVEN, None, start, budget)
@@ -168,12 +168,12 @@ class _Ladder:
         return self._taken(made)
 
     def _taken(self, made: MapResult) -> MapResult:
-        """The constructed map, with what was done before it is handed back."""
+        """Record the construction as an attempt and return it."""
         self._rungs.append(RefinementAttempt(CONSTRUCTED, made.added, made.injective, made.stages[-1].seconds))
         return made
 
     def _between(self, first: MapResult, budget: int, rounds: int) -> MapResult | None:
-        """Split the edges that a diagnosis names, then others around what stays inverted; a map, if one is found."""
+        """Split the edges that a diagnosis names, then edges at inverted triangles; return the map if one is found."""
         problem = self._problem
         straight = split_edges(problem.V, problem.F, self._flat)
         named = refine_problem(refined_problem(problem, straight))
@@ -191,12 +191,12 @@ class _Ladder:
         return result if result.injective else None
 
     def _searched(self, name: str, refined: Refined | None, start: ArrayLike | None, budget: int) -> MapResult:
-        """Search for a map of the mesh as given, or of a finer one, which then is thinned out.
+        """Search for a map of the given mesh or of a refined mesh, which is then thinned.
 
         Raises
         ------
         KeyboardInterrupt
-            When the search was interrupted.
+            If the search was interrupted.
         """
         began = time.perf_counter()
         problem = self._problem
@@ -217,13 +217,13 @@ class _Ladder:
         return result
 
     def _constructed(self, first: MapResult) -> MapResult:
-        """A constructed map, certified, or where doubles have no room for one."""
+        """Return a constructed map, certified, or a map that shows where double precision is insufficient."""
         began, before, result = time.perf_counter(), self._last, first
         for made in constructions(self._problem, first.uv):
-            # In place of the one before it, and there if an interrupt keeps it from getting better.
+            # Replace the previous construction, which is kept if an interrupt stops the improvement.
             self._last = before
             result = self._continued(self._as_result(made, first, time.perf_counter() - began))
-        # Other constructions were tried after the best.
+        # Include the time of constructions tried after the best one.
         *others, last = result.stages
         return replace(result, stages=[*others, replace(last, seconds=time.perf_counter() - began)])
 
@@ -246,7 +246,7 @@ class _Ladder:
         )
 
     def _continued(self, result: MapResult) -> MapResult:
-        """A result with what was done before it, which is the latest from here on."""
+        """Prepend the stages and history of earlier attempts to a result, and store it as the latest."""
         last, best = self._last, self._best
         if last is not None:
             result = replace(result, stages=last.stages + result.stages, history=last.history + result.history)
@@ -263,19 +263,19 @@ def _status(made: Construction) -> Status:
 
 
 def _rank(result: MapResult) -> tuple[int, bool, int]:
-    """The lower, the better."""
+    """Sort key of a result; lower is better."""
     certificate = result.certificate
     bad = certificate.inverted.size + certificate.degenerate.size + certificate.nonfinite.size
     return bad, not certificate.bijective, result.added
 
 
 def _if_any(refined: Refined) -> Refined | None:
-    """A refinement, if it has added anything."""
+    """Return the refinement, or None if it has no added vertices."""
     return refined if len(refined.parents) else None
 
 
 def _around(refined: Refined, certificate: Certificate) -> IntArray:
-    """Inner edges (s, 2) of the triangles that are not positive, and of those around them."""
+    """Interior edges (s, 2) of triangles that are not positive, and of their neighbours."""
     F, n = refined.F, len(refined.V)
     bad = np.concatenate([certificate.inverted, certificate.degenerate])
     near = np.zeros(n, dtype=np.bool_)

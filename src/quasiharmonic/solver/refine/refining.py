@@ -1,4 +1,4 @@
-"""Meshes that are too coarse for a target: edges are split, those that the caller or that a diagnosis names."""
+"""Refine meshes that are too coarse for a target: split edges that the caller or a diagnosis names."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class RefinedProblem:
     problem : Problem
         The same vertices are fixed, at the same positions.
     refined : Refined
-        How its mesh came from the old one.
+        Relation of its mesh to the original one.
     diagnosis : Diagnosis
-        What is known to forbid a map of it; no refinement cures that.
+        Obstructions to a map; refinement does not remove these.
     rounds : int
-        How often edges were split.
+        Number of rounds of edge splitting.
     """
 
     problem: Problem
@@ -38,9 +38,9 @@ class RefinedProblem:
 def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
     """Split edges of a mesh at their midpoints, and the triangles beside them to match.
 
-    A triangle with one split edge becomes two, with two three (along the shorter diagonal of the
-    quadrilateral that remains), with three four. No other triangle changes, and no old vertex moves
-    or changes its index, so that fixed vertices stay as they are.
+    A triangle with one split edge becomes two, with two split edges three (along the shorter diagonal of the remaining
+    quadrilateral), with three split edges four. Other triangles do not change. Original vertices keep their positions
+    and indices, so ``fixed`` remains valid.
 
     Parameters
     ----------
@@ -49,11 +49,11 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     F : (f, 3) array of int
         Triangles, no edge in more than two of them.
     edges : (s, 2) array of int
-        Edges to split, as pairs of vertices in any order; naming one twice does no harm.
-        `Diagnosis.split` names those that stand in the way of a map.
+        Edges to split, as pairs of vertices in any order; duplicates are allowed. `Diagnosis.split` names the edges
+        that prevent a map.
     boundary : bool
-        Also split edges on the boundary. Their midpoints are new boundary vertices, which need a
-        position in the target: `Refined.extend` finds them one.
+        Also split edges on the boundary. Their midpoints are new boundary vertices, which need a position in the
+        target; `Refined.extend` computes one.
 
     Returns
     -------
@@ -62,13 +62,12 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
     Raises
     ------
     ValueError
-        When a pair is not an edge of the mesh, or is on its boundary and ``boundary`` is false; when
-        indices are no integers, have the wrong shape or refer to no vertex; when positions are no real
-        numbers, not finite or of the wrong shape.
+        If a pair is not an edge of the mesh, or is on its boundary and ``boundary`` is false. If indices are not
+        integers, have the wrong shape or are out of range. If positions are not real, not finite or of the wrong shape.
 
     See Also
     --------
-    refine_problem : splits what a diagnosis names.
+    refine_problem : splits the edges that a diagnosis names.
 
     Examples
     --------
@@ -81,19 +80,19 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
 
 
 def refine_problem(problem: Problem, *, max_rounds: int = 20) -> RefinedProblem:
-    """Split the edges that a diagnosis names, and no others, until it names none.
+    """Split the edges that a diagnosis names until it names none.
 
     Parameters
     ----------
     problem : Problem
     max_rounds : int
-        Diagnoses to act upon at most. One is enough as a rule; where much room is lacking, edges that
-        were split may have to be split again.
+        Maximum number of rounds of diagnosis and splitting. One round usually suffices. If the mesh is much too coarse,
+        split edges may have to be split again.
 
     Returns
     -------
     RefinedProblem
-        The problem as it was, on the same mesh, when no edge is named.
+        If no edge is named, the original problem on the original mesh.
 
     See Also
     --------
