@@ -1,4 +1,4 @@
-"""Positions of the mid-side nodes of six-node triangles: they follow their sides and move aside if an element needs it."""
+"""Positions of the mid-side nodes of six-node triangles: they follow their sides, or move aside for valid elements."""
 
 from __future__ import annotations
 

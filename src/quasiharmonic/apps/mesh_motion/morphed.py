@@ -1,4 +1,4 @@
-"""A planar mesh after its boundary has moved: where its nodes are, what is inverted, how far a chain has drifted."""
+"""Result of a morph: the nodes of the mesh, its inverted elements, and the drift of a chain of steps."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ class MorphResult:
     Attributes
     ----------
     points : (n, 2) float64
-        All nodes, those in no element where they were.
+        All nodes; those in no element keep their positions.
     F : (f, 3), (f, 4) or (f, 6) int64
-        The elements in their order, all of them counterclockwise at rest.
+        The elements in the given order, counterclockwise at rest.
     inverted : (k,) int64
-        Elements that are inverted, or have no area, somewhere, decided exactly on ``points``: see
+        Elements that are inverted or degenerate somewhere, verified exactly on ``points``; see
         `quasiharmonic.geometry.exact.jacobian_signs`.
     forbidden : (k,) int64
-        Those of them that nodes on the boundary, or others that were given, invert by themselves: no placing of the
-        other nodes would right them.
+        Inverted elements that are inverted by nodes with given positions alone; no placement of the other nodes can
+        untangle them.
     result : MapResult
-        The search: status, certificate, stages, seconds. Its ``uv`` has the nodes that elements use, in their order,
-        and its triangles are those that cover the elements: two of a quadrilateral, four of a six-node triangle, whose
-        mid-side nodes are placed after that.
+        The search: status, certificate, stages, seconds. Its ``uv`` has the nodes that elements use, in their order.
+        Its triangles cover the elements: two per quadrilateral, four per six-node triangle, whose mid-side nodes are
+        placed afterwards.
     quality_before, quality_after : (f,) float64
-        `quasiharmonic.apps.mesh_motion.quality.element_quality` of every element: 1 for an equilateral triangle and a
-        square, 0 without area, negative where it is inverted.
+        `quasiharmonic.apps.mesh_motion.quality.element_quality` of every element: 1 for an equilateral triangle or a
+        square, 0 without area, negative if inverted.
     """
 
     points: FloatArray
@@ -51,20 +51,20 @@ class MorphResult:
 
     @property
     def valid(self) -> bool:
-        """Whether no element is inverted anywhere, decided exactly."""
+        """Whether no element is inverted or degenerate anywhere, verified exactly."""
         return not self.inverted.size
 
     def drift(self) -> float:
-        """How far a node is, at most, from where one step from the mesh at rest puts it, boundary and pins as here.
+        """Return the maximum distance of a node from its position after one step from the rest mesh with the same boundary.
 
-        It takes such a step, anew each time it is called; NaN where that finds no valid mesh. At the end of a chain
-        whose steps have the first mesh as ``rest`` this is what is left of the way: a trifle that falls with
-        ``tolerance``, unless the energy has several minima and the chain has come to another one.
+        Each call computes such a step; NaN if it finds no valid mesh. For a chain of steps that all use the first mesh
+        as ``rest``, the drift is small and falls with ``tolerance``. It is large if the energy has several minima and
+        the chain has reached another one.
         """
         return float(np.hypot(*(self.points - self._one_step()).T).max())
 
     def summary(self) -> str:
-        """Say in a sentence or two whether the mesh is valid, and what is wrong if it is not."""
+        """Return a text that says whether the mesh is valid, and otherwise what is wrong."""
         if self.valid:
             return f"None of {counted('element', 'elements', len(self.F))} is inverted anywhere."
         lines = [f"Inverted, or without area, somewhere: {name_elements(self.F, self.inverted)}."]
@@ -80,7 +80,7 @@ class MorphResult:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the result for JSON."""
         both = (("quality_before", self.quality_before), ("quality_after", self.quality_after))
         return {
             **self.result.to_dict(),
@@ -95,20 +95,20 @@ class MorphResult:
 
 
 def forbidden_elements(F: IntArray, points: FloatArray, given: IntArray) -> IntArray:
-    """Elements that turn over, or have no area, at a corner of which all that matters is given; ascending.
+    """Return elements inverted or degenerate at a corner whose relevant nodes all have given positions; ascending.
 
     Parameters
     ----------
     F : (f, 3), (f, 4) or (f, 6) int64
     points : (n, 2) float64
     given : (k,) int64
-        Nodes whose places are not open to choice.
+        Nodes with given positions.
     """
     known = np.zeros(len(points), dtype=bool)
     known[given] = True
     if F.shape[1] == 6:
         x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)
-        # At a corner the derivatives depend on the corners and on the middles of the two sides there.
+        # At a corner the derivatives depend on the corners and on the midpoints of its two sides.
         nodes = np.array([(0, 1, 2, 3, 5), (0, 1, 2, 3, 4), (0, 1, 2, 4, 5)])
         return np.flatnonzero((known[F[:, nodes]].all(axis=2) & (jacobian_coefficients(x, y)[:, :3] < 0)).any(axis=1))
     triangles, of = (F, np.arange(len(F))) if F.shape[1] == 3 else corner_triangles(F)

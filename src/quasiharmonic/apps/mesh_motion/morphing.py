@@ -1,4 +1,4 @@
-"""Morphing of planar meshes: the boundary has moved, give me a valid interior."""
+"""Morphing of planar meshes: compute a valid interior after the boundary has moved."""
 
 from __future__ import annotations
 
@@ -57,67 +57,69 @@ def morph(
     start: ArrayLike | None = None,
     tolerance: float = 1e-8,
 ) -> MorphResult:
-    """Move some nodes of a planar mesh and place the others such that no element is inverted.
+    """Move some nodes of a planar mesh and place the others so that no element is inverted.
 
     Parameters
     ----------
     points : (n, 2) array, or a mesh in the plane in place of ``points`` and ``F``
-        The mesh as it is.
+        The current mesh.
     F : (f, 3), (f, 4) or (f, 6) array of int
-        Triangles, quadrilaterals, or triangles of six nodes, wound either way, corners first (see
-        `quasiharmonic.geometry.mesh.elements`). A quadrilateral whose last two nodes are one is a triangle.
+        Triangles, quadrilaterals or six-node triangles, clockwise or counterclockwise, corners first (see
+        `quasiharmonic.geometry.mesh.elements`). A quadrilateral whose last two nodes are equal is a triangle.
     moved_vertices : (k,) array of int
-        Nodes that go somewhere else: of the boundary, or inside. Boundary nodes not among them stay, but for mid-side
-        nodes, which go along with the side that they are on.
+        Nodes to move, on the boundary or inside. Other boundary nodes are fixed, except mid-side nodes, which follow
+        their side.
     positions : (k, 2) array
-        Where they go.
+        Target positions of the moved nodes.
     energy : str, Energy or None
-        What the placement minimises; see `quasiharmonic.polish`. The default keeps shapes and sizes of the
-        triangles, so that a graded mesh stays graded. None takes the first valid mesh.
+        Energy that the placement minimises; see `quasiharmonic.polish`. The default preserves shapes and sizes of the
+        triangles, so a graded mesh stays graded. None returns the first valid mesh.
     max_iterations : int
-        Linear solves to spend at most on finding a valid mesh.
+        Maximum number of linear solves to find a valid mesh.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional
         Called with a `Step` at every iteration, and with the last one again at least every half second in between, but
         not within a single factorisation.
     slide : bool or BoundaryCurves
-        Let the boundary vertices that are not moved glide along their outline, its corners held, as nodes on the walls
-        of a channel do: along the curves of `quasiharmonic.geometry.curves.BoundaryCurves`, or with True along the
-        polygon that the boundary is. Moved ones slide only where ``BoundaryCurves`` tell them a curve of their own.
+        Let the boundary vertices that are not moved slide along their outline, with fixed corners, like nodes on the
+        walls of a channel. With `quasiharmonic.geometry.curves.BoundaryCurves` they slide along these curves, with True
+        along the boundary polygon. Moved vertices slide only if ``BoundaryCurves`` assigns them a curve.
     rest : (n, 2) array, optional
-        The mesh against which distortion is measured, ``points`` by default. In a chain of steps it is the first one,
-        so that the chain does not drift (`MorphResult.drift`).
+        The mesh against which distortion is measured; default ``points``. In a chain of steps use the first mesh, so
+        that the chain does not drift (`MorphResult.drift`).
     start : (n, 2) array, optional
-        A mesh near to the one sought, to begin from. By default that is ``points`` where ``rest`` is another, and else
-        the harmonic extension of the displacement.
+        Initial mesh, close to the result. Default: ``points`` if ``rest`` is given, otherwise the harmonic extension of
+        the displacement.
     tolerance : float
-        What a further step could lower the energy by, as a part of it, when the mesh counts as at rest; see
-        `quasiharmonic.polish`. The larger, the sooner, and the more it shows from where it came there.
+        The mesh has converged if a further step is predicted to lower the energy by less than this fraction; see
+        `quasiharmonic.polish`. A larger value is faster, and the result depends more on the initial mesh.
 
     Returns
     -------
     MorphResult
-        When no valid mesh was found, ``result.status`` says why, or ``inverted`` which elements are to blame.
+        If no valid mesh was found, ``result.status`` has the reason, or ``inverted`` has the inverted elements.
 
     Raises
     ------
     ValueError
-        When the input is malformed (see `Problem`), a node to move is in no element, or at rest an element has no area
-        or a quadrilateral is not convex, or the mesh is folded over; names the elements.
+        If the input is malformed (see `Problem`), a moved node is in no element, or the rest mesh overlaps itself. If
+        an element at rest has no area, or a quadrilateral at rest is not convex. The message names the elements.
 
     Notes
     -----
-    Triangles are searched for as every map is. Of quadrilaterals the triangles on either side of a diagonal are, and
-    then those at all four corners are righted and their energy lowered. Of six-node triangles those between their
-    corners are, and mid-side nodes inside go where they are on their sides at rest, straight if they were, or aside by
-    as little as it takes where a curved side would invert an element; if that does not do, corners near by move too,
-    and the search is made once more on the four triangles between the nodes of each. On these the boundary slides, with
-    its mid-side nodes, before all that.
+    Triangles are searched as any map. For quadrilaterals the search uses the triangles on either side of a diagonal;
+    then the triangles at all four corners are untangled and their energy is lowered.
+
+    For six-node triangles the search uses the triangles between corners. Interior mid-side nodes keep their relative
+    position on their sides at rest; straight sides stay straight. If a curved side would invert an element, nodes move
+    aside as little as possible, if necessary corners too. If this fails, the search is repeated on the four triangles
+    between the nodes of each element. With ``slide``, the boundary and its mid-side nodes first slide on these four
+    triangles.
 
     Examples
     --------
-    The upper side of a square pushed halfway down in its middle:
+    Push the middle of the upper side of a square halfway down:
 
     >>> import numpy as np
     >>> from quasiharmonic import morph
@@ -143,7 +145,7 @@ def morph(
     after, result = _answered(question, points, target, begin, (slide, np.asarray(moved_vertices)), settings)
 
     def one_step() -> FloatArray:
-        # Where the boundary has slid to, it is held.
+        # Fix the boundary at the positions to which it has slid.
         alone = settings._replace(callback=None)
         whole, _ = _answered(question, first, after[fixed], None, (False, fixed), alone)
         return np.full_like(whole, np.nan) if inverted_elements(F, whole).size else whole
@@ -155,7 +157,7 @@ def morph(
 
 
 class _Question(NamedTuple):
-    """A mesh at rest, the nodes whose places are given, and the triangles to search on, one set after the other."""
+    """A rest mesh, the nodes with given positions, and sets of triangles to search on, in order."""
 
     F: IntArray
     rest: FloatArray
@@ -164,7 +166,7 @@ class _Question(NamedTuple):
 
 
 class _Settings(NamedTuple):
-    """How to search, as of `morph`."""
+    """Search options; see `morph`."""
 
     energy: str | Energy | None
     max_iterations: int
@@ -181,24 +183,24 @@ def _answered(
     slide: tuple[bool | BoundaryCurves, IntArray],
     settings: _Settings,
 ) -> tuple[FloatArray, MapResult]:
-    """Places of all nodes by the first set of triangles that leaves no element inverted, or the best one.
+    """Place all nodes by the first set of triangles that leaves no element inverted, or by the best one.
 
     Parameters
     ----------
     question : _Question
     points : (n, 2) float64
-        Where nodes are that belong to no element, and mid-side nodes on a boundary that slides.
+        Positions of nodes in no element, and of mid-side nodes on a sliding boundary.
     target : (k, 2) float64
-        Where the given nodes go.
+        Target positions of the given nodes.
     begin : (n, 2) float64 or None
-        What to begin with.
+        Initial mesh.
     slide : (bool or BoundaryCurves, (l,) int64)
-        What the boundary slides along, and which nodes do not.
+        The curves of the boundary, and the nodes that do not slide.
     settings : _Settings
     """
     F, rest, fixed, nets = question
     if F.shape[1] == 6 and slide[0] is not False:
-        # Mid-side nodes slide as others do, and then stay in the middle of where their sides have come to.
+        # Mid-side nodes slide as other nodes do. They are then moved to the middle of their sides and fixed there.
         there, slid = _searched(question, nets[-1], points, target, begin, slide, settings)
         has_slid = fixed[(there[fixed] != target).any(axis=1)]
         before = points.copy()
@@ -215,7 +217,7 @@ def _answered(
     for triangles in nets:
         after, result = _searched(question, triangles, points, target, begin, slide, settings)
         if F.shape[1] == 6:
-            # Mid-side nodes that the triangles leave out have not been anywhere.
+            # Mid-side nodes outside these triangles have not moved yet.
             inside = ~np.isin(F[:, MIDDLES], triangles).any()
             straight = followed(F, rest, after, fixed)
             after = settled(F, straight, straight if inside else after, fixed)
@@ -237,13 +239,13 @@ def _searched(
     slide: tuple[bool | BoundaryCurves, IntArray],
     settings: _Settings,
 ) -> tuple[FloatArray, MapResult]:
-    """A map of some triangles, those at quadrilaterals' corners positive, and the mesh with its nodes there."""
+    """Search a map of some triangles, untangle those at quadrilaterals' corners, and return the mesh with its nodes there."""
     F, rest, fixed, _ = question
     energy, max_iterations, linear_solver, callback, tolerance = settings
     used = np.unique(triangles)
     known = np.isin(fixed, used)
     own, held = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
-    # On the mesh's own triangles the search starts from the harmonic extension of the displacement.
+    # With the mesh's own reference triangles, the search starts from the harmonic extension of the displacement.
     problem = Problem(rest[used], own, held, target[known], reference="corrected")
     rails = _rails(slide[0], problem, used, slide[1])
     corners = np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None
@@ -280,7 +282,7 @@ def _searched(
 
 
 def _like(name: str, mesh: ArrayLike, points: FloatArray, used: IntArray) -> FloatArray:
-    """Other places of the nodes of a mesh; those in no element may be anywhere."""
+    """Check other positions of a mesh's nodes; nodes in no element may be anywhere."""
     array = map_array(name, mesh, len(points), finite=False)
     _check_used(name, array, used)
     return array
@@ -293,7 +295,7 @@ def _check_used(name: str, points: FloatArray, used: IntArray) -> None:
 
 
 def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
-    """The elements, all in one direction around; a ValueError that names those of which distortion is not defined."""
+    """Return the elements with counterclockwise winding; raise ValueError for elements whose distortion is undefined."""
     quadrilaterals = F.shape[1] == 4
     triangles, of = corner_triangles(F) if quadrilaterals else covering_triangles(F)
     sign = orientation(*(rest[triangles[:, k]] for k in range(3)))
@@ -316,7 +318,7 @@ def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
 def _placed(
     points: FloatArray, F: IntArray, moved_vertices: ArrayLike, positions: ArrayLike
 ) -> tuple[IntArray, FloatArray]:
-    """Return the nodes that are given, those moved and the rest of the boundary, and where they go."""
+    """Return the fixed nodes (moved nodes and the rest of the boundary) and their target positions."""
     given = index_array("moved_vertices", moved_vertices)
     if given.ndim != 1:
         raise ValueError(f"moved_vertices must have shape (k,), not {given.shape}")
@@ -337,14 +339,14 @@ def _placed(
 
 
 def _curves(slide: bool | BoundaryCurves, triangles: IntArray, places: FloatArray) -> list[Curve]:
-    """What the boundary of some triangles slides along."""
+    """Return the curves along which the boundary of some triangles slides."""
     if isinstance(slide, BoundaryCurves):
         return slide.curves
     return [Curve.polygon(places[loop]) for loop in boundary_loops(triangles, len(places))]
 
 
 def _rails(slide: bool | BoundaryCurves, problem: Problem, used: IntArray, moved: IntArray) -> bool | BoundaryCurves:
-    """What the boundary slides along, in the numbers of the vertices that triangles use; those moved are held."""
+    """Return the boundary curves in the indices of the triangles' vertices, with moved vertices fixed."""
     held = np.searchsorted(used, moved)
     if isinstance(slide, BoundaryCurves):
         return slide.among(used).holding(held)

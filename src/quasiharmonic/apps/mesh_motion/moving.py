@@ -1,8 +1,8 @@
-"""A planar mesh whose boundary moves, time after time, as that of a simulation does: valid at each, and without drift.
+"""A planar mesh whose boundary moves step by step, as in a simulation: valid at each step, and without drift.
 
-    boundary moves ──Newton, the interior taken along──▶ valid ──a step down the energy──▶ next time
+    boundary moves ──Newton, interior follows──▶ valid ──a step down the energy──▶ next time step
 
-The energy compares with the first mesh, whatever the way that has led to the present one.
+The energy compares with the first mesh and does not depend on the path to the present one.
 """
 
 from __future__ import annotations
@@ -36,44 +36,44 @@ from quasiharmonic.util.arrays import (
     whole_number,
 )
 
-# What a step down the energy has to promise, relative to it, and how many may bring the boundary where it goes.
+# Least decrease, relative to the energy, that a step must predict. Maximum number of steps that move the boundary.
 _TOLERANCE, _STEPS = 1e-4, 25
 
 
 class MovingMesh:
     """A planar mesh that follows its boundary in small steps.
 
-    For a simulation in which a boundary moves with time: the mesh at each time is that of the time before with the
-    boundary moved and the interior taken along, by one or two factorisations of the size of linear elasticity. `morph`
-    is for a single large displacement.
+    Use it for a simulation with a moving boundary. Each call moves the boundary and lets the interior follow, with one
+    or two factorisations of the size of linear elasticity. For a single large displacement use `morph`.
 
     Parameters
     ----------
     points : (n, 2) array, or a mesh in the plane in place of ``points`` and ``F``
-        The mesh at the start, valid: shapes and sizes of its triangles are what is kept. Every vertex belongs to one.
+        The initial mesh, valid; the shapes and sizes of its triangles are preserved. Every vertex belongs to a
+        triangle.
     F : (f, 3) array of int
-        Triangles, wound either way.
+        Triangles, clockwise or counterclockwise.
     moved_vertices : (k,) array of int
-        Vertices that will move, of the boundary or inside. Boundary vertices not among them stay.
+        Vertices that will move, on the boundary or inside. Other boundary vertices are fixed.
     energy : str or Energy
-        What is kept low; see `quasiharmonic.polish`. The default minds shapes more than sizes.
+        Distortion energy to keep low; see `quasiharmonic.polish`. The default weights shapes more than sizes.
     settle : int
-        Newton steps down the energy after each move; 0 saves time and is as valid.
+        Newton steps down the energy after each move. With 0 the mesh is also valid, and a step is faster.
     slide : bool
-        Let the boundary vertices that are not moved glide along their outline, its corners held; it takes ``settle``
-        at least 1. They follow what the mesh wants, one step behind: moved vertices that come along the same wall stop
-        at them, where `morph` knows better.
+        Let the boundary vertices that are not moved slide along their outline, with fixed corners; needs ``settle`` of
+        at least 1. They lag one step behind the mesh, so moved vertices that arrive along the same wall are blocked by
+        them. `morph` does not have this limitation.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 
     Raises
     ------
     ValueError
-        When the input is malformed, a triangle has no area, or an option has no such value.
+        If the input is malformed, a triangle has no area, or an option is invalid.
 
     Examples
     --------
-    The hole of a ring that turns by 200°:
+    Turn the hole of a ring by 200°:
 
     >>> import numpy as np
     >>> from quasiharmonic import MovingMesh
@@ -144,13 +144,14 @@ class MovingMesh:
         self._domain = Domain(self._points, F, np.concatenate([self._moved, rest]))
         self._linear_solver = linear_solver
         still = [loop for loop in self._domain.loops if not np.isin(loop, self._moved).any()]
-        # Walls that nothing moves are those of the first mesh for good: gliding vertices do not cut their corners.
+        # Walls without moved vertices keep the curves of the first mesh, so that sliding vertices do not cut corners.
         self._walls = BoundaryCurves.around(still, self._points, fixed=self._moved) if slide and still else None
-        # In the mesh's own unit, so that no area leaves the numbers' range.
+        # Scale to the mesh's size, so that no area overflows or underflows.
         exponent = np.frexp(np.abs(self._points).max())[1]
         a, b, c = np.ldexp(self._points, -exponent)[self._domain.F].transpose(1, 0, 2)
         area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-        # Small triangles are where a simulation looks closely: each counts the same, whatever its area.
+        # Small triangles mark regions of interest in a simulation, so all triangles have equal weight, whatever their
+        # area.
         self._weights = area.mean() / area
         deformation, exponent = at_own_scale(self._domain, self._points, self._energy, self._weights)
         self._descent = CarryingDescent(deformation, self._points, self._domain.fixed, exponent, linear_solver)
@@ -158,7 +159,7 @@ class MovingMesh:
 
     @property
     def points(self) -> FloatArray:
-        """The mesh at present, (n, 2) float64: every triangle strictly positive, decided exactly. A copy."""
+        """A copy of the current mesh, (n, 2) float64; every triangle is strictly positive, verified exactly."""
         return self._points.copy()
 
     @property
@@ -172,19 +173,19 @@ class MovingMesh:
         Parameters
         ----------
         positions : (k, 2) array
-            Where the moved vertices are next.
+            Next positions of the moved vertices.
 
         Returns
         -------
         (n, 2) float64
-            The mesh there; also kept as ``points``.
+            The new mesh; also available as ``points``.
 
         Raises
         ------
         ValueError
-            When ``positions`` has another shape or is not finite.
+            If ``positions`` has another shape or is not finite.
         RuntimeError
-            When the triangles do not let the boundary arrive. The mesh is then as it was.
+            If triangles prevent the boundary from reaching its positions. The mesh is then unchanged.
         """
         there = map_array("positions", positions, self._moved.size, finite=False)
         check_finite("positions", "row", "rows", there)
@@ -200,12 +201,12 @@ class MovingMesh:
                 )
             self._points = self._settled()
         finally:
-            # From the mesh there, its walls where they have slid to, or after whatever went wrong from the last.
+            # Restart from the new mesh, whose walls may have slid, or from the last mesh after an error.
             self._descent.place(self._points)
         return self._points.copy()
 
     def _settled(self) -> FloatArray:
-        """The mesh after some steps down the energy."""
+        """Return the mesh after some steps down the energy."""
         with np.errstate(all="ignore"):
             descent = self._sliding_from(self._descent.positions(self._descent.w)) if self._slide else self._descent
             for _ in descent.descend(self._settle, _TOLERANCE):
@@ -213,7 +214,7 @@ class MovingMesh:
         return descent.positions(descent.w)
 
     def _sliding_from(self, here: FloatArray) -> SlidingDescent:
-        """A descent from a mesh whose walls slide, by the matrix of the last one while the same vertices do."""
+        """Return a descent with sliding walls; reuse the matrix of the last one if the same vertices slide."""
         domain, rails = self._domain, self._walls
         mixed = any(0 < np.isin(loop, self._moved).sum() < loop.size for loop in domain.loops)
         if rails is None or mixed:
