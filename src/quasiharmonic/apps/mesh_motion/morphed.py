@@ -55,7 +55,9 @@ class MorphResult:
         return not self.inverted.size
 
     def drift(self) -> float:
-        """Return the maximum distance of a node from its position after one step from the rest mesh with the same boundary.
+        """Return the maximum distance of a node from its position after one step from the rest mesh.
+
+        The boundary and pins of that step are those of this mesh.
 
         Each call computes such a step; NaN if it finds no valid mesh. For a chain of steps that all use the first mesh
         as ``rest``, the drift is small and falls with ``tolerance``. It is large if the energy has several minima and

@@ -239,7 +239,7 @@ def _searched(
     slide: tuple[bool | BoundaryCurves, IntArray],
     settings: _Settings,
 ) -> tuple[FloatArray, MapResult]:
-    """Search a map of some triangles, untangle those at quadrilaterals' corners, and return the mesh with its nodes there."""
+    """Search a map of some triangles, untangle those at quadrilaterals' corners, and return the moved mesh."""
     F, rest, fixed, _ = question
     energy, max_iterations, linear_solver, callback, tolerance = settings
     used = np.unique(triangles)
@@ -295,7 +295,7 @@ def _check_used(name: str, points: FloatArray, used: IntArray) -> None:
 
 
 def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
-    """Return the elements with counterclockwise winding; raise ValueError for elements whose distortion is undefined."""
+    """Return the elements with counterclockwise winding; raise ValueError if the distortion of one is undefined."""
     quadrilaterals = F.shape[1] == 4
     triangles, of = corner_triangles(F) if quadrilaterals else covering_triangles(F)
     sign = orientation(*(rest[triangles[:, k]] for k in range(3)))
