@@ -24,7 +24,7 @@ def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
     -------
     (f,) float64
         Triangles: `quasiharmonic.energies.measures.mean_ratio`. Quadrilaterals: the least over the corners of
-        ``2 a b sin φ / (a² + b²)`` with sides a and b at an angle φ, which is 1 for a square and has an exact sign.
+        ``2 a b sin φ / (a² + b²)`` with sides a and b at an angle φ; 1 for a square, exact sign.
         Six-node triangles: the mean ratio of the corners' triangle times the least Jacobian determinant over its mean.
 
     Raises

@@ -116,7 +116,7 @@ def injective_map(
     problem = Problem(V, F, fixed, target, reference=reference)
     way = solve
     if refine:
-        # Only here: it brings the construction and the diagnosis along, which most maps do without.
+        # Import on demand: refinement also imports the construction and the diagnosis, which most maps do not need.
         from quasiharmonic.solver.refine.attempts import solve_refining
 
         way = solve_refining
