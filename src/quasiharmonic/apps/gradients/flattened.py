@@ -116,7 +116,9 @@ def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge
     """The transformations that do not change the energy; None if there are at least two fixed vertices."""
     if domain.fixed.size > 1:
         return None
-    here, doubled = measure.value(w), measure.value(2 * w)
+    # Energies beyond the range of doubles are reported where derivatives are taken.
+    with np.errstate(all="ignore"):
+        here, doubled = measure.value(w), measure.value(2 * w)
     pin = int(domain.fixed[0]) if domain.fixed.size else None
     return Gauge(w, pin, abs(doubled - here) <= _SAME * here, domain.loops)
 
