@@ -212,14 +212,14 @@ class TestRun:
         assert batch.run(stars / "a", tmp_path / "out").resumed == 0
         assert batch.run(stars / "a", tmp_path / "out").resumed == 1
         package = tmp_path / "package"
-        (package / "report").mkdir(parents=True)
-        monkeypatch.setattr(settings_module, "__file__", str(package / "batch" / "settings.py"))
+        (package / "ui" / "report").mkdir(parents=True)
+        monkeypatch.setattr(settings_module, "__file__", str(package / "ui" / "batch" / "settings.py"))
         states = []
         for file, text in (
             ("__init__.py", ""),
             ("solving.py", "a = 1"),
             ("solving.py", "a = 2"),
-            ("report/page.py", "only shows"),
+            ("ui/report/page.py", "only shows"),
         ):
             (package / file).write_text(text)
             states.append(settings_module.sources_digest.__wrapped__())
@@ -685,5 +685,5 @@ class TestCommand:
 
 def test_records_depend_on_every_source_that_changes_results():
     names = [name for name, _ in sources()]
-    assert {"solver/field/tensor.py", "util/kernels/c/field.c", "ui/batch/worker.py"} <= {*names}
+    assert {"solver/field/tensor.py", "util/kernels/__init__.py", "ui/batch/worker.py"} <= {*names}
     assert not [name for name in names if name.startswith("ui/cli/")]
