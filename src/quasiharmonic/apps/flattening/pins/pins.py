@@ -1,4 +1,6 @@
-"""Bijective maps with fixed vertices and a boundary that is otherwise free::
+"""Bijective maps with fixed vertices and a boundary that is otherwise free.
+
+::
 
     surface ─▶ flattened freely ─▶ shifted, rotated and scaled onto the pins ─▶ air around it up to a frame
             ─▶ surface and air solved as one problem with frame and pins fixed
