@@ -27,6 +27,7 @@ from quasiharmonic.solver.methods import (
     RandomRestarts,
     Untangling,
     VectorAdam,
+    WideRepair,
     reweighting,
 )
 from quasiharmonic.solver.methods.base import FunctionalDescent, SearchStage, SearchState, Steps
@@ -314,6 +315,20 @@ class TestPatches:
     def test_leaves_alone_what_is_injective(self):
         objective, start = self.displaced()
         assert path(LocalRepair(tries=5), objective, start) == [start]
+
+    def test_a_wide_patch_rights_at_once_what_takes_many_narrow_ones(self):
+        V, F = grid(80, 80)
+        problem = Problem(V, F, boundary_of(F), V[boundary_of(F)])
+        objective = Objective(problem)
+        w = problem.frame.inward(V)
+        # Six vertices near each other, all of them displaced by two edges' lengths.
+        w[[8 * 81 + 8, 8 * 81 + 14, 8 * 81 + 20, 14 * 81 + 8, 14 * 81 + 14, 14 * 81 + 20]] += 0.05
+        start = objective.of_map(w)
+        assert 0 < start.inverted <= 50
+        assert len(path(LocalRepair(tries=30), objective, start)) > 4
+        seen = path(WideRepair(), objective, start)
+        assert [i.inverted for i in seen] == [start.inverted, 0]
+        assert not np.isin(np.flatnonzero(seen[-1].w != start.w), problem.fixed).any()
 
 
 class TestUntangling:

@@ -390,6 +390,13 @@ class TestNoMap:
             "LocalRepair",
         ]
 
+    def test_wide_patches_come_before_the_whole_of_a_large_mesh(self):
+        for rings, before in (45, "WideRepair"), (27, "WideRepair"), (20, "CoarseToFine"):
+            V, F = disk(rings)
+            stages = speed(Problem(V, F, boundary_of(F), V[boundary_of(F)]))
+            words = [type(stage).__name__ for stage in stages]
+            assert words[words.index("Untangling") - 1] == before
+
     def test_stages_for_a_coarse_mesh_alone_solve_a_small_one_as_it_is(self):
         result = injective_map(*star_problem(n=80), strategy=[CoarseToFine(VectorAdam())])
         assert result.injective

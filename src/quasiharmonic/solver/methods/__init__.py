@@ -11,7 +11,7 @@ from quasiharmonic.solver.methods.base import Descent
 from quasiharmonic.solver.methods.composite import Composite
 from quasiharmonic.solver.methods.lbfgs import LBFGS
 from quasiharmonic.solver.methods.line_shift import LineShift
-from quasiharmonic.solver.methods.local_repair import LocalRepair
+from quasiharmonic.solver.methods.local_repair import LocalRepair, WideRepair
 from quasiharmonic.solver.methods.newton import Newton
 from quasiharmonic.solver.methods.random_restarts import RandomRestarts
 from quasiharmonic.solver.methods.untangling import Untangling
@@ -28,4 +28,5 @@ __all__ = [
     "RandomRestarts",
     "Untangling",
     "VectorAdam",
+    "WideRepair",
 ]

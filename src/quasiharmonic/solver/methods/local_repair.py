@@ -29,6 +29,10 @@ MOST_TRIANGLES = 1000
 _MOST_SHARE = 0.25
 # Rings of triangles around an inverted one, tried in this order.
 _RINGS = 2, 4, 8, 16
+# A wide patch: rings around an inverted triangle, maximum number of triangles, and maximum as a fraction of the mesh.
+_WIDE_RINGS, _MOST_WIDE, _MOST_WIDE_SHARE = 24, 5000, 0.5
+# The grading of untangling that solves most wide patches.
+_WIDE_GRADING = 0.5
 # Overhead of a step on a patch and of an iteration on a mesh, as an equivalent number of triangles. The last value is
 # the maximum mesh size in the cost of an iteration, because patches do not grow with the mesh.
 _BESIDES, _BESIDES_AN_ITERATION, _LARGE = 400, 200, 4 * MOST_TRIANGLES
@@ -120,6 +124,49 @@ class LocalRepair(VertexDescent):
                 if now.size < left.size:
                     w, left = moved, now
                     yield objective.of_map(w)
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class WideRepair(VertexDescent):
+    """Untangle a wide patch around the inverted triangles that local repair leaves.
+
+    It runs before the whole mesh is untangled.
+
+    Attributes
+    ----------
+    tries : int
+        Maximum number of patches.
+    """
+
+    tries: int = 2
+
+    word: ClassVar[str] = "wide patches"
+
+    def __post_init__(self) -> None:
+        whole_number("tries", self.tries, least=1)
+
+    def iterates(self, objective: Objective, start: Iterate) -> Iterates:
+        """Yield a map after every patch that leaves fewer inverted triangles."""
+        problem, solver = objective.problem, objective.laplacian.solver.name
+        w, left = start.w, inverted_triangles(problem.F, problem.positions(start.w))
+        most = min(_MOST_WIDE, int(_MOST_WIDE_SHARE * len(problem.F)))
+        tried = np.zeros(len(problem.F), dtype=bool)
+        for _ in range(self.tries):
+            open_ = left[~tried[left]]
+            if left.size > MOST_FLIPS or not open_.size:
+                return True
+            patch = patch_around(problem, int(open_[0]), _WIDE_RINGS, most)
+            tried[open_[0]] = True
+            if patch is None:
+                continue
+            tried |= np.isin(problem.F, patch.vertices).all(axis=1)
+            moved = w.copy()
+            moved[patch.vertices] = last_untangled(patch, w[patch.vertices], patch.held, _WIDE_GRADING, solver)
+            now = inverted_triangles(problem.F, problem.positions(moved))
+            if now.size < left.size:
+                w, left = moved, now
+                yield objective.of_map(w)
         return True
 
 

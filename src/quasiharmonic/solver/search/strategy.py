@@ -17,6 +17,7 @@ from quasiharmonic.solver.methods import (
     RandomRestarts,
     Untangling,
     VectorAdam,
+    WideRepair,
 )
 from quasiharmonic.solver.methods.base import SearchStage
 from quasiharmonic.solver.search.stages import CoarseToFine, Stages, TentativeStage, WhereMany
@@ -25,6 +26,8 @@ from quasiharmonic.util.arrays import kind_of
 # Number of vertices from which a coarse-to-fine start pays. Making, solving and refining the coarse mesh is then faster
 # than ten iterations on the fine mesh.
 _LARGE = 6000
+# Number of triangles from which wide patches are tried before the whole mesh is untangled.
+_WIDE_FROM = 4000
 # Up to this number of triangles, or of triangles per boundary edge, the composite costs more time than it saves.
 _SMALL, _SLIM = 1000, 4
 # Repetitions of alternation and Newton's method in the paper's pipeline.
@@ -42,6 +45,7 @@ def speed(problem: Problem) -> Stages:
     - After the first stage a few triangles in narrow regions may be inverted; moving vertices untangles them faster
       than changing tensors. Otherwise parts of the map are far from a solution, and Newton's method is used.
     - On a large mesh a coarse mesh is searched first; on a small mesh it is searched after the first repairs.
+    - On a large mesh, wide patches are untangled before the whole mesh.
 
     Parameters
     ----------
@@ -56,12 +60,15 @@ def speed(problem: Problem) -> Stages:
     pinned, triangles = bool(domain.pins.size), len(problem.F)
     alone = len(domain.loops) == 1 and not pinned
     composed = alone and triangles > max(_SMALL, _SLIM * domain.loops[0].size)
-    return list(_speed(pinned, alone, composed, problem.n >= _LARGE))
+    return list(_speed(pinned, alone, composed, problem.n >= _LARGE, triangles >= _WIDE_FROM))
 
 
 @cache
-def _speed(pinned: bool, alone: bool, composed: bool, large: bool) -> Stages:
-    """Stages for a mesh with pins or not, with one loop and no pins or not, composite first or not, large or not."""
+def _speed(pinned: bool, alone: bool, composed: bool, large: bool, wide: bool) -> Stages:
+    """Stages for a mesh with pins or not, with one loop and no pins or not, composite first or not, large or not.
+
+    ``wide`` adds wide patches before the whole mesh is untangled.
+    """
     other: Stages = ()
     if pinned:
         first: Descent = VectorAdam(parameterisation="si-log", iterations=400, placing=True)
@@ -82,6 +89,7 @@ def _speed(pinned: bool, alone: bool, composed: bool, large: bool) -> Stages:
         soon = (coarse, first, *((WhereMany(newton),) if alone else ()), *repair)
     return (
         *soon,
+        *((WideRepair(resume=True),) if wide else ()),
         Untangling(iterations=400, resume=True),
         LineShift(in_vain=10, resume=True),
         *other,
