@@ -133,7 +133,7 @@ def test_thin_air_is_raised_to_the_gap():
         (lambda V, F, frame: (V, F[:0], frame), "the mesh has no triangles"),
         (lambda V, F, frame: (np.concatenate([V, [[0, 0]]]), F, frame), "in no triangle"),
         (lambda V, F, frame: (V, F[:, ::-1], frame), "not counterclockwise"),
-        (lambda V, F, frame: (V, F + 0.5, frame), "F must hold integer indices"),
+        (lambda V, F, frame: (V, F + 0.5, frame), "F must contain integer indices"),
         (lambda V, F, frame: (V, F - 1, frame), "F refers to vertex -1, but there are only vertices 0 …"),
         (lambda V, F, frame: (V, F, [*frame, square(1, 2)[:2]]), r"at least 3 points, not \[\d+, 2\]"),
         (lambda V, F, frame: (V, F, [square(1)]), "and the container meet at|not inside"),

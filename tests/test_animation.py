@@ -180,7 +180,7 @@ def test_wrong_targets_are_named(head):
         animate(problem, targets)
     with pytest.raises(ValueError, match="no frame"):
         animate(problem, [])
-    with pytest.raises(ValueError, match="frame 1 must hold real numbers"):
+    with pytest.raises(ValueError, match="frame 1 must contain real numbers"):
         animate(problem, [targets[0], targets[1] + 1j])
     for none in (None, 5, "frames"):
         with pytest.raises(TypeError, match="targets must be a sequence of arrays"):

@@ -427,7 +427,7 @@ class TestRun:
             ({"flatten": True, "refine": True}, "refine is of maps onto a given boundary"),
             ({"cut": True}, "cut is of plain meshes and the outline that they go to: name one by to"),
             ({"corners": "auto"}, "corners is of plain meshes and the outline"),
-            ({"to": "rect:1x1", "corners": "near:1,2"}, "'near:1,2' is none of V, V:K and V:X:Y"),
+            ({"to": "rect:1x1", "corners": "near:1,2"}, "'near:1,2' is not one of V, V:K and V:X:Y"),
             ({"flatten": True, "to": "letter:O"}, "to is of maps onto a given boundary, and flatten sets it free"),
             ({"flatten": True, "polish": "mips"}, "polish is of maps onto a given boundary"),
             ({"flatten": True, "slide": True}, "slide is of maps onto a given boundary"),

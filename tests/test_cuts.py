@@ -343,7 +343,7 @@ class TestGiven:
         ({"edges": [0, 1]}, r"edges must have shape \(k, 2\)"),
         ({"edges": [[0, 4]]}, r"edge \(0, 4\): no triangle has such a side"),
         ({"edges": [[0, 7]]}, "refers to vertex 7"),
-        ({"edges": [[0.5, 1]]}, "edges must hold integer indices"),
+        ({"edges": [[0.5, 1]]}, "edges must contain integer indices"),
         ({"forbidden_edges": [[0, 7]]}, "forbidden_edges refers to vertex 7"),
         ({"min_gain": 0}, "min_gain must be a positive number, not 0"),
         ({"min_gain": np.nan}, "min_gain must be a positive number, not nan"),

@@ -484,7 +484,7 @@ class TestStrategy:
             ({"parameterisation": "log"}, "parameterisation must be one of tanh, si-log"),
             ({"functional": "v3"}, "functional must be one of neumann, sobolev, dirichlet, poisson"),
             ({"reference": "square"}, "reference must be one of"),
-            ({"iterations": 0}, "iterations must be a whole number of at least 1"),
+            ({"iterations": 0}, "iterations must be an integer of at least 1"),
             ({"iterations": 2.5}, "iterations must be a whole number"),
             ({"schedule": "abc"}, "schedule must be pairs"),
             ({"schedule": [(5, -1)]}, "schedule must be pairs"),

@@ -185,9 +185,9 @@ def test_isometries_have_no_error_and_a_point_has_all(flat):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"rings": 0}, "rings must be a whole number of at least 1, not 0"),
+        ({"rings": 0}, "rings must be an integer of at least 1, not 0"),
         ({"sources": 2.5}, "sources must be a whole number"),
-        ({"crossings": -1}, "crossings must be a whole number of at least 0"),
+        ({"crossings": -1}, "crossings must be an integer of at least 0"),
         ({"uv": np.zeros((3, 2))}, "a pair refers to vertex 3, but there are only vertices 0 … 2"),
         ({"uv": np.full((4, 2), np.nan)}, "uv is not finite at vertices 0, 1, 2, 3"),
         ({"V": np.zeros((4, 4))}, "V must have shape"),
@@ -418,7 +418,7 @@ def test_starts_that_will_not_do(dome, change, message):
 @pytest.mark.parametrize("rings", [None, "a", [3], 0, 2.5])
 def test_rings_that_are_no_number_of_edges_are_refused(dome, rings):
     V, F = dome
-    with pytest.raises(ValueError, match="rings must be a whole number of at least 1, not"):
+    with pytest.raises(ValueError, match="rings must be an integer of at least 1, not"):
         keep_distances(V, F, V[:, :2], rings=rings)
 
 
@@ -609,7 +609,7 @@ def test_ctrl_c_while_distances_are_sampled_leaves_the_map_there_is(dome, monkey
     [
         ({"weights": np.ones(4)}, "leave fixed and weights out"),
         ({"fixed": [0], "target": [[0, 0]]}, "leave fixed and weights out"),
-        ({"rings": 0}, "rings must be a whole number of at least 1, not 0"),
+        ({"rings": 0}, "rings must be an integer of at least 1, not 0"),
         ({"gap": -1}, "gap must be a finite number of at least 0"),
     ],
 )

@@ -170,7 +170,7 @@ def test_what_becomes_of_a_boundary_that_cannot_be_or_overlaps_itself(tmp_path, 
     assert main(command) == 1
     said = capsys.readouterr().out
     assert f"of {len(faces)} triangles are not positive" in said
-    assert "wound against the mesh" in said
+    assert "has the opposite orientation to the mesh" in said
     assert "mean-ratio quality after" in said
 
 

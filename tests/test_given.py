@@ -271,12 +271,12 @@ def test_arrays_of_other_libraries(wrap):
     ("call", "message"),
     [
         (lambda: distortion(Tensor(V, requires_grad=True), F, MAP), r"V is a Tensor that requires grad.*V\.detach\(\)"),
-        (lambda: distortion(V, F, Tensor(MAP.uv, device="cuda:0")), r"uv is a Tensor on cuda:0: hand over uv\.cpu\(\)"),
-        (lambda: distortion(V, F, MESH), "uv must hold real numbers, not a SimpleNamespace"),
-        (lambda: distortion(V, MESH, MAP), "F must hold integer indices, not a SimpleNamespace"),
-        (lambda: distortion(V, F, "map.obj"), "uv must hold real numbers, not 'map.obj'"),
-        (lambda: distortion(None, F, MAP), "V must hold real numbers, not None"),
-        (lambda: distortion([[0, None]], F, MAP), "V must hold real numbers, not objects, of which the first is 0"),
+        (lambda: distortion(V, F, Tensor(MAP.uv, device="cuda:0")), r"uv is a Tensor on cuda:0: pass uv\.cpu\(\)"),
+        (lambda: distortion(V, F, MESH), "uv must contain real numbers, not a SimpleNamespace"),
+        (lambda: distortion(V, MESH, MAP), "F must contain integer indices, not a SimpleNamespace"),
+        (lambda: distortion(V, F, "map.obj"), "uv must contain real numbers, not 'map.obj'"),
+        (lambda: distortion(None, F, MAP), "V must contain real numbers, not None"),
+        (lambda: distortion([[0, None]], F, MAP), "V must contain real numbers, not objects, the first of them 0"),
         (lambda: distortion((V, F), MAP), r"V is a tuple of 2 arrays: hand these over one by one, as in distortion\("),
         (lambda: flatten(SimpleNamespace(geometry={})), "a SimpleNamespace is no mesh .* it has no vertices"),
         (lambda: flatten({"vertices": V}), "a dict is no mesh .* it has no faces"),
@@ -284,15 +284,15 @@ def test_arrays_of_other_libraries(wrap):
         (lambda: flatten(SimpleNamespace(points=V, cells=[block("tetra", F)])), "cells of the kind 'tetra'"),
         (lambda: flatten(SimpleNamespace(points=V, cells=padded(F), celltypes=[10] * len(F))), "VTK's kind 10"),
         (lambda: flatten(SimpleNamespace(points=V, faces=padded(F + 99))), "the faces refers? to vert"),
-        (lambda: flatten(V, F + 1), rf"vertex {len(V)}, but .*; if it counts from 1, hand over F - 1"),
+        (lambda: flatten(V, F + 1), rf"vertex {len(V)}, but .*; if its indices count from 1, pass F - 1"),
         (
             lambda: quasiharmonic.injective_map(V, F, np.ones(len(V), dtype=bool), MAP.uv),
-            r"fixed must hold integer indices, not bool: hand over numpy\.flatnonzero\(fixed\)",
+            r"fixed must contain integer indices, not bool: pass numpy\.flatnonzero\(fixed\)",
         ),
         (lambda: quasiharmonic.solve(MAP), "solve takes a Problem, not a MapResult"),
         (lambda: targets.boundary_to(V, F, 3), 'outline must be contours .* "letter:R", not 3'),
-        (lambda: targets.boundary_to(V, F, "letter"), "'letter' is no outline that is known"),
-        (lambda: targets.boundary_to(V, F, [["a", "b"]] * 3), "must hold real numbers, not <U1"),
+        (lambda: targets.boundary_to(V, F, "letter"), "unknown outline 'letter'"),
+        (lambda: targets.boundary_to(V, F, [["a", "b"]] * 3), "must contain real numbers, not <U1"),
     ],
 )
 def test_what_cannot_be_meant_well_is_named(call, message):
@@ -317,7 +317,7 @@ def test_files_that_are_none():
     ],
 )
 def test_arguments_in_another_order(call):
-    with pytest.raises(ValueError, match="not float64; are these positions, and the arguments in another order"):
+    with pytest.raises(ValueError, match="not float64; check the order of the arguments: these may be positions"):
         call()
 
 

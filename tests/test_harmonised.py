@@ -376,7 +376,7 @@ class TestHarmonise:
         for eta in (0, -1, np.nan, [], [[1.0]], [1.0, np.inf]):
             with pytest.raises(ValueError, match="eta must be a positive number"):
                 harmonise(V, F, uv, fixed=fixed, eta=eta)
-        with pytest.raises(ValueError, match="eta must hold real numbers"):
+        with pytest.raises(ValueError, match="eta must contain real numbers"):
             harmonise(V, F, uv, fixed=fixed, eta="much")
         for wrong in (-1, np.inf, np.nan, None, "little"):
             with pytest.raises(ValueError, match="conformal must be a finite number of at least 0"):

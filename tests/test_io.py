@@ -469,7 +469,7 @@ def test_inputs_of_other_types_are_taken_and_left_alone(tmp_path):
             lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2, 0]]),
             r"F must have shape \(f, 3\), triangles only, not \(1, 4\)",
         ),
-        (lambda: MeshData(np.zeros((3, 3)), [[0.0, 1.0, 2.0]]), "F must hold integer indices, not float64"),
+        (lambda: MeshData(np.zeros((3, 3)), [[0.0, 1.0, 2.0]]), "F must contain integer indices, not float64"),
         (
             lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]], vt=[[0, 0]], FT=[[0, 0, 1]]),
             "FT refers to row 1, but there are only rows 0 … 0",

@@ -260,7 +260,7 @@ class TestTrouble:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"jobs": 0}, "jobs must be a whole number of at least 1"),
+            ({"jobs": 0}, "jobs must be an integer of at least 1"),
             ({"errors": "ignore"}, "errors must be one of raise, yield"),
             ({"strategy": "haste"}, "strategy must be one of speed, paper"),
             ({"reference": "round"}, "reference must be one of equilateral"),

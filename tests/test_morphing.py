@@ -92,7 +92,7 @@ def test_a_boundary_that_crosses_itself_is_told():
         (lambda p, F: (p, F, [-1], [[0, 0]]), "vertex -1"),
         (lambda p, F: (p, F, [10**6], [[0, 0]]), "vertex 1000000"),
         (lambda p, F: (p, F, [0], [[0, 0, 0]]), r"shape \(1, 2\)"),
-        (lambda p, F: (p, F, [0.5], [[0, 0]]), "moved_vertices must hold integer indices, not float64"),
+        (lambda p, F: (p, F, [0.5], [[0, 0]]), "moved_vertices must contain integer indices, not float64"),
         (lambda p, F: (p[:, :1], F, [0], [[0, 0]]), r"shape \(n, 2\)"),
         (lambda p, F: (p, F[:0], [0], [[0, 0]]), "the mesh has no triangles"),
         (lambda p, F: (p, F + 1, [0], [[0, 0]]), "F refers to vertex 16, but there are only vertices 0 … 15"),

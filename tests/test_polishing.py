@@ -402,12 +402,12 @@ def test_barriers_may_come_as_objects():
 def test_options_that_make_no_sense():
     V, F, uv, fixed = bowl()
     for wrong in (-1, 2.5, "many", None):
-        with pytest.raises(ValueError, match="max_iterations must be a whole number of at least 0"):
+        with pytest.raises(ValueError, match="max_iterations must be an integer of at least 0"):
             polish(V, F, uv, fixed=fixed, max_iterations=wrong)
     for wrong in (-1, np.nan, np.inf, "small", None):
         with pytest.raises(ValueError, match="tolerance must be a finite number of at least 0"):
             polish(V, F, uv, fixed=fixed, tolerance=wrong)
-    with pytest.raises(ValueError, match="weights must hold real numbers, not <U5"):
+    with pytest.raises(ValueError, match="weights must contain real numbers, not <U5"):
         polish(V, F, uv, fixed=fixed, weights=["heavy"] * len(F))
 
     class FirstOnly(Energy):

@@ -231,7 +231,7 @@ LOST[1, 4, 0], LOST[3, 2, 1] = np.nan, np.inf
         (np.zeros((2, 5, 6)), {}, r"not \(2, 5, 6\): hand over numpy.moveaxis\(field, 0, -1\)"),
         (np.zeros((4, 5, 6, 3)), {}, "fields of volumes are not handled"),
         (np.zeros((1, 6, 2)), {}, "at least 2 × 2 pixels"),
-        (WRONG + 1j, {}, "field must hold real numbers"),
+        (WRONG + 1j, {}, "field must contain real numbers"),
         (WRONG, {"spacing": (1, 0)}, "spacing must be a positive number, or two"),
         (WRONG, {"spacing": (1, 1, 1)}, "spacing must be a positive number, or two"),
     ],

@@ -399,7 +399,7 @@ class TestCommand:
         assert run("repair", path, "-o", out) == 1
         said = capsys.readouterr().out
         assert "32 inverted before, 32 now; 0 vertices moved" in said
-        assert "wound against the mesh" in said
+        assert "has the opposite orientation to the mesh" in said
         assert np.array_equal(io.map_of(io.read_obj(out)), V[:, ::-1])
 
     @pytest.mark.parametrize(

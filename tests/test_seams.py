@@ -93,7 +93,7 @@ class TestIslands:
             islands(F, V, np.where(np.arange(8)[:, None] == 2, 9, F))
         with pytest.raises(ValueError, match="FT refers to row -2, but there are only rows 0 … 8"):
             islands(F, V, F - 2)
-        with pytest.raises(ValueError, match="must hold integer"):
+        with pytest.raises(ValueError, match="must contain integer"):
             islands(F, V, F.astype(float))
         with pytest.raises(ValueError, match="uv must have shape"):
             islands(F, V[:, :1])

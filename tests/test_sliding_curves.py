@@ -146,7 +146,7 @@ def test_transformed():
 @pytest.mark.parametrize(
     ("pieces", "message"),
     [
-        ([[(0, 0), ("a", 0)]], "piece 0 of the curve must hold real numbers"),
+        ([[(0, 0), ("a", 0)]], "piece 0 of the curve must contain real numbers"),
         ([[(0, 0), (1,)]], "piece 0 of the curve is not an array: its rows differ in length"),
         ([], "at least one piece"),
         ([[(0, 0)]], r"piece 0 of the curve must have shape \(2, 2\), \(3, 2\) or \(4, 2\), not \(1, 2\)"),

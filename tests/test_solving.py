@@ -306,8 +306,8 @@ class TestNoMap:
     @pytest.mark.parametrize(
         ("start", "words"),
         [
-            ("here", "start must hold real numbers"),
-            (np.zeros((80, 2), dtype=complex), "start must hold real numbers"),
+            ("here", "start must contain real numbers"),
+            (np.zeros((80, 2), dtype=complex), "start must contain real numbers"),
             ([[0.0], [1.0, 2.0]], "start is not an array"),
             (np.zeros((80, 3)), r"start must have shape \(80, 2\)"),
             (np.full((80, 2), np.inf), "start is not finite at vertices 0, 1"),
