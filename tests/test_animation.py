@@ -196,7 +196,7 @@ def test_wrong_options_are_told(head):
     for limit in (0.5, np.nan, "3", [3]):
         with pytest.raises(ValueError, match="max_motion_ratio must be a number of at least 1"):
             animate(problem, targets, polish="mips", max_motion_ratio=limit)
-    with pytest.raises(ValueError, match="max_motion_ratio is for frames that are polished"):
+    with pytest.raises(ValueError, match="max_motion_ratio applies only to polished frames"):
         animate(problem, targets, max_motion_ratio=2)
 
 

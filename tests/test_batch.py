@@ -431,7 +431,7 @@ class TestRun:
             ({"flatten": True, "to": "letter:O"}, "to is of maps onto a given boundary, and flatten sets it free"),
             ({"flatten": True, "polish": "mips"}, "polish is of maps onto a given boundary"),
             ({"flatten": True, "slide": True}, "slide is of maps onto a given boundary"),
-            ({"slide": True}, "slides while distortion is lowered: name an energy for that too, by polish"),
+            ({"slide": True}, "slides while distortion is lowered: give an energy as well, by polish"),
             ({"energy": "mips"}, "energy is for flatten, and flatten was not asked for"),
             ({"flatten": True, "energy": "arap"}, "energy must be one of .*arap-barrier, distances, not 'arap'"),
         ],
@@ -483,7 +483,7 @@ class TestRun:
             batch.run(stars, tmp_path / "out", jobs=2, scheduler="tcp://localhost:1")
         assert not (tmp_path / "out").exists()
         (tmp_path / "file").write_text("")
-        with pytest.raises(OSError, match="cannot make the folder"):
+        with pytest.raises(OSError, match="cannot create the folder"):
             batch.run(stars, tmp_path / "file" / "out")
         with pytest.raises(OSError, match="it is no folder"):
             batch.run(stars, tmp_path / "file")

@@ -96,7 +96,7 @@ def test_a_folder_that_cannot_be_made(folder, capsys):
     (folder / "file").write_text("")
     for call in ("demo -o file/D", "demo -o file"):
         assert run(*call.split()) == 2
-        assert "cannot make the folder file" in capsys.readouterr().err
+        assert "cannot create the folder file" in capsys.readouterr().err
     assert left(folder) == ["file", "m.obj"]
 
 
@@ -144,15 +144,18 @@ def changed(document, path, value):
         (lambda: square().gltf(uri="../none.bin"), "is not in the folder of the file"),
         (lambda: without(square(), "buffer").gltf(), "an entry lacks buffer"),
         (lambda: without(square(), "byteLength").gltf(), "an entry lacks byteLength"),
-        (lambda: changed(square(), ("bufferViews", 0, "buffer"), 9).gltf(), "refers to another that is not there"),
+        (
+            lambda: changed(square(), ("bufferViews", 0, "buffer"), 9).gltf(),
+            "refers to another entry that does not exist",
+        ),
         (
             lambda: changed(square(), ("accessors", 0, "componentType"), 9).gltf(),
             "accessor 0 must be one of 5120",
         ),
-        (lambda: changed(square(), ("accessors", 0, "componentType"), []).gltf(), "not of the kind that it should be"),
-        (lambda: changed(square(), ("meshes", 0, "primitives"), 7).gltf(), "not of the kind that it should be"),
+        (lambda: changed(square(), ("accessors", 0, "componentType"), []).gltf(), "has the wrong type"),
+        (lambda: changed(square(), ("meshes", 0, "primitives"), 7).gltf(), "has the wrong type"),
         (lambda: b'{"asset": {}}', "an entry lacks version"),
-        (lambda: b"[1]", "not of the kind that it should be"),
+        (lambda: b"[1]", "has the wrong type"),
         (lambda: b"[" * 100_000, "nested too deeply"),
     ],
 )
@@ -196,7 +199,7 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         ("map m.obj -o o.obj --plot-kind map", "--plot"),
         ("map m.obj -o o.obj --margin 0.1", "--pack"),
         ("map m.obj -o o.obj --font x", "--to"),
-        ("map m.obj -o o.obj --to disk --font x", "only for letter: and word:"),
+        ("map m.obj -o o.obj --to disk --font x", "only letter: and word:"),
         ("map m.obj -o o.obj --corner-angle 9", "--to"),
         ("map m.obj -o o.obj --corners auto", "--to"),
         ("map m.obj -o o.obj --cut", "--to"),

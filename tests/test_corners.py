@@ -306,7 +306,9 @@ def test_words_in_a_file(tmp_path):
     "text", ["near:0,1", "near:0,1,x", "near:0,1,nan", "near:", "near:1,2,3:x", "next:1,2,3", "auto,3"]
 )
 def test_words_that_cannot_be_read(text):
-    with pytest.raises(ValueError, match=r"is not one of V, V:K and V:X:Y, where near:x,y,z may stand for the vertex V"):
+    with pytest.raises(
+        ValueError, match=r"is not one of V, V:K and V:X:Y, where near:x,y,z may stand for the vertex V"
+    ):
         read_corners(text)
 
 

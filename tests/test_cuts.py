@@ -341,7 +341,7 @@ class TestGiven:
         ({"F": np.zeros((0, 3), dtype=int)}, "no triangles"),
         ({"V": np.full((5, 3), np.nan)}, "V is not finite at vertices 0, 1"),
         ({"edges": [0, 1]}, r"edges must have shape \(k, 2\)"),
-        ({"edges": [[0, 4]]}, r"edge \(0, 4\): no triangle has such a side"),
+        ({"edges": [[0, 4]]}, r"edge \(0, 4\): not an edge of the mesh"),
         ({"edges": [[0, 7]]}, "refers to vertex 7"),
         ({"edges": [[0.5, 1]]}, "edges must contain integer indices"),
         ({"forbidden_edges": [[0, 7]]}, "forbidden_edges refers to vertex 7"),

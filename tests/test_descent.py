@@ -485,7 +485,7 @@ class TestStrategy:
             ({"functional": "v3"}, "functional must be one of neumann, sobolev, dirichlet, poisson"),
             ({"reference": "square"}, "reference must be one of"),
             ({"iterations": 0}, "iterations must be an integer of at least 1"),
-            ({"iterations": 2.5}, "iterations must be a whole number"),
+            ({"iterations": 2.5}, "iterations must be an integer"),
             ({"schedule": "abc"}, "schedule must be pairs"),
             ({"schedule": [(5, -1)]}, "schedule must be pairs"),
             ({"schedule": [(5, 1), (5, 2)]}, "schedule must be pairs"),

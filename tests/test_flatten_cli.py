@@ -189,11 +189,11 @@ def test_pattern(tmp_path, allowance):
     ("options", "words"),
     [
         (["--pattern", "p.svg", "--unit-square"], "a pattern is true to scale, and --unit-square is not"),
-        (["--pattern", "p.pdf"], "as .svg or .dxf, not .pdf"),
+        (["--pattern", "p.pdf"], "must be .svg or .dxf, not .pdf"),
         (["--pattern", "p.svg", "--allowance", "-1"], "allowance must be a finite number of at least 0"),
         (["--pattern", "nowhere/p.svg"], "nowhere"),
         (["--allowance", "1"], "name its file by --pattern"),
-        (["--energy", "distances", "--fixed", "held.txt"], "leave fixed and weights out"),
+        (["--energy", "distances", "--fixed", "held.txt"], "omit fixed and weights"),
     ],
 )
 def test_wrong_patterns_and_distances(head, tmp_path, capsys, monkeypatch, options, words):

@@ -101,9 +101,9 @@ def test_a_boundary_that_crosses_itself_is_told():
             lambda p, F: (np.where(np.arange(16)[:, None] == 5, np.nan, p), F, [0], [[0, 0]]),
             "points is not finite at vertex 5",
         ),
-        (lambda p, F: (p * (1, 0), F, [0], [[0, 0]]), "triangles 0, 1, .* without area"),
-        (lambda p, F: (np.where(np.arange(16)[:, None] == 5, 0.9, p), F, [0], [[0, 0]]), "folded over at edge.* rest="),
-        (lambda p, F: (np.concatenate([p, [[9, 9]]]), F, [len(p)], [[0, 0]]), "vertex 16 .*in no triangle"),
+        (lambda p, F: (p * (1, 0), F, [0], [[0, 0]]), "triangles 0, 1, .* degenerate"),
+        (lambda p, F: (np.where(np.arange(16)[:, None] == 5, 0.9, p), F, [0], [[0, 0]]), "folded at edge.* rest="),
+        (lambda p, F: (np.concatenate([p, [[9, 9]]]), F, [len(p)], [[0, 0]]), "vertex 16, but no triangle uses"),
     ],
 )
 def test_wrong_arguments(arguments, message):
@@ -235,7 +235,7 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
 
     path, out = plate("grid.vtu"), tmp_path / "out.vtu"
     assert main(["morph", str(path), "-o", str(out), "--field", "wind"]) == 2
-    assert "no point data 'wind'; there are: 'T', 'displacement'" in capsys.readouterr().err
+    assert "no point data 'wind'; available: 'T', 'displacement'" in capsys.readouterr().err
     assert main(["morph", str(path), "-o", str(out), "--field", "T"]) == 2
     assert "no vectors in the plane" in capsys.readouterr().err
     assert main(["morph", str(path), "-o", str(path), "--field", "displacement"]) == 2
@@ -253,7 +253,7 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
         with pytest.raises(MeshFileError, match=message):
             read_fem(tmp_path / f"{name}.vtu")
     with pytest.raises(
-        ValueError, match=r"points must have shape \(81, 2\), a position for every vertex, not \(3, 2\)"
+        ValueError, match=r"points must have shape \(81, 2\), one position for each vertex, not \(3, 2\)"
     ):
         write_fem(out, read_fem(path), np.zeros((3, 2)))
     assert not out.exists()

@@ -268,7 +268,7 @@ def test_an_energy_of_ones_own_that_is_no_number_is_named(spoilt, words):
             return values
 
     V, F, uv, fixed = bowl()
-    with pytest.raises(ValueError, match=rf"Spoilt: {words} no number \(NaN\) at triangles 3, 50, where \|p\| = "):
+    with pytest.raises(ValueError, match=rf"Spoilt: {words} NaN at triangles 3, 50, where \|p\| = "):
         polish(V, F, uv, fixed=fixed, energy=Spoilt())
 
 
@@ -362,7 +362,7 @@ def test_starts_that_are_not_injective():
     moved = uv.copy()
     inner = int(np.setdiff1d(np.arange(len(V)), fixed)[0])
     moved[inner] = 5, 5
-    with pytest.raises(ValueError, match=r"uv is not injective: triangles \d+, .* inverted or without area"):
+    with pytest.raises(ValueError, match=r"uv is not injective: triangles \d+, .* inverted or degenerate"):
         polish(V, F, moved, fixed=fixed)
     moved[inner] = np.nan, 0
     with pytest.raises(ValueError, match="uv is not finite at vertex"):
@@ -384,7 +384,7 @@ def test_malformed_input():
     with pytest.raises(ValueError, match="energy must be one of symmetric-dirichlet, mips"):
         polish(V, F, uv, fixed=fixed, energy="beauty")
     for energy in (ARAP(), AreaPreserving(), MassSpring(V, F)):
-        with pytest.raises(ValueError, match=f"{type(energy).__name__} is no barrier"):
+        with pytest.raises(ValueError, match=f"{type(energy).__name__} is not a barrier energy"):
             polish(V, F, uv, fixed=fixed, energy=energy)
     weights = np.ones(len(F))
     weights[3] = 0

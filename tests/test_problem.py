@@ -58,7 +58,7 @@ TWO_TRIANGLES = np.array([[0, 1, 2], [3, 4, 5]])
         (
             {"V": np.eye(6)[:, :2] + np.arange(12).reshape(6, 2) % 5, "F": TWO_TRIANGLES, "fixed": range(6),
              "target": np.zeros((6, 2))},
-            "2 components, the first ones around vertices 0, 3: map them one at a time",
+            "2 components, the first ones around vertices 0, 3: map each component separately",
         ),
         (
             {"V": np.eye(4)[:, :3], "F": [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], "fixed": [], "target": []},

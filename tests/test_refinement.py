@@ -63,7 +63,7 @@ def test_values_follow():
     refined = refine(V, F, edges(F, len(V)).interior[::5])
     np.testing.assert_allclose(refined.extend(V), refined.V)
     np.testing.assert_allclose(refined.extend(V[:, 0]), refined.V[:, 0])
-    with pytest.raises(ValueError, match="one a vertex"):
+    with pytest.raises(ValueError, match="one for each vertex"):
         refined.extend(refined.V)
 
 
@@ -118,7 +118,10 @@ def test_nothing_to_split():
         ([[0.0, 2.0]], "edges must contain integer indices, not float64"),
         ([0, 2], r"edges must have shape \(k, 2\), not \(2,\)"),
         ([[0, 2, 3]], r"edges must have shape \(k, 2\), not \(1, 3\)"),
-        (np.array([[0, 2**64 - 1]], dtype=np.uint64), "edges refers to vertex 18446744073709551615, which no mesh"),
+        (
+            np.array([[0, 2**64 - 1]], dtype=np.uint64),
+            "edges refers to vertex 18446744073709551615, which is not a valid index",
+        ),
     ],
 )
 def test_wrong_edges_are_named(pairs, message):

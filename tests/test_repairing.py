@@ -254,7 +254,7 @@ class TestBeyondRepair:
         result = repair(V, F, uv, FT=FT)
         assert [island.mirrored for island in result.islands] == [False, False, True]
         assert result.injective
-        assert "mirrored, and left so" in result.summary()
+        assert "mirrored, left unchanged" in result.summary()
         assert np.array_equal(result.uv, uv)
 
     def test_mirrored_and_turned_over(self):
@@ -287,7 +287,7 @@ class TestBeyondRepair:
         uv[2] = np.nan
         result = repair(V, F, uv)
         assert not result.injective
-        assert result.islands[0].reason == "No finite place for the boundary vertex 2."
+        assert result.islands[0].reason == "No finite position for the boundary vertex 2."
 
     def test_vertex_used_twice(self):
         V, F = grid(3, 3)

@@ -95,8 +95,8 @@ def test_elements_are_taken_as_they_are(name):
 def test_cells_that_are_no_elements():
     points, F = QUADRILATERALS
     for cells, message in (
-        ([block("tetra", F)], "of a SimpleNamespace are of the kind 'tetra'"),
-        ([block("triangle6", CURVED[1]), block("quad", F)], "six-node triangles beside others"),
+        ([block("tetra", F)], "of a SimpleNamespace have the cell type 'tetra'"),
+        ([block("triangle6", CURVED[1]), block("quad", F)], "both six-node triangles and other elements"),
     ):
         with pytest.raises(ValueError, match=message):
             morph(SimpleNamespace(points=points, cells=cells), *dent(points))

@@ -354,7 +354,10 @@ def test_contours_run_as_they_are_written(tmp_path, read):
         ("0 0\n1 a\n1 1\n", "'a' is not a finite number at line 2"),
         ("0 0\n1 nan\n1 1\n", "'nan' is not a finite number"),
         ("a b\nc d\n", "'c' is not a finite number at line 2"),
-        ("0 0\n1 0\n\n1 1\n", "2 different points that encloses no area begins at line 1; use blank lines only between"),
+        (
+            "0 0\n1 0\n\n1 1\n",
+            "2 different points that encloses no area begins at line 1; use blank lines only between",
+        ),
         ("0 0\n1 0\n1 1\n\n\n5 5\n6 6\n7 7\n", "encloses no area begins at line 6"),
         ("0 0\n1 1\n1 0\n0 1\n", r"meets itself: .* crosses .* \(the contour begins at line 1\)"),
         ("0 0\n4 0\n4 4\n\n3 1\n5 1\n5 2\n", r"contours 0 and 1 .* meet.* \(the contours begin at lines 1, 5\)"),

@@ -258,7 +258,10 @@ def test_too_few_vertices_for_the_shape_are_refused():
     arm = (0.2 + turn / 10)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     spiral = np.concatenate([arm, 1.15 * arm[::-1]])
     V, F = surfaces.disk(3)
-    with pytest.raises(ValueError, match=r"the boundary placed along the outline crosses or touches itself: boundary loop 0 meets itself.*too few"):
+    with pytest.raises(
+        ValueError,
+        match=r"the boundary placed along the outline crosses or touches itself: boundary loop 0 meets itself.*too few",
+    ):
         boundary_to(V, F, spiral)
     V, F = surfaces.disk(20)
     fixed, target = boundary_to(V, F, spiral)
@@ -481,7 +484,7 @@ def test_a_point_says_which_loop_goes_where():
         boundary_to(V, F, circles, corners={inner: (1, 0), outer: (0, 1)})
     with pytest.raises(ValueError, match="goes to a different contour than other vertices of its boundary loop"):
         boundary_to(V, F, circles, corners={inner: (1, 0), inner + 1: (0.5, 0)})
-    with pytest.raises(ValueError, match="those of one boundary loop, but 2 loops have some"):
+    with pytest.raises(ValueError, match="must lie on one boundary loop, but 2 loops have some"):
         boundary_to(V, F, circles, corners=[inner, outer])
 
 

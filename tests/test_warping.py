@@ -252,7 +252,7 @@ def test_the_plate_has_the_gradient_it_says():
     [
         ({"weights": [1, 1]}, r"weights must have shape \(1,\)"),
         ({"weights": [0]}, "the weight is not positive at landmark 0"),
-        ({"weights": [1], "smoothness": 0}, "weights need a smoothness that is positive"),
+        ({"weights": [1], "smoothness": 0}, "weights need a positive smoothness"),
         ({"smoothness": -1}, "smoothness must be a finite number"),
         ({"resolution": 1}, "resolution must be an integer of at least 2"),
         ({"curves": [([[1, 1], [2, 2]],)]}, "curve 0 must be two polylines, the one that goes and where to, not 1"),

@@ -83,7 +83,7 @@ def test_what_is_refused():
     derivative = quasi_harmonic_derivative(problem, tensors(len(problem.F)))
     with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\)"):
         derivative.jvp(target=problem.target[:3])
-    with pytest.raises(ValueError, match=r"rest must have shape .* not \(3, 2\)"):
+    with pytest.raises(ValueError, match=r"rest must have the shape of the rest positions, .* not \(3, 2\)"):
         derivative.jvp(rest=problem.V[:3])
     with pytest.raises(ValueError, match=r"mu must hold \d+ numbers"):
         derivative.jvp(mu=np.zeros(3))

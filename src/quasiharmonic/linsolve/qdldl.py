@@ -49,12 +49,12 @@ class Qdldl(LinearSolver):
         try:
             self._solver.update(self._matrix, upper=True)
         except RuntimeError:
-            raise NotPositiveDefinite("the matrix is not positive definite: QDLDL met a pivot that is zero") from None
+            raise NotPositiveDefinite("the matrix is not positive definite: QDLDL found a pivot that is zero") from None
         # LDLᵀ exists for indefinite matrices as well, and QDLDL goes on after a zero pivot without a word. The signs of
         # D are the only sound test. They come with a copy of L, a quarter of the factorisation's time.
         pivots = self._solver.factors()[1]
         if not pivots.min() > 0:
-            raise NotPositiveDefinite("the matrix is not positive definite: QDLDL met a pivot that is not positive")
+            raise NotPositiveDefinite("the matrix is not positive definite: QDLDL found a pivot that is not positive")
 
     def _solve(self, b: FloatArray) -> FloatArray:
         x = np.empty_like(b, order="F")

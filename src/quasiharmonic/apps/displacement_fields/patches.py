@@ -30,7 +30,7 @@ class NoRoomError(Exception):
     """Pixels that are fixed leave no map without folds that could be found; ``mask`` (h, w) says where."""
 
     def __init__(self, mask: BoolArray) -> None:
-        super().__init__("pixels that are fixed leave no room")
+        super().__init__("the fixed pixels allow no field without folds")
         self.mask = mask
 
 

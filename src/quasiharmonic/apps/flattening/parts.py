@@ -81,7 +81,7 @@ def _part(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) -
 
 def anew(vertices: IntArray) -> str:
     """Say which part it is that a message is of, where that has numbers of its own."""
-    return f"the piece around vertex {vertices[0]}, its elements numbered anew"
+    return f"the piece around vertex {vertices[0]}, with its own numbering"
 
 
 def united(parts: Sequence[Part]) -> Part:

@@ -100,7 +100,7 @@ class Minimum:
                 self._at()
                 return size
             last = size
-        raise AssertionError("the last step has been returned from")
+        raise AssertionError("the last step has already returned")
 
     def _at(self) -> ComplexArray:
         """Look at the map at hand; the slopes by the unknowns."""
