@@ -310,13 +310,13 @@ def test_what_the_command_refuses(head, tmp_path, capsys):
     for frames, options, words in (
         ("short.npy", [], "must be real numbers of shape"),
         ("none.npy", [], "must be real numbers of shape"),
-        ("no.npy", [], "no array of numbers"),
+        ("no.npy", [], "not an array of numbers"),
         ("missing.npy", [], "missing.npy: there is no such file"),
         ("short.npy", ["-o", tmp_path / "out"], "the same output is named twice"),
         ("short.npy", ["-o", tmp_path / "f.gif", "--frames-per-second", 60], "of a GIF must be at most 50"),
         ("empty", [], "no mesh in this folder"),
-        ("short.npy", ["--max-motion-ratio", 2], "--max-motion-ratio belongs to --polish"),
-        ("short.npy", ["--frames-per-second", 2], "belongs to a moving picture"),
+        ("short.npy", ["--max-motion-ratio", 2], "--max-motion-ratio needs --polish"),
+        ("short.npy", ["--frames-per-second", 2], "needs a moving picture"),
     ):
         assert run("animate", surface, tmp_path / frames, "-o", tmp_path / "out", *options) == 2
         assert words in capsys.readouterr().err

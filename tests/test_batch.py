@@ -425,7 +425,7 @@ class TestRun:
         [
             ({"flatten": True, "corners": "auto"}, "corners is of maps onto a given boundary"),
             ({"flatten": True, "refine": True}, "refine is of maps onto a given boundary"),
-            ({"cut": True}, "cut is of plain meshes and the outline that they go to: name one by to"),
+            ({"cut": True}, "cut is of plain meshes and the outline that they go to: give the outline by to"),
             ({"corners": "auto"}, "corners is of plain meshes and the outline"),
             ({"to": "rect:1x1", "corners": "near:1,2"}, "'near:1,2' is not one of V, V:K and V:X:Y"),
             ({"flatten": True, "to": "letter:O"}, "to is of maps onto a given boundary, and flatten sets it free"),

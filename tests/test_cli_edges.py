@@ -211,7 +211,7 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         ("polish m.obj -o o.obj --to disk", "--slide"),
         ("harmonise m.obj -o o.obj --margin 0.1", "--pack"),
         ("animate m.obj m.obj -o o --max-motion-ratio 2", "--polish"),
-        ("animate m.obj m.obj -o o --frames-per-second 2", "--frames-per-second belongs to a moving picture"),
+        ("animate m.obj m.obj -o o --frames-per-second 2", "--frames-per-second needs a moving picture"),
         ("measure m.obj --rings 3", "--distances"),
         ("plot m.obj -o o.png --measure mips", "--kind distortion"),
         ("plot m.obj -o o.png --kind texture --measure isometric", "--kind distortion"),
@@ -222,7 +222,7 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         ("batch . -o o --flatten --strategy speed", "--strategy"),
         ("batch . -o o --to disk --energy mips", "flatten"),
         ("batch . -o o --to disk --slide", "polish"),
-        ("batch . -o o --corners auto", "name one by to"),
+        ("batch . -o o --corners auto", "give the outline by to"),
     ],
 )
 def test_an_option_without_effect_is_refused(folder, capsys, call, needs):

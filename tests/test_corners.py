@@ -408,7 +408,7 @@ def test_check_boundary_without_a_map_of_several_loops_and_of_none(tmp_path, cap
 
 def test_check_boundary_called_wrongly(sheet, capsys):
     for options, message in (
-        (["--plot", "b.png"], "--plot draws what --boundary numbers"),
+        (["--plot", "b.png"], "--plot needs --boundary"),
         (["--boundary", "--plot", "b.txt"], "pictures are written as .png, .svg, .pdf"),
         (["--boundary", "--json", str(sheet)], "would replace an input"),
     ):

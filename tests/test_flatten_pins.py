@@ -208,7 +208,7 @@ def test_malformed_input_is_refused():
         ([1], [[np.nan, 0.0]], "not finite at row 0"),
         ([1], [[0.0, 0.0, 0.0]], r"shape \(1, 2\)"),
         ([0.5], [[0.0, 0.0]], "integer"),
-        ([1], None, "belong together"),
+        ([1], None, "give fixed and target together"),
     ):
         with pytest.raises(ValueError, match=message):
             flatten(V, F, fixed=fixed, target=target)

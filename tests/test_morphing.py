@@ -213,7 +213,7 @@ def test_positions_from_a_table(plate, tmp_path):
         ("0,nan,0", "'nan' is not a finite number at line 1"),
         ("0,0,0,0", "not 3 numbers"),
         ("", "moves no vertex"),
-        ("3,0,0\n4,0,0\n3,1,0", "to.csv: names vertex 3 a second time at line 3"),
+        ("3,0,0\n4,0,0\n3,1,0", "to.csv: lists vertex 3 a second time at line 3"),
     ],
 )
 def test_tables_that_cannot_be_read(plate, tmp_path, capsys, text, message):
@@ -237,7 +237,7 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
     assert main(["morph", str(path), "-o", str(out), "--field", "wind"]) == 2
     assert "no point data 'wind'; available: 'T', 'displacement'" in capsys.readouterr().err
     assert main(["morph", str(path), "-o", str(out), "--field", "T"]) == 2
-    assert "no vectors in the plane" in capsys.readouterr().err
+    assert "not plane vectors" in capsys.readouterr().err
     assert main(["morph", str(path), "-o", str(path), "--field", "displacement"]) == 2
     assert "would replace an input" in capsys.readouterr().err
     garbage = tmp_path / "garbage.msh"

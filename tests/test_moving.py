@@ -124,7 +124,7 @@ def test_a_boundary_that_cannot_arrive_leaves_the_mesh_as_it_was(ring):
     points, F, _walls, hole = ring
     mesh = MovingMesh(points, F, hole)
     before = mesh.advance(points[hole] + (0.1, 0))
-    with pytest.raises(RuntimeError, match="can be moved only .* of the way"):
+    with pytest.raises(RuntimeError, match=r"can be moved only .* of the way"):
         mesh.advance(points[hole] + (5, 0))
     np.testing.assert_array_equal(mesh.points, before)
     after = mesh.advance(points[hole] + (0.12, 0))

@@ -156,7 +156,7 @@ def test_file_names_say_the_format(ring, tmp_path):
     V, F = ring
     with pytest.raises(ValueError, match=r"must be \.svg or \.dxf, not \.pdf"):
         write_pattern(tmp_path / "ring.pdf", F, V)
-    with pytest.raises(ValueError, match="not without an ending"):
+    with pytest.raises(ValueError, match="not without a suffix"):
         write_pattern(tmp_path / "ring", F, V)
     with pytest.raises(OutputError, match="there is no directory"):
         write_pattern(tmp_path / "nowhere" / "ring.svg", F, V)

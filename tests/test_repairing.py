@@ -408,7 +408,7 @@ class TestCommand:
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.obj", "no face has texture coordinates"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3\n", "out.obj", "at all three corners"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 4 2\n", "out.obj", "uses a vertex twice"),
-            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", "OFF has no room for seams"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", "OFF does not support seams"),
             (None, "out.obj", "there is no such file"),
         ],
     )

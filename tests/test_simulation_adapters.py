@@ -244,7 +244,7 @@ def test_files_whose_quadrilaterals_cannot_be_morphed(tmp_path, capsys):
     assert main(["morph", str(path), "-o", str(out), "--positions", str(table)]) == 1
     said = capsys.readouterr().out
     assert "1 of 16 quadrilaterals are not positive" in said
-    assert "wherever the others go: quadrilateral 15" in said
+    assert "Inverted for every position of the free nodes: quadrilateral 15" in said
 
 
 def test_tables_of_numbers_in_any_notation(tmp_path):

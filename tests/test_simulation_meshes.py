@@ -178,7 +178,7 @@ def test_quadrilaterals_that_the_boundary_inverts_are_named():
     morphed = morph(points, F, [corner], [[0.9, 0.9]])
     assert morphed.inverted.tolist() == morphed.forbidden.tolist() == [len(F) - 1]
     assert not morphed.valid
-    assert "wherever the others go: quadrilateral 35" in morphed.summary()
+    assert "Inverted for every position of the free nodes: quadrilateral 35" in morphed.summary()
     assert json.loads(json.dumps(morphed.to_dict()))["forbidden"] == [35]
 
 

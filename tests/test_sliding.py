@@ -549,7 +549,7 @@ def test_what_the_command_line_refuses(tmp_path, capsys):
     _write(tmp_path / "in.obj", lift(surfaces.disk(4)[0]), surfaces.disk(4)[1])
     out = ["-o", str(tmp_path / "out.obj")]
     assert main(["map", str(tmp_path / "in.obj"), "--to", "disk", "--slide", "--no-polish", *out]) == 2
-    assert "--no-polish forbids" in capsys.readouterr().err
+    assert "--slide needs polishing: omit --no-polish" in capsys.readouterr().err
     assert main(["map", str(tmp_path / "in.obj"), "--to", "disk", "--slide", *out]) == 0
     assert main(["polish", str(tmp_path / "out.obj"), "--to", "disk", "-o", str(tmp_path / "b.obj")]) == 2
     assert "add --slide" in capsys.readouterr().err
@@ -607,7 +607,7 @@ def test_vertices_are_told_their_sides(tmp_path, capsys):
         ("3 4", "says side 4, but the outline has only sides 0 … 3 at line 1"),
         ("3", "is not 'vertex side'"),
         ("-3 1", "is not 'vertex side'"),
-        ("3 1\n3 1", "names vertex 3 a second time at line 2"),
+        ("3 1\n3 1", "lists vertex 3 a second time at line 2"),
         ("9999 1", "on refers to vertex 9999"),
     ):
         pieces.write_text(text)

@@ -785,9 +785,9 @@ def test_flat_triangles_are_told_of_which_file(qhm):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--corners", "3"], "--corners says how the boundary goes to an outline: name one by --to"),
-        (["--font", "x"], "--font says how"),
-        (["--cut"], "--cut says how"),
+        (["--corners", "3"], "--corners applies only to an outline: give one by --to"),
+        (["--font", "x"], "--font applies only to an outline"),
+        (["--cut"], "--cut applies only to an outline"),
         (["--to", "lettr:G"], "unknown outline 'lettr:G'"),
         (["--to", "none.svg"], "none.svg: there is no such file"),
         (["--to", "disk", "--font", "x"], "'disk' takes no font"),
@@ -800,8 +800,8 @@ def test_flat_triangles_are_told_of_which_file(qhm):
         (["--to", "disk", "--corners", "1,2:3"], "vertex 1 has no corner or point"),
         (["--to", "disk", "--corners", "1:2,1:3"], "vertex 1 is named more than once"),
         (["--to", "disk", "--corners", "1,1"], "vertex 1 is named more than once"),
-        (["--corner-angle", "0"], "--corner-angle says how"),
-        ([], "in.obj: no face refers to texture coordinates (vt), which would say where the boundary goes: "),
+        (["--corner-angle", "0"], "--corner-angle applies only to an outline"),
+        ([], "in.obj: no face refers to texture coordinates (vt), so the boundary has no targets: "),
     ],
 )
 def test_wrong_calls(qhm, options, message):

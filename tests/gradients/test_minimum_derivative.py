@@ -191,7 +191,7 @@ def test_a_map_that_was_not_found_has_no_derivative():
         polish_derivative(problem.V, problem.F, crossed, fixed=problem.fixed)
     with pytest.raises(ValueError, match="not in fixed"):
         polish_derivative(problem.V, problem.F, uv, fixed=problem.fixed[1:])
-    with pytest.raises(ValueError, match="mu: only a quasi-harmonic map"):
+    with pytest.raises(ValueError, match="mu is supported only for quasi-harmonic maps"):
         polish_derivative(problem.V, problem.F, uv, fixed=problem.fixed).jvp(mu=np.zeros(len(problem.F)))
 
 
