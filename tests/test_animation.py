@@ -312,7 +312,7 @@ def test_what_the_command_refuses(head, tmp_path, capsys):
         ("none.npy", [], "must be real numbers of shape"),
         ("no.npy", [], "not an array of numbers"),
         ("missing.npy", [], "missing.npy: there is no such file"),
-        ("short.npy", ["-o", tmp_path / "out"], "the same output is named twice"),
+        ("short.npy", ["-o", tmp_path / "out"], "the same output is given twice"),
         ("short.npy", ["-o", tmp_path / "f.gif", "--frames-per-second", 60], "of a GIF must be at most 50"),
         ("empty", [], "no mesh in this folder"),
         ("short.npy", ["--max-motion-ratio", 2], "--max-motion-ratio needs --polish"),

@@ -219,7 +219,7 @@ class TestCut:
         (tmp_path / "edges.txt").write_text(f"{a} {b}\n")
         given = ["--seams", tmp_path / "edges.txt"]
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", *given) == 2
-        assert f"edge ({a}, {b}) inside a face" in capsys.readouterr().err
+        assert f"edge ({a}, {b}) inside a polygon" in capsys.readouterr().err
 
 
 class TestSeenFromOutside:

@@ -245,7 +245,7 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
     with pytest.raises(MeshFileError, match="cannot be read"):
         read_fem(garbage)
     for name, cells, message in (
-        ("solid", [("tetra", [[0, 1, 2, 3]])], "cells of the kind tetrahedron"),
+        ("solid", [("tetra", [[0, 1, 2, 3]])], "cells of type tetrahedron"),
         ("line", [("line", [[0, 1]])], "has no triangles"),
         ("bent", [("triangle", [[0, 1, 2]])], "is not planar"),
     ):
