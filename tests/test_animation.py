@@ -321,7 +321,7 @@ def test_what_the_command_refuses(head, tmp_path, capsys):
         assert run("animate", surface, tmp_path / frames, "-o", tmp_path / "out", *options) == 2
         assert words in capsys.readouterr().err
     assert run("animate", surface, tmp_path / "short.npy", "-o", tmp_path / "out.avi") == 2
-    assert "neither a moving picture" in capsys.readouterr().err
+    assert "give a moving picture" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -221,7 +221,7 @@ def test_damaged_vtk_files_are_refused(vtk, tmp_path, name, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.replace(b"4.1 0 8", b"3.0 0 8"), "version 3.0 is not known"),
+        (lambda d: d.replace(b"4.1 0 8", b"3.0 0 8"), "version 3.0 is not supported"),
         (lambda d: d.replace(b"4.1 0 8", b"4.1 0 4"), "4 bytes"),
         (lambda d: d[: d.index(b"$EndNodes")], "Nodes does not end"),
         (lambda d: d.replace(b"Nodes", b"ParametricNodes"), "save it as 4.1, or without them"),

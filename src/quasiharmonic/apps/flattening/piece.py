@@ -326,7 +326,7 @@ class Flattening:
                 continue
             self._begun.add((self._settings.linear_solver, energy))
             self._bijective = uv
-            what = f"restart, {name}" if self._stages else "start"
+            what = f"start again, {name}" if self._stages else "start"
             self._stages.append(Stage(what, 0, time.perf_counter() - began, (0, 0), (energy, energy)))
             return uv, energy < _NEAR
         return None
