@@ -180,7 +180,7 @@ def test_wrong_targets_are_named(head):
         animate(problem, targets)
     with pytest.raises(ValueError, match="no frame"):
         animate(problem, [])
-    with pytest.raises(ValueError, match="frame 1 must hold real numbers"):
+    with pytest.raises(ValueError, match="frame 1 must contain real numbers"):
         animate(problem, [targets[0], targets[1] + 1j])
     for none in (None, 5, "frames"):
         with pytest.raises(TypeError, match="targets must be a sequence of arrays"):
@@ -196,7 +196,7 @@ def test_wrong_options_are_told(head):
     for limit in (0.5, np.nan, "3", [3]):
         with pytest.raises(ValueError, match="max_motion_ratio must be a number of at least 1"):
             animate(problem, targets, polish="mips", max_motion_ratio=limit)
-    with pytest.raises(ValueError, match="max_motion_ratio is for frames that are polished"):
+    with pytest.raises(ValueError, match="max_motion_ratio applies only to polished frames"):
         animate(problem, targets, max_motion_ratio=2)
 
 
@@ -310,18 +310,18 @@ def test_what_the_command_refuses(head, tmp_path, capsys):
     for frames, options, words in (
         ("short.npy", [], "must be real numbers of shape"),
         ("none.npy", [], "must be real numbers of shape"),
-        ("no.npy", [], "no array of numbers"),
+        ("no.npy", [], "not an array of numbers"),
         ("missing.npy", [], "missing.npy: there is no such file"),
-        ("short.npy", ["-o", tmp_path / "out"], "the same output is named twice"),
+        ("short.npy", ["-o", tmp_path / "out"], "the same output is given twice"),
         ("short.npy", ["-o", tmp_path / "f.gif", "--frames-per-second", 60], "of a GIF must be at most 50"),
         ("empty", [], "no mesh in this folder"),
-        ("short.npy", ["--max-motion-ratio", 2], "--max-motion-ratio belongs to --polish"),
-        ("short.npy", ["--frames-per-second", 2], "belongs to a moving picture"),
+        ("short.npy", ["--max-motion-ratio", 2], "--max-motion-ratio needs --polish"),
+        ("short.npy", ["--frames-per-second", 2], "needs a moving picture"),
     ):
         assert run("animate", surface, tmp_path / frames, "-o", tmp_path / "out", *options) == 2
         assert words in capsys.readouterr().err
     assert run("animate", surface, tmp_path / "short.npy", "-o", tmp_path / "out.avi") == 2
-    assert "neither a moving picture" in capsys.readouterr().err
+    assert "give a moving picture" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -117,7 +117,7 @@ class TestCommands:
             ("0 1\n0 400000\n", "line 2"),
             ("0 1\n2 " + "9" * 5000, f"'{'9' * 40}...' is far too large at line 2"),
             ("0 x\n", "is not an edge"),
-            ("0 100\n", "no such edge to cut"),
+            ("0 100\n", "not an edge of the mesh, so it cannot be cut"),
         ],
     )
     def test_bad_lists_of_edges(self, source, tmp_path, capsys, text, words):
@@ -151,7 +151,7 @@ class TestMirroredAndStacked:
         run("measure", tmp_path / "in.obj", "--json", tmp_path / "straight.json")
         seamed(tmp_path / "in.obj", mirrored=1)
         run("measure", tmp_path / "in.obj", "--json", tmp_path / "mirrored.json")
-        assert "mirrored island 1 measured as the other side shows" in capsys.readouterr().out
+        assert "mirrored island 1 measured with reversed orientation" in capsys.readouterr().out
         one, other = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("straight", "mirrored"))
         assert other["isometric"] == pytest.approx(one["isometric"])
         assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
@@ -167,7 +167,7 @@ class TestMirroredAndStacked:
     def test_islands_over_one_another_are_told_and_left(self, tmp_path, capsys):
         seamed(tmp_path / "in.obj", stacked=True)
         assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
-        assert "Islands lie on or touch each other" in capsys.readouterr().out
+        assert "Islands overlap or touch each other" in capsys.readouterr().out
         assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--pack") == 0
         assert "Islands lie on" not in capsys.readouterr().out
 
@@ -219,7 +219,7 @@ class TestCut:
         (tmp_path / "edges.txt").write_text(f"{a} {b}\n")
         given = ["--seams", tmp_path / "edges.txt"]
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", *given) == 2
-        assert f"edge ({a}, {b}) inside a face" in capsys.readouterr().err
+        assert f"edge ({a}, {b}) inside a polygon" in capsys.readouterr().err
 
 
 class TestSeenFromOutside:
@@ -353,7 +353,7 @@ class TestFunctions:
 
     def test_pins_decide_the_size(self):
         V, F, uv, FT, _ = strips(4)
-        with pytest.raises(ValueError, match="vertices that are held decide the map's size"):
+        with pytest.raises(ValueError, match="fixed vertices determine the size of the map"):
             atlas.flatten(SeamedMesh(V, F, FT, uv), fixed=[0], unit_square=True)
 
     def test_weights_and_pins(self):

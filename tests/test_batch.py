@@ -426,13 +426,13 @@ class TestRun:
         [
             ({"flatten": True, "corners": "auto"}, "corners is of maps onto a given boundary"),
             ({"flatten": True, "refine": True}, "refine is of maps onto a given boundary"),
-            ({"cut": True}, "cut is of plain meshes and the outline that they go to: name one by to"),
+            ({"cut": True}, "cut is of plain meshes and the outline that they go to: give the outline by to"),
             ({"corners": "auto"}, "corners is of plain meshes and the outline"),
-            ({"to": "rect:1x1", "corners": "near:1,2"}, "'near:1,2' is none of V, V:K and V:X:Y"),
+            ({"to": "rect:1x1", "corners": "near:1,2"}, "'near:1,2' is not one of V, V:K and V:X:Y"),
             ({"flatten": True, "to": "letter:O"}, "to is of maps onto a given boundary, and flatten sets it free"),
             ({"flatten": True, "polish": "mips"}, "polish is of maps onto a given boundary"),
             ({"flatten": True, "slide": True}, "slide is of maps onto a given boundary"),
-            ({"slide": True}, "slides while distortion is lowered: name an energy for that too, by polish"),
+            ({"slide": True}, "slides while distortion is lowered: give an energy as well, by polish"),
             ({"energy": "mips"}, "energy is for flatten, and flatten was not asked for"),
             ({"flatten": True, "energy": "arap"}, "energy must be one of .*arap-barrier, distances, not 'arap'"),
         ],
@@ -484,7 +484,7 @@ class TestRun:
             batch.run(stars, tmp_path / "out", jobs=2, scheduler="tcp://localhost:1")
         assert not (tmp_path / "out").exists()
         (tmp_path / "file").write_text("")
-        with pytest.raises(OSError, match="cannot make the folder"):
+        with pytest.raises(OSError, match="cannot create the folder"):
             batch.run(stars, tmp_path / "file" / "out")
         with pytest.raises(OSError, match="it is no folder"):
             batch.run(stars, tmp_path / "file")

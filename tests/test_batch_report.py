@@ -176,7 +176,7 @@ class TestPage:
         batch.run(tmp_path / "set", tmp_path / "out", jobs=1)
         text = Reader(written(tmp_path, tmp_path / "out")).text
         assert "1 no injective map found; it is proven of 1 that they have no such map" in text
-        assert "The target is wound against the mesh" in text
+        assert "The target has the opposite orientation to the mesh" in text
 
     @pytest.mark.parametrize("column", ["problem", "error", "outcome", "source", "versions"])
     def test_whatever_things_are_called(self, tmp_path, column):

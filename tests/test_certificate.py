@@ -195,17 +195,17 @@ def test_vertices_of_no_triangle_are_not_looked_at():
     [
         (SQUARE[0], CORNERS, r"F must have shape \(f, 3\), triangles only, not \(3,\)"),
         (np.zeros((2, 4), int), CORNERS, r"F must have shape \(f, 3\), triangles only, not \(2, 4\)"),
-        (SQUARE.astype(float), CORNERS, "F must hold integer indices, not float64"),
-        (SQUARE.astype(bool), CORNERS, "F must hold integer indices, not bool"),
+        (SQUARE.astype(float), CORNERS, "F must contain integer indices, not float64"),
+        (SQUARE.astype(bool), CORNERS, "F must contain integer indices, not bool"),
         (
             SQUARE + 1,
             CORNERS,
-            r"F refers to vertex 4, but there are only vertices 0 … 3; if it counts from 1, hand over F - 1$",
+            r"F refers to vertex 4, but there are only vertices 0 … 3; if its indices count from 1, pass F - 1$",
         ),
         (np.arange(-9, 0).reshape(3, 3), CORNERS, r"vertices -9, -8, -7, -6, -5, … \(9 in all\)"),
         (SQUARE, CORNERS[:, :1], r"uv must have shape \(n, 2\), not \(4, 1\)"),
         (SQUARE, np.zeros((4, 3)), r"uv must have shape \(n, 2\), not \(4, 3\)"),
-        (SQUARE, CORNERS.astype(complex), "uv must hold real numbers, not complex128"),
+        (SQUARE, CORNERS.astype(complex), "uv must contain real numbers, not complex128"),
         (SQUARE, CORNERS.astype(int) * (2**53 + 1), "double precision at vertices 1, 2, 3"),
     ],
 )

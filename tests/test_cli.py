@@ -450,7 +450,7 @@ class TestDemo:
     def test_a_folder_that_cannot_be_made(self, tmp_path, capsys):
         (tmp_path / "file").touch()
         assert run("demo", "-o", tmp_path / "file" / "demo") == 2
-        assert f"cannot make the folder {tmp_path / 'file' / 'demo'}" in capsys.readouterr().err
+        assert f"cannot create the folder {tmp_path / 'file' / 'demo'}" in capsys.readouterr().err
 
     def test_writes_its_three_files(self, tmp_path, capsys):
         assert run("demo", "-o", tmp_path / "d") == 0

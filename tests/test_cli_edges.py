@@ -96,7 +96,7 @@ def test_a_folder_that_cannot_be_made(folder, capsys):
     (folder / "file").write_text("")
     for call in ("demo -o file/D", "demo -o file"):
         assert run(*call.split()) == 2
-        assert "cannot make the folder file" in capsys.readouterr().err
+        assert "cannot create the folder file" in capsys.readouterr().err
     assert left(folder) == ["file", "m.obj"]
 
 
@@ -144,15 +144,18 @@ def changed(document, path, value):
         (lambda: square().gltf(uri="../none.bin"), "is not in the folder of the file"),
         (lambda: without(square(), "buffer").gltf(), "an entry lacks buffer"),
         (lambda: without(square(), "byteLength").gltf(), "an entry lacks byteLength"),
-        (lambda: changed(square(), ("bufferViews", 0, "buffer"), 9).gltf(), "refers to another that is not there"),
+        (
+            lambda: changed(square(), ("bufferViews", 0, "buffer"), 9).gltf(),
+            "refers to another entry that does not exist",
+        ),
         (
             lambda: changed(square(), ("accessors", 0, "componentType"), 9).gltf(),
             "accessor 0 must be one of 5120",
         ),
-        (lambda: changed(square(), ("accessors", 0, "componentType"), []).gltf(), "not of the kind that it should be"),
-        (lambda: changed(square(), ("meshes", 0, "primitives"), 7).gltf(), "not of the kind that it should be"),
+        (lambda: changed(square(), ("accessors", 0, "componentType"), []).gltf(), "has the wrong type"),
+        (lambda: changed(square(), ("meshes", 0, "primitives"), 7).gltf(), "has the wrong type"),
         (lambda: b'{"asset": {}}', "an entry lacks version"),
-        (lambda: b"[1]", "not of the kind that it should be"),
+        (lambda: b"[1]", "has the wrong type"),
         (lambda: b"[" * 100_000, "nested too deeply"),
     ],
 )
@@ -196,7 +199,7 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         ("map m.obj -o o.obj --plot-kind map", "--plot"),
         ("map m.obj -o o.obj --margin 0.1", "--pack"),
         ("map m.obj -o o.obj --font x", "--to"),
-        ("map m.obj -o o.obj --to disk --font x", "only for letter: and word:"),
+        ("map m.obj -o o.obj --to disk --font x", "only letter: and word:"),
         ("map m.obj -o o.obj --corner-angle 9", "--to"),
         ("map m.obj -o o.obj --corners auto", "--to"),
         ("map m.obj -o o.obj --cut", "--to"),
@@ -208,7 +211,7 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         ("polish m.obj -o o.obj --to disk", "--slide"),
         ("harmonise m.obj -o o.obj --margin 0.1", "--pack"),
         ("animate m.obj m.obj -o o --max-motion-ratio 2", "--polish"),
-        ("animate m.obj m.obj -o o --frames-per-second 2", "--frames-per-second belongs to a moving picture"),
+        ("animate m.obj m.obj -o o --frames-per-second 2", "--frames-per-second needs a moving picture"),
         ("measure m.obj --rings 3", "--distances"),
         ("plot m.obj -o o.png --measure mips", "--kind distortion"),
         ("plot m.obj -o o.png --kind texture --measure isometric", "--kind distortion"),
@@ -219,7 +222,7 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         ("batch . -o o --flatten --strategy speed", "--strategy"),
         ("batch . -o o --to disk --energy mips", "flatten"),
         ("batch . -o o --to disk --slide", "polish"),
-        ("batch . -o o --corners auto", "name one by to"),
+        ("batch . -o o --corners auto", "give the outline by to"),
     ],
 )
 def test_an_option_without_effect_is_refused(folder, capsys, call, needs):

@@ -67,10 +67,10 @@ def test_a_field_without_an_inverse(tmp_path, capsys):
         (["field.npy", "-o", "field.npy"], "would replace an input file"),
         (["field.npy", "-o", "a.npy", "--spacing", "0"], "field.npy: spacing must be a positive number"),
         (["lost.npy", "-o", "a.npy"], r"lost.npy: field is not finite at pixel (2, 3), row and column"),
-        (["words.npy", "-o", "a.npy"], "words.npy: no array of numbers in NumPy's format .npy"),
+        (["words.npy", "-o", "a.npy"], "words.npy: not an array of numbers in NumPy's format .npy"),
         (["none.npy", "-o", "a.npy"], "none.npy"),
         (["row.npy", "-o", "a.npy", "--hold-border"], "row.npy: field must have shape (height, width, 2)"),
-        (["several.npz", "-o", "a.npy"], "several.npz: no array of numbers in NumPy's format .npy"),
+        (["several.npz", "-o", "a.npy"], "several.npz: not an array of numbers in NumPy's format .npy"),
     ],
 )
 def test_wrong_calls(tmp_path, monkeypatch, field, capsys, arguments, message):

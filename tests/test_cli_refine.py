@@ -96,7 +96,7 @@ def test_what_no_refinement_cures(tmp_path, capsys):
     assert run("refine", tmp_path, "-o", tmp_path / "same.obj") == 1
     said = capsys.readouterr().out
     assert "0 edges split" in said
-    assert "wound against the mesh" in said
+    assert "has the opposite orientation to the mesh" in said
     assert "Next" not in said
     np.testing.assert_array_equal(io.read_mesh(tmp_path / "same.obj").F, problem.F)
 

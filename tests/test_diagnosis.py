@@ -114,7 +114,7 @@ def test_conditions_on_simple_targets_are_left_out_elsewhere():
     diagnosis = diagnose(problem)
     assert diagnosis.forbids_bijective
     assert not diagnosis.forbids_injective
-    assert any("vertices see" in text for text in diagnosis.unchecked)
+    assert any("visibility from vertices" in text for text in diagnosis.unchecked)
 
 
 def test_clean_problems_have_no_obstruction():

@@ -185,9 +185,9 @@ def test_isometries_have_no_error_and_a_point_has_all(flat):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"rings": 0}, "rings must be a whole number of at least 1, not 0"),
-        ({"sources": 2.5}, "sources must be a whole number"),
-        ({"crossings": -1}, "crossings must be a whole number of at least 0"),
+        ({"rings": 0}, "rings must be an integer of at least 1, not 0"),
+        ({"sources": 2.5}, "sources must be an integer"),
+        ({"crossings": -1}, "crossings must be an integer of at least 0"),
         ({"uv": np.zeros((3, 2))}, "a pair refers to vertex 3, but there are only vertices 0 … 2"),
         ({"uv": np.full((4, 2), np.nan)}, "uv is not finite at vertices 0, 1, 2, 3"),
         ({"V": np.zeros((4, 4))}, "V must have shape"),
@@ -404,8 +404,8 @@ def test_few_iterations(dome):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda uv: -uv * [1, -1], "uv is not. Not injective"),
-        (lambda uv: uv[:-1], "a position for every vertex"),
+        (lambda uv: -uv * [1, -1], "uv is not bijective: the descent needs a bijective map. Not injective"),
+        (lambda uv: uv[:-1], "one position for each vertex"),
         (lambda uv: np.where(uv > 0.5, np.inf, uv), "uv is not finite"),
     ],
 )
@@ -418,7 +418,7 @@ def test_starts_that_will_not_do(dome, change, message):
 @pytest.mark.parametrize("rings", [None, "a", [3], 0, 2.5])
 def test_rings_that_are_no_number_of_edges_are_refused(dome, rings):
     V, F = dome
-    with pytest.raises(ValueError, match="rings must be a whole number of at least 1, not"):
+    with pytest.raises(ValueError, match="rings must be an integer of at least 1, not"):
         keep_distances(V, F, V[:, :2], rings=rings)
 
 
@@ -431,7 +431,7 @@ def test_record_keeps_maps_on_the_way(dome):
     if last % 2 == 0:
         assert np.array_equal(result.path[-1].uv, result.uv)
     assert not keep_distances(V, F, V[:, :2], rings=6).path
-    with pytest.raises(ValueError, match="record_every must be a whole number"):
+    with pytest.raises(ValueError, match="record_every must be an integer"):
         keep_distances(V, F, V[:, :2], record_every=-1)
 
 
@@ -607,9 +607,9 @@ def test_ctrl_c_while_distances_are_sampled_leaves_the_map_there_is(dome, monkey
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"weights": np.ones(4)}, "leave fixed and weights out"),
-        ({"fixed": [0], "target": [[0, 0]]}, "leave fixed and weights out"),
-        ({"rings": 0}, "rings must be a whole number of at least 1, not 0"),
+        ({"weights": np.ones(4)}, "omit fixed and weights"),
+        ({"fixed": [0], "target": [[0, 0]]}, "omit fixed and weights"),
+        ({"rings": 0}, "rings must be an integer of at least 1, not 0"),
         ({"gap": -1}, "gap must be a finite number of at least 0"),
     ],
 )

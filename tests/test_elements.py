@@ -123,7 +123,7 @@ def test_triangles_among_quadrilaterals():
     assert over.tolist() == [[0, 3, 2, 1], [1, 2, 4, 4]]
     assert inverted_elements(over, points).tolist() == [0, 1]
     assert rim(F).tolist() == [0, 1, 2, 3, 4]
-    with pytest.raises(ValueError, match="six-node triangles beside others"):
+    with pytest.raises(ValueError, match="both six-node triangles and other elements"):
         joined([np.zeros((1, 6), dtype=int), np.zeros((1, 3), dtype=int)])
 
 
@@ -159,5 +159,5 @@ def test_rows_that_are_no_elements(F, message):
 def test_other_orders_of_nodes_are_told(order):
     points, F = second_order(*surfaces.grid(2, 2))
     element_array(F, len(points))
-    with pytest.raises(ValueError, match=r"nodes .* between other corners in one triangle than in another"):
+    with pytest.raises(ValueError, match=r"nodes .* between different corners in one triangle than in another"):
         element_array(F[:, order], len(points))

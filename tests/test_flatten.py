@@ -269,7 +269,7 @@ class TestOptions:
             ({"start": [[0, 0]]}, "start must have shape"),
             ({"max_iterations": -1}, "max_iterations"),
             ({"tolerance": -1}, "tolerance"),
-            ({"fixed": [0]}, "fixed and target belong together"),
+            ({"fixed": [0]}, "give fixed and target together"),
         ],
     )
     def test_wrong_options(self, options, words):

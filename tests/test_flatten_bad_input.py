@@ -54,8 +54,8 @@ def with_a_flat_triangle():
 
 
 REFUSED = {
-    "closed": (octahedron(), "the surface is closed: it has no boundary to place; cut it open first"),
-    "a handle": (torus(), "the surface has 1 handle and cannot lie in the plane: cut it open first"),
+    "closed": (octahedron(), "the surface is closed: it has no boundary; cut it open first"),
+    "a handle": (torus(), "the surface has 1 handle and cannot be flattened: cut it open first"),
     "no area": (with_a_flat_triangle(), "triangles 7, 43 of zero area in the rest mesh: distortion is undefined there"),
 }
 
@@ -88,9 +88,9 @@ def test_what_is_refused_is_named(mesh, message, fixed, target, tmp_path, capsys
 
 
 IMPOSSIBLE = {
-    "wound wrongly": (F[5], [(0.0, 0), (0, 1), (1, 0)], "inverted_triangle", "All vertices of triangle 5 are held"),
-    "in a row": (F[5], [(0.0, 0), (1, 1), (2, 2)], "inverted_triangle", "their places flatten it"),
-    "two in one place": ([3, 40], [(0.5, 0.5), (0.5, 0.5)], "pin", "Vertices 3, 40 are held in one place"),
+    "wound wrongly": (F[5], [(0.0, 0), (0, 1), (1, 0)], "inverted_triangle", "All vertices of triangle 5 are fixed"),
+    "in a row": (F[5], [(0.0, 0), (1, 1), (2, 2)], "inverted_triangle", "their targets flatten it"),
+    "two in one place": ([3, 40], [(0.5, 0.5), (0.5, 0.5)], "pin", "Vertices 3, 40 are fixed at the same position"),
 }
 
 

@@ -62,7 +62,7 @@ def test_a_start_from_which_the_map_collapses_is_left_for_another(arms):
     assert result.status is Status.POLISHED
     assert worst(V, F, result.uv) < 5
     names = [stage.name for stage in result.stages]
-    assert names[2] == "start anew, disk"
+    assert names[2] == "start again, disk"
     # What had collapsed is on record as discarded.
     assert [stage.kept for stage in result.stages] == [False, False, True, True]
     assert result.stages[1].energy[1] > 100 * result.stages[3].energy[1]
@@ -91,7 +91,7 @@ def test_a_descent_without_end_is_left_for_another_start():
     result = flatten(V, F, start=away * (size / size.max()) ** 8, max_iterations=100)
     assert result.status is Status.POLISHED
     assert worst(V, F, result.uv) < 5
-    assert any(stage.name.startswith("start anew") for stage in result.stages)
+    assert any(stage.name.startswith("start again") for stage in result.stages)
 
 
 class Stuck(SymmetricDirichlet):

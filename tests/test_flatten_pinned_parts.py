@@ -95,7 +95,7 @@ def test_what_forbids_it_has_the_mesh_s_numbers():
     assert result.status is Status.IMPOSSIBLE
     (patch,) = result.diagnosis.obstructions
     assert patch.kind is Kind.INVERTED_PATCH
-    assert f"the piece around vertex {second}, its elements numbered anew" in patch.message
+    assert f"the piece around vertex {second}, with its own numbering" in patch.message
     assert (patch.triangles >= len(F) // 2).all()
     assert not result.certificate.injective
 
@@ -149,7 +149,7 @@ def test_the_command_s_messages_have_the_file_s_numbers(tmp_path, capsys, rng):
     (tmp_path / "pins.txt").write_text("".join(f"{v}\n" for v in pins))
     call = ["flatten", str(tmp_path / "in.obj"), "--fixed", str(tmp_path / "pins.txt"), "-o", str(tmp_path / "out.obj")]
     assert main(call) == 1
-    assert f"Vertices {pins.min()}, {pins.max()} are held in one place" in capsys.readouterr().out
+    assert f"Vertices {pins.min()}, {pins.max()} are fixed at the same position" in capsys.readouterr().out
     # With room for both, every triangle is where the file has it.
     write_obj(tmp_path / "in.obj", mesh.with_map(places + 7))
     assert main(call) == 0

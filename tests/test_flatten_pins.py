@@ -202,13 +202,13 @@ def test_pins_of_a_map_are_never_called_impossible():
 def test_malformed_input_is_refused():
     V, F = disk(3)
     for fixed, target, message in (
-        ([], np.zeros((0, 2)), "fixed names no vertex"),
+        ([], np.zeros((0, 2)), "fixed has no vertex"),
         ([1, 1], np.zeros((2, 2)), "vertex 1 fixed more than once"),
         ([1, 99], np.zeros((2, 2)), "refers to vertex 99"),
         ([1], [[np.nan, 0.0]], "not finite at row 0"),
         ([1], [[0.0, 0.0, 0.0]], r"shape \(1, 2\)"),
         ([0.5], [[0.0, 0.0]], "integer"),
-        ([1], None, "belong together"),
+        ([1], None, "give fixed and target together"),
     ):
         with pytest.raises(ValueError, match=message):
             flatten(V, F, fixed=fixed, target=target)

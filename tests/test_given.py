@@ -150,9 +150,9 @@ def test_one_mesh_in_place_of_both(name, tmp_path):
     for mesh in (MESH, tmp_path / "mesh.obj", str(tmp_path / "mesh.obj")):
         assert state(function(mesh, *rest, **options)) == wanted
     assert state(function(*rest, V=V, F=F, **options) if not rest else function(V, F, *rest, **options)) == wanted
-    with pytest.raises(TypeError, match="a SimpleNamespace stands for V and F both: leave F out"):
+    with pytest.raises(TypeError, match="a SimpleNamespace provides both V and F: omit F"):
         function(MESH, F, *rest, **options)
-    with pytest.raises(TypeError, match="stands for V and F both"):
+    with pytest.raises(TypeError, match="provides both V and F"):
         function(MESH, *rest, F=F, **options)
     assert list(inspect.signature(function).parameters)[:2] == ["V", "F"]
     assert "or a mesh in place of ``V`` and ``F``" in inspect.getdoc(function)
@@ -211,7 +211,7 @@ def test_atlases_of_files_and_objects(tmp_path):
         np.testing.assert_array_equal(atlas.polish(given, max_iterations=2).mesh.uv, wanted)
         assert atlas.certify(given).bijective
     assert len(atlas.flatten(MESH, max_iterations=1).islands) == 1
-    with pytest.raises(TypeError, match="a list is no mesh: hand over a SeamedMesh"):
+    with pytest.raises(TypeError, match="a list is not a mesh: pass a SeamedMesh"):
         atlas.certify([V, F])
 
 
@@ -271,28 +271,31 @@ def test_arrays_of_other_libraries(wrap):
     ("call", "message"),
     [
         (lambda: distortion(Tensor(V, requires_grad=True), F, MAP), r"V is a Tensor that requires grad.*V\.detach\(\)"),
-        (lambda: distortion(V, F, Tensor(MAP.uv, device="cuda:0")), r"uv is a Tensor on cuda:0: hand over uv\.cpu\(\)"),
-        (lambda: distortion(V, F, MESH), "uv must hold real numbers, not a SimpleNamespace"),
-        (lambda: distortion(V, MESH, MAP), "F must hold integer indices, not a SimpleNamespace"),
-        (lambda: distortion(V, F, "map.obj"), "uv must hold real numbers, not 'map.obj'"),
-        (lambda: distortion(None, F, MAP), "V must hold real numbers, not None"),
-        (lambda: distortion([[0, None]], F, MAP), "V must hold real numbers, not objects, of which the first is 0"),
-        (lambda: distortion((V, F), MAP), r"V is a tuple of 2 arrays: hand these over one by one, as in distortion\("),
-        (lambda: flatten(SimpleNamespace(geometry={})), "a SimpleNamespace is no mesh .* it has no vertices"),
-        (lambda: flatten({"vertices": V}), "a dict is no mesh .* it has no faces"),
-        (lambda: flatten(SimpleNamespace(vertices=V, faces=[0, 1, 2])), "faces of a SimpleNamespace must be rows"),
-        (lambda: flatten(SimpleNamespace(points=V, cells=[block("tetra", F)])), "cells of the kind 'tetra'"),
-        (lambda: flatten(SimpleNamespace(points=V, cells=padded(F), celltypes=[10] * len(F))), "VTK's kind 10"),
+        (lambda: distortion(V, F, Tensor(MAP.uv, device="cuda:0")), r"uv is a Tensor on cuda:0: pass uv\.cpu\(\)"),
+        (lambda: distortion(V, F, MESH), "uv must contain real numbers, not a SimpleNamespace"),
+        (lambda: distortion(V, MESH, MAP), "F must contain integer indices, not a SimpleNamespace"),
+        (lambda: distortion(V, F, "map.obj"), "uv must contain real numbers, not 'map.obj'"),
+        (lambda: distortion(None, F, MAP), "V must contain real numbers, not None"),
+        (lambda: distortion([[0, None]], F, MAP), "V must contain real numbers, not objects, the first of them 0"),
+        (
+            lambda: distortion((V, F), MAP),
+            r"V is a tuple of 2 arrays: pass them as separate arguments, as in distortion\(",
+        ),
+        (lambda: flatten(SimpleNamespace(geometry={})), "a SimpleNamespace is not a mesh, because it has no vertices"),
+        (lambda: flatten({"vertices": V}), "a dict is not a mesh, because it has no faces"),
+        (lambda: flatten(SimpleNamespace(vertices=V, faces=[0, 1, 2])), "faces of a SimpleNamespace must have one row"),
+        (lambda: flatten(SimpleNamespace(points=V, cells=[block("tetra", F)])), "cells of type 'tetra'"),
+        (lambda: flatten(SimpleNamespace(points=V, cells=padded(F), celltypes=[10] * len(F))), "VTK type 10"),
         (lambda: flatten(SimpleNamespace(points=V, faces=padded(F + 99))), "the faces refers? to vert"),
-        (lambda: flatten(V, F + 1), rf"vertex {len(V)}, but .*; if it counts from 1, hand over F - 1"),
+        (lambda: flatten(V, F + 1), rf"vertex {len(V)}, but .*; if its indices count from 1, pass F - 1"),
         (
             lambda: quasiharmonic.injective_map(V, F, np.ones(len(V), dtype=bool), MAP.uv),
-            r"fixed must hold integer indices, not bool: hand over numpy\.flatnonzero\(fixed\)",
+            r"fixed must contain integer indices, not bool: pass numpy\.flatnonzero\(fixed\)",
         ),
         (lambda: quasiharmonic.solve(MAP), "solve takes a Problem, not a MapResult"),
         (lambda: targets.boundary_to(V, F, 3), 'outline must be contours .* "letter:R", not 3'),
-        (lambda: targets.boundary_to(V, F, "letter"), "'letter' is no outline that is known"),
-        (lambda: targets.boundary_to(V, F, [["a", "b"]] * 3), "must hold real numbers, not <U1"),
+        (lambda: targets.boundary_to(V, F, "letter"), "unknown outline 'letter'"),
+        (lambda: targets.boundary_to(V, F, [["a", "b"]] * 3), "must contain real numbers, not <U1"),
     ],
 )
 def test_what_cannot_be_meant_well_is_named(call, message):
@@ -303,7 +306,7 @@ def test_what_cannot_be_meant_well_is_named(call, message):
 def test_files_that_are_none():
     with pytest.raises(MeshFileError, match=r"nowhere\.obj"):
         flatten(Path("nowhere.obj"))
-    with pytest.raises(MeshFileError, match="no suffix that would say its format"):
+    with pytest.raises(MeshFileError, match="no suffix, so its format is unknown"):
         flatten("mesh")
 
 
@@ -317,7 +320,7 @@ def test_files_that_are_none():
     ],
 )
 def test_arguments_in_another_order(call):
-    with pytest.raises(ValueError, match="not float64; are these positions, and the arguments in another order"):
+    with pytest.raises(ValueError, match="not float64; check the order of the arguments: these may be positions"):
         call()
 
 
@@ -343,9 +346,9 @@ def test_trimesh():
     trimesh = pytest.importorskip("trimesh")
     mesh = trimesh.Trimesh(V, F, process=False)
     assert distortion(mesh, injective_map(mesh, LOOP, BEAN)).inverted.size == 0
-    with pytest.raises(ValueError, match="a Scene is no mesh"):
+    with pytest.raises(ValueError, match="a Scene is not a mesh"):
         flatten(trimesh.Scene([mesh]))
-    with pytest.raises(ValueError, match=r"a PointCloud is no mesh .* no faces"):
+    with pytest.raises(ValueError, match=r"a PointCloud is not a mesh, .* no faces"):
         flatten(trimesh.PointCloud(V))
 
 
@@ -361,5 +364,5 @@ def test_pyvista():
     mesh = pyvista.PolyData.from_regular_faces(V, F)
     for given in (mesh, mesh.cast_to_unstructured_grid()):
         np.testing.assert_array_equal(injective_map(given, LOOP, BEAN).uv, MAP.uv)
-    with pytest.raises(ValueError, match=r"an ImageData is no mesh .* no faces"):
+    with pytest.raises(ValueError, match=r"an ImageData is not a mesh, .* no faces"):
         flatten(pyvista.ImageData(dimensions=(3, 3, 1)))

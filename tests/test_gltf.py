@@ -256,7 +256,7 @@ def test_vertices_that_single_precision_joins_are_told_before(tmp_path):
     mesh = MeshData(V, np.arange(9).reshape(3, 3))
     (digits, joined) = io.not_held("out.glb", mesh)
     assert digits.startswith("digits")
-    assert joined.startswith("2 vertices at positions that others have too")
+    assert joined.startswith("2 vertices at positions that coincide with others")
     io.write_map(tmp_path / "out.glb", mesh, V)
     assert len(io.read_mesh(tmp_path / "out.glb").V) == 7
 
@@ -278,11 +278,11 @@ def placed(tree, **node):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda tree: tree["accessors"][0].update(count=10**15), "ends before"),
+        (lambda tree: tree["accessors"][0].update(count=10**15), "too short for its numbers"),
         (lambda tree: tree["accessors"][0].update(count=-1), "whole number"),
         (lambda tree: (tree["accessors"][0].update(count=10**15), tree["accessors"][0].pop("bufferView")), "no data"),
-        (lambda tree: tree["accessors"][-1].update(count=4), "make no triangles"),
-        (lambda tree: tree["bufferViews"][0].update(byteLength=10**9), "behind its buffer"),
+        (lambda tree: tree["accessors"][-1].update(count=4), "are not a valid number for triangles"),
+        (lambda tree: tree["bufferViews"][0].update(byteLength=10**9), "after the end of its buffer"),
         (lambda tree: tree["buffers"][0].update(byteLength=10**9), "shorter"),
         (lambda tree: tree["buffers"][0].update(uri="../../etc/passwd"), "not in the folder"),
         (lambda tree: tree["buffers"][0].update(uri="/etc/passwd"), "not in the folder"),
@@ -291,17 +291,23 @@ def placed(tree, **node):
         (lambda tree: tree["asset"].update(version="1.0"), "glTF 2.0"),
         (lambda tree: tree.update(extensionsUsed=["KHR_draco_mesh_compression"]), "without compression"),
         (lambda tree: tree.update(meshes=[]), "no triangles"),
-        (lambda tree: tree.update(meshes=3), "meshes are no list"),
+        (lambda tree: tree.update(meshes=3), "meshes must be a list"),
         (
             lambda tree: tree["meshes"].__setitem__(0, {"primitives": tree["meshes"][0]["primitives"] * 999}),
             "too often",
         ),
         (lambda tree: tree.update(scenes=[{"nodes": [7]}]), "damaged"),
         (lambda tree: tree["meshes"][0]["primitives"][0].update(indices=99), "damaged"),
-        (lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=1), "number of vertices"),
-        (lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=0), "3 numbers a vertex"),
+        (
+            lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=1),
+            "different numbers of vertices",
+        ),
+        (
+            lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].update(TEXCOORD_0=0),
+            "3 numbers for each vertex",
+        ),
         (lambda tree: tree["meshes"][0]["primitives"][0].update(targets=[{"POSITION": 7}]), "damaged"),
-        (lambda tree: tree.update(images=[3]), "images are no list"),
+        (lambda tree: tree.update(images=[3]), "images must be a list"),
         (
             lambda tree: tree["accessors"][0].update(type="MAT9"),
             "type of accessor 0 must be one of SCALAR, ",
@@ -330,7 +336,7 @@ def test_nodes_that_hold_themselves_and_deep_nests(tmp_path):
     made.tree |= {"nodes": [{"children": [0, 1]}, {"mesh": 0, "children": [0]}], "scenes": [{"nodes": [0]}]}
     assert len(read(made, tmp_path).F) == 2
     (tmp_path / "deep.gltf").write_text("[" * 100_000)
-    with pytest.raises(MeshFileError, match="no glTF"):
+    with pytest.raises(MeshFileError, match="not a glTF"):
         io.read_mesh(tmp_path / "deep.gltf")
 
 

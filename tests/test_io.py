@@ -210,10 +210,10 @@ def test_decimal_text_is_rounded_correctly(put, regular):
         (SQUARE + "f 1 2 3\nsurf 0 1 0 1 1 2 3\n", "'surf' statement at line 6; only polygons"),
         (SQUARE + "f 1 2 3\nl 1/1 2/2\n", "'l' element with relative or texture indices at line 6"),
         (SQUARE + "f 1 2 3\np -1\n", "'p' element with relative or texture indices at line 6"),
-        (SQUARE, "holds no faces"),
-        ("", "holds no vertices"),
-        ("\n\n# nothing\n", "holds no vertices"),
-        ("solid\nfacet normal 0 0 1\n", "holds no vertices; is it an OBJ file?"),
+        (SQUARE, "has no faces"),
+        ("", "has no vertices"),
+        ("\n\n# nothing\n", "has no vertices"),
+        ("solid\nfacet normal 0 0 1\n", "has no vertices; is it an OBJ file?"),
         (SQUARE + "f 1 2 3\0\n", "a NUL byte at line 5"),
         ((SQUARE + "f 1 2 3\n").encode("utf-16"), "is UTF-16 text; save it as UTF-8"),
         (b"\x1f\x8b\x08\0", "is compressed by gzip; unpack it first"),
@@ -263,11 +263,11 @@ def test_a_pipe_is_not_waited_for(tmp_path):
 @pytest.mark.parametrize("name", ["mesh.3ds", "mesh", ".obj", "mesh.obj.gz"])
 def test_unsupported_suffixes(tmp_path, name):
     mesh = MeshData([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-    with pytest.raises(MeshFileError, match=r"supported are \.obj, \.off"):
+    with pytest.raises(MeshFileError, match=r"supported: \.obj, \.off"):
         io.read_mesh(tmp_path / name)
-    with pytest.raises(MeshFileError, match=r"supported are \.obj, \.off"):
+    with pytest.raises(MeshFileError, match=r"supported: \.obj, \.off"):
         io.write_map(tmp_path / name, mesh, mesh.V[:, :2])
-    with pytest.raises(MeshFileError, match=r"supported are \.obj, \.off"):
+    with pytest.raises(MeshFileError, match=r"supported: \.obj, \.off"):
         io.check_output(tmp_path / name)
 
 
@@ -469,7 +469,7 @@ def test_inputs_of_other_types_are_taken_and_left_alone(tmp_path):
             lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2, 0]]),
             r"F must have shape \(f, 3\), triangles only, not \(1, 4\)",
         ),
-        (lambda: MeshData(np.zeros((3, 3)), [[0.0, 1.0, 2.0]]), "F must hold integer indices, not float64"),
+        (lambda: MeshData(np.zeros((3, 3)), [[0.0, 1.0, 2.0]]), "F must contain integer indices, not float64"),
         (
             lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]], vt=[[0, 0]], FT=[[0, 0, 1]]),
             "FT refers to row 1, but there are only rows 0 … 0",
@@ -477,7 +477,7 @@ def test_inputs_of_other_types_are_taken_and_left_alone(tmp_path):
         (lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]], vt=[[0, 0, 0]]), r"vt must have shape \(n, 2\), not \(1, 3\)"),
         (
             lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]]).with_map(np.zeros((2, 2))),
-            r"uv must have shape \(3, 2\), a position for every vertex, not \(2, 2\)",
+            r"uv must have shape \(3, 2\), one position for each vertex, not \(2, 2\)",
         ),
         (
             lambda: MeshData(np.zeros((3, 3)), [[0, 1, 2]]).with_map([[0, 0], [np.inf, 0], [0, 0]]),
@@ -503,7 +503,7 @@ def test_map_without_seams(put):
 
 def test_map_with_seams_is_refused_by_vertex(put):
     seams = io.read_mesh(put(SQUARE + SQUARE_VT + "vt 5 5\nvt 6 5\nf 1/1 2/2 3/3\nf 1/5 3/6 4/4\n"))
-    with pytest.raises(MeshFileError, match=r"more than one place in the plane for vertices 0, 2 \(0-based\)"):
+    with pytest.raises(MeshFileError, match=r"more than one pair of texture coordinates for vertices 0, 2 \(0-based\)"):
         io.map_of(seams)
     uv, seam = io.vertex_places(seams)
     assert seam.tolist() == [True, False, True, False]
@@ -568,8 +568,8 @@ def test_off(put, text):
         ("OFF\n", "no counts of vertices and faces at line 1"),
         ("OFF\n3\n", "no counts of vertices and faces at line 2"),
         ("OFF\nx 1 0\n", "no counts of vertices and faces: 'x' is not an integer at line 2"),
-        ("OFF\n-1 1 0\n", "holds -1 vertices and 1 faces at line 2"),
-        ("OFF\n0 0 0\n", "holds 0 vertices and 0 faces at line 2"),
+        ("OFF\n-1 1 0\n", "has -1 vertices and 1 faces at line 2"),
+        ("OFF\n0 0 0\n", "has 0 vertices and 0 faces at line 2"),
         (f"OFF\n{10**30} 1 0\n", "far too large at line 2"),
         (f"OFF\n{10**17} {10**17} 0\n0 0 0\n", f"ends after 1 of {10**17} vertices and 0 of {10**17} faces"),
         ("OFF\n3 1 0\n0 0 0\n1 0\n0 1 0\n3 0 1 2\n", "a vertex with fewer than three coordinates at line 4"),
@@ -578,7 +578,7 @@ def test_off(put, text):
             "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2 0\n",
             "face with 4 corners that uses a vertex twice at line 6; remove the rep",
         ),
-        ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "face of 3 corners with 2 of them at line 6"),
+        ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "face of 3 corners lists only 2 at line 6"),
         ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "index 3, but the file has 3 vertices at line 6"),
         ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 -1\n", "index -1, but the file has 3 vertices at line 6"),
         ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 x\n", "'x' is not an integer at line 6"),
@@ -631,10 +631,10 @@ def test_handles_may_pin_the_interior(put, tmp_path):
         ("0\n1\n5\n", "vertex 5 of a mesh with 5 at line 3; indices count from 0"),
         ("0\n-1\n", "vertex -1 of a mesh with 5 at line 2"),
         ("0\n1\n\n1\n", "vertex 1, already named at line 2, again at line 4"),
-        ("0\n1 2\n", "'1 2' is not an integer at line 2; one vertex index a line"),
+        ("0\n1 2\n", "'1 2' is not an integer at line 2; give one vertex index per line"),
         ("1.0\n", "'1.0' is not an integer at line 1"),
         (f"{10**30}\n", "far too large at line 1"),
-        ("# none\n\n", "names no vertices"),
+        ("# none\n\n", "lists no vertices"),
         (b"\xff\xfe0\0", "UTF-16"),
         (b"0\n\0", "a NUL byte at line 2"),
     ],
@@ -646,15 +646,15 @@ def test_malformed_handles_are_named_with_their_line(put, text, message):
 
 
 def test_problems_that_do_not_say_where_vertices_go(put, tmp_path):
-    with pytest.raises(MeshFileError, match="nothing says where"):
+    with pytest.raises(MeshFileError, match="the fixed vertices have no target positions"):
         io.read_problem(put(SQUARE + "f 1 2 3\nf 1 3 4\n"))
     with pytest.raises(MeshFileError, match="no such file"):
         io.read_problem(tmp_path)
     pinned = put("3\n", "handles.txt")
-    with pytest.raises(MeshFileError, match=r"no place in the plane for the fixed vertex 3 \(0-based\)"):
+    with pytest.raises(MeshFileError, match=r"no texture coordinates for the fixed vertex 3 \(0-based\)"):
         io.read_problem(put(SQUARE + SQUARE_VT + "f 1/1 2/2 3/3\n"), pinned)
     torn = put(SQUARE + SQUARE_VT + "vt 5 5\nf 1/1 2/2 3/3\nf 1/5 3/3 4/4\n")
-    with pytest.raises(MeshFileError, match=r"more than one place in the plane for the fixed vertex 0 "):
+    with pytest.raises(MeshFileError, match=r"more than one pair of texture coordinates for the fixed vertex 0 "):
         io.read_problem(torn)
     assert io.read_problem(torn, pinned).target.tolist() == [[0, 2]]
     closed = "f 1/1 3/3 2/2\nf 1/1 2/2 4/4\nf 2/2 3/3 4/4\nf 3/3 1/1 4/4\n"

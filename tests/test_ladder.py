@@ -235,7 +235,7 @@ class TestCtrlCWithAMapInHand:
 
 def test_an_energy_is_named_for_what_slides():
     V, F, fixed, target = chevron()
-    with pytest.raises(ValueError, match="name an energy"):
+    with pytest.raises(ValueError, match="give an energy"):
         solve_refining(Problem(V, F, fixed, target), slide=True)
 
 

@@ -292,7 +292,7 @@ def test_an_indefinite_matrix_is_an_event_and_the_next_one_is_solved(name, share
         for _ in range(2):
             with pytest.raises(NotPositiveDefinite, match="not positive definite"):
                 solver.factor(shifted.data)
-            with pytest.raises(RuntimeError, match="did not succeed"):
+            with pytest.raises(RuntimeError, match="was not called or failed"):
                 solver.solve(np.ones(225))
             solver.factor(A.data)
             np.testing.assert_allclose(both(A) @ solver.solve(np.ones(225)), 1, rtol=1e-10)
@@ -547,9 +547,7 @@ def test_malformed_patterns(indptr, indices, message):
 
 
 def test_unknown_name():
-    with pytest.raises(
-        ValueError, match=r"no linear solver 'umfpack'.*'auto', 'pardiso'.*available here are .*superlu"
-    ):
+    with pytest.raises(ValueError, match=r"unknown linear solver 'umfpack'.*'auto', 'pardiso'.*available: .*superlu"):
         make_solver([0, 1], [0], name="umfpack")
 
 
@@ -565,7 +563,7 @@ def test_unknown_name():
 def test_a_backend_that_is_not_installed(monkeypatch, backend, command):
     monkeypatch.setattr(backend, "present", classmethod(lambda cls: False))
     assert backend.name not in available()
-    with pytest.raises(ImportError, match=f"'{backend.name}' is not installed; available .*superlu.*: {command}"):
+    with pytest.raises(ImportError, match=f"'{backend.name}' is not installed; available: .*superlu.*: {command}"):
         make_solver([0, 1], [0], name=backend.name)
     assert make_solver([0, 1], [0]).name != backend.name
 
@@ -716,7 +714,7 @@ def test_rslab_does_its_trials_itself(monkeypatch):
         x = solve(scaled, rhs, "rslab") * scale
         np.testing.assert_allclose(both(A) @ x, rhs / scale, rtol=0, atol=1e-9)
         scaled.data[scaled.indptr[:-1]] *= 0.9
-        with pytest.raises(NotPositiveDefinite, match="rslab met a pivot"):
+        with pytest.raises(NotPositiveDefinite, match="rslab found a pivot"):
             solver_for(scaled, "rslab").factor(scaled.data)
 
 
@@ -871,7 +869,7 @@ def test_pardiso_with_all_threads():
             np.testing.assert_array_equal(x, solver.solve(columns))
         indefinite = A.data.copy()
         indefinite[A.indptr[:-1]] *= 0.9
-        with pytest.raises(NotPositiveDefinite, match="PARDISO met a pivot that is not positive"):
+        with pytest.raises(NotPositiveDefinite, match="PARDISO found a pivot that is not positive"):
             solver.factor(indefinite)
         solver.factor(A.data)
         solver.solve(rhs)
@@ -1114,7 +1112,7 @@ def test_a_library_that_does_not_load(monkeypatch, tmp_path):
     monkeypatch.setattr(mkl, "find_mkl", lambda: str(fake))
     mkl.load_mkl.cache_clear()
     try:
-        with pytest.raises(ImportError, match="does not load"):
+        with pytest.raises(ImportError, match="cannot load"):
             mkl.load_mkl()
         assert make_solver([0, 1], [0]).name != "pardiso"
         monkeypatch.setattr(mkl, "find_mkl", lambda: None)

@@ -179,7 +179,7 @@ def test_a_picture_that_is_missing_is_named_and_nothing_is_written(suffix, tmp_p
     (tmp_path / "in.obj").write_text(SQUARE + HALVES)
     (tmp_path / "text.png").write_text("no picture")
     before = sorted(tmp_path.iterdir())
-    for name, message in (("gone.png", "no such file"), ("text.png", "no PNG or JPEG")):
+    for name, message in (("gone.png", "no such file"), ("text.png", "not a PNG or JPEG")):
         for command in (("polish", tmp_path / "in.obj", "-o", tmp_path / f"out{suffix}"),
                         ("plot", tmp_path / "in.obj", "-o", tmp_path / "out.png")):  # fmt: skip
             status, _, told = qhm(*command, "--picture", tmp_path / name)
@@ -242,7 +242,7 @@ def test_commands_from_format_to_format(tmp_path, qhm):
     (tmp_path / "quad.obj").write_text(SQUARE + quads)
     status, said, told = qhm("polish", tmp_path / "quad.obj", "-o", tmp_path / "quad.glb")
     assert status == 0, said + told
-    assert "polygons, of which it has the triangles" in told
+    assert "polygons, which are written as triangles" in told
     status, _, told = qhm("flatten", tmp_path / "cat.stl", "-o", tmp_path / "flat.stl")
     assert status == 2
     assert ".stl files cannot be written" in told

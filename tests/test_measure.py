@@ -97,7 +97,7 @@ def test_values_that_cannot_be_written(stretched, tmp_path):
         io.write_per_triangle(tmp_path / "faces.txt", V, F, uv, {"one": one})
     with pytest.raises(ValueError, match="not a word"):
         io.write_per_triangle(tmp_path / "faces.csv", V, F, uv, {"one, two": one})
-    with pytest.raises(ValueError, match=r"one must have shape \(60,\), one for every triangle, not \(59,\)"):
+    with pytest.raises(ValueError, match=r"one must have shape \(60,\), one for each triangle, not \(59,\)"):
         io.write_per_triangle(tmp_path / "faces.csv", V, F, uv, {"one": one[1:]})
     with pytest.raises(ValueError, match="uv must have shape"):
         io.write_per_triangle(tmp_path / "faces.csv", V, F, uv[1:], {"one": one})
@@ -137,7 +137,7 @@ def test_pictures_of_what_is_no_map(tmp_path, monkeypatch, capsys, arguments):
     mesh = tmp_path / "mesh.obj"
     io.write_obj(mesh, io.MeshData([[0, 0, 0], [1, 0, 0], [0, 1, 1.0]], [[0, 1, 2]]))
     assert main([*arguments, str(mesh)]) == 2
-    assert capsys.readouterr().err.startswith(f"qhm {arguments[0]}: {mesh}: there is no map")
+    assert capsys.readouterr().err.startswith(f"qhm {arguments[0]}: {mesh}: has no map")
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.obj"]
 
 

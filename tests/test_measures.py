@@ -178,7 +178,7 @@ def test_malformed_input():
         distortion(V, F, V[:-1])
     with pytest.raises(ValueError, match=r"F must have shape \(f, 3\)"):
         distortion(V, F[:, :2], V)
-    with pytest.raises(ValueError, match="F must hold integer"):
+    with pytest.raises(ValueError, match="F must contain integer"):
         distortion(V, F * 1.0, V)
     with pytest.raises(ValueError, match="F refers to vertex 9, but there are only vertices 0 … 8"):
         distortion(V, F + 1, V)

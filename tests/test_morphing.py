@@ -92,7 +92,7 @@ def test_a_boundary_that_crosses_itself_is_told():
         (lambda p, F: (p, F, [-1], [[0, 0]]), "vertex -1"),
         (lambda p, F: (p, F, [10**6], [[0, 0]]), "vertex 1000000"),
         (lambda p, F: (p, F, [0], [[0, 0, 0]]), r"shape \(1, 2\)"),
-        (lambda p, F: (p, F, [0.5], [[0, 0]]), "moved_vertices must hold integer indices, not float64"),
+        (lambda p, F: (p, F, [0.5], [[0, 0]]), "moved_vertices must contain integer indices, not float64"),
         (lambda p, F: (p[:, :1], F, [0], [[0, 0]]), r"shape \(n, 2\)"),
         (lambda p, F: (p, F[:0], [0], [[0, 0]]), "the mesh has no triangles"),
         (lambda p, F: (p, F + 1, [0], [[0, 0]]), "F refers to vertex 16, but there are only vertices 0 … 15"),
@@ -101,9 +101,9 @@ def test_a_boundary_that_crosses_itself_is_told():
             lambda p, F: (np.where(np.arange(16)[:, None] == 5, np.nan, p), F, [0], [[0, 0]]),
             "points is not finite at vertex 5",
         ),
-        (lambda p, F: (p * (1, 0), F, [0], [[0, 0]]), "triangles 0, 1, .* without area"),
-        (lambda p, F: (np.where(np.arange(16)[:, None] == 5, 0.9, p), F, [0], [[0, 0]]), "folded over at edge.* rest="),
-        (lambda p, F: (np.concatenate([p, [[9, 9]]]), F, [len(p)], [[0, 0]]), "vertex 16 .*in no triangle"),
+        (lambda p, F: (p * (1, 0), F, [0], [[0, 0]]), "triangles 0, 1, .* degenerate"),
+        (lambda p, F: (np.where(np.arange(16)[:, None] == 5, 0.9, p), F, [0], [[0, 0]]), "folded at edge.* rest="),
+        (lambda p, F: (np.concatenate([p, [[9, 9]]]), F, [len(p)], [[0, 0]]), "vertex 16, but no triangle uses"),
     ],
 )
 def test_wrong_arguments(arguments, message):
@@ -213,7 +213,7 @@ def test_positions_from_a_table(plate, tmp_path):
         ("0,nan,0", "'nan' is not a finite number at line 1"),
         ("0,0,0,0", "not 3 numbers"),
         ("", "moves no vertex"),
-        ("3,0,0\n4,0,0\n3,1,0", "to.csv: names vertex 3 a second time at line 3"),
+        ("3,0,0\n4,0,0\n3,1,0", "to.csv: lists vertex 3 a second time at line 3"),
     ],
 )
 def test_tables_that_cannot_be_read(plate, tmp_path, capsys, text, message):
@@ -235,9 +235,9 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
 
     path, out = plate("grid.vtu"), tmp_path / "out.vtu"
     assert main(["morph", str(path), "-o", str(out), "--field", "wind"]) == 2
-    assert "no point data 'wind'; there are: 'T', 'displacement'" in capsys.readouterr().err
+    assert "no point data 'wind'; available: 'T', 'displacement'" in capsys.readouterr().err
     assert main(["morph", str(path), "-o", str(out), "--field", "T"]) == 2
-    assert "no vectors in the plane" in capsys.readouterr().err
+    assert "not plane vectors" in capsys.readouterr().err
     assert main(["morph", str(path), "-o", str(path), "--field", "displacement"]) == 2
     assert "would replace an input" in capsys.readouterr().err
     garbage = tmp_path / "garbage.msh"
@@ -245,7 +245,7 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
     with pytest.raises(MeshFileError, match="cannot be read"):
         read_fem(garbage)
     for name, cells, message in (
-        ("solid", [("tetra", [[0, 1, 2, 3]])], "cells of the kind tetrahedron"),
+        ("solid", [("tetra", [[0, 1, 2, 3]])], "cells of type tetrahedron"),
         ("line", [("line", [[0, 1]])], "has no triangles"),
         ("bent", [("triangle", [[0, 1, 2]])], "is not planar"),
     ):
@@ -253,7 +253,7 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
         with pytest.raises(MeshFileError, match=message):
             read_fem(tmp_path / f"{name}.vtu")
     with pytest.raises(
-        ValueError, match=r"points must have shape \(81, 2\), a position for every vertex, not \(3, 2\)"
+        ValueError, match=r"points must have shape \(81, 2\), one position for each vertex, not \(3, 2\)"
     ):
         write_fem(out, read_fem(path), np.zeros((3, 2)))
     assert not out.exists()

@@ -124,7 +124,7 @@ def test_a_boundary_that_cannot_arrive_leaves_the_mesh_as_it_was(ring):
     points, F, _walls, hole = ring
     mesh = MovingMesh(points, F, hole)
     before = mesh.advance(points[hole] + (0.1, 0))
-    with pytest.raises(RuntimeError, match="of the way only"):
+    with pytest.raises(RuntimeError, match=r"can be moved only .* of the way"):
         mesh.advance(points[hole] + (5, 0))
     np.testing.assert_array_equal(mesh.points, before)
     after = mesh.advance(points[hole] + (0.12, 0))
@@ -218,12 +218,12 @@ def test_units_do_not_matter(ring, exponent):
     ("change", "message"),
     [
         ({"points": [[0, 0], [1, 0], [np.nan, 1]]}, "points"),
-        ({"points": [[0, 0], [1, 0], [2, 0]]}, "without area"),
+        ({"points": [[0, 0], [1, 0], [2, 0]]}, "degenerate"),
         ({"moved": [7]}, "moved"),
         ({"moved": [[0]]}, r"moved_vertices must have shape \(k,\), not \(1, 1\)"),
         (
             {"points": [[0, 0], [1, 0], [0, 1], [0.1, 0.1]], "F": [[0, 1, 2], [1, 3, 2]]},
-            "folded over at edge \\(1, 2\\)",
+            "folded at edge \\(1, 2\\)",
         ),
         ({"energy": "arap"}, "energy must be"),
         ({"settle": 0, "slide": True}, "settle"),

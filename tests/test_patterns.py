@@ -129,7 +129,7 @@ def test_pieces_need_room_for_their_allowances(tmp_path):
     V, F = surfaces.grid(2, 2)
     uv, both = np.concatenate([V, V + np.array([1.5, 0])]), np.concatenate([F, F + len(V)])
     assert len(pattern(both, uv, allowance=0.24).cut) == 2
-    with pytest.raises(ValueError, match="overlap: lay them out farther apart"):
+    with pytest.raises(ValueError, match="overlap: place them farther apart"):
         pattern(both, uv, allowance=0.26)
     with pytest.raises(ValueError, match="overlap"):
         write_pattern(tmp_path / "none.svg", both, uv, allowance=0.26)
@@ -142,7 +142,7 @@ def test_pieces_need_room_for_their_allowances(tmp_path):
         (1.0, {"unit": "furlong"}, "unit must be one of mm, cm, m, in, not 'furlong'"),
         (1.0, {"allowance": -1}, "allowance must be a finite number of at least 0"),
         (1.0, {"allowance": np.nan}, "allowance must be a finite number of at least 0"),
-        (-1.0, {}, "overlaps itself cannot be cut out. Not injective"),
+        (-1.0, {}, "overlaps itself, so its pattern cannot be cut out. Not injective"),
     ],
 )
 def test_what_makes_no_pattern_is_refused(ring, tmp_path, change, options, message):
@@ -154,9 +154,9 @@ def test_what_makes_no_pattern_is_refused(ring, tmp_path, change, options, messa
 
 def test_file_names_say_the_format(ring, tmp_path):
     V, F = ring
-    with pytest.raises(ValueError, match=r"as \.svg or \.dxf, not \.pdf"):
+    with pytest.raises(ValueError, match=r"must be \.svg or \.dxf, not \.pdf"):
         write_pattern(tmp_path / "ring.pdf", F, V)
-    with pytest.raises(ValueError, match="not without an ending"):
+    with pytest.raises(ValueError, match="not without a suffix"):
         write_pattern(tmp_path / "ring", F, V)
     with pytest.raises(OutputError, match="there is no directory"):
         write_pattern(tmp_path / "nowhere" / "ring.svg", F, V)
@@ -177,5 +177,5 @@ def test_missing_packages_are_named(ring, tmp_path, monkeypatch, package, name, 
 
 def test_coordinates_that_no_double_holds_in_mm_are_refused():
     V, F = surfaces.grid(2, 2)
-    with pytest.raises(ValueError, match=r"beyond the largest double; is m its unit\?"):
+    with pytest.raises(ValueError, match=r"exceed double precision: check the unit m"):
         pattern(F, 1e306 * V, unit="m")

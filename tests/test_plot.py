@@ -333,7 +333,7 @@ def test_an_animation_shows_all_of_every_frame(planar, tmp_path):
 
 def test_animation_says_what_is_wrong(planar, tmp_path):
     V, F, _ = planar
-    with pytest.raises(ValueError, match=r"as \.gif or \.mp4"):
+    with pytest.raises(ValueError, match=r"must be \.gif or \.mp4"):
         save_animation(tmp_path / "a.avi", V, F, [("one", V)])
     with pytest.raises(ValueError, match="no frames"):
         save_animation(tmp_path / "a.gif", V, F, [])

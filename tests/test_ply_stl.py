@@ -104,13 +104,13 @@ def test_an_obj_as_ply(tmp_path):
     text = "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0 0 0 .5\nvn 0 0 1\nvn 0 1 0\nusemtl a\nf 1//1 2//2 3//1\n"
     (tmp_path / "in.obj").write_text(text)
     mesh = io.read_mesh(tmp_path / "in.obj")
-    assert io.not_held("out.ply", mesh) == ["groups, names of materials and other statements"]
+    assert io.not_held("out.ply", mesh) == ["groups, material names and other statements"]
     io.write_mapped(tmp_path / "out.ply", mesh)
     again = io.read_mesh(tmp_path / "out.ply")
     assert again.normals == b"vn 0.0 0.0 1.0\nvn 0.0 1.0 0.0\nvn 0.0 0.0 1.0\n"
     np.testing.assert_array_equal(again.extra, mesh.extra)
     (tmp_path / "in.obj").write_text(text + "f 1//2 3//1 2//1\n")
-    assert "normals, of which a vertex has several" in io.not_held("out.ply", io.read_mesh(tmp_path / "in.obj"))
+    assert "normals, because some vertices have several" in io.not_held("out.ply", io.read_mesh(tmp_path / "in.obj"))
 
 
 @pytest.mark.parametrize(
@@ -121,12 +121,12 @@ def test_an_obj_as_ply(tmp_path):
         (MIXED.replace(b"element vertex 5", b"element vertex 500000000000000000"), "too early"),
         (swapped(MIXED).replace(b"element vertex 5", b"element vertex 999999999999999"), "too early"),
         (MIXED.replace(b"element vertex 5", b"element vertex -5"), "element vertex -5"),
-        (MIXED.replace(b"end_header", b"end_head"), "no end"),
+        (MIXED.replace(b"end_header", b"end_head"), "its header does not end"),
         (MIXED.replace(b"uchar float texcoord", b"float float texcoord"), "its header has"),
         (MIXED.replace(b"property int label", b"property int x"), "two properties"),
         (MIXED.replace(b"4 0 1 2 3", b"4 0 1 2 9"), "refers to vertex 9"),
         (MIXED.replace(b"4 0 1 2 3", b"4 0 1 2 1"), "vertex twice"),
-        (MIXED.replace(b"3 3 2 4 6", b"-3 3 2 4 6"), "no uchar"),
+        (MIXED.replace(b"3 3 2 4 6", b"-3 3 2 4 6"), "not uchar"),
         (
             swapped(MIXED).replace(b"list uchar int", b"list char int").replace(b"\4\0\0\0\0", b"\xff\0\0\0\0"),
             "of -1 num",
@@ -161,7 +161,7 @@ def test_stl_is_welded(tmp_path):
             np.testing.assert_array_equal(
                 np.unique(mesh.F, return_index=True)[1], np.sort(np.unique(F, return_index=True)[1])
             )
-    with pytest.raises(MeshFileError, match=r"stl files cannot be written; supported are \.obj"):
+    with pytest.raises(MeshFileError, match=r"stl files cannot be written; supported: \.obj"):
         io.write_map(tmp_path / "out.stl", mesh, mesh.V[:, :2])
 
 

@@ -268,7 +268,7 @@ def test_an_energy_of_ones_own_that_is_no_number_is_named(spoilt, words):
             return values
 
     V, F, uv, fixed = bowl()
-    with pytest.raises(ValueError, match=rf"Spoilt: {words} no number \(NaN\) at triangles 3, 50, where \|p\| = "):
+    with pytest.raises(ValueError, match=rf"Spoilt: {words} NaN at triangles 3, 50, where \|p\| = "):
         polish(V, F, uv, fixed=fixed, energy=Spoilt())
 
 
@@ -362,7 +362,7 @@ def test_starts_that_are_not_injective():
     moved = uv.copy()
     inner = int(np.setdiff1d(np.arange(len(V)), fixed)[0])
     moved[inner] = 5, 5
-    with pytest.raises(ValueError, match=r"uv is not injective: triangles \d+, .* inverted or without area"):
+    with pytest.raises(ValueError, match=r"uv is not injective: triangles \d+, .* inverted or degenerate"):
         polish(V, F, moved, fixed=fixed)
     moved[inner] = np.nan, 0
     with pytest.raises(ValueError, match="uv is not finite at vertex"):
@@ -384,7 +384,7 @@ def test_malformed_input():
     with pytest.raises(ValueError, match="energy must be one of symmetric-dirichlet, mips"):
         polish(V, F, uv, fixed=fixed, energy="beauty")
     for energy in (ARAP(), AreaPreserving(), MassSpring(V, F)):
-        with pytest.raises(ValueError, match=f"{type(energy).__name__} is no barrier"):
+        with pytest.raises(ValueError, match=f"{type(energy).__name__} is not a barrier energy"):
             polish(V, F, uv, fixed=fixed, energy=energy)
     weights = np.ones(len(F))
     weights[3] = 0
@@ -402,12 +402,12 @@ def test_barriers_may_come_as_objects():
 def test_options_that_make_no_sense():
     V, F, uv, fixed = bowl()
     for wrong in (-1, 2.5, "many", None):
-        with pytest.raises(ValueError, match="max_iterations must be a whole number of at least 0"):
+        with pytest.raises(ValueError, match="max_iterations must be an integer of at least 0"):
             polish(V, F, uv, fixed=fixed, max_iterations=wrong)
     for wrong in (-1, np.nan, np.inf, "small", None):
         with pytest.raises(ValueError, match="tolerance must be a finite number of at least 0"):
             polish(V, F, uv, fixed=fixed, tolerance=wrong)
-    with pytest.raises(ValueError, match="weights must hold real numbers, not <U5"):
+    with pytest.raises(ValueError, match="weights must contain real numbers, not <U5"):
         polish(V, F, uv, fixed=fixed, weights=["heavy"] * len(F))
 
     class FirstOnly(Energy):

@@ -63,7 +63,7 @@ def test_values_follow():
     refined = refine(V, F, edges(F, len(V)).interior[::5])
     np.testing.assert_allclose(refined.extend(V), refined.V)
     np.testing.assert_allclose(refined.extend(V[:, 0]), refined.V[:, 0])
-    with pytest.raises(ValueError, match="one a vertex"):
+    with pytest.raises(ValueError, match="one for each vertex"):
         refined.extend(refined.V)
 
 
@@ -115,10 +115,13 @@ def test_nothing_to_split():
         ([[0, 7]], r"\(0, 7\): not an edge"),
         ([[-1, 2]], r"\(-1, 2\): not an edge"),
         ([[2, 2]], r"\(2, 2\): not an edge"),
-        ([[0.0, 2.0]], "edges must hold integer indices, not float64"),
+        ([[0.0, 2.0]], "edges must contain integer indices, not float64"),
         ([0, 2], r"edges must have shape \(k, 2\), not \(2,\)"),
         ([[0, 2, 3]], r"edges must have shape \(k, 2\), not \(1, 3\)"),
-        (np.array([[0, 2**64 - 1]], dtype=np.uint64), "edges refers to vertex 18446744073709551615, which no mesh"),
+        (
+            np.array([[0, 2**64 - 1]], dtype=np.uint64),
+            "edges refers to vertex 18446744073709551615, which is not a valid index",
+        ),
     ],
 )
 def test_wrong_edges_are_named(pairs, message):
@@ -129,14 +132,14 @@ def test_wrong_edges_are_named(pairs, message):
 def test_wrong_triangles_are_refused():
     with pytest.raises(ValueError, match="F refers to vertex 4, but there are only vertices 0 … 3"):
         refine(TWO[0], [[0, 1, 4]], [])
-    with pytest.raises(ValueError, match="F must hold integer"):
+    with pytest.raises(ValueError, match="F must contain integer"):
         refine(TWO[0], [[0.5, 1, 2]], [])
 
 
 @pytest.mark.parametrize(
     ("V", "message"),
     [
-        (np.array(TWO[0]) + 1j, "V must hold real numbers"),
+        (np.array(TWO[0]) + 1j, "V must contain real numbers"),
         (TWO[0][0], r"V must have shape \(n, 2\) or \(n, 3\)"),
         (np.full((4, 2), np.nan), "V is not finite at vertices 0, 1, 2, 3"),
     ],

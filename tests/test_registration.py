@@ -129,7 +129,7 @@ def test_pixels_that_are_held_stay():
         nearest_invertible(field, fixed=np.ones((24, 24), dtype=bool))
     swapped = np.zeros((5, 7, 2))
     swapped[2, 2, 0], swapped[2, 4, 0] = 2, -2
-    with pytest.raises(RuntimeError, match=r"keeps what is fixed; what folds still has pixels \(1, 2\), "):
+    with pytest.raises(RuntimeError, match=r"keeps the fixed pixels; folds remain at pixels \(1, 2\), "):
         nearest_invertible(swapped, fixed=np.hypot(swapped[..., 0], swapped[..., 1]) > 0)
 
 
@@ -147,7 +147,7 @@ def test_noise_far_away_is_mended_as_doubles_have_it():
     assert not fold_free(field, spacing=0.1).all()
     mended = nearest_invertible(field, spacing=0.1, min_jacobian=0)
     assert fold_free(mended.field, spacing=0.1).all()
-    with pytest.raises(RuntimeError, match="rounding folds the field"):
+    with pytest.raises(RuntimeError, match="rounding folds the new field"):
         nearest_invertible(field + 1e16, spacing=0.1)
 
 
@@ -228,10 +228,10 @@ LOST[1, 4, 0], LOST[3, 2, 1] = np.nan, np.inf
     ("field", "options", "message"),
     [
         (LOST, {}, r"field is not finite at pixels \(1, 4\), \(3, 2\), row and column"),
-        (np.zeros((2, 5, 6)), {}, r"not \(2, 5, 6\): hand over numpy.moveaxis\(field, 0, -1\)"),
-        (np.zeros((4, 5, 6, 3)), {}, "fields of volumes are not handled"),
+        (np.zeros((2, 5, 6)), {}, r"not \(2, 5, 6\): pass numpy.moveaxis\(field, 0, -1\)"),
+        (np.zeros((4, 5, 6, 3)), {}, "fields on volumes are not supported"),
         (np.zeros((1, 6, 2)), {}, "at least 2 × 2 pixels"),
-        (WRONG + 1j, {}, "field must hold real numbers"),
+        (WRONG + 1j, {}, "field must contain real numbers"),
         (WRONG, {"spacing": (1, 0)}, "spacing must be a positive number, or two"),
         (WRONG, {"spacing": (1, 1, 1)}, "spacing must be a positive number, or two"),
     ],
@@ -246,5 +246,5 @@ def test_wrong_options():
         nearest_invertible(WRONG, min_jacobian=1)
     with pytest.raises(ValueError, match=r"min_jacobian must be at least 0 and less than 1, not '0\.5'"):
         nearest_invertible(WRONG, min_jacobian="0.5")
-    with pytest.raises(ValueError, match=r"fixed must be an array of bool of shape \(5, 6\)"):
+    with pytest.raises(ValueError, match=r"fixed must be a bool array of shape \(5, 6\)"):
         nearest_invertible(WRONG, fixed=[0, 1])

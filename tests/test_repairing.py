@@ -254,7 +254,7 @@ class TestBeyondRepair:
         result = repair(V, F, uv, FT=FT)
         assert [island.mirrored for island in result.islands] == [False, False, True]
         assert result.injective
-        assert "mirrored, and left so" in result.summary()
+        assert "mirrored, left unchanged" in result.summary()
         assert np.array_equal(result.uv, uv)
 
     def test_mirrored_and_turned_over(self):
@@ -287,7 +287,7 @@ class TestBeyondRepair:
         uv[2] = np.nan
         result = repair(V, F, uv)
         assert not result.injective
-        assert result.islands[0].reason == "No finite place for the boundary vertex 2."
+        assert result.islands[0].reason == "No finite position for the boundary vertex 2."
 
     def test_vertex_used_twice(self):
         V, F = grid(3, 3)
@@ -399,7 +399,7 @@ class TestCommand:
         assert run("repair", path, "-o", out) == 1
         said = capsys.readouterr().out
         assert "32 inverted before, 32 now; 0 vertices moved" in said
-        assert "wound against the mesh" in said
+        assert "has the opposite orientation to the mesh" in said
         assert np.array_equal(io.map_of(io.read_obj(out)), V[:, ::-1])
 
     @pytest.mark.parametrize(
@@ -408,7 +408,7 @@ class TestCommand:
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.obj", "no face has texture coordinates"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3\n", "out.obj", "at all three corners"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 4 2\n", "out.obj", "uses a vertex twice"),
-            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", "OFF has no room for seams"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", "OFF does not support seams"),
             (None, "out.obj", "there is no such file"),
         ],
     )

@@ -180,9 +180,9 @@ def test_plots_say_what_is_wrong():
         RESULT.plot("maps")
     with pytest.raises(ValueError, match="measure must be one of"):
         RESULT.plot("distortion", measure="stretch")
-    with pytest.raises(ValueError, match="does not know its surface"):
+    with pytest.raises(ValueError, match="the result has no surface"):
         replace(RESULT, V=None).plot()
-    with pytest.raises(ValueError, match="does not know its problem"):
+    with pytest.raises(ValueError, match="has no problem to draw"):
         Diagnosis(()).plot()
     with pytest.raises(ValueError, match="no history"):
         replace(RESULT, history=[]).plot("convergence")

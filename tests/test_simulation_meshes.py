@@ -114,7 +114,7 @@ def test_other_meshes_that_are_none(flap, name):
     for mesh, message in ((points[:-1], r"\(n, 2\)|shape"), (lost, f"{name} is not finite at vertex 7")):
         with pytest.raises(ValueError, match=message):
             morph(points, F, body, points[body], **{name: mesh})
-    with pytest.raises(ValueError, match="without area"):
+    with pytest.raises(ValueError, match="degenerate"):
         morph(points, F, body, points[body], rest=points * (1, 0))
 
 
@@ -178,7 +178,7 @@ def test_quadrilaterals_that_the_boundary_inverts_are_named():
     morphed = morph(points, F, [corner], [[0.9, 0.9]])
     assert morphed.inverted.tolist() == morphed.forbidden.tolist() == [len(F) - 1]
     assert not morphed.valid
-    assert "wherever the others go: quadrilateral 35" in morphed.summary()
+    assert "Inverted for every position of the free nodes: quadrilateral 35" in morphed.summary()
     assert json.loads(json.dumps(morphed.to_dict()))["forbidden"] == [35]
 
 

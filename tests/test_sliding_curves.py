@@ -146,15 +146,15 @@ def test_transformed():
 @pytest.mark.parametrize(
     ("pieces", "message"),
     [
-        ([[(0, 0), ("a", 0)]], "piece 0 of the curve must hold real numbers"),
+        ([[(0, 0), ("a", 0)]], "piece 0 of the curve must contain real numbers"),
         ([[(0, 0), (1,)]], "piece 0 of the curve is not an array: its rows differ in length"),
         ([], "at least one piece"),
         ([[(0, 0)]], r"piece 0 of the curve must have shape \(2, 2\), \(3, 2\) or \(4, 2\), not \(1, 2\)"),
         ([[(0, 0), (1, 0)], [(1, 0), (np.nan, 1)]], "piece 1 of the curve is not finite"),
         ([[(0, 0), (1, 0)], [(2, 0), (2, 1)]], "pieces 0 and 1 of the curve .* do not meet"),
-        ([[(1, 1), (1, 1)]], "leaves the range"),
-        ([[(0, 0), (1e200, 0)]], "leaves the range"),
-        ([[(0, 0), (1e-200, 0)]], "leaves the range"),
+        ([[(1, 1), (1, 1)]], "is outside the supported range"),
+        ([[(0, 0), (1e200, 0)]], "is outside the supported range"),
+        ([[(0, 0), (1e-200, 0)]], "is outside the supported range"),
         ([Arc((0, 0), (1, 0, 0), (0, 1), 0, 1)], "an arc has a centre and two axes"),
         ([Arc((0, 0), (1, 0), (0, 1), 0, np.inf)], "piece 0 of the curve is not finite"),
     ],
@@ -310,5 +310,5 @@ def test_a_drawing_keeps_its_arcs(tmp_path):
 def test_a_drawing_that_cannot_be(tmp_path):
     path = tmp_path / "drawing.svg"
     path.write_text('<svg xmlns="http://www.w3.org/2000/svg"><circle r="0"/></svg>')
-    with pytest.raises(MeshFileError, match="draws"):
+    with pytest.raises(MeshFileError, match="has no path or shape"):
         outline_curves(path)

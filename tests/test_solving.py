@@ -296,7 +296,7 @@ class TestNoMap:
 
     @pytest.mark.parametrize("wrong", [0, -5, 2.5, "many", np.nan])
     def test_wrong_number_of_iterations(self, wrong):
-        with pytest.raises(ValueError, match="max_iterations must be a whole number"):
+        with pytest.raises(ValueError, match="max_iterations must be an integer"):
             injective_map(*star_problem(n=60), max_iterations=wrong)
 
     def test_a_strategy_of_ones_own_that_ends_early_has_not_settled(self):
@@ -306,8 +306,8 @@ class TestNoMap:
     @pytest.mark.parametrize(
         ("start", "words"),
         [
-            ("here", "start must hold real numbers"),
-            (np.zeros((80, 2), dtype=complex), "start must hold real numbers"),
+            ("here", "start must contain real numbers"),
+            (np.zeros((80, 2), dtype=complex), "start must contain real numbers"),
             ([[0.0], [1.0, 2.0]], "start is not an array"),
             (np.zeros((80, 3)), r"start must have shape \(80, 2\)"),
             (np.full((80, 2), np.inf), "start is not finite at vertices 0, 1"),
@@ -541,13 +541,13 @@ def test_a_solve_within_a_callback_disturbs_nothing():
 
 @pytest.mark.parametrize(
     ("mu", "words"),
-    [(1.0, "not below 1 in modulus at triangles 0, 1"), (np.nan, "not below 1"), ("x", "one a triangle")],
+    [(1.0, "not below 1 in modulus at triangles 0, 1"), (np.nan, "not below 1"), ("x", "one for each triangle")],
 )
 def test_quasi_harmonic_map_checks_its_tensors(mu, words):
     problem = Problem(*star_problem(n=60))
     with pytest.raises(ValueError, match=words):
         quasi_harmonic_map(problem, np.full(len(problem.F), mu))
-    with pytest.raises(ValueError, match="one a triangle"):
+    with pytest.raises(ValueError, match="one for each triangle"):
         quasi_harmonic_map(problem, np.zeros(3))
     with pytest.raises(ValueError, match="reference must be one of"):
         quasi_harmonic_map(problem, reference="square")

@@ -148,7 +148,7 @@ def test_pages_do_not_meet_and_one_that_crashes_takes_no_other(running):
         assert hear(other, "map", state="settled").header["outline"] == "rect:1x1"
         first = min(children(), key=lambda pid: os.stat(f"/proc/{pid}").st_ctime)
         os.kill(first, signal.SIGKILL)
-        assert "ended by itself" in hear(one, "note").header["text"]
+        assert "the process of this page has ended" in hear(one, "note").header["text"]
         with pytest.raises(ConnectionClosed):
             hear(one, "map")
         other.send(encode({"do": "outline", "to": "disk"}))

@@ -176,7 +176,7 @@ def test_few_vertices_between_chosen_corners(cat):
         ({5: (0.5, 0.5)}, r"vertex 405 goes to \(0.5, 0.5\), 0.5 off the outline at \(0.5, 0\)"),
         ({5: (0.5, np.nan)}, "vertex 405 goes to a corner's number or a point"),
         ({5: "x"}, "could not convert string"),
-        ({5: 0, 9: (0, 0)}, "vertices 405 and 409 go to the same place"),
+        ({5: 0, 9: (0, 0)}, "vertices 405 and 409 have the same target position"),
     ],
 )
 def test_corners_that_cannot_be(cat, corners, message):
@@ -206,7 +206,7 @@ def test_corners_are_numbered_as_the_outline_was_given(cat, tmp_path, shift):
         assert [tuple(p) for p in where[list(order or (d, c, b, a))].tolist()] == sharp
         where = placed(V, F, contour, corners={a: 2})
         assert tuple(where[a]) == sharp[2]
-    with pytest.raises(ValueError, match=r"in this order around the outline, .* to its left: name them the other way"):
+    with pytest.raises(ValueError, match=r"in this order around the outline, .* to its left: reverse their order"):
         boundary_to(V, F, ring[::-1], corners=[a, b, c, d])
 
 
@@ -258,7 +258,10 @@ def test_too_few_vertices_for_the_shape_are_refused():
     arm = (0.2 + turn / 10)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     spiral = np.concatenate([arm, 1.15 * arm[::-1]])
     V, F = surfaces.disk(3)
-    with pytest.raises(ValueError, match=r"the boundary is no outline itself: boundary loop 0 meets itself.*too few"):
+    with pytest.raises(
+        ValueError,
+        match=r"the boundary placed along the outline crosses or touches itself: boundary loop 0 meets itself.*too few",
+    ):
         boundary_to(V, F, spiral)
     V, F = surfaces.disk(20)
     fixed, target = boundary_to(V, F, spiral)
@@ -479,9 +482,9 @@ def test_a_point_says_which_loop_goes_where():
     assert np.linalg.norm(where[outer]) == pytest.approx(0.5, rel=1e-3)
     with pytest.raises(ValueError, match="two boundary loops have vertices that go to the same contour"):
         boundary_to(V, F, circles, corners={inner: (1, 0), outer: (0, 1)})
-    with pytest.raises(ValueError, match="goes to another contour than others of its boundary loop"):
+    with pytest.raises(ValueError, match="goes to a different contour than other vertices of its boundary loop"):
         boundary_to(V, F, circles, corners={inner: (1, 0), inner + 1: (0.5, 0)})
-    with pytest.raises(ValueError, match="those of one boundary loop, but 2 loops have some"):
+    with pytest.raises(ValueError, match="must lie on one boundary loop, but 2 loops have some"):
         boundary_to(V, F, circles, corners=[inner, outer])
 
 
@@ -782,23 +785,23 @@ def test_flat_triangles_are_told_of_which_file(qhm):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--corners", "3"], "--corners says how the boundary goes to an outline: name one by --to"),
-        (["--font", "x"], "--font says how"),
-        (["--cut"], "--cut says how"),
-        (["--to", "lettr:G"], "'lettr:G' is no outline that is known"),
+        (["--corners", "3"], "--corners applies only to an outline: give one by --to"),
+        (["--font", "x"], "--font applies only to an outline"),
+        (["--cut"], "--cut applies only to an outline"),
+        (["--to", "lettr:G"], "unknown outline 'lettr:G'"),
         (["--to", "none.svg"], "none.svg: there is no such file"),
-        (["--to", "disk", "--font", "x"], "a font has no meaning for 'disk'"),
+        (["--to", "disk", "--font", "x"], "'disk' takes no font"),
         (["--to", "rect:1x1", "--corners", "0"], "in.obj --to rect:1x1: vertex 0 in corners, but not on the boundary"),
         (["--to", "letter:i"], "in.obj --to letter:i: the outline is in 2 separate pieces"),
         (["--to", "rect:0x1"], "--to rect:0x1: width must be positive"),
-        (["--to", "disk", "--corners", "a"], "--corners a: 'a' is none of V, V:K and V:X:Y"),
-        (["--to", "disk", "--corners", "1,,2"], "'' is none of V"),
-        (["--to", "disk", "--corners", "1:2:3:4"], "'1:2:3:4' is none of V"),
-        (["--to", "disk", "--corners", "1,2:3"], "where does vertex 1 go?"),
+        (["--to", "disk", "--corners", "a"], "--corners a: 'a' is not one of V, V:K and V:X:Y"),
+        (["--to", "disk", "--corners", "1,,2"], "'' is not one of V"),
+        (["--to", "disk", "--corners", "1:2:3:4"], "'1:2:3:4' is not one of V"),
+        (["--to", "disk", "--corners", "1,2:3"], "vertex 1 has no corner or point"),
         (["--to", "disk", "--corners", "1:2,1:3"], "vertex 1 is named more than once"),
         (["--to", "disk", "--corners", "1,1"], "vertex 1 is named more than once"),
-        (["--corner-angle", "0"], "--corner-angle says how"),
-        ([], "in.obj: no face refers to texture coordinates (vt), which would say where the boundary goes: "),
+        (["--corner-angle", "0"], "--corner-angle applies only to an outline"),
+        ([], "in.obj: no face refers to texture coordinates (vt), so the boundary has no targets: "),
     ],
 )
 def test_wrong_calls(qhm, options, message):

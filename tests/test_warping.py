@@ -143,7 +143,7 @@ def test_a_warp_that_cannot_be_says_what_to_do():
         ((np.zeros((9, 9)), [[1, np.nan]], [[1, 1]]), "landmarks is not finite at point 0"),
         (
             (np.zeros((9, 9)), [[1, 1], [1, 1]], [[1, 1], [2, 2]]),
-            r"landmarks: points 0, 1 are at the same place, \(1.0, 1.0\)",
+            r"landmarks: points 0, 1 have the same position, \(1.0, 1.0\)",
         ),
         ((np.zeros((9, 9)), [[1, 1]], [[1, 1], [2, 2]]), "as many rows"),
     ],
@@ -252,14 +252,14 @@ def test_the_plate_has_the_gradient_it_says():
     [
         ({"weights": [1, 1]}, r"weights must have shape \(1,\)"),
         ({"weights": [0]}, "the weight is not positive at landmark 0"),
-        ({"weights": [1], "smoothness": 0}, "weights need a smoothness that is positive"),
+        ({"weights": [1], "smoothness": 0}, "weights need a positive smoothness"),
         ({"smoothness": -1}, "smoothness must be a finite number"),
-        ({"resolution": 1}, "resolution must be a whole number of at least 2"),
-        ({"curves": [([[1, 1], [2, 2]],)]}, "curve 0 must be two polylines, the one that goes and where to, not 1"),
+        ({"resolution": 1}, "resolution must be an integer of at least 2"),
+        ({"curves": [([[1, 1], [2, 2]],)]}, "curve 0 must be two polylines, before and after, not 1"),
         ({"curves": [([[1, 1]], [[1, 1], [2, 2]])]}, "curve 0 must be two polylines"),
         ({"curves": [([[1, 1], [np.nan, 2]], [[1, 1], [2, 2]])]}, "curve 0 is not finite at point 1"),
         ({"curves": [([[1, 1], [1, 1]], [[1, 1], [2, 2]])]}, "curve 0 has no length"),
-        ({"curves": [([[1, 1], [5, 1]], [[1, 1], [2, 20]])]}, "curve 0, after: points .* not inside the picture"),
+        ({"curves": [([[1, 1], [5, 1]], [[1, 1], [2, 20]])]}, "curve 0, after: points .* not inside the image"),
     ],
 )
 def test_wrong_landmark_options(options, message):

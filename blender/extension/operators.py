@@ -67,7 +67,7 @@ class ChosenWorking(UvWorking):
 
 
 class QHM_OT_check(UvWorking):
-    """Select the faces whose UVs are inverted or without area, or lie on others; decided exactly."""
+    """Select the faces whose UVs are inverted or degenerate, or lie on others; decided exactly."""
 
     bl_idname = "uv.qhm_check"
     bl_label = "Check UVs"

@@ -23,7 +23,7 @@ def test_torch():
         ValueError, match=r"V is a Tensor that requires grad.*V\.detach\(\), or see quasiharmonic\.torch"
     ):
         flatten(torch.tensor(V, requires_grad=True), F)
-    with pytest.raises(ValueError, match=r"uv is a Tensor on meta: hand over uv\.cpu\(\)"):
+    with pytest.raises(ValueError, match=r"uv is a Tensor on meta: pass uv\.cpu\(\)"):
         distortion(V, F, torch.empty(V.shape, device="meta"))
 
 

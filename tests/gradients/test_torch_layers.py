@@ -135,11 +135,11 @@ def test_what_is_refused():
         layers.injective_map(problem, target=target.float())
     with pytest.raises(TypeError, match=r"mu must be of torch.complex128, not torch.float64"):
         layers.quasi_harmonic_map(problem, torch.zeros(len(problem.F), dtype=torch.float64))
-    with pytest.raises(ValueError, match="target is on meta, and maps are made on the CPU"):
+    with pytest.raises(ValueError, match="target is on meta, and maps are computed on the CPU"):
         layers.injective_map(problem, target=target.to("meta"))
     with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\), or that with a batch in front, not \(3"):
         layers.injective_map(problem, target=target[:3])
-    with pytest.raises(ValueError, match="fixed and target belong together"):
+    with pytest.raises(ValueError, match="give fixed and target together"):
         layers.flatten(leaf(problem.V), problem.F, target=target)
     with pytest.raises(NotImplementedError, match=r"leave torch\.func\.vmap out"):
         torch.func.vmap(lambda target: layers.quasi_harmonic_map(problem, target=target))(target[None])

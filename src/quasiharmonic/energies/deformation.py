@@ -173,7 +173,7 @@ class DeformationEnergy:
                 raise ValueError(
                     f"{type(self.energy).__name__}: the {what} is {how} at {where}, "
                     f"where |p| = {abs(d.p[bad[0]]):.6g} and |q| = {abs(d.q[bad[0]]):.6g} at the first; "
-                    "quasiharmonic.energies.derivatives.check_energy tries an energy"
+                    "check an energy with quasiharmonic.energies.derivatives.check_energy"
                 )
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
@@ -196,7 +196,9 @@ class DeformationEnergy:
     def _check_places(self, n: int) -> None:
         """Raise a ValueError unless ``n`` positions cover all vertices of the triangles."""
         if n < self._least_places:
-            raise ValueError(f"the triangles refer to vertex {self._least_places - 1}, but there are only {n} places")
+            raise ValueError(
+                f"the triangles refer to vertex {self._least_places - 1}, but there are only {n} positions"
+            )
 
 
 @compiled
@@ -272,7 +274,7 @@ def _edges(corners: NDArray[np.integer], w: ComplexArray) -> tuple[ComplexArray,
 def _weights(weights: ArrayLike, f: int) -> FloatArray:
     array = real_array("weights", weights)
     if array.shape != (f,):
-        raise ValueError(f"weights must have shape ({f},), one for every triangle, not {array.shape}")
+        raise ValueError(f"weights must have shape ({f},), one for each triangle, not {array.shape}")
     bad = np.flatnonzero(~((array >= 0) & (array < np.inf)))
     if bad.size:
         raise ValueError(f"the weight is negative or not finite at {named('triangle', 'triangles', bad)}")
@@ -289,7 +291,7 @@ def positive_weights(weights: ArrayLike, f: int) -> FloatArray:
     """
     array = real_array("weights", weights)
     if array.shape != (f,):
-        raise ValueError(f"weights must have shape ({f},), one for every triangle, not {array.shape}")
+        raise ValueError(f"weights must have shape ({f},), one for each triangle, not {array.shape}")
     bad = np.flatnonzero(~(array > 0))
     if bad.size:
         raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")

@@ -71,8 +71,9 @@ class Sampling:
         """Return the parameters as a sentence."""
         others = "all others" if self.targets is None else f"at most {self.targets} others"
         return (
-            f"pairs of {self.sources} vertices with {others} at most {self.rings} edges away; along the surface, by "
-            f"chains of straight segments that cross at most {self.crossings} edges each, against straight in the plane"
+            f"pairs of {self.sources} vertices with {others} at most {self.rings} edges away. Surface distances are "
+            f"lengths of polylines whose segments cross at most {self.crossings} edges each; plane "
+            f"distances are straight"
         )
 
 

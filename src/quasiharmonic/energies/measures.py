@@ -195,7 +195,7 @@ class Distortion(Displayable):
             if not np.isnan(values).all():
                 one = self.summary(name)
                 lines.append(f"{name:>19} {one.median:>10.4g} {one.p95:>10.4g} {one.maximum:>10.4g}")
-        for found, what in ((self.inverted, "inverted or without area"), (self.flat, "without area in the rest mesh")):
+        for found, what in ((self.inverted, "inverted or degenerate"), (self.flat, "degenerate in the rest mesh")):
             if found.size:
                 lines.append(f"{len(found):,} of {len(self.F):,} triangles {what}")
         return "\n".join(lines)
@@ -203,9 +203,9 @@ class Distortion(Displayable):
     def short_repr(self) -> str:
         triangles = counted("triangle", "triangles", len(self.F))
         if self.inverted.size:
-            return f"{triangles}, {self.inverted.size:,} inverted or without area"
+            return f"{triangles}, {self.inverted.size:,} inverted or degenerate"
         if np.isnan(self.isometric).all():
-            return f"{triangles}, all without area in the rest mesh"
+            return f"{triangles}, all degenerate in the rest mesh"
         one = self.summary("isometric")
         return f"{triangles}, stretch max(σ₁, 1/σ₂) {one.median:.3g} in the median, {one.maximum:.3g} at most"
 

@@ -181,7 +181,7 @@ def polish_map(
     whole_number("max_iterations", max_iterations, least=0)
     not_negative("tolerance", tolerance)
     check_callback(callback)
-    start = injective_array(domain, uv, "a polish starts from an injective map")
+    start = injective_array(domain, uv, "polish needs an injective map")
     track = lay_boundary(slide, domain, start) if slide is not False else None
     if track is not None:
         start = track.uv
@@ -281,13 +281,13 @@ def energy_named(energy: str | Energy) -> Energy:
         raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {kind_of(energy)}")
     if not energy.barrier:
         raise ValueError(
-            f"{type(energy).__name__} is no barrier: it would let the first triangles collapse and stop there; "
-            "combine it with an energy that is one, such as AreaBarrier"
+            f"{type(energy).__name__} is not a barrier energy, so triangles would collapse; "
+            "combine it with a barrier energy, such as AreaBarrier"
         )
     if type(energy).curvature is Energy.curvature:
         raise ValueError(
             f"{type(energy).__name__} has no second derivatives, and Newton's method needs them: "
-            "write its curvature, or use `harmonise`, which does without"
+            "implement its curvature, or use `harmonise`, which needs only first derivatives"
         )
     return energy
 
@@ -324,6 +324,6 @@ def injective_array(domain: Domain, uv: ArrayLike, why: str) -> FloatArray:
     inverted = inverted_triangles(domain.F, array)
     if inverted.size:
         raise ValueError(
-            f"uv is not injective: {named('triangle', 'triangles', inverted)} inverted or without area; {why}"
+            f"uv is not injective: {named('triangle', 'triangles', inverted)} inverted or degenerate; {why}"
         )
     return array

@@ -36,7 +36,7 @@ class MassSpring(Energy):
         if shapes.flat.size:
             raise ValueError(
                 f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
-                "springs are shared out by area"
+                "spring constants depend on the areas"
             )
         self._sides, self._lengths = shapes.sides, np.abs(shapes.sides)
         n = int(F.max()) + 1

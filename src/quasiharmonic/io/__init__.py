@@ -184,6 +184,6 @@ def _suffix(path: str | os.PathLike[str], done: str) -> str:
     suffix = Path(path).suffix.lower()
     known = READERS if done == "read" else MAP_WRITERS
     if suffix not in known:
-        what = f"{suffix} files cannot be {done}" if suffix else "has no suffix that would say its format"
-        raise MeshFileError(path, what, remedy=f"supported are {', '.join(known)}")
+        what = f"{suffix} files cannot be {done}" if suffix else "has no suffix, so its format is unknown"
+        raise MeshFileError(path, what, remedy=f"supported: {', '.join(known)}")
     return suffix

@@ -121,7 +121,7 @@ def new_folder(path: str | os.PathLike[str], *, leftovers: frozenset[str] = froz
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         _remove_empty(missing)
-        raise OutputError(f"cannot make the folder {printable(path)}: {_reason(error)}") from error
+        raise OutputError(f"cannot create the folder {printable(path)}: {_reason(error)}") from error
     try:
         yield
     except BaseException:

@@ -119,21 +119,21 @@ def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArra
     if mesh.FT is None:
         raise MeshFileError(
             mesh.source,
-            "has no faces that refer to texture coordinates, so nothing says where the fixed vertices go",
-            remedy="write it with uv coordinates, in OBJ vt lines and faces like 1/1 2/2 3/3",
+            "has no faces that refer to texture coordinates, so the fixed vertices have no target positions",
+            remedy="export it with uv coordinates (in OBJ: vt lines and faces like 1/1 2/2 3/3)",
         )
     if fixed is None:
         fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))
         if not fixed.size:
             raise MeshFileError(
                 mesh.source,
-                "has no boundary that could be fixed",
-                remedy="cut it open, or name fixed vertices",
+                "has no boundary to fix",
+                remedy="cut it open, or give fixed vertices",
             )
     uv, seam = vertex_places(mesh)
     for wrong, what, remedy in (
-        (np.isnan(uv[fixed, 0]), "no place in the plane", "give every fixed vertex a vt"),
-        (seam[fixed], "more than one place in the plane", "cut the mesh along its seams first"),
+        (np.isnan(uv[fixed, 0]), "no texture coordinates", "give every fixed vertex a vt"),
+        (seam[fixed], "more than one pair of texture coordinates", "cut the mesh along its seams first"),
     ):
         if wrong.any():
             which = named("vertex", "vertices", fixed[wrong])
@@ -171,12 +171,12 @@ def read_handles(path: str | os.PathLike[str], n: int) -> IntArray:
         try:
             vertex = integer(text)
         except ValueError as error:
-            raise MeshFileError(path, str(error), line, "one vertex index a line is needed") from None
+            raise MeshFileError(path, str(error), line, "give one vertex index per line") from None
         if not 0 <= vertex < n:
             raise MeshFileError(path, f"vertex {vertex} of a mesh with {n}", line, "indices count from 0")
         if vertex in seen:
             raise MeshFileError(path, f"vertex {vertex}, already named at line {seen[vertex]}, again", line)
         seen[vertex] = line
     if not seen:
-        raise MeshFileError(path, "names no vertices")
+        raise MeshFileError(path, "lists no vertices")
     return np.fromiter(seen, dtype=np.int64, count=len(seen))

@@ -30,11 +30,11 @@ def not_held(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".off":
-        return ["the surface, of which it has the map alone"]
+        return ["the surface: only the map is written"]
     if suffix == ".ply":
         return not_in_ply(mesh)
     painted = mesh.texture is not None and any(line.startswith(b"usemtl") for line in mesh.statements.split(b"\n"))
-    lost = ["its own materials, in place of which the picture is"] if painted else []
+    lost = ["its own materials, which the image replaces"] if painted else []
     if suffix in (".glb", ".gltf"):
         return lost + not_in_gltf(mesh)
     if mesh.carried is not None:

@@ -316,8 +316,8 @@ def map_of(mesh: MeshData) -> FloatArray:
         torn = named("vertex", "vertices", np.flatnonzero(seam))
         raise MeshFileError(
             mesh.source,
-            f"more than one place in the plane for {torn} (0-based)",
-            remedy="a map with seams needs its vertices split along them",
+            f"more than one pair of texture coordinates for {torn} (0-based)",
+            remedy="split the vertices along the seams of the map",
         )
     return uv
 
@@ -353,14 +353,14 @@ def check_mapped(mesh: MeshData) -> None:
         if not is_planar(mesh.V):
             raise MeshFileError(
                 mesh.source,
-                "there is no map: the mesh has no texture coordinates and is not planar",
-                remedy="write it with uv coordinates",
+                "has no map: the mesh has no texture coordinates and is not planar",
+                remedy="export it with uv coordinates",
             )
         return
     bare = np.flatnonzero((mesh.FT < 0).any(axis=1))
     if bare.size:
         raise MeshFileError(
             mesh.source,
-            f"{named('face', 'faces', bare)} (0-based) without texture coordinates, which others have",
+            f"{named('face', 'faces', bare)} (0-based) without texture coordinates, which other faces have",
             remedy="map the whole mesh, or remove these faces",
         )

@@ -64,9 +64,9 @@ def write_per_triangle(
         if not (name.isascii() and name.isidentifier()):
             raise ValueError(f"{name!r} is not a word of letters, digits and _")
         if name in _TAKEN:
-            raise ValueError(f"{name!r} means something else in such files: choose another name")
+            raise ValueError(f"{name!r} has a reserved meaning in this format: choose another name")
         if column.shape != (len(F),):
-            raise ValueError(f"{name} must have shape ({len(F)},), one for every triangle, not {column.shape}")
+            raise ValueError(f"{name} must have shape ({len(F)},), one for each triangle, not {column.shape}")
     suffix = Path(path).suffix.lower()
     if suffix == ".csv":
         data = _csv(columns, len(F))

@@ -48,7 +48,7 @@ def read_texture(path: str | os.PathLike[str]) -> Texture:
     for start, kind in _KINDS.items():
         if data.startswith(start):
             return Texture(data, *kind)
-    raise MeshFileError(path, "is no PNG or JPEG picture", remedy="save it as one")
+    raise MeshFileError(path, "is not a PNG or JPEG image", remedy="save it as PNG or JPEG")
 
 
 def checkerboard() -> Texture:

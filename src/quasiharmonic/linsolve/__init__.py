@@ -97,13 +97,13 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
                 continue  # installed but broken; the last candidate is part of SciPy and always loads
     if name not in BACKENDS:
         raise ValueError(
-            f"there is no linear solver {name!r}; the names are 'auto', {', '.join(map(repr, BACKENDS))}, "
-            f"and available here are {', '.join(available())}"
+            f"unknown linear solver {name!r}; the names are 'auto', {', '.join(map(repr, BACKENDS))}; "
+            f"available: {', '.join(available())}"
         )
     backend = _backend(name)
     if not backend.present():
         raise ImportError(
-            f"linear solver {name!r} is not installed; available here are {', '.join(available())}. "
+            f"linear solver {name!r} is not installed; available: {', '.join(available())}. "
             f"To install it: {backend.requirement}"
         )
     return backend(indptr, indices, ordered=ordered)

@@ -136,7 +136,7 @@ class LinearSolver(ABC):
         with self._lock:
             self._require_open()
             if not self._ready:
-                raise RuntimeError("there is no factor to solve with: factor() was not called or did not succeed")
+                raise RuntimeError("the matrix has no factorisation: factor() was not called or failed")
             if not given.size:
                 return np.zeros(given.shape)
             x = self._solve(b)
@@ -178,7 +178,7 @@ class LinearSolver(ABC):
             raise NotPositiveDefinite("there is no solution: the right-hand side has NaN or infinite entries")
         raise NotPositiveDefinite(
             "the matrix is not numerically positive definite: the residual of the solution found by "
-            f"{self.name} is {excess:.1e} times what is allowed"
+            f"{self.name} is {excess:.1e} times the allowed value"
         )
 
     # ---- implemented by backends ------------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ class Cholmod(LinearSolver):
         except self._errors as error:
             raise NotPositiveDefinite(f"the matrix is not positive definite: CHOLMOD says {error}") from None
         if not positive:
-            raise NotPositiveDefinite("the matrix is not positive definite: CHOLMOD met a pivot that is not positive")
+            raise NotPositiveDefinite("the matrix is not positive definite: CHOLMOD found a pivot that is not positive")
 
     def _solve(self, b: FloatArray) -> FloatArray:
         x: FloatArray

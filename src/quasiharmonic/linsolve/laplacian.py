@@ -177,7 +177,7 @@ class FactoredLaplacian:
         """
         of, pattern, out = self.pattern, self.pattern._pattern, w.copy()
         if w.shape != (of.n,):
-            raise ValueError(f"w must have shape ({of.n},), a place for every vertex, not {w.shape}")
+            raise ValueError(f"w must have shape ({of.n},), one position for each vertex, not {w.shape}")
         load = np.empty((2, of.free.size))
         boundary_load(self.stiffness, pattern.border, pattern.border_row, pattern.border_fixed, w, load)
         of._solve(self, load, out)

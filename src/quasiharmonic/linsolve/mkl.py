@@ -97,7 +97,7 @@ class Pardiso(LinearSolver):
             forward = np.empty_like(self._ones)
             self.handle.check(_FORWARD_ONLY, self._ones, forward)
             if not np.isfinite(forward.sum()):
-                raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a negative pivot")
+                raise NotPositiveDefinite("the matrix is not positive definite: PARDISO found a negative pivot")
 
     def _solve(self, b: FloatArray) -> FloatArray:
         if self._size > self.n:
@@ -172,7 +172,7 @@ class Handle:
         code = self.call(phase, b, x)
         # Positive codes are not documented; they occur when a pivot is negative.
         if code in _NOT_POSITIVE_DEFINITE or (code > 0 and phase == _FACTOR):
-            raise NotPositiveDefinite("the matrix is not positive definite: PARDISO met a pivot that is not positive")
+            raise NotPositiveDefinite("the matrix is not positive definite: PARDISO found a pivot that is not positive")
         if code:
             text = f"MKL PARDISO failed in phase {phase} with error {code}: {_ERRORS.get(code, 'unknown error')}"
             raise MemoryError(text) if code in _OUT_OF_MEMORY else RuntimeError(text)
@@ -227,7 +227,7 @@ def load_mkl() -> ctypes.CDLL:
         library = ctypes.CDLL(path)
         layer = library.MKL_Set_Interface_Layer(0)
     except (OSError, AttributeError) as error:
-        raise ImportError(f"MKL's runtime library {path} does not load: {error}") from error
+        raise ImportError(f"cannot load MKL's runtime library {path}: {error}") from error
     # The environment or another package may have switched MKL to 64-bit integers for the whole process.
     if layer & 1:
         raise ImportError("MKL is set to 64-bit integers (ILP64) in this process; PARDISO is called with 32-bit ones")

@@ -49,13 +49,13 @@ class Qdldl(LinearSolver):
         try:
             self._solver.update(self._matrix, upper=True)
         except RuntimeError:
-            raise NotPositiveDefinite("the matrix is not positive definite: QDLDL met a pivot that is zero") from None
+            raise NotPositiveDefinite("the matrix is not positive definite: QDLDL found a pivot that is zero") from None
         # LDLᵀ exists for indefinite matrices as well, and QDLDL may continue after a zero pivot without an error. Only
         # the signs of D are a reliable test. QDLDL returns D with a copy of L, which takes a quarter of the
         # factorisation time.
         pivots = self._solver.factors()[1]
         if not pivots.min() > 0:
-            raise NotPositiveDefinite("the matrix is not positive definite: QDLDL met a pivot that is not positive")
+            raise NotPositiveDefinite("the matrix is not positive definite: QDLDL found a pivot that is not positive")
 
     def _solve(self, b: FloatArray) -> FloatArray:
         x = np.empty_like(b, order="F")

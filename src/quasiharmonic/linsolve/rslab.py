@@ -82,7 +82,7 @@ class Rslab(LinearSolver):
         if self._numeric is None:
             self._factor_by_another()
         elif self._numeric.inertia != (self.n, 0, 0):
-            raise NotPositiveDefinite("the matrix is not positive definite: rslab met a pivot that is not positive")
+            raise NotPositiveDefinite("the matrix is not positive definite: rslab found a pivot that is not positive")
 
     def _solve(self, b: FloatArray) -> FloatArray:
         if self._numeric is not None:
@@ -131,7 +131,7 @@ class Rslab(LinearSolver):
         except RuntimeError as error:
             if _SINGULAR in str(error):
                 raise NotPositiveDefinite(
-                    "the matrix is not positive definite: rslab met a pivot that is zero"
+                    "the matrix is not positive definite: rslab found a pivot that is zero"
                 ) from None
         except BaseException as error:
             # Rust panics on a failed assertion. The exception class cannot be imported.

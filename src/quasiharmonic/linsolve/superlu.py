@@ -58,7 +58,7 @@ class SuperLU(LinearSolver):
         # With all pivots on the diagonal U = D Lᵀ, and A has as many positive eigenvalues as D has positive entries.
         # SuperLU leaves the diagonal only if a pivot is exactly zero.
         if not (np.array_equal(lu.perm_r, lu.perm_c) and lu.U.diagonal().min() > 0):
-            raise NotPositiveDefinite("the matrix is not positive definite: SuperLU met a pivot that is not positive")
+            raise NotPositiveDefinite("the matrix is not positive definite: SuperLU found a pivot that is not positive")
         self._lu = lu
 
     def _solve(self, b: FloatArray) -> FloatArray:

@@ -124,7 +124,7 @@ class Domain(ReadOnly):
         if missing.size:
             raise ValueError(
                 f"the boundary {named('vertex', 'vertices', missing)} not in fixed: "
-                "every boundary vertex needs a position"
+                "every boundary vertex needs a target position"
             )
 
     def check_areas(self) -> None:
@@ -133,7 +133,7 @@ class Domain(ReadOnly):
         if flat.size:
             raise ValueError(
                 f"{named('triangle', 'triangles', flat)} of zero area in the rest mesh; "
-                "choose the reference 'equilateral' to map it all the same"
+                "choose the reference 'equilateral', or repair the mesh"
             )
 
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:

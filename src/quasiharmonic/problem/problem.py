@@ -185,7 +185,7 @@ class Problem(ReadOnly, Displayable):
             (
                 f"{'A curved surface' if curved else 'A planar mesh'}: {self.n:,} vertices, {len(self.F):,} triangles.",
                 f"{loops}, of {lengths} vertices; {counted('pin', 'pins', len(self.domain.pins))} inside.",
-                f"Its fixed vertices go to [{left:.4g}, {right:.4g}] × [{lower:.4g}, {upper:.4g}].",
+                f"The targets of its fixed vertices span [{left:.4g}, {right:.4g}] × [{lower:.4g}, {upper:.4g}].",
             )
         )
 

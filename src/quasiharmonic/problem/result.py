@@ -24,60 +24,60 @@ if TYPE_CHECKING:
 class Status(Enum):
     """Outcome of a solve; the value is a message for the user with the outcome and the next action."""
 
-    INJECTIVE = "Every triangle is strictly positive, decided exactly."
+    INJECTIVE = "Every triangle is strictly positive, verified exactly."
     STALLED = (
-        "Some triangles stay inverted and the energy has settled at a positive value: "
-        "no map was found, and perhaps this mesh and this target admit none. No known obstruction forbids one."
+        "Stalled: some triangles are still inverted and the energy has converged to a positive value. "
+        "No known obstruction forbids a map, but this mesh and this target may still allow none."
     )
     IMPOSSIBLE = (
-        "No such map exists for this mesh and this target: the diagnosis names what forbids it, and what would "
-        "help. This is the best map found."
+        "No such map exists for this mesh and this target. The diagnosis names the obstructions and how to remove "
+        "them. This is the best map found."
     )
     OUT_OF_ITERATIONS = (
         "Some triangles were still inverted after the last iteration. "
         "The energy was still falling: allow more iterations."
     )
-    INTERRUPTED = "Interrupted; this is the best map so far."
+    INTERRUPTED = "Interrupted. This is the best map so far."
     ROUNDED = (
         "The map is injective in the solver's own coordinates, but its smallest triangles invert when the "
-        "positions are rounded to doubles at the target's offset: move the target nearer to the origin."
+        "positions are rounded to double precision at the target's offset. Move the target nearer to the origin."
     )
     POLISHED = (
-        "Every triangle is strictly positive, decided exactly, and the distortion has converged: "
+        "Every triangle is strictly positive, verified exactly, and the distortion has converged: "
         "no small change of the map lowers it noticeably."
     )
     STILL_FALLING = (
-        "Every triangle is strictly positive, decided exactly. The distortion was still falling after the last "
-        "iteration: allow more iterations for less of it."
+        "Every triangle is strictly positive, verified exactly. The distortion was still falling after the last "
+        "iteration: allow more iterations to lower it further."
     )
     EXHAUSTED = (
-        "Every triangle is strictly positive, decided exactly. The distortion falls no further: doubles express no "
-        "better map near this one. Where energy='mips' has left triangles tiny, energy='symmetric-dirichlet' opens "
-        "them up; another linear_solver may get further, too."
+        "Every triangle is strictly positive, verified exactly. Double precision limits the distortion: it has no "
+        "better map near this one. If energy='mips' has left tiny triangles, use energy='symmetric-dirichlet'. "
+        "Another linear_solver may also lower the distortion further."
     )
     COLLAPSED = (
-        "Every triangle is strictly positive, decided exactly, but the map has collapsed: it stretches triangles far "
-        "more than the surface asks for, and no other start has led to a better one. More cuts (find_cuts with a "
-        "smaller gain), a map to begin with (start), or energy='symmetric-dirichlet', if it was another, may help."
+        "Every triangle is strictly positive, verified exactly, but the map has collapsed: it stretches triangles far "
+        "more than this surface requires, and no other start has led to a better map. Use more cuts (find_cuts with "
+        "a smaller min_gain), give an initial map (start), or use energy='symmetric-dirichlet'."
     )
     NEARBY = (
-        "Every triangle is strictly positive, decided exactly, and the distortion is as low as the frames before and "
-        "after allow, to which it keeps near."
+        "Every triangle is strictly positive, verified exactly. The distortion has converged under the condition that "
+        "this frame stays close to the frames before and after it."
     )
     UNIMPROVED = (
-        "Every triangle is strictly positive, decided exactly, but this is the map that was given: no injective map of "
-        "less distortion was found. A smaller eta may help."
+        "Every triangle is strictly positive, verified exactly, but the map is unchanged: no injective map with less "
+        "distortion was found. A smaller eta may help."
     )
     PRECISION_LIMIT = (
-        "A finer mesh has a map, but doubles have no room for it at the vertices named: the target is too narrow there "
-        "for the spacing of the numbers. Move it nearer to the origin, or widen it."
+        "A finer mesh has a map, but double precision cannot express it at the vertices listed: the target is too "
+        "narrow there. Move the target nearer to the origin, or widen it."
     )
     TOO_MANY_SPLITS = (
-        "A finer mesh has a map, but cutting it as the target is took too many vertices: pins and holes lie in another "
-        "order than in the mesh. Hold fewer, or where the mesh has them; this is the best map of the mesh as given."
+        "A finer mesh has a map, but it needs too many new vertices: pins and holes lie in another order than in the "
+        "mesh. Use fewer pins, or place them in the order of the mesh. This is the best map of the input mesh."
     )
     UNSOLVABLE = (
-        "No linear solver could factor the system any more; this is the best map so far. "
+        "No linear solver could factor the system. This is the best map so far. "
         "Another linear solver or reference triangle may help."
     )
 
@@ -282,7 +282,7 @@ class MapResult(ReadOnly, Displayable):
         """Return a few lines of text: outcome, certificate, stages, and the diagnosis if there is one."""
         lines = [self.status.value, self.certificate.summary()]
         lines += [str(stage) for stage in self.stages]
-        lines.append(f"{self.seconds:.3g} s in all, solved by {self.linear_solver or 'no linear solver'}")
+        lines.append(f"{self.seconds:.3g} s in total, solved by {self.linear_solver or 'no linear solver'}")
         return "\n".join(lines if self.diagnosis is None else [*lines, self.diagnosis.summary()])
 
     def plot(self, kind: str = "map", *, measure: str = "isometric") -> Figure:

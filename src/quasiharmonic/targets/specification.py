@@ -61,11 +61,11 @@ def outline(
     text = fspath(specification)
     name, colon, argument = text.partition(":")
     if not 0 < tolerance < 1:
-        raise ValueError(f"the tolerance is between 0 and 1, not {tolerance}")
+        raise ValueError(f"tolerance must be between 0 and 1, not {tolerance}")
     if name in ("letter", "word") and colon:
         return (letter if name == "letter" else word)(argument, font, tolerance=tolerance)
     if font is not None:
-        raise ValueError(f"a font has no meaning for {text!r}, only for letter: and word:")
+        raise ValueError(f"{text!r} takes no font: only letter: and word: do")
     suffix = Path(text).suffix.lower()
     if suffix == ".svg":
         return read_svg(text, tolerance=tolerance)
@@ -86,7 +86,7 @@ def outline(
             return [outlines.regular_polygon(_count(text, argument))]
         case "star", ":":
             return [outlines.star(_count(text, argument))]
-    raise ValueError(f"{text!r} is no outline that is known; there are {FORMS}")
+    raise ValueError(f"unknown outline {text!r}: use {FORMS}")
 
 
 def _number(text: str, argument: str) -> float:
@@ -99,7 +99,7 @@ def _number(text: str, argument: str) -> float:
 def _pair(text: str, argument: str) -> tuple[float, float]:
     parts = argument.lower().split("x")
     if len(parts) != 2:
-        raise ValueError(f"{text!r}: two numbers with an x between them are needed, as in 2x1")
+        raise ValueError(f"{text!r}: give two numbers with an x between them, as in 2x1")
     return _number(text, parts[0]), _number(text, parts[1])
 
 
@@ -107,5 +107,5 @@ def _count(text: str, argument: str) -> int:
     if not (argument.isascii() and argument.isdigit()):
         raise ValueError(f"{text!r}: {argument!r} is not a whole number")
     if len(argument) > 6 or int(argument) > MOST_POINTS // 2:
-        raise ValueError(f"{text!r}: {argument} is far too many")
+        raise ValueError(f"{text!r}: {argument} is too many")
     return int(argument)

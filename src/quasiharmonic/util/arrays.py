@@ -48,7 +48,7 @@ def real_array(name: str, values: ArrayLike) -> FloatArray:
     """
     array = _array(name, values)
     if array.dtype.kind not in "iufb":
-        raise ValueError(f"{name} must hold real numbers, not {_held(values, array)}")
+        raise ValueError(f"{name} must contain real numbers, not {_held(values, array)}")
     if array.dtype == np.float64:
         return np.array(array, order="C")
     # A signalling NaN is invalid in a conversion. It is reported later as not finite.
@@ -72,12 +72,12 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     if array.dtype.kind not in "iu":
         advice = ""
         if array.dtype.kind == "b" and array.ndim == 1:
-            advice = f": hand over numpy.flatnonzero({name})"
+            advice = f": pass numpy.flatnonzero({name})"
         elif array.dtype.kind == "f" and array.ndim == 2:
-            advice = "; are these positions, and the arguments in another order?"
-        raise ValueError(f"{name} must hold integer indices, not {_held(values, array)}{advice}")
+            advice = "; check the order of the arguments: these may be positions"
+        raise ValueError(f"{name} must contain integer indices, not {_held(values, array)}{advice}")
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
-        raise ValueError(f"{name} refers to vertex {array.max()}, which no mesh has")
+        raise ValueError(f"{name} refers to vertex {array.max()}, which is not a valid index")
     return np.array(array, dtype=np.int64, order="C") if copy else np.require(array, np.int64, ["C", "A"])
 
 
@@ -96,7 +96,7 @@ def _in_range(name: str, integers: NDArray[np.object_]) -> IntArray:
     """Convert integers of any size to int64, or raise a ValueError that names the first one that does not fit."""
     for value in integers.flat:
         if not -(2**63) <= int(value) < 2**63:
-            raise ValueError(f"{name} refers to vertex {kind_of(value)}, which no mesh has")
+            raise ValueError(f"{name} refers to vertex {kind_of(value)}, which is not a valid index")
     return integers.astype(np.int64)
 
 
@@ -193,7 +193,7 @@ def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = 
     """
     array = real_array(name, getattr(uv, "uv", uv))
     if array.ndim != 2 or array.shape[1] != 2 or n not in (None, len(array)):
-        wanted = "(n, 2)" if n is None else f"({n}, 2), a position for every vertex"
+        wanted = "(n, 2)" if n is None else f"({n}, 2), one position for each vertex"
         raise ValueError(f"{name} must have shape {wanted}, not {array.shape}")
     if finite:
         check_finite(name, "vertex", "vertices", array)
@@ -228,7 +228,7 @@ def held_places(target: ArrayLike, k: int) -> FloatArray:
     """
     array = real_array("target", target)
     if array.shape != (k, 2):
-        raise ValueError(f"target must have shape ({k}, 2), a position for every fixed vertex, not {array.shape}")
+        raise ValueError(f"target must have shape ({k}, 2), one position for each fixed vertex, not {array.shape}")
     check_finite("target", "row", "rows", array)
     return array
 
@@ -247,7 +247,7 @@ def loop_arrays(loops: Iterable[ArrayLike], n: int) -> list[IntArray]:
     for k, loop in enumerate(loops):
         array = index_array(f"loops[{k}]", loop)
         if array.ndim != 1:
-            advice = "" if array.ndim else "; hand over a list of loops"
+            advice = "" if array.ndim else "; pass a list of loops"
             raise ValueError(f"loops[{k}] must have shape (l,), the vertices of one loop, not {array.shape}{advice}")
         check_range(f"loops[{k}]", array, n)
         if len(array) < 3:
@@ -275,7 +275,7 @@ def check_range(
         bad = np.unique(indices[(indices < least) | (indices >= n)])
         there = f"only {many} 0 … {n - 1}" if n else f"no {many}"
         from_one = name == "F" and indices.min() == 1 and indices.max() == n
-        advice = "; if it counts from 1, hand over F - 1" if from_one else ""
+        advice = "; if its indices count from 1, pass F - 1" if from_one else ""
         raise ValueError(f"{name} refers to {named(one, many, bad)}, but there are {there}{advice}")
 
 
@@ -301,13 +301,16 @@ def _array(name: str, values: ArrayLike) -> NDArray[Any]:
 def _withheld(name: str, values: Any, error: Exception) -> str:
     """Explain why an array of another library cannot be converted, and what to do."""
     if getattr(values, "requires_grad", False):
-        return f"that requires grad, which would be lost here: hand over {name}.detach(), or see quasiharmonic.torch"
+        return (
+            f"that requires grad, which this function does not support: pass {name}.detach(), or use "
+            f"quasiharmonic.torch"
+        )
     if "Tracer" in type(values).__name__:
-        return "that JAX traces, of which there are no numbers yet: see quasiharmonic.jax"
+        return "that JAX traces, so its values are not available: use quasiharmonic.jax"
     device = getattr(values, "device", "cpu")
     if not str(device).startswith("cpu"):
-        return f"on {device}: hand over {name}.{'cpu' if hasattr(values, 'cpu') else 'get'}()"
-    return f"whose numbers NumPy cannot have: {str(error).partition(chr(10))[0]}"
+        return f"on {device}: pass {name}.{'cpu' if hasattr(values, 'cpu') else 'get'}()"
+    return f"that NumPy cannot convert: {str(error).partition(chr(10))[0]}"
 
 
 def _held(values: object, array: NDArray[Any]) -> str:
@@ -315,7 +318,7 @@ def _held(values: object, array: NDArray[Any]) -> str:
     if not array.ndim:
         return kind_of(values)
     if array.dtype == object and array.size:
-        return f"objects, of which the first is {kind_of(array.flat[0])}"
+        return f"objects, the first of them {kind_of(array.flat[0])}"
     return str(array.dtype)
 
 
@@ -336,7 +339,7 @@ def kind_of(value: object) -> str:
 def whole_number(name: str, value: Any, *, least: int) -> None:
     """Raise a ValueError unless the value is an integer of at least ``least``."""
     if not isinstance(value, Integral) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, not {kind_of(value)}")
+        raise ValueError(f"{name} must be an integer of at least {least}, not {kind_of(value)}")
 
 
 def true_or_false(name: str, value: Any) -> None:

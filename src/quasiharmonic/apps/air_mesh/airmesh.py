@@ -114,7 +114,7 @@ class AirMesh:
         self._F = triangle_array(F, len(self._rest))
         idle = np.setdiff1d(np.arange(len(self._rest)), self._F)
         if idle.size:
-            raise ValueError(f"{named('vertex', 'vertices', idle)} in no triangle")
+            raise ValueError(f"no triangle uses {named('vertex', 'vertices', idle)}: remove unused vertices")
         turned = np.flatnonzero(orientation(*(self._rest[self._F[:, k]] for k in range(3))) <= 0)
         if turned.size:
             raise ValueError(f"{named('triangle', 'triangles', turned)} not counterclockwise")
@@ -129,7 +129,7 @@ class AirMesh:
         around = _loops_of(frame)
         self._sizes = [len(loop) for loop in around]
         if min(self._sizes) < 3:
-            raise ValueError(f"loops of the frame have at least 3 points, not {self._sizes}")
+            raise ValueError(f"each loop of the frame needs at least 3 points, not {self._sizes}")
         self.moment = self._at_rest(np.concatenate([self._rest, self._stacked(around)]))
         if not self.moment.certificate.bijective:
             raise ValueError(f"shapes, container and obstacles overlap. {self.moment.certificate.summary()}")
@@ -172,8 +172,9 @@ class AirMesh:
                     step /= 2
                 else:
                     raise RuntimeError(
-                        f"the frame can be moved there for {done:.1%} of the way only: then it leaves no room, crosses "
-                        "itself or has met a shape head-on"
+                        f"the frame can be moved only {done:.1%} of the way: then no space is "
+                        f"left, or it crosses itself or "
+                        "meets a shape"
                     )
         except BaseException:
             self.moment = present
@@ -238,7 +239,9 @@ class AirMesh:
         loops = _loops_of(frame)
         sizes = [len(loop) for loop in loops]
         if sizes != self._sizes:
-            raise ValueError(f"the frame must have loops of {self._sizes} points, as at the start, not of {sizes}")
+            raise ValueError(
+                f"the frame must have loops of {self._sizes} points, as in the initial frame, not of {sizes}"
+            )
         for k, loop in enumerate(loops):
             check_finite(f"loop {k} of the frame", "point", "points", loop)
         return np.concatenate(loops)
@@ -252,13 +255,13 @@ def _loops_of(frame: Iterable[ArrayLike]) -> list[FloatArray]:
     """Convert the loops of a frame, one or more, to new arrays (k, 2) of real numbers."""
     if isinstance(frame, str | bytes) or not isinstance(frame, Iterable):
         raise ValueError(
-            f"frame must be a list of loops (k, 2), the container's and those of obstacles, not {kind_of(frame)}"
+            f"frame must be a list of loops (k, 2), the container first, then obstacles, not {kind_of(frame)}"
         )
     loops = [real_array(f"loop {k} of the frame", loop) for k, loop in enumerate(frame)]
     if not loops:
-        raise ValueError("frame has no loops, but the first must be the container's")
+        raise ValueError("frame has no loops: the first must be the container")
     if all(loop.shape == (2,) for loop in loops):
-        raise ValueError("frame must be a list of loops (k, 2), not a single loop: hand over [frame]")
+        raise ValueError("frame must be a list of loops (k, 2), not a single loop: pass [frame]")
     for k, loop in enumerate(loops):
         if loop.ndim != 2 or loop.shape[1] != 2:
             raise ValueError(f"loop {k} of the frame must have shape (k, 2), not {loop.shape}")
@@ -306,7 +309,7 @@ def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[i
     for thing in solid:
         holding = [k for k, room in enumerate(rooms) if room.contains(shapely.Point(thing[0]))]
         if not holding:
-            raise ValueError(f"what has a corner at {tuple(thing[0].tolist())} is not inside the container")
+            raise ValueError(f"the loop with a corner at {tuple(thing[0].tolist())} is not inside the container")
         inside[min(holding, key=lambda k: rooms[k].area)].append(thing)
     regions = [shapely.Polygon(space, things) for space, things in zip(spaces, inside, strict=True)]
     for region in regions:
@@ -327,7 +330,7 @@ def _check_apart(loops: Sequence[FloatArray], names: Sequence[str]) -> None:
     for i, j in sorted(zip(first.tolist(), second.tolist(), strict=True)):
         if i < j:
             x, y = shapely.get_coordinates(shapely.intersection(rings[i], rings[j]))[0].tolist()
-            raise ValueError(f"{names[i]} and {names[j]} meet at ({x:.6g}, {y:.6g}): leave room for air between them")
+            raise ValueError(f"{names[i]} and {names[j]} meet at ({x:.6g}, {y:.6g}): leave a gap between them")
 
 
 def thickened(corners: FloatArray, gap: float) -> FloatArray:

@@ -102,10 +102,10 @@ def animate(
     if max_motion_ratio is not None and (not isinstance(max_motion_ratio, Real) or not max_motion_ratio >= 1):
         raise ValueError(
             f"max_motion_ratio must be a number of at least 1, not {max_motion_ratio!r}: "
-            "the boundary itself moves as far"
+            "the boundary itself has ratio 1"
         )
     if max_motion_ratio is not None and energy is None:
-        raise ValueError("max_motion_ratio is for frames that are polished: name an energy for that too")
+        raise ValueError("max_motion_ratio applies only to polished frames: give an energy as well")
     whole_number("max_iterations", max_iterations, least=1)
     true_or_false("fill_gaps", fill_gaps)
     check_callback(callback)

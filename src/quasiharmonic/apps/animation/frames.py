@@ -110,9 +110,9 @@ class Animation:
     def summary(self) -> str:
         """Return a text with the number of certified frames, the reasons for missing ones, and the largest move."""
         found, count = self.found, counted("frame", "frames", len(self.frames))
-        lines = [f"{count}: {np.count_nonzero(found)} with every triangle strictly positive, decided exactly"]
+        lines = [f"{count}: {np.count_nonzero(found)} with every triangle strictly positive, verified exactly"]
         if self.interrupted:
-            lines.append("interrupted before all was done")
+            lines.append("interrupted before the last frame")
         if self.bridged.any():
             lines.append(f"between their neighbours: {named('frame', 'frames', np.flatnonzero(self.bridged))}")
         overlapping = np.flatnonzero(found & ~self.bijective)
@@ -175,5 +175,5 @@ def checked_targets(targets: Iterable[ArrayLike], count: int) -> FloatArray:
         check_finite(name, "row", "rows", array)
         checked.append(array)
     if not checked:
-        raise ValueError("targets: there is no frame")
+        raise ValueError("targets has no frames")
     return np.stack(checked)

@@ -165,7 +165,7 @@ def faced(mesh: SeamedMesh, *, reflect: bool = True) -> list[tuple[Island, bool]
         manifold_edges(mesh.F, len(mesh.V))
     islands = mesh.islands
     if not islands:
-        raise ValueError("the mesh has no triangles" if not len(mesh.F) else "no triangle has a place")
+        raise ValueError("the mesh has no triangles" if not len(mesh.F) else "no triangle has texture coordinates")
     mirrored = mirrored_islands(mesh) if reflect else [False] * len(islands)
     return [
         (replace(island, uv=island.uv * MIRROR) if turned else island, turned)
@@ -181,7 +181,7 @@ def naming(island: Island, count: int) -> Iterator[None]:
     except ValueError as error:
         if count == 1:
             raise
-        raise ValueError(f"the {which_island(island.triangles)}, its elements numbered anew: {error}") from None
+        raise ValueError(f"the {which_island(island.triangles)}, with its own numbering: {error}") from None
 
 
 def in_place_of(island: Island, uv: FloatArray) -> FloatArray:

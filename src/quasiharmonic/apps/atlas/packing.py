@@ -92,8 +92,8 @@ def packed(
         i = int(owner[lost[0]])
         own = lost[owner[lost] == i] - int(np.searchsorted(owner, i))
         raise ValueError(
-            f"island {i}: rounding to places in the unit square would invert {named('triangle', 'triangles', own)} of "
-            "it, too thin for that: polish the map first, or leave it unpacked"
+            f"island {i}: its {named('triangle', 'triangles', own)} would be inverted by rounding in the unit square, "
+            "because they are too thin: polish the map first, or do not pack it"
         )
     return found
 
@@ -105,19 +105,17 @@ def _checked(
     surface = real_array("areas", areas)
     for name, arrays in (("uv", uv), ("F", F)):
         if not isinstance(arrays, Sized) or isinstance(arrays, str | bytes):
-            raise ValueError(f"{name} must be a list of arrays, one for every island, not {kind_of(arrays)}")
+            raise ValueError(f"{name} must be a list of arrays, one for each island, not {kind_of(arrays)}")
     if surface.ndim != 1 or not len(uv) == len(F) == len(surface):
         raise ValueError(
-            f"there are {len(uv)} islands' places, {len(F)} islands' triangles and areas of shape {surface.shape}: one "
-            "of each is needed for every island"
+            f"uv has {len(uv)} islands, F has {len(F)}, and areas has shape {surface.shape}: give one of each for "
+            "each island"
         )
     wrong = np.flatnonzero(~((surface >= 0) & np.isfinite(surface)))
     if wrong.size:
-        raise ValueError(
-            f"areas must be finite and not negative, as they are not of {named('island', 'islands', wrong)}"
-        )
+        raise ValueError(f"areas must be finite and not negative, unlike that of {named('island', 'islands', wrong)}")
     if not 0 <= margin < 1:
-        raise ValueError(f"margin must be a share of the square's side, from 0 to below 1, not {margin}")
+        raise ValueError(f"margin must be a fraction of the square's side, at least 0 and less than 1, not {margin}")
     islands = [map_array(f"uv[{i}]", points) for i, points in enumerate(uv)]
     return islands, [triangle_array(rows, len(points)) for rows, points in zip(F, islands, strict=True)], surface
 
@@ -197,8 +195,8 @@ def _largest_scale(sizes: FloatArray, margin: float) -> tuple[float, list[Laid]]
         scale = (low + high) / 2 if low > 0 else 0.8 * high
     if best is None or (low == 0 and longest.max() > 0):
         raise ValueError(
-            f"{len(sizes)} islands, each with a margin of {margin:g} of the square's side around it, have no room: "
-            "lower the margin"
+            f"{len(sizes)} islands do not fit with a margin of {margin:g} of the square's side around each: lower the "
+            "margin"
         )
     return low, best
 

@@ -74,9 +74,7 @@ def cut_along(mesh: SeamedMesh, pairs: ArrayLike, *, polygons: Polygons | None =
         inside, given = polygons.diagonals(mesh.F), np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
         within = np.isin(_keys(given, len(mesh.V)), _keys(inside, len(mesh.V)))
         if within.any():
-            raise ValueError(
-                f"{named_edges(given[within])} inside a face of more than three corners, not at its border"
-            )
+            raise ValueError(f"{named_edges(given[within])} inside a polygon: give only edges of the polygons")
     return cut
 
 

@@ -121,7 +121,7 @@ class AtlasVerdict:
         if len(self.overlapping):
             first = ", ".join(f"{one} and {other}" for one, other in self.overlapping[:5].tolist())
             more = f", … ({len(self.overlapping)} pairs in all)" if len(self.overlapping) > 5 else ""
-            lines.append(f"Islands lie on or touch each other: {first}{more} (from 0).")
+            lines.append(f"Islands overlap or touch each other: {first}{more} (from 0).")
         lines += [f"- {island.summary()}" for island in self.islands if not island.bijective][:10]
         return "\n".join(lines)
 

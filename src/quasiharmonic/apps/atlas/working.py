@@ -63,7 +63,7 @@ def polish(
     mesh = seamed_mesh(mesh)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     if free and fixed is not None:
-        raise ValueError("with free borders nothing is held: leave fixed out, or free")
+        raise ValueError("fixed and free exclude each other: omit one of them")
     held = _fixed(mesh, fixed)
 
     def lower(island: Island) -> MapResult:
@@ -160,9 +160,9 @@ def flatten(
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     held = _fixed(mesh, fixed)
     if held is not None and unit_square:
-        raise ValueError("vertices that are held decide the map's size: leave unit_square out")
+        raise ValueError("fixed vertices determine the size of the map: omit unit_square")
     if held is not None and mesh.uv is None:
-        raise ValueError("nothing says where the fixed vertices go: the mesh has no places")
+        raise ValueError("the fixed vertices have no target positions: the mesh has no texture coordinates")
 
     def lay(island: Island) -> MapResult:
         own: dict[str, Any] = {} if weights is None else {"weights": weights[island.triangles]}
@@ -267,7 +267,7 @@ def _fixed(mesh: SeamedMesh, fixed: ArrayLike | None) -> IntArray | None:
     array = index_array("fixed", fixed).ravel()
     absent = array[(array < 0) | (array >= len(mesh.V))]
     if absent.size:
-        raise ValueError(f"fixed refers to {named('vertex', 'vertices', absent)}, which the mesh has not")
+        raise ValueError(f"fixed refers to {named('vertex', 'vertices', absent)}, which the mesh does not have")
     return array
 
 

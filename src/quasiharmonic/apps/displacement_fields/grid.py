@@ -100,7 +100,7 @@ def checked_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:
     """
     sides = real_array("spacing", spacing)
     if sides.shape not in ((), (2,)) or not (np.isfinite(sides) & (sides > 0)).all():
-        raise ValueError(f"spacing must be a positive number, or two, along x and along y, not {spacing!r}")
+        raise ValueError(f"spacing must be a positive number, or two (along x and along y), not {spacing!r}")
     x, y = np.broadcast_to(sides, 2).tolist()
     return Grid((shape[0], shape[1]), (x, y))
 
@@ -117,11 +117,11 @@ def checked_field(field: ArrayLike) -> FloatArray:
     if array.ndim != 3 or array.shape[2] != 2 or min(array.shape[:2]) < 2:
         advice = ""
         if array.ndim == 3 and array.shape[0] == 2:
-            advice = ": hand over numpy.moveaxis(field, 0, -1)"
+            advice = ": pass numpy.moveaxis(field, 0, -1)"
         elif array.ndim == 4 or (array.ndim == 3 and array.shape[2] == 3):
-            advice = "; fields of volumes are not handled"
+            advice = "; fields on volumes are not supported"
         raise ValueError(
-            "field must have shape (height, width, 2), a displacement along x and y for each of at least 2 × 2 "
+            "field must have shape (height, width, 2), displacements along x and y for at least 2 × 2 "
             f"pixels, not {array.shape}{advice}"
         )
     bad = np.asarray(~np.isfinite(array).all(axis=2))

@@ -41,7 +41,9 @@ class InverseField:
     def summary(self) -> str:
         """Describe the inverse in one sentence."""
         share = 100 * float(self.outside.mean())
-        return f"{share:.3g} % of the pixels lie outside; there and back the others are off by {self.error:.2g} at most"
+        return (
+            f"{share:.3g} % of the pixels lie outside; for the others, the round-trip error is at most {self.error:.2g}"
+        )
 
 
 def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField:
@@ -85,7 +87,7 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
     if wrong.any():
         raise ValueError(
             f"the field folds, so it has no inverse: at the cells whose first pixels are {named_pixels(wrong)}. "
-            "`nearest_invertible` gives the nearest one that does not"
+            "use `nearest_invertible` to get the nearest invertible field"
         )
     places, F = (grid.points + given).reshape(-1, 2), grid.triangles()
     certificate = certify(F, places)

@@ -55,11 +55,11 @@ class InvertibleField:
     def summary(self) -> str:
         """Describe the field in one or two sentences."""
         if not self.folds:
-            return f"The field does not fold, and is as it was. {self.certificate.summary()}"
+            return f"The field does not fold and is unchanged. {self.certificate.summary()}"
         moved = int(np.count_nonzero(self.moved_mask))
         return (
             f"{counted('cell', 'cells', self.folds)} folded; {counted('pixel', 'pixels', moved)} moved, "
-            f"{self.distance:.3g} away in the root mean square over all. {self.certificate.summary()}"
+            f"root mean square change {self.distance:.3g}. {self.certificate.summary()}"
         )
 
 
@@ -136,7 +136,7 @@ def nearest_invertible(
         places = np.stack([here.real, here.imag], axis=-1) * grid.unit
         mended[moved] = (places - grid.points)[moved]
         if not _fold_free(grid, mended).all():
-            raise RuntimeError("rounding folds the field that was found: displacements are too large for its spacing")
+            raise RuntimeError("rounding folds the new field: its displacements are too large for its spacing")
     certificate = certify(grid.triangles(), (grid.points + mended).reshape(-1, 2))
     moved = (mended != given).any(axis=2)
     away = np.hypot(*np.moveaxis(mended - given, 2, 0))
@@ -199,7 +199,7 @@ def _fixed_mask(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
         return np.zeros(grid.shape, dtype=bool)
     mask = np.asarray(fixed)
     if mask.shape != grid.shape or mask.dtype != bool:
-        raise ValueError(f"fixed must be an array of bool of shape {grid.shape}, not of {mask.dtype} and {mask.shape}")
+        raise ValueError(f"fixed must be a bool array of shape {grid.shape}, not {mask.dtype} of shape {mask.shape}")
     return mask
 
 
@@ -218,8 +218,8 @@ def _descended(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: 
         w, patch = filled_in(grid, given, fixed, min_jacobian)
     except NoRoomError as none:
         raise RuntimeError(
-            "no field without folds was found that keeps what is fixed; what folds still has "
-            f"{named_pixels(none.mask)}. Hold fewer pixels around these"
+            "no field without folds was found that keeps the fixed pixels; folds remain at "
+            f"{named_pixels(none.mask)}. Fix fewer pixels around these"
         ) from none
     moving = patch
     for _ in range(_ROUNDS):

@@ -29,7 +29,7 @@ class NoRoomError(Exception):
     """Because of fixed pixels, no map without folds was found; ``mask`` (h, w) marks the pixels of the folds."""
 
     def __init__(self, mask: BoolArray) -> None:
-        super().__init__("pixels that are fixed leave no room")
+        super().__init__("the fixed pixels allow no field without folds")
         self.mask = mask
 
 

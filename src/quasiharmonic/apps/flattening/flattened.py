@@ -154,9 +154,9 @@ def flatten(
     """
     began = time.perf_counter()
     if (fixed is None) != (target is None):
-        raise ValueError("fixed and target belong together: vertices that are held, and where")
+        raise ValueError("give fixed and target together: fixed vertices and their target positions")
     if fixed is not None and unit_square:
-        raise ValueError("vertices that are held decide the map's size: leave unit_square out")
+        raise ValueError("fixed vertices determine the size of the map: omit unit_square")
     whole_number("max_iterations", max_iterations, least=0)
     whole_number("record_every", record_every, least=0)
     whole_number("rings", rings, least=1)
@@ -166,8 +166,8 @@ def flatten(
     of_distances = isinstance(energy, str) and energy == "distances"
     if of_distances and not (fixed is None and weights is None):
         raise ValueError(
-            "distances are kept of a map whose vertices are all free and whose triangles all count alike: leave fixed "
-            "and weights out, or choose another energy"
+            "the energy 'distances' supports neither fixed vertices nor weights: omit fixed and weights, or choose "
+            "another energy"
         )
     density = SymmetricDirichlet() if of_distances else energy_named(energy)
     name = "symmetric-dirichlet" if of_distances else energy if isinstance(energy, str) else type(energy).__name__
@@ -289,8 +289,8 @@ def _injective(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
     inverted = inverted_triangles(F, array)
     if inverted.size:
         raise ValueError(
-            f"start is not injective: {named('triangle', 'triangles', inverted)} inverted or without area; "
-            "leave it out, or make it injective first (quasiharmonic.repair)"
+            f"start is not injective: {named('triangle', 'triangles', inverted)} inverted or degenerate; "
+            "omit it, or make it injective first (quasiharmonic.repair)"
         )
     return array
 

@@ -81,7 +81,7 @@ def _part(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) -
 
 def anew(vertices: IntArray) -> str:
     """Name a part in messages that use the part's own numbering."""
-    return f"the piece around vertex {vertices[0]}, its elements numbered anew"
+    return f"the piece around vertex {vertices[0]}, with its own numbering"
 
 
 def united(parts: Sequence[Part]) -> Part:

@@ -87,11 +87,11 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     triangles, places = index_array("F", mesh_triangles(F)), map_array("uv", uv)
     judged = certify(triangles, places)
     if not judged.bijective:
-        raise ValueError(f"what overlaps itself cannot be cut out. {judged.summary()}")
+        raise ValueError(f"the map overlaps itself, so its pattern cannot be cut out. {judged.summary()}")
     with np.errstate(over="ignore"):
         seam = [places[loop] * UNITS[unit] for loop in judged.loops]
     if not all(np.isfinite(line).all() for line in seam):
-        raise ValueError(f"in mm the map's coordinates are beyond the largest double; is {unit} its unit?")
+        raise ValueError(f"the map's coordinates in mm exceed double precision: check the unit {unit}")
     if not allowance:
         return Pattern(seam, seam)
     label = components(triangles, len(places))
@@ -131,7 +131,7 @@ def check_pattern(path: str | os.PathLike[str], *, unit: str = "mm", allowance: 
     """Check before mapping whether a pattern can be written; raises the same errors as `write_pattern`."""
     ending = _ending(path)
     if ending not in (".svg", ".dxf"):
-        raise ValueError(f"a pattern is written as .svg or .dxf, not {ending or 'without an ending'}: {path}")
+        raise ValueError(f"a pattern must be .svg or .dxf, not {ending or 'without a suffix'}: {path}")
     if unit not in UNITS:
         raise ValueError(f"unit must be one of {', '.join(UNITS)}, not {unit!r}")
     not_negative("allowance", allowance)
@@ -160,7 +160,7 @@ def _widened(pieces: list[list[FloatArray]], allowance: float) -> list[FloatArra
         i, j = (shapely.get_coordinates(wide[int(side[near[0]])].centroid)[0].tolist() for side in (first, second))
         raise ValueError(
             f"the allowances of the pieces around ({i[0]:.6g}, {i[1]:.6g}) and ({j[0]:.6g}, {j[1]:.6g}) mm overlap: "
-            "lay them out farther apart or write each to a file of its own"
+            "place them farther apart, or write each to a separate file"
         )
     oriented = [shapely.geometry.polygon.orient(piece) for piece in wide]
     rings = [ring for piece in oriented for ring in (piece.exterior, *piece.interiors)]
@@ -217,7 +217,7 @@ def _ezdxf() -> Any:
         import ezdxf
         import ezdxf.units
     except ImportError as error:
-        raise ImportError("DXF is written by ezdxf: pip install 'quasiharmonic[patterns]'") from error
+        raise ImportError("DXF output needs ezdxf: pip install 'quasiharmonic[patterns]'") from error
     return ezdxf
 
 
@@ -225,5 +225,5 @@ def _shapely() -> Any:
     try:
         import shapely
     except ImportError as error:
-        raise ImportError("an allowance is drawn by Shapely: pip install 'quasiharmonic[shapes]'") from error
+        raise ImportError("an allowance needs Shapely: pip install 'quasiharmonic[shapes]'") from error
     return shapely

@@ -108,7 +108,7 @@ class Piece:
         handles, odd = divmod(self._missing(domain), 2)
         if handles or odd:
             raise ValueError(
-                f"the surface has {counted('handle', 'handles', handles)} and cannot lie in the plane: "
+                f"the surface has {counted('handle', 'handles', handles)} and cannot be flattened: "
                 "cut it open first (cut_open; --cut of qhm map and qhm flatten)"
             )
         self.exponent = int(np.frexp(np.abs(domain.V).max())[1])
@@ -328,8 +328,8 @@ class Flattening:
         own = self._next_start()
         if own is None:
             raise ValueError(
-                "no bijective map to start from was found within double precision: the triangles differ too much in "
-                "size; give one by start"
+                "no initial bijective map was found in double precision: the triangles differ too much in "
+                "size; give a bijective map as start"
             )
         return own
 
@@ -347,7 +347,7 @@ class Flattening:
                 continue
             self._begun.add((self._settings.linear_solver, energy))
             self._bijective = uv
-            what = f"start anew, {name}" if self._stages else "start"
+            what = f"start again, {name}" if self._stages else "start"
             self._stages.append(Stage(what, 0, time.perf_counter() - began, (0, 0), (energy, energy)))
             return uv, energy < _NEAR
         return None

@@ -40,24 +40,21 @@ class Doubt(Enum):
     """A reason why a derivative may differ from finite differences of the map; the value is a sentence for the user."""
 
     NEAR_SINGULAR = (
-        "The second derivative is singular but for rounding: there are other maps next to this one that are as good, "
-        "or it is about to leap to another."
+        "The second derivative is singular up to rounding: maps next to this one are equally good, or a small change "
+        "makes the map jump."
     )
-    NOT_LEAST = "The second derivative has a negative direction: the map is at rest, but another next to it is better."
-    NOT_AT_REST = (
-        "The map did not come to rest to rounding. The derivative is that of the forces that are left, which it takes "
-        "as staying what they are."
-    )
-    NEAR_COLLAPSE = "Triangles of the map are so thin that their rounding is a good part of them."
+    NOT_LEAST = "The second derivative has a negative direction: the map is stationary but not a minimum."
+    NOT_AT_REST = "The map did not converge to rounding. The derivative treats the remaining forces as constant."
+    NEAR_COLLAPSE = "Triangles of the map are so thin that rounding changes them noticeably."
     CONTACT = (
-        "The boundary leans on itself: without what keeps it apart the map would overlap itself. The derivative takes "
-        "that push as staying what it is."
+        "The boundary is in contact with itself: without the contact barrier the map would overlap itself. The "
+        "derivative treats the contact forces as constant."
     )
     SLIDING = (
-        "Vertices that slide rest at a kink or an end of their curve, and are taken as held there; a small change may "
-        "let them go."
+        "Sliding vertices are at a kink or an end of their curve. The derivative treats them as fixed; a small change "
+        "may release them."
     )
-    CLIPPED = "Tensors are as far from isotropic as doubles allow, and do not follow μ any further."
+    CLIPPED = "Tensors have the largest anisotropy that double precision allows, and no longer depend on μ."
 
 
 class Gradients:
@@ -210,7 +207,7 @@ class Derivative:
                 load += forces.by_strain(*self._strain.of(moved))
         if mu is not None:
             if self._tensors is None:
-                raise ValueError("mu: only a quasi-harmonic map is a map of tensors")
+                raise ValueError("mu is supported only for quasi-harmonic maps")
             load += self._tensors.by_mu(forces, self._checked_mu(mu))
         more = 0.0 if self._scale is None else self._scale.change(held, moved)
         if self._scaled:
@@ -280,14 +277,16 @@ class Derivative:
     def _rest_positions(self, rest: ArrayLike) -> FloatArray:
         moved = real_array("rest", rest)
         if moved.shape != self._rest_shape:
-            raise ValueError(f"rest must have shape {self._rest_shape}, as the rest positions have, not {moved.shape}")
+            raise ValueError(f"rest must have the shape of the rest positions, {self._rest_shape}, not {moved.shape}")
         check_finite("rest", "vertex", "vertices", moved)
         return moved
 
     def _checked_mu(self, mu: ArrayLike) -> ComplexArray:
         array, f = np.asarray(mu), self._forces.share.size
         if array.shape != (f,) or array.dtype.kind not in "iufc":
-            raise ValueError(f"mu must hold {f} numbers, one a triangle, not {array.dtype} of shape {array.shape}")
+            raise ValueError(
+                f"mu must contain {f} numbers, one for each triangle, not {array.dtype} of shape {array.shape}"
+            )
         if not np.isfinite(array).all():
             raise ValueError(
                 f"mu is not finite at {named('triangle', 'triangles', np.flatnonzero(~np.isfinite(array)))}"

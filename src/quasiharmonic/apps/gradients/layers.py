@@ -106,7 +106,7 @@ class Layer(ABC):
             return np.broadcast_shapes(*leads.values())
         except ValueError:
             batches = ", ".join(f"{name} {tuple(lead)}" for name, lead in leads.items())
-            raise ValueError(f"batches must go together as NumPy broadcasts them, not {batches}") from None
+            raise ValueError(f"batch shapes must be broadcastable, not {batches}") from None
 
     def item(self, arrays: Mapping[str, Array], item: tuple[int, ...]) -> dict[str, Array]:
         """Return the arguments of one item of the batch."""
@@ -198,10 +198,10 @@ class FlattenLayer(Layer):
     ) -> FlattenLayer:
         """Make a layer from a call's arguments; only the shape of ``rest`` is read, as it may be a traced array."""
         if (fixed is None) != (target is None):
-            raise ValueError("fixed and target belong together: vertices that are held, and where")
+            raise ValueError("give fixed and target together: fixed vertices and their target positions")
         shape = tuple(getattr(rest, "shape", ()))
         if len(shape) < 2 or shape[-1] not in (2, 3):
-            raise ValueError(f"rest must have shape (n, 2) or (n, 3), or that with a batch in front, not {shape}")
+            raise ValueError(f"rest must have shape (n, 2) or (n, 3), or batch axes before these, not {shape}")
         return cls(
             index_array("F", F),
             (shape[-2], shape[-1]),
@@ -310,7 +310,7 @@ def summed(gradient: Array, shape: tuple[int, ...]) -> Array:
 def expected(name: str, shape: tuple[int, ...], one: tuple[int, ...]) -> None:
     """Raise ValueError if an argument has neither one problem's shape nor that with batch axes in front."""
     if len(shape) < len(one) or shape[len(shape) - len(one) :] != one:
-        raise ValueError(f"{name} must have shape {one}, or that with a batch in front, not {tuple(shape)}")
+        raise ValueError(f"{name} must have shape {one}, or batch axes before it, not {tuple(shape)}")
 
 
 def _found(result: MapResult) -> FloatArray:

@@ -108,7 +108,7 @@ class Minimum:
                 self._at()
                 return size
             last = size
-        raise AssertionError("the last step has been returned from")
+        raise AssertionError("the last step has already returned")
 
     def _at(self) -> ComplexArray:
         """Evaluate the energy at the current map; return the gradient by the unknowns."""

@@ -21,7 +21,7 @@ from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 #: Error message for maps that are not injective.
-NOT_FOUND = "there is no derivative of a map that was not found"
+NOT_FOUND = "no map was found, so there is no derivative"
 
 
 @accepts_mesh

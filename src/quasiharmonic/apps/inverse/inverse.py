@@ -362,7 +362,7 @@ class InverseMap(ReadOnly):
             If there are fewer than 2 points along an axis.
         """
         if columns < 2 or rows < 2:
-            raise ValueError(f"a grid has at least 2 points along each axis, not {columns} by {rows}")
+            raise ValueError(f"a grid needs at least 2 points along each axis, not {columns} by {rows}")
         if box is None:
             corners = self.uv[self.F]
             box = (*corners.min(axis=(0, 1)).tolist(), *corners.max(axis=(0, 1)).tolist())
@@ -403,5 +403,5 @@ def _check(certificate: Certificate, overlapping: bool) -> None:
     if not (certificate.bijective or overlapping):
         raise ValueError(
             f"this map has no inverse. {certificate.summary()} "
-            "With overlapping=True, the point in the triangle of the smallest index is found at each place."
+            "With overlapping=True, each point is located in the triangle with the smallest index."
         )

@@ -138,8 +138,8 @@ def _summed(gradient: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 def _check(name: str, array: Any, one: tuple[int, ...]) -> None:
     if not jax.config.read("jax_enable_x64"):
         raise TypeError(
-            "maps are in double precision, and JAX is in single: jax.config.update('jax_enable_x64', True) before the "
-            "first array is made"
+            "maps need double precision, but JAX uses single: jax.config.update('jax_enable_x64', True) before the "
+            "first array is created"
         )
     if not isinstance(array, jax.Array | np.ndarray):
         raise TypeError(f"{name} must be an array, not {type(array).__name__}")
@@ -150,7 +150,7 @@ def _check(name: str, array: Any, one: tuple[int, ...]) -> None:
         elsewhere = [device for device in array.devices() if device.platform != "cpu"]
         if elsewhere:
             raise ValueError(
-                f"{name} is on {elsewhere[0]}, and maps are made on the CPU: "
+                f"{name} is on {elsewhere[0]}, but maps are computed on the CPU: "
                 f"jax.device_put({name}, jax.devices('cpu')[0])"
             )
     expected(name, array.shape, one)

@@ -69,11 +69,11 @@ class MorphResult:
         """Return a text that says whether the mesh is valid, and otherwise what is wrong."""
         if self.valid:
             return f"None of {counted('element', 'elements', len(self.F))} is inverted anywhere."
-        lines = [f"Inverted, or without area, somewhere: {name_elements(self.F, self.inverted)}."]
+        lines = [f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}."]
         if self.forbidden.size:
             lines.append(
-                f"By given nodes alone, wherever the others go: {name_elements(self.F, self.forbidden)}. Move the "
-                "boundary less far there, or split these elements."
+                f"Inverted for every position of the free nodes: {name_elements(self.F, self.forbidden)}. Move the "
+                "boundary less there, or split these elements."
             )
         if not self.result.injective:
             lines.append(self.result.status.value)

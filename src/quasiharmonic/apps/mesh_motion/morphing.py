@@ -252,7 +252,7 @@ def _searched(
     if energy is not None:
         energy_named(energy)
     elif rails is not False:
-        raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
+        raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
     if rails is not False:
         problem = moved_onto(rails, problem)
     result = solve(
@@ -304,13 +304,13 @@ def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
         bad = np.flatnonzero(np.abs(turning) != np.bincount(of, minlength=len(F)))
         if bad.size:
             raise ValueError(
-                f"{name_elements(F, bad)} not convex: all four corners of a quadrilateral must turn alike before "
-                "it is morphed. Move their nodes, or cut them into triangles"
+                f"{name_elements(F, bad)} not convex: all four corners of a quadrilateral must turn the same way. "
+                "Move their nodes, or split them into triangles"
             )
     else:
         flat = np.unique(of[sign == 0])
         if flat.size:
-            raise ValueError(f"{name_elements(F, flat)} without area: repair the mesh first")
+            raise ValueError(f"{name_elements(F, flat)} degenerate: repair the mesh first")
         turning = orientation(*(rest[F[:, k]] for k in range(3))).astype(np.float64)
     return np.where((turning < 0)[:, None], turned_over(F), F)
 
@@ -327,7 +327,7 @@ def _placed(
     check_finite("positions", "row", "rows", target)
     idle = given[~np.isin(given, F)]
     if idle.size:
-        raise ValueError(f"{named('vertex', 'vertices', idle)} to be moved in no triangle")
+        raise ValueError(f"moved_vertices refers to {named('vertex', 'vertices', idle)}, but no triangle uses them")
     left = np.setdiff1d(boundary_edges(covering_triangles(F)[0], len(points)), given)
     there = points.copy()
     there[given] = target

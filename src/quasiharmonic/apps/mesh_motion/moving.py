@@ -129,7 +129,7 @@ class MovingMesh:
         ratio = mean_ratio(self._points, F)
         flat = np.flatnonzero(ratio == 0)
         if flat.size:
-            raise ValueError(f"{named('triangle', 'triangles', flat)} without area: repair the mesh first")
+            raise ValueError(f"{named('triangle', 'triangles', flat)} degenerate: repair the mesh first")
         F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
         check_spread(F, len(self._points))
         self._moved = index_array("moved_vertices", moved_vertices)
@@ -196,8 +196,8 @@ class MovingMesh:
                 share = self._descent.carry(goal, _TOLERANCE, _STEPS)
             if share < 1:
                 raise RuntimeError(
-                    f"the boundary can be moved there for {share:.1%} of the way only: then triangles leave it no "
-                    "room, or too little for such a step; try shorter ones, or a new mesh"
+                    f"the boundary can be moved only {share:.1%} of the way: then triangles become too small for such "
+                    "a step; use shorter steps, or a new mesh"
                 )
             self._points = self._settled()
         finally:

@@ -66,13 +66,13 @@ def held_in_place(
     if fixed is None:
         own = np.unique(boundary_edges(island.F, len(island.vertices)))
         if not own.size:
-            raise ValueError("there is no boundary that could be fixed: cut it open, or name fixed vertices")
+            raise ValueError("the mesh has no boundary to fix: cut it open, or give fixed vertices")
     else:
         own = np.flatnonzero(np.isin(island.vertices, fixed))
     nowhere = own[np.isnan(island.uv[own]).any(axis=1)]
     if nowhere.size:
         which = named("vertex", "vertices", island.vertices[nowhere])
-        raise ValueError(f"no place in the plane for the fixed {which}: give every fixed vertex a vt")
+        raise ValueError(f"no texture coordinates for the fixed {which}: give every fixed vertex a vt")
     return Fitted(Problem(island.V, island.F, own, island.uv[own], reference=reference))
 
 

@@ -181,7 +181,7 @@ class IslandRepair:
         self._polish(self._put_back(free) if keep else free)
         if not np.array_equal(free, ~self._held) and self._overwound(free):
             self.uv = before
-            self.reason = "The maps found of a part of the island wind more than once around one of its vertices."
+            self.reason = "The maps found for a part of the island wind more than once around one of its vertices."
 
     def _put_back(self, moved: BoolArray) -> BoolArray:
         """Return vertices to their old positions where possible; return the mask of those that stay moved."""
@@ -233,7 +233,9 @@ class IslandRepair:
         corners = island.vertices[self._F]
         twice = np.flatnonzero((np.roll(corners, 1, axis=1) == corners).any(axis=1))
         if nowhere.size:
-            self.reason = f"No finite place for the boundary {named('vertex', 'vertices', island.vertices[nowhere])}."
+            self.reason = (
+                f"No finite position for the boundary {named('vertex', 'vertices', island.vertices[nowhere])}."
+            )
         elif twice.size:
             self.reason = f"A vertex is used twice in {named('triangle', 'triangles', island.triangles[twice])}."
         elif self._held[self._F[left]].all(axis=1).any():

@@ -65,7 +65,7 @@ class RepairedIsland:
         where = which_island(self.triangles)
         overlap = "" if self.bijective or not self.injective else "; it overlaps itself"
         if self.mirrored:
-            done = "turned over" if self.moved_vertices.size else "mirrored, and left so"
+            done = "turned over" if self.moved_vertices.size else "mirrored, left unchanged"
             return f"{where}: {done}{overlap}"
         if not self.inverted_before.size:
             return f"{where}: nothing to repair{overlap}"
@@ -263,5 +263,5 @@ def _mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:
         moved_vertices=np.unique(island.vertices) if turn else none,
         mirrored=True,
         bijective=bool(certificate.bijective),
-        reason="Doubles have no room for it the other way around." if wrong.size else "",
+        reason="Double precision cannot express it the other way around." if wrong.size else "",
     )

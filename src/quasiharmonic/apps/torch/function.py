@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.gradients.layers import Array, Layer, along, back, expected, forth, summed
 
-_COMPILED = "maps are made by NumPy and SciPy: under torch.compile they are a break in the graph"
+_COMPILED = "maps are computed by NumPy and SciPy, so torch.compile breaks the graph here"
 
 
 @torch.compiler.disable(reason=_COMPILED)  # type: ignore[untyped-decorator]
@@ -79,7 +79,7 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
     def vmap(info: Any, in_dims: Any, *arguments: Any) -> Any:
         """Raise NotImplementedError."""
         raise NotImplementedError(
-            "a batch of maps is one call, with further axes in front of the arguments: leave torch.func.vmap out"
+            "compute a batch of maps in one call, with batch axes first in the arguments: do not use torch.func.vmap"
         )
 
 
@@ -90,7 +90,7 @@ def _numpy(tensor: torch.Tensor) -> Array:
         return tensor.detach().resolve_conj().resolve_neg().numpy()
     except RuntimeError as error:
         raise NotImplementedError(
-            "maps are differentiated by backward(), torch.autograd.grad and forward mode, not by torch.func"
+            "maps support backward(), torch.autograd.grad and forward mode, but not torch.func"
         ) from error
 
 
@@ -101,5 +101,5 @@ def _check(name: str, tensor: Any, one: tuple[int, ...]) -> None:
     if tensor.dtype != wanted:
         raise TypeError(f"{name} must be of {wanted}, not {tensor.dtype}: {name}.to({wanted})")
     if tensor.device.type != "cpu":
-        raise ValueError(f"{name} is on {tensor.device}, and maps are made on the CPU: {name}.cpu()")
+        raise ValueError(f"{name} is on {tensor.device}, but maps are computed on the CPU: {name}.cpu()")
     expected(name, tuple(tensor.shape), one)

@@ -73,12 +73,12 @@ def landmarks_of(
         _check_inside("target", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
     soft = np.flatnonzero(edge & ~np.isinf(weight))
     if soft.size:
-        raise ValueError(f"weights: {named('landmark', 'landmarks', soft)} on the border, where all arrive exactly")
+        raise ValueError(f"weights: {named('landmark', 'landmarks', soft)} on the border, where landmarks are exact")
     _check_apart("landmarks", before)
     _check_apart("target", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
     for number, pair in enumerate(curves):
         if len(pair) != 2:
-            raise ValueError(f"curve {number} must be two polylines, the one that goes and where to, not {len(pair)}")
+            raise ValueError(f"curve {number} must be two polylines, before and after, not {len(pair)}")
         one, other = _resampled(*pair, f"curve {number}", step)
         for name, points in ((f"curve {number}, before", one), (f"curve {number}, after", other)):
             _check_inside(name, points, ((points > 0) & (points < size)).all(axis=1), size)
@@ -107,7 +107,7 @@ def _weights(weights: ArrayLike | None, k: int) -> FloatArray:
     """Check the weights of ``k`` landmarks; infinite by default."""
     array = np.full(k, np.inf) if weights is None else real_array("weights", weights)
     if array.shape != (k,):
-        raise ValueError(f"weights must have shape ({k},), one for every landmark, not {array.shape}")
+        raise ValueError(f"weights must have shape ({k},), one for each landmark, not {array.shape}")
     bad = np.flatnonzero(~(array > 0))
     if bad.size:
         raise ValueError(f"the weight is not positive at {named('landmark', 'landmarks', bad)}")
@@ -121,7 +121,7 @@ def _check_apart(name: str, array: FloatArray, numbers: IntArray | None = None) 
         place = array[first[count > 1][0]]
         same = np.flatnonzero((array == place).all(axis=1))
         which = same if numbers is None else numbers[same]
-        raise ValueError(f"{name}: {named('point', 'points', which)} are at the same place, {tuple(place.tolist())}")
+        raise ValueError(f"{name}: {named('point', 'points', which)} have the same position, {tuple(place.tolist())}")
 
 
 def _resampled(start: ArrayLike, end: ArrayLike, name: str, step: float) -> tuple[FloatArray, FloatArray]:
@@ -149,7 +149,7 @@ def _check_inside(name: str, points: FloatArray, inside: Any, size: IntArray) ->
     outside = np.flatnonzero(~inside)
     if outside.size:
         raise ValueError(
-            f"{name}: {named('point', 'points', outside)} not inside the picture, 0 < x < {size[0]} to the right and "
+            f"{name}: {named('point', 'points', outside)} not inside the image, 0 < x < {size[0]} to the right and "
             f"0 < y < {size[1]} down: the first is at {tuple(points[outside[0]].tolist())}"
         )
 

@@ -123,7 +123,7 @@ def warp_by_landmarks(
     not_negative("smoothness", length)
     given = landmarks_of(landmarks, target, weights, curves, float(size.max()) / resolution, size)
     if not length and not given.hard.all():
-        raise ValueError("weights need a smoothness that is positive: without, a point pulls nothing along")
+        raise ValueError("weights need a positive smoothness: without it, a point moves nothing else")
     before, after, edge = given.before, given.after, on_border(given.before, size)
     points, F = picture_mesh(before, width, height, resolution)
     own = len(points) - len(before) + np.arange(len(before))
@@ -134,11 +134,11 @@ def warp_by_landmarks(
     # Landmarks can pass each other. The corrected reference spreads the resulting distortion from the start.
     result = injective_map(points, F, fixed, target, reference="corrected", polish=None if length else energy)
     if result.certificate.crossings.size:
-        raise ValueError("target: the border that goes along with the landmarks on it crosses itself")
+        raise ValueError("target: the border, moved by the landmarks on it, crosses itself")
     if not result.injective:
         raise RuntimeError(
-            "no warp without folds was found: landmarks that go far past each other or the border leave no room "
-            f"between them. Move them less far, or give more of them along the way. ({result.status.value})"
+            "no warp without folds was found: landmarks may move too far past each other or past the border. "
+            f"Move them less, or give more landmarks between them. ({result.status.value})"
         )
     if length:
         pull = Pull(own[~held], after[~held], given.weights[~held])

@@ -53,8 +53,8 @@ def lay_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) -
     inverted = inverted_triangles(domain.F, track.uv)
     if inverted.size:
         raise ValueError(
-            f"with the boundary on the curves to slide along, {named('triangle', 'triangles', inverted)} inverted or "
-            "without area: let it be there from the start (injective_map with slide, or qhm map --slide)"
+            f"with the boundary moved onto its curves, {named('triangle', 'triangles', inverted)} inverted or "
+            "degenerate: find the map with the boundary on the curves (injective_map with slide, or qhm map --slide)"
         )
     return track
 

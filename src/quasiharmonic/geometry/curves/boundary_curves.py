@@ -79,15 +79,15 @@ class BoundaryCurves:
             raise ValueError("there is no curve to slide along")
         on = {} if on is None else on
         if not isinstance(on, Mapping):
-            raise ValueError(f"on must say which vertex is on which curve, as in {{12: 0}}, and is {type(on).__name__}")
+            raise ValueError(f"on must map vertices to curves, as in {{12: 0}}, not {kind_of(on)}")
         vertices, numbers = index_array("on", list(on)), index_array("on", list(on.values()))
         check_range("on", numbers, len(self.curves), "curve", "curves")
         self.on: dict[int, int] = dict(zip(vertices.tolist(), numbers.tolist(), strict=True))
         self.fixed = index_array("fixed", fixed).ravel()
         if not 0 <= corner_angle <= 180:
-            raise ValueError(f"corner_angle is between 0 and 180 degrees, not {corner_angle}")
+            raise ValueError(f"corner_angle must be between 0 and 180 degrees, not {corner_angle}")
         if not 0 <= tolerance < 1:
-            raise ValueError(f"tolerance is between 0 and 1, not {tolerance}")
+            raise ValueError(f"tolerance must be between 0 and 1, not {tolerance}")
         self.corner_angle, self.tolerance = float(corner_angle), float(tolerance)
 
     @classmethod
@@ -106,7 +106,9 @@ class BoundaryCurves:
         known = np.concatenate([index_array("on", list(self.on)), self.fixed])
         absent = np.setdiff1d(known, used)
         if absent.size:
-            raise ValueError(f"{named('vertex', 'vertices', absent)} of the rails in no triangle")
+            raise ValueError(
+                f"the boundary curves refer to {named('vertex', 'vertices', absent)}, but no triangle uses them"
+            )
         on = {int(np.searchsorted(used, v)): k for v, k in self.on.items()}
         return self._with(on, np.searchsorted(used, self.fixed))
 
@@ -179,7 +181,9 @@ class BoundaryCurves:
         check_range("fixed", self.fixed, len(uv))
         inner = np.setdiff1d(told, boundary)
         if inner.size:
-            raise ValueError(f"{named('vertex', 'vertices', inner)} told a curve, but not on the boundary")
+            raise ValueError(
+                f"on assigns curves to interior {named('vertex', 'vertices', inner)}: only boundary vertices can slide"
+            )
         only = np.array([self.on.get(int(v), -1) for v in boundary])
         allowed = self.tolerance * max(one.size for one in self.curves)
         curve, s, least = np.full(boundary.size, -1), np.zeros(boundary.size), np.full(boundary.size, np.inf)
@@ -189,16 +193,17 @@ class BoundaryCurves:
             far = (away > allowed) & (only[asked] == k)
             if far.any():
                 raise ValueError(
-                    f"{named('vertex', 'vertices', boundary[asked[far]])} told to be on curve {k}, but off it by "
-                    f"{away[far].max():.3g} at most, where {allowed:.3g} is mended"
+                    f"on assigns curve {k} to {named('vertex', 'vertices', boundary[asked[far]])}, "
+                    f"but the distance to it is "
+                    f"up to {away[far].max():.3g}, and at most {allowed:.3g} is allowed"
                 )
             near = (away <= allowed) & (away < least[asked])
             found = asked[near]
             curve[found], s[found], least[found] = k, where[near], away[near]
         if (curve < 0).all():
             raise ValueError(
-                f"no boundary vertex is within {allowed:.3g} of the curves to slide along: are they drawn at another "
-                "scale, or elsewhere?"
+                f"no boundary vertex is within {allowed:.3g} of the curves to slide along: check the scale and the "
+                "position of the curves"
             )
         return curve, s
 
@@ -321,7 +326,10 @@ def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> Non
     same = np.flatnonzero(np.diff(chain.s) <= 0)
     if same.size:
         i, j = chain.vertices[same[0]], chain.vertices[same[0] + 1]
-        raise ValueError(f"boundary vertices {i} and {j} are at one place of curve {k}: they could not slide in order")
+        raise ValueError(
+            f"boundary vertices {i} and {j} have the same position on curve {k}: separate them, or "
+            f"keep their order along the curve"
+        )
     rank = np.full(n, -1)
     rank[chain.vertices] = np.arange(count)
     for loop in loops:
@@ -333,6 +341,6 @@ def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> Non
         if wrong.size:
             i, j = loop[wrong[0]], np.roll(loop, -1)[wrong[0]]
             raise ValueError(
-                f"boundary vertices {i} and {j} follow each other around the surface but not along curve {k}: put them "
-                "in order, or, where curves come close, tell vertices theirs (BoundaryCurves, on=)"
+                f"boundary vertices {i} and {j} are neighbours on the boundary but not along curve {k}: correct their "
+                "order, or, if curves are close together, assign vertices to curves (BoundaryCurves, on=)"
             )

@@ -291,7 +291,7 @@ class Curve:
         self.size = float(max(np.ptp(every.real), np.ptp(every.imag)))
         if not (self.size > _SMALLEST and np.abs(every).max() < _LARGEST):
             raise ValueError(
-                f"a curve of size {self.size:.3g} around {every[0]:.3g} leaves the range that can be computed in "
+                f"a curve of size {self.size:.3g} around {every[0]:.3g} is outside the supported range "
                 f"({_SMALLEST:.0e} to {_LARGEST:.0e}): scale the drawing"
             )
         lengths = self._way(np.arange(count.size), np.ones(count.size))
@@ -317,7 +317,7 @@ class Curve:
         if apart[:-1].any():
             k = int(np.argmax(apart[:-1]))
             raise ValueError(
-                f"pieces {k} and {k + 1} of the curve (those without length left out) do not meet: "
+                f"pieces {k} and {k + 1} of the curve (without pieces of zero length) do not meet: "
                 f"{heads[k]:.6g} and {tails[k + 1]:.6g}"
             )
         self.closed = not apart[-1]

@@ -190,7 +190,7 @@ def certify(
     F, uv = _taken(F, uv)
     given = None if loops is None else loop_arrays(loops, len(uv))
     if given == [] and len(F):
-        raise ValueError("loops has no boundary loop: leave it out to have the loops found")
+        raise ValueError("loops has no boundary loop: omit it to find the loops automatically")
     sign, nonfinite = triangle_signs(F, uv)
     inverted = degenerate = np.empty(0, dtype=np.int64)
     reasons: list[Reason] = []

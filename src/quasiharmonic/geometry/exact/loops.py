@@ -354,7 +354,7 @@ def _misplaced(curves: _Curves) -> list[Reason]:
         outside = around[inner == loop].tolist()
         runs = f"boundary loop {loop} runs {'counterclockwise' if sense[loop] > 0 else 'clockwise'}"
         if outside:
-            text = f"{runs} inside {listed(outside)}: what it encloses is covered {covered[loop] + sense[loop]} times"
+            text = f"{runs} inside {listed(outside)}: its interior is covered {covered[loop] + sense[loop]} times"
             reasons.append(Reason(Obstacle.NESTING, text, (loop, *outside)))
         else:
             reasons.append(Reason(Obstacle.WINDING, f"{runs} and no other loop is around it", (loop,)))

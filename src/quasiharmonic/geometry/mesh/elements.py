@@ -76,8 +76,9 @@ def _check_middles(F: IntArray) -> None:
     torn = (ends != ends[first][number.ravel()]).any(axis=1)
     if torn.any():
         raise ValueError(
-            f"{named('node', 'nodes', middle[np.unique(number.ravel()[torn])])} between other corners in one triangle "
-            "than in another: a row of F has the three corners, and then the nodes between the first and the second, "
+            f"{named('node', 'nodes', middle[np.unique(number.ravel()[torn])])} between different "
+            f"corners in one triangle "
+            "than in another: a row of F needs the three corners, then the nodes between the first and the second, "
             "the second and the third, the third and the first"
         )
 
@@ -93,8 +94,8 @@ def check_spread(F: IntArray, n: int) -> None:
     found = edges(covering_triangles(F)[0], n)
     if found.inconsistent.size and not found.nonmanifold.size:
         raise ValueError(
-            f"the mesh at rest is folded over at {named_edges(found.inconsistent)}, both of whose elements lie on one "
-            "side: some are inverted. Hand over the mesh as it was when it was valid; to `morph` as rest="
+            f"the rest mesh is folded at {named_edges(found.inconsistent)}: both elements lie on the same side, so "
+            "some are inverted. Pass a valid mesh, with the argument rest= of `morph`"
         )
 
 
@@ -108,7 +109,9 @@ def joined(blocks: Sequence[IntArray]) -> IntArray:
     """
     sizes = {block.shape[1] for block in blocks if len(block)}
     if len(sizes) > 1 and 6 in sizes:
-        raise ValueError("there are six-node triangles beside others: all elements must be of one order")
+        raise ValueError(
+            "the mesh has both six-node triangles and other elements: all elements must have the same order"
+        )
     width = max(sizes, default=3)
     # A triangle among quadrilaterals repeats its last node.
     whole = [block[:, [*range(block.shape[1]), 2][:width]] for block in blocks if len(block)]

@@ -67,7 +67,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
     shapes = rest_shapes(V, F, lowest=lowest)
     if shapes.flat.size:
         raise ValueError(
-            f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: it cannot be laid flat there"
+            f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: repair the mesh first"
         )
     n, f = len(V), len(F)
     # Half-edges, corner by corner; the next half-edge of a triangle is f further.

@@ -57,5 +57,5 @@ def opened_along(F: IntArray, cut: IntArray, n: int) -> Corners:
     sides, wanted = edge_keys(F, np.roll(F, -1, axis=1), n), edge_keys(cut[:, 0], cut[:, 1], n)
     strange = ~np.isin(wanted, sides)
     if strange.any():
-        raise ValueError(f"{named_edges(cut[strange])}: no triangle has such a side")
+        raise ValueError(f"{named_edges(cut[strange])}: not an edge of the mesh")
     return Corners(*numbered(F, fans(F, np.isin(sides, wanted))[0], n))

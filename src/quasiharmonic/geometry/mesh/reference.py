@@ -194,7 +194,7 @@ class ReferenceMesh:
             If ``w`` does not have one position for each vertex.
         """
         if w.shape != (self.n,):
-            raise ValueError(f"w must have shape ({self.n},), a place for every vertex, not {w.shape}")
+            raise ValueError(f"w must have shape ({self.n},), one position for each vertex, not {w.shape}")
         f = len(self.F)
         p, q, area = np.empty(f, dtype=np.complex128), np.empty(f, dtype=np.complex128), np.empty(f)
         wirtinger(w, self.F, self.half_gamma, p, q, area)

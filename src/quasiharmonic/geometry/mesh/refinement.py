@@ -67,7 +67,9 @@ class Refined:
         old = np.asarray(values, dtype=np.float64)
         if not old.ndim or len(old) != len(self.V) - len(self.parents):
             rows = "a number" if not old.ndim else f"{len(old)} rows"
-            raise ValueError(f"values must have {len(self.V) - len(self.parents)} rows, one a vertex, not {rows}")
+            raise ValueError(
+                f"values must have {len(self.V) - len(self.parents)} rows, one for each vertex, not {rows}"
+            )
         return np.concatenate([old, np.einsum("sk,sk...->s...", self.weights, old[self.parents])])
 
 
@@ -106,7 +108,7 @@ def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool 
     _refuse(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
     true_or_false("boundary", boundary)
     if not boundary:
-        _refuse(wanted, _keys(found.interior, n), n, "on the boundary; pass boundary=True to split it all the same")
+        _refuse(wanted, _keys(found.interior, n), n, "on the boundary; pass boundary=True to split it")
 
     V = np.concatenate([V, V[wanted[:, 0]] / 2 + V[wanted[:, 1]] / 2])
     keys = _keys(wanted, n)

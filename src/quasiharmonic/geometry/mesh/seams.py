@@ -187,7 +187,9 @@ class SeamedMesh:
         """
         bare = np.flatnonzero((self.FT < 0).any(axis=1))
         if bare.size:
-            raise ValueError(f"{named('triangle', 'triangles', bare)} without a place, which others have")
+            raise ValueError(
+                f"{named('triangle', 'triangles', bare)} without texture coordinates, which other triangles have"
+            )
         if self.seamless:
             FT, origin = self.F, np.arange(len(self.V))
         else:
@@ -223,7 +225,7 @@ class SeamedMesh:
         wanted = edge_keys(pairs[:, 0], pairs[:, 1], len(self.V))
         absent = ~np.isin(wanted, sides)
         if absent.any():
-            raise ValueError(f"{named_edges(pairs[absent])}: the mesh has no such edge to cut")
+            raise ValueError(f"{named_edges(pairs[absent])}: not an edge of the mesh, so it cannot be cut")
         FT, _ = self._numbered(np.isin(sides, wanted))
         return SeamedMesh(self.V, self.F, FT)
 

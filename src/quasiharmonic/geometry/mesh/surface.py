@@ -41,14 +41,13 @@ def surface_edges(F: IntArray, n: int, *, closed: bool = False) -> Edges:
     found = manifold_edges(F, n)
     if not closed and not found.boundary.size:
         raise ValueError(
-            "the surface is closed: it has no boundary to place; cut it open first "
-            "(cut_open; --cut of qhm map and qhm flatten)"
+            "the surface is closed: it has no boundary; cut it open first (cut_open; --cut of qhm map and qhm flatten)"
         )
     if not connected:
         first = np.unique(label)
         raise ValueError(
             f"the mesh has {first.size} components, the first ones around {named('vertex', 'vertices', first)}: "
-            "map them one at a time"
+            "map each component separately"
         )
     return found
 

@@ -89,7 +89,7 @@ def _taking(
             args = (*before, *arrays(mesh), *after)
         elif len(args) > place and isinstance(args[place], tuple) and np.ndim(args[place][:1]) > 2:
             pair = f"a tuple of {len(args[place])} arrays"
-            raise TypeError(f"V is {pair}: hand these over one by one, as in {function.__name__}(*mesh)")
+            raise TypeError(f"V is {pair}: pass them as separate arguments, as in {function.__name__}(*mesh)")
         elif first in kwargs and "F" not in kwargs and stands_for_mesh(kwargs[first]):
             kwargs[first], kwargs["F"] = arrays(kwargs[first])
         return function(*args, **kwargs)
@@ -102,4 +102,4 @@ def _check_room(function: Callable[..., Any], mesh: object, count: int, kwargs: 
     parameters = inspect.signature(function).parameters.values()
     most = sum(parameter.kind is not inspect.Parameter.KEYWORD_ONLY for parameter in parameters)
     if "F" in kwargs or count > most:
-        raise TypeError(f"{kind_of(mesh)} stands for V and F both: leave F out, or hand over V in its place")
+        raise TypeError(f"{kind_of(mesh)} provides both V and F: omit F, or pass the array V instead")

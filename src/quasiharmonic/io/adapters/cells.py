@@ -78,8 +78,8 @@ def _elements(blocks: Iterable[tuple[Any, Any]], name: str) -> IntArray:
             continue
         if kind not in _NODES:
             raise ValueError(
-                f"{name} are of the kind {kind!r}: a planar mesh of triangles, six-node triangles or quadrilaterals is "
-                "needed"
+                f"{name} have the cell type {kind!r}: only planar meshes of triangles, six-node triangles or "
+                "quadrilaterals are supported"
             )
         rows.append(index_array(name, nodes).reshape(-1, _NODES[kind]))
     return joined(rows)

@@ -151,8 +151,8 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     if positions is None or faces is None:
         lacking = "vertices" if positions is None else "faces"
         raise ValueError(
-            f"{what} is no mesh that can be taken as one, as it has no {lacking}: hand over an object with vertices "
-            "and faces, the path of a file, or the arrays V and F"
+            f"{what} is not a mesh, because it has no {lacking}: pass an object with vertices and faces, the path of "
+            "a file, or the arrays V and F"
         )
     name = f"{faces} of {what}"
     V = vertex_array(_part(mesh, positions), f"{positions} of {what}")
@@ -176,7 +176,7 @@ def seamed_mesh(mesh: MeshLike) -> SeamedMesh:
     if isinstance(mesh, io.MeshData):
         return io.seamed(mesh)
     if not stands_for_mesh(mesh):
-        raise TypeError(f"{kind_of(mesh)} is no mesh: hand over a SeamedMesh, or the path of a file")
+        raise TypeError(f"{kind_of(mesh)} is not a mesh: pass a SeamedMesh, or the path of a file")
     return SeamedMesh(*mesh_arrays(mesh))
 
 
@@ -222,7 +222,7 @@ def _block(name: str, block: Any) -> Iterable[IntArray]:
     if block.type in _PASSED_OVER:
         return ()
     if block.type not in _FACES_OF:
-        raise ValueError(f"{name} has cells of the kind {block.type!r}, of which no surface of triangles is made")
+        raise ValueError(f"{name} has cells of type {block.type!r}: only surface cells are supported")
     return (index_array(name, ring) for ring in block.data)
 
 
@@ -242,7 +242,7 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
         faces = np.isin(kinds, _FACES_OF_VTK)
         wrong = np.setdiff1d(kinds, (*_FACES_OF_VTK, *_PASSED_OVER_OF_VTK))
         if wrong.size:
-            raise ValueError(f"{name} has cells of VTK's kind {wrong[0]}, of which no surface of triangles is made")
+            raise ValueError(f"{name} has cells of VTK type {wrong[0]}: only surface cells are supported")
     corner = np.repeat(faces, sizes + 1)
     corner[heads] = False
     return numbers[corner], sizes[faces]
@@ -253,7 +253,9 @@ def _heads(name: str, numbers: list[int]) -> list[int]:
     heads, at = [], 0
     while at < len(numbers):
         if numbers[at] < 1 or at + numbers[at] >= len(numbers):
-            raise ValueError(f"{name} must be rows of corners, or (count, corners, count, …) from beginning to end")
+            raise ValueError(
+                f"{name} must have one row of corners per face, or the flat form (count, corners, count, …)"
+            )
         heads.append(at)
         at += 1 + numbers[at]
     return heads

@@ -60,7 +60,7 @@ class FemMesh:
         which, fields = np.asarray(vertices, dtype=np.int64), self.parts.fields
         if name not in fields:
             there = ", ".join(map(repr, sorted(fields))) or "none"
-            raise MeshFileError(self.source, f"there is no point data {name!r}", remedy=f"there are: {there}")
+            raise MeshFileError(self.source, f"there is no point data {name!r}", remedy=f"available: {there}")
         try:
             # Converting a signalling NaN to double raises a warning.
             with np.errstate(invalid="ignore"):
@@ -70,17 +70,17 @@ class FemMesh:
         if values.shape[1] not in (2, 3):
             raise MeshFileError(
                 self.source,
-                f"the point data {name!r} are no vectors in the plane: {values.shape[1]} numbers at each point",
+                f"the point data {name!r} are not plane vectors: they have {values.shape[1]} numbers for each point",
             )
         lost = which[~np.isfinite(values).all(axis=1)]
         if lost.size:
             raise MeshFileError(
                 self.source,
                 f"{name!r} has no finite value at {named('boundary point', 'boundary points', lost)} (0-based)",
-                remedy="give every point of the boundary one, 0 where it stays",
+                remedy="give every boundary point a value, 0 for points that do not move",
             )
         if values[:, 2:].any():
-            raise MeshFileError(self.source, f"the point data {name!r} lead out of the plane")
+            raise MeshFileError(self.source, f"the point data {name!r} have displacements out of the plane")
         return values[:, :2].copy()
 
 
@@ -122,8 +122,8 @@ def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str
     if here in _READERS and there != here:
         raise MeshFileError(
             path,
-            f"a {here} file is written as {here}, in which only positions change; written as "
-            f"{there or 'a file without suffix'}, it could lose groups, data or times",
+            f"a {here} file can only be written as {here}: {there or 'a file without suffix'} could lose groups, "
+            "data or times",
             remedy="convert the written file if you need another format",
         )
     check_writable(path)
@@ -152,7 +152,7 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
     with np.errstate(over="ignore"):
         expected = points.astype(mesh.parts.precision).astype(np.float64)
     if not np.isfinite(expected).all():
-        raise MeshFileError(path, "positions are too large for single precision, which the file has")
+        raise MeshFileError(path, "positions are too large for the file's single precision")
     data = mesh.parts.replaced(points)
     written = _mesh(mesh.source, data)
     if not (
@@ -160,7 +160,7 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
         and np.array_equal(written.F, mesh.F)
         and np.array_equal(written.parts.points[:, 2], mesh.parts.points[:, 2])
     ):
-        raise MeshFileError(path, "what would be written does not read back as it should, so it is not")
+        raise MeshFileError(path, "nothing was written, because the new file would not read back correctly")
     write_whole(path, data)
 
 
@@ -177,7 +177,7 @@ def _mesh(source: Path, data: bytes) -> FemMesh:
         with np.errstate(invalid="ignore"):
             parts = reader(data)
     except _DAMAGE as error:
-        what = str(error) if isinstance(error, ValueError) else f"something is missing in it ({error})"
+        what = str(error) if isinstance(error, ValueError) else f"an entry is missing ({error})"
         raise MeshFileError(source, f"cannot be read: {what}") from error
     points, F = parts.points, parts.F
     if not F.size:
@@ -190,6 +190,6 @@ def _mesh(source: Path, data: bytes) -> FemMesh:
         raise MeshFileError(
             source,
             f"is not planar: z goes from {used[:, 2].min():.6g} to {used[:, 2].max():.6g}",
-            remedy="a mesh in the plane z = constant is needed",
+            remedy="only meshes in a plane z = constant are supported",
         )
     return FemMesh(points[:, :2].copy(), F, source, parts)

@@ -48,7 +48,7 @@ def read_gmsh(data: bytes) -> MeshParts:
         if name == b"Nodes":
             nodes.append(_nodes(data, begin, end, version, order))
         elif name == b"ParametricNodes":
-            raise ValueError("nodes with parameters are not known in version 2: save it as 4.1, or without them")
+            raise ValueError("nodes with parameters are not supported in version 2: save it as 4.1, or without them")
         elif name == b"Elements":
             elements.append(_elements(data, begin, end, version, order))
         elif name == b"NodeData":
@@ -63,14 +63,14 @@ def read_gmsh(data: bytes) -> MeshParts:
         all(np.array_equal(t, tags) and np.array_equal(p.values, nodes[0][1].values) for t, p in nodes[1:])
         and all(np.array_equal(other, numbers) for other in elements[1:])
     ):
-        raise ValueError("it has several meshes: save each in a file of its own")
+        raise ValueError("it has several meshes: save each in a separate file")
     place = stacked([table for _, table in nodes], 3)
     known = np.argsort(tags, kind="stable")
     at = np.searchsorted(tags, numbers, sorter=known).clip(max=max(len(tags) - 1, 0))
     F = known[at] if len(tags) else numbers
     wrong = numbers[tags[F] != numbers] if len(tags) else numbers.ravel()
     if wrong.size:
-        raise ValueError(f"an element refers to node {wrong[0]}, which is not there")
+        raise ValueError(f"an element refers to node {wrong[0]}, which does not exist")
     if version == "2":
         # Version 2 repeats an element for each of its physical groups.
         F = F[np.sort(np.unique(np.sort(F, axis=1), axis=0, return_index=True)[1])]
@@ -94,13 +94,13 @@ def _format(data: bytes) -> tuple[str, str | None, int]:
     reader.line()
     words = reader.words()
     if begin < 0 or len(words) != 3:
-        raise ValueError("it does not begin as an MSH file of version 2 or 4 does")
+        raise ValueError("it does not start like an MSH file of version 2 or 4")
     version = words[0].decode("ascii", "replace")
     version = "2" if version.split(".")[0] == "2" else "4.0" if version == "4" else version
     if version not in ("2", "4.0", "4.1"):
-        raise ValueError(f"version {version} is not known: save it as 2.2 or 4.1")
+        raise ValueError(f"version {version} is not supported: save it as 2.2 or 4.1")
     if words[2] != b"8":
-        raise ValueError(f"numbers of {words[2].decode('ascii', 'replace')} bytes are not known: save it with 8")
+        raise ValueError(f"numbers of {words[2].decode('ascii', 'replace')} bytes are not supported: save it with 8")
     order: str | None = None
     if words[1] == b"1":
         one = data[reader.position : reader.position + 4]
@@ -195,8 +195,8 @@ def _element_lines(numbers: list[int], count: int) -> IntArray:
 def _nodes_of(kind: int) -> int:
     if kind not in _NODES:
         raise ValueError(
-            f"there are cells of the kind {_NAMES.get(kind, f'number {kind}')}: triangles of three or six "
-            "nodes or quadrilaterals are needed"
+            f"cells of type {_NAMES.get(kind, f'number {kind}')} are not supported: use triangles of three or six "
+            "nodes or quadrilaterals"
         )
     return _NODES[kind]
 

@@ -57,11 +57,11 @@ class _Walk:
         self._data = data
         head = TableReader(data, 0, len(data), ">")
         if not head.line().startswith(b"# vtk DataFile Version"):
-            raise ValueError("it does not begin as a legacy VTK file does")
+            raise ValueError("it does not start like a legacy VTK file")
         head.line()
         coding = head.line().upper()
         if coding not in (b"ASCII", b"BINARY"):
-            raise ValueError("its third line is neither ASCII nor BINARY")
+            raise ValueError("its third line must be ASCII or BINARY")
         self._reader = TableReader(data, head.position, len(data), None if coding == b"ASCII" else ">")
         self._points: Table | None = None
         self._lists: list[tuple[IntArray, IntArray, int]] = []
@@ -92,11 +92,11 @@ class _Walk:
         reader = self._reader
         if name == b"DATASET":
             if words[:1] not in ([b"UNSTRUCTURED_GRID"], [b"POLYDATA"]):
-                raise ValueError(f"its data set is {_text(words)}: an unstructured grid or polygons are needed")
+                raise ValueError(f"its data set is {_text(words)}: save it as an unstructured grid or polygons")
         elif name == b"POINTS":
             kind = _KINDS.get(words[1].lower(), "")
             if kind not in ("f4", "f8"):
-                raise ValueError(f"its positions are {_text(words[1:])}: float or double is needed")
+                raise ValueError(f"its positions are {_text(words[1:])}: save them as float or double")
             (self._points,) = reader.tables(int(words[0]), (kind, 3))
         elif name == b"CELLS" or name in _POLY:
             self._cells(int(words[0]), int(words[1]), _POLY.get(name, 0))
@@ -124,7 +124,7 @@ class _Walk:
         elif name in _COMPONENTS:
             self._array(words[0], words[1], _COMPONENTS[name])
         else:
-            raise ValueError(f"the section {_text([name])} is not known")
+            raise ValueError(f"the section {_text([name])} is not supported")
 
     def _cells(self, count: int, size: int, kind: int) -> None:
         """Read a list of cells, in the format of version 5.1 or of earlier versions."""
@@ -166,7 +166,7 @@ class _Walk:
             self._array(words[0], words[3], int(words[1]))
             self._count, self._of_points = count, of_points
         elif words[:1] != [b"NULL_ARRAY"]:
-            raise ValueError(f"{_text(words)[:60]!r} stands where an array of a field should")
+            raise ValueError(f"an array of a field was expected, not {_text(words)[:60]!r}")
 
     def _array(self, name: bytes, kind: bytes, components: int) -> None:
         """Read past values at points, cells or neither; register those at points."""
@@ -189,7 +189,7 @@ class _Walk:
         elif kind == b"bit":
             reader.take("u1", count if reader.text else (count + 7) // 8)
         elif kind not in _KINDS:
-            raise ValueError(f"arrays of {_text([kind])} are not known")
+            raise ValueError(f"arrays of {_text([kind])} are not supported")
         else:
             reader.skip(_KINDS[kind], count)
 

@@ -123,7 +123,7 @@ class TableReader:
             If the file ends before, or contains anything but numbers there.
         """
         if rows < 0 or any(count < 1 for _, count in columns):
-            raise ValueError("a number of things below what is possible")
+            raise ValueError("a count is negative or too small")
         if self._order is None:
             return self._words(rows, columns)
         row = np.dtype([(str(i), self._order + kind, (count,)) for i, (kind, count) in enumerate(columns)])

@@ -53,8 +53,7 @@ def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: 
     if other.size:
         names = (_NAMES.get(kind, "polygon" if kind == _POLYGON else f"number {kind}") for kind in other.tolist())
         raise ValueError(
-            f"there are cells of the kind {', '.join(names)}: triangles of three or six nodes or quadrilaterals are "
-            "needed"
+            f"cells of type {', '.join(names)} are not supported: use triangles of three or six nodes or quadrilaterals"
         )
     begins, sizes = starts[:-1][wanted], sizes[wanted]
     changes = np.flatnonzero(np.diff(sizes)) + 1

@@ -74,7 +74,7 @@ def read_vtu(data: bytes) -> MeshParts:
     points = file.only("Points", None)
     precision = points.attributes.get("type")
     if precision not in ("Float32", "Float64") or points.attributes.get("NumberOfComponents") != "3":
-        raise ValueError(f"its positions are not three Float32 or Float64 each but {precision}")
+        raise ValueError(f"its positions must be three Float32 or Float64 each, not {precision}")
     place = file.values(points, 3 * file.points).reshape(-1, 3)
     ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
     connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
@@ -111,9 +111,9 @@ class _VtuFile:
         try:
             self._parser.Parse(head, True)
         except ExpatError as error:
-            raise ValueError(f"it is not the XML of a VTU file: {error}") from error
+            raise ValueError(f"it is not well-formed XML: {error}") from error
         if self._file.get("type") != "UnstructuredGrid":
-            raise ValueError("it is not a VTU file of an unstructured grid")
+            raise ValueError("it is not a VTU file with an unstructured grid")
         if len(self._pieces) != 1:
             raise ValueError(f"it has {len(self._pieces)} pieces: merge them into one")
         self.points, self.cells = (int(self._pieces[0].get(f"NumberOf{what}", "0")) for what in ("Points", "Cells"))
@@ -138,14 +138,14 @@ class _VtuFile:
         found = [a for (p, n), arrays in self._arrays.items() if p == parent and name in (None, n) for a in arrays]
         if len(found) != 1:
             what = parent if name is None else f"{parent} called {name}"
-            raise ValueError(f"it has {len(found)} arrays of {what}: one is needed, of one time")
+            raise ValueError(f"it has {len(found)} arrays of {what}: save one array at one time step")
         return found[0]
 
     def values(self, array: _Array, most: int) -> NDArray[Any]:
         """Return the numbers of an array, at most ``most`` of them if compressed."""
         kind = _KINDS.get(array.attributes.get("type", ""))
         if kind is None:
-            raise ValueError(f"arrays of {array.attributes.get('type', '')[:40]} are no numbers")
+            raise ValueError(f"arrays of {array.attributes.get('type', '')[:40]} are not numbers")
         if array.attributes.get("format") == "ascii":
             text = self._data[array.begin : array.end].split()
             return np.array(text, dtype=np.bytes_).astype(np.float64 if kind[0] == "f" else np.int64).astype(kind)
@@ -215,7 +215,7 @@ class _VtuFile:
         part, last, *lengths = np.frombuffer(header, self._word)[1:].tolist()
         sizes = [part] * (count - 1) + [last or part] * (count > 0)
         if sum(sizes) > most:
-            raise ValueError(f"compressed data are of {sum(sizes)} bytes, and there is room for {most}")
+            raise ValueError(f"compressed data have {sum(sizes)} bytes, but at most {most} are expected")
         packed, end = take(self._data, at, sum(lengths))
         ends = accumulate(lengths, initial=0)
         whole = b"".join(self._unpacked(packed[a:b], size) for (a, b), size in zip(pairwise(ends), sizes, strict=True))
@@ -231,7 +231,7 @@ class _VtuFile:
         except (zlib.error, lzma.LZMAError, OverflowError) as error:
             raise ValueError(f"compressed data are damaged: {error}") from error
         if len(whole) != size or not coder.eof:
-            raise ValueError(f"compressed data are damaged: they are not the {size} bytes that they should be")
+            raise ValueError(f"compressed data are damaged: {size} bytes were expected")
         return whole
 
     def _coded(self, block: bytes, array: _Array) -> bytes:
@@ -255,7 +255,7 @@ class _VtuFile:
             return array.begin + len(inline) - len(inline.lstrip()), False
         begin = self._appended + int(array.attributes["offset"])
         if self._appended < 0 or begin > len(self._data):
-            raise ValueError("an array refers to what should be appended, but is not")
+            raise ValueError("an array refers to appended data that do not exist")
         return begin, self._raw
 
 
@@ -272,7 +272,7 @@ def _take_base64(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
     try:
         found = base64.b64decode(data[begin:end], validate=True)[:length]
     except binascii.Error as error:
-        raise ValueError(f"what should be base64 is not: {error}") from error
+        raise ValueError(f"base64 data are damaged: {error}") from error
     if len(found) < length:
         raise ValueError("it ends too early")
     return found, end

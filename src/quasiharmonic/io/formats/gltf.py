@@ -158,7 +158,7 @@ class Document:
         view, begin, row = self.views[index], whole(where.get("byteOffset", 0)), kind.itemsize * width
         stride = whole(self.tree["bufferViews"][index].get("byteStride", row))
         if count and (stride < row or begin + (count - 1) * stride + row > len(view)):
-            raise ValueError(f"buffer view {index} ends before the numbers in it do")
+            raise ValueError(f"buffer view {index} is too short for its numbers")
         found = np.ndarray((count, row), np.uint8, view, begin if count else 0, (stride, 1))
         return np.array(found).view(kind).reshape(count, width)
 
@@ -178,12 +178,12 @@ def load(path: str | os.PathLike[str]) -> Document:
         version = str(tree["asset"]["version"])
         _check_lists(tree)
     except (*DAMAGE, RecursionError) as error:
-        raise MeshFileError(path, f"is no glTF file: {fault(error)}") from error
+        raise MeshFileError(path, f"is not a glTF file: {fault(error)}") from error
     if not version.startswith("2."):
         raise MeshFileError(path, f"is glTF {version[:20]}", remedy="save it as glTF 2.0")
     packed = [name for name in _PACKED if f'"{name}"' in json.dumps(tree.get("extensionsUsed", []))]
     if packed:
-        raise MeshFileError(path, f"is packed by {packed[0]}", remedy="save it without compression")
+        raise MeshFileError(path, f"is compressed by {packed[0]}", remedy="save it without compression")
     try:
         buffers = [_buffer(path, buffer, chunk) for buffer in tree.get("buffers", [])]
         views = [_view(view, buffers) for view in tree.get("bufferViews", [])]
@@ -203,10 +203,10 @@ def fault(error: Exception) -> str:
         case KeyError():
             return f"an entry lacks {printable(str(error.args[0]))[:80]}"
         case IndexError():
-            return "an entry refers to another that is not there"
+            return "an entry refers to another entry that does not exist"
         case RecursionError():
             return "its entries are nested too deeply"
-    return "an entry is not of the kind that it should be"
+    return "an entry has the wrong type"
 
 
 def picture_type(data: bytes) -> str | None:
@@ -238,7 +238,7 @@ def embed_pictures(document: Document, folder: Path) -> list[str]:
 def whole(value: object) -> int:
     """Return a non-negative integer of a document; raise `ValueError` for anything else."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 53:
-        raise ValueError(f"{ascii(value)[:40]} where a whole number should be")
+        raise ValueError(f"{ascii(value)[:40]} is not a whole number")
     return value
 
 
@@ -252,7 +252,7 @@ def _look_up(accessor: dict[str, Any], name: str, table: dict[Any, Any], index: 
 
 
 def _no_number(word: str) -> float:
-    raise ValueError(f"{word} is no JSON")
+    raise ValueError(f"{word} is not JSON")
 
 
 def _check_lists(tree: dict[str, Any]) -> None:
@@ -260,7 +260,7 @@ def _check_lists(tree: dict[str, Any]) -> None:
     for name in _LISTS:
         there = tree.get(name, [])
         if not isinstance(there, list) or not all(isinstance(one, dict) for one in there):
-            raise ValueError(f"its {name} are no list of objects")
+            raise ValueError(f"its {name} must be a list of objects")
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
@@ -294,7 +294,7 @@ def _buffer(path: str | os.PathLike[str], buffer: dict[str, Any], chunk: bytes |
     else:
         data = read_bytes(_beside(Path(path).parent, uri))
     if data is None or len(data) < size:
-        raise ValueError("a buffer is shorter than it should be")
+        raise ValueError("a buffer is shorter than its length states")
     return data[:size]
 
 
@@ -311,6 +311,6 @@ def _view(view: dict[str, Any], buffers: list[bytes]) -> bytes | memoryview:
     begin, size = whole(view.get("byteOffset", 0)), whole(view["byteLength"])
     buffer = buffers[whole(view["buffer"])]
     if begin + size > len(buffer):
-        raise ValueError("a buffer view ends behind its buffer")
+        raise ValueError("a buffer view ends after the end of its buffer")
     # No copy, so that many views of one buffer need no more memory than the buffer.
     return memoryview(buffer)[begin : begin + size]

@@ -117,7 +117,7 @@ def read_gltf(path: str | os.PathLike[str]) -> MeshData:
     except (*DAMAGE, RecursionError) as error:
         raise MeshFileError(path, f"is damaged: {fault(error)}") from error
     if mesh is None:
-        raise MeshFileError(path, "holds no triangles", remedy="a surface is needed")
+        raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
     return mesh
 
 
@@ -197,7 +197,7 @@ def _common_count(document: Document, of: list[dict[str, int]]) -> int:
     count = len(document.numbers(of[0]["POSITION"]))
     for name, accessor in (pair for attributes in of for pair in attributes.items()):
         if len(document.numbers(accessor)) != count:
-            raise ValueError(f"{name} has another number of vertices than POSITION")
+            raise ValueError(f"{name} and POSITION have different numbers of vertices")
     return count
 
 
@@ -205,7 +205,7 @@ def _triangles(corners: IntArray, mode: int) -> IntArray:
     """Return the triangles (k, 3) of a list, a strip or a fan."""
     if mode == _TRIANGLES:
         if len(corners) % 3:
-            raise ValueError(f"{len(corners)} indices make no triangles")
+            raise ValueError(f"{len(corners)} indices are not a valid number for triangles")
         return corners.reshape(-1, 3)
     i = np.arange(max(len(corners) - 2, 0))
     if mode == _FAN:
@@ -231,7 +231,7 @@ def _attribute(document: Document, pools: list[Pool], name: str, width: int | No
         if table is None:
             continue
         if table.shape[1] > width:
-            raise ValueError(f"{name} has {table.shape[1]} numbers a vertex")
+            raise ValueError(f"{name} has {table.shape[1]} numbers for each vertex")
         rows = slice(pool.first, pool.first + pool.count)
         numbers[rows, : table.shape[1]] = table
         numbers[rows, table.shape[1] :] = 1.0

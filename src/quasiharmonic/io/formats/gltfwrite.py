@@ -60,24 +60,24 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
     carried = mesh.carried
     if isinstance(carried, CarriedGltf) and carried.fits(mesh):
         missing = embed_pictures(carried.document.copy(), carried.folder)
-        return [f"the picture {name}, which is not beside {mesh.source} or is none" for name in missing]
+        return [f"the image {name}, which is not an image file in the folder of {mesh.source}" for name in missing]
     lost = ["digits beyond single precision"] if carried is None else [*carried.further()]
     with np.errstate(over="ignore"):
         apart = len(np.unique(mesh.V.astype(np.float32), axis=0))
     if apart < len(mesh.V):
         same = counted("vertex", "vertices", len(mesh.V) - apart)
-        lost.append(f"{same} at positions that others have too in single precision")
+        lost.append(f"{same} at positions that coincide with others in single precision")
     if mesh.polygons is not None:
-        lost.append("polygons, of which it has the triangles")
+        lost.append("polygons, which are written as triangles")
     if mesh.extra is not None and _colours(mesh) is None:
-        lost.append("what stands behind the coordinates of some vertices, or is no colour")
+        lost.append("data after the coordinates of some vertices, unless they are colours")
     if mesh.FN is not None and _normals(mesh) is None:
-        lost.append("normals, which some faces lack")
+        lost.append("normals, because some faces have none")
     words = {line.split(None, 1)[0] for line in mesh.statements.splitlines() if line.split()}
     if words & {b"o", b"g", b"s"}:
         lost.append("groups")
     if b"mtllib" in words and mesh.texture is None:
-        lost.append("what materials look like")
+        lost.append("the appearance of materials")
     return lost
 
 
@@ -93,7 +93,7 @@ def _refilled(carried: CarriedGltf, mesh: MeshData) -> Document:
         if FT is None or (FT < 0).all():
             continue
         if (FT < 0).any() or mesh.vt is None:
-            raise ValueError("some faces of a primitive have places and some have none, which glTF cannot hold")
+            raise ValueError("some faces of a primitive have no texture coordinates, which glTF does not support")
         places = _stored(mesh.vt)[FT]
         rows, origin, corner = _split(carried.rows[faces] - pool.first, _bits(places), pool.count)
         table = places.reshape(-1, 2)[corner]
@@ -226,7 +226,7 @@ def _single(what: str, numbers: FloatArray) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):
         single = numbers.astype(np.float32)
     if not np.isfinite(single).all():
-        raise ValueError(f"{what} is beyond single precision, which is all that glTF holds: write .ply or .obj")
+        raise ValueError(f"{what} exceeds single precision, the only one in glTF: write .ply or .obj")
     return single
 
 

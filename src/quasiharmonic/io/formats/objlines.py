@@ -66,7 +66,7 @@ class _Reader:
     def vertex(self, line: int, text: bytes) -> None:
         row = _numbers(text, 3 + _MOST_EXTRA)
         if len(row) < 3:
-            raise _FaultError(f"a vertex with {_count(row, 'coordinate')}", "three are needed")
+            raise _FaultError(f"a vertex with {_count(row, 'coordinate')}", "give three")
         self.coordinates.extend(row)
         self.width.append(len(row))
         self.positions += text + b"\n"
@@ -74,7 +74,7 @@ class _Reader:
     def texture(self, line: int, text: bytes) -> None:
         row = _numbers(text, 3)
         if len(row) < 2:
-            raise _FaultError(f"a texture coordinate with {_count(row, 'number')}", "two are needed")
+            raise _FaultError(f"a texture coordinate with {_count(row, 'number')}", "give two")
         self.vt.extend(row[:2])
         self.places += text + b"\n"
 
@@ -109,9 +109,9 @@ class _Reader:
     def result(self) -> MeshData:
         count, faces = len(self.width), len(self.face_line)
         if not count:
-            raise MeshFileError(self.path, "holds no vertices", remedy="is it an OBJ file?")
+            raise MeshFileError(self.path, "has no vertices", remedy="is it an OBJ file?")
         if not faces:
-            raise MeshFileError(self.path, "holds no faces", remedy="a surface is needed")
+            raise MeshFileError(self.path, "has no faces", remedy="give a mesh with faces")
         corners = np.array(self.corners, dtype=np.int64).reshape(-1, 3)
         starts = np.array(self.starts, dtype=np.int64)
         counts = (count, len(self.vt) // 2, self.normal_count)

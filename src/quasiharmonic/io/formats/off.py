@@ -50,7 +50,7 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
     line, text = next(lines, (1, b""))
     header, *counts = text.split(None, 3) or [b""]
     if not _HEADER.fullmatch(header):
-        raise MeshFileError(path, f"{shown(text)} and not OFF", line, "only the plain text form is read")
+        raise MeshFileError(path, f"{shown(text)} and not OFF", line, "only the plain text form is supported")
     if not counts:
         line, text = next(lines, (line, b""))
         counts = text.split(None, 2)
@@ -61,8 +61,8 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
     except ValueError as error:
         raise MeshFileError(path, f"no counts of vertices and faces: {error}", line) from None
     if vertices < 1 or faces < 1:
-        what = f"holds {vertices} vertices and {faces} faces"
-        raise MeshFileError(path, what, line, "a surface is needed")
+        what = f"has {vertices} vertices and {faces} faces"
+        raise MeshFileError(path, what, line, "give a mesh with vertices and faces")
     arrays = read_regular(data, line, vertices, faces) or _read_lines(path, lines, vertices, faces)
     return polygon_mesh(*arrays, source=os.fspath(path))
 
@@ -148,7 +148,7 @@ def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -
         remedy = "a triangle has 3" if size < 3 else "triangulate it first"
         raise MeshFileError(path, f"face with {size} corners", line, remedy)
     if len(rest) < size:
-        raise MeshFileError(path, f"face of {size} corners with {len(rest)} of them", line)
+        raise MeshFileError(path, f"face of {size} corners lists only {len(rest)}", line)
     ring = [integer(corner) for corner in rest[:size]]
     beyond = next((index for index in ring if not 0 <= index < vertices), None)
     if beyond is not None:

@@ -120,21 +120,21 @@ def not_in_ply(mesh: MeshData) -> list[str]:
         return []
     lost = [] if mesh.carried is None else [*mesh.carried.further()]
     if mesh.statements.strip():
-        lost.append("groups, names of materials and other statements")
+        lost.append("groups, material names and other statements")
     if mesh.extra is not None and _colours(mesh) is None:
-        lost.append("what stands behind the coordinates of some vertices, or is no colour")
+        lost.append("data after the coordinates of some vertices, unless they are colours")
     if mesh.FN is not None and _normals(mesh) is None:
-        lost.append("normals, of which a vertex has several")
+        lost.append("normals, because some vertices have several")
     return lost
 
 
 def _mesh(tables: PlyTables, source: str) -> MeshData:
     vertex, face = tables.find("vertex"), tables.find("face")
     if vertex is None or not vertex.rows:
-        raise ValueError("holds no vertices")
+        raise ValueError("has no vertices")
     ring = None if face is None else face.find(*_RINGS)
     if face is None or not face.rows or ring is None or ring.sizes is None:
-        raise ValueError("holds no faces")
+        raise ValueError("has no faces")
     V = _table(vertex, "x", "y", "z")
     if V is None:
         raise ValueError("its vertices lack x, y or z")

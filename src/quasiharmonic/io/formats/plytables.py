@@ -91,11 +91,11 @@ def decoded(data: bytes) -> PlyTables:
     """
     first = _FIRST.match(data)
     if first is None:
-        raise ValueError("does not begin as a PLY file")
+        raise ValueError("does not start like a PLY file")
     newline = first.group(1)
     ending = re.compile(rb"end_header[ \t]*" + newline).search(data)
     if ending is None:
-        raise ValueError("its header has no end")
+        raise ValueError("its header does not end")
     order, declared, remarks = _header(data[first.end() : ending.start()].split(newline))
     reader = _TextReader(data[ending.end() :]) if order == "" else _BinaryReader(data, ending.end(), order)
     return PlyTables(tuple(Element(name, rows, reader.columns(rows, of)) for name, rows, of in declared), remarks)
@@ -138,12 +138,12 @@ def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Propert
             case _:
                 raise ValueError(f"its header has {shown(line)}")
     if order is None:
-        raise ValueError("its header names no format that is known")
+        raise ValueError("its header has no supported format")
     for element, many, of in declared:
         if many and not of:
             raise ValueError(f"element {element!r} has no properties")
         if len({property_.name for property_ in of}) < len(of):
-            raise ValueError(f"element {element!r} has two properties of one name")
+            raise ValueError(f"element {element!r} has two properties with the same name")
     return order, declared, tuple(remarks)
 
 
@@ -233,7 +233,7 @@ class _TextReader:
 
     def __init__(self, text: bytes) -> None:
         if b"_" in text:
-            raise ValueError("it has an underscore where numbers should be")
+            raise ValueError("it has an underscore in its numbers")
         self._numbers = np.array(list(map(float, text.split())), dtype=np.float64)
         self._at = 0
 
@@ -293,7 +293,7 @@ def _typed(numbers: NDArray[np.float64], kind: str) -> NDArray[Any]:
             return numbers.astype(kind)
     limits = np.iinfo(kind)
     if not ((numbers >= limits.min) & (numbers <= limits.max) & (numbers == np.floor(numbers))).all():
-        raise ValueError(f"it has a number that is no {_WORDS[kind]} where its header says so")
+        raise ValueError(f"it has a number that is not {_WORDS[kind]}, as its header states")
     return numbers.astype(kind)
 
 

@@ -48,9 +48,9 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
     if corners is None:
         corners = _text(data)
     if corners is None:
-        raise MeshFileError(path, "is neither a text nor a binary STL file, or is cut off")
+        raise MeshFileError(path, "is not a text or binary STL file, or is cut off")
     if not len(corners):
-        raise MeshFileError(path, "holds no triangles", remedy="a surface is needed")
+        raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
     V, F = welded(corners.reshape(-1, 3))
     try:
         return MeshData(V, F.reshape(-1, 3), source=os.fspath(path))

@@ -135,7 +135,7 @@ def half_planes(star: Star, fixture: Fixture) -> Obstruction | None:
     ends = np.unique(needed)
     message = (
         f"{named_vertices(vertex).capitalize()} must lie to the left of the fixed {named_edges(needed)}, "
-        "and no point of the target's bounding box does."
+        "but no point of the target's bounding box does."
     )
     return Obstruction(
         Kind.HALF_PLANES,

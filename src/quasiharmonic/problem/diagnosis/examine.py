@@ -79,10 +79,12 @@ def diagnose(problem: Problem) -> Diagnosis:
     euler = problem.n - len(problem.domain.edges.interior) - len(problem.domain.edges.boundary) + len(problem.F)
     area = _twice_area(fixture, curves)
     if area < 0 and _fits_mirrored(curves, euler):
-        message = "The target is wound against the mesh: every loop runs the wrong way around."
+        message = "The target has the opposite orientation to the mesh: every loop runs the wrong way around."
         loops = np.arange(len(problem.domain.loops))
         reversed_ = Obstruction(Kind.REVERSED, Forbids.INJECTIVE, message, loops=loops)
-        return Diagnosis((reversed_,), ("everything else, until target and mesh are wound alike",), problem)
+        return Diagnosis(
+            (reversed_,), ("all other conditions, which need target and mesh of the same orientation",), problem
+        )
 
     proper = _proper(curves)
     unchecked = list(_unchecked(curves, proper))
@@ -131,7 +133,7 @@ def _unplaced(
         if obstruction is not None:
             found.append(obstruction)
     which = named_vertices(np.array(passed_over))
-    return found, [f"whether a place sees the fixed neighbours of {which}"] * bool(passed_over)
+    return found, [f"whether a point of the target sees all fixed neighbours of {which}"] * bool(passed_over)
 
 
 def _twice_area(fixture: Fixture, curves: TargetCurves) -> int:
@@ -178,7 +180,7 @@ def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> It
         yield Obstruction(Kind.SIGNED_AREA, Forbids.INJECTIVE, message, loops=every)
     if genus > 0:
         handles = "a handle" if genus == 1 else f"{genus} handles"
-        message = f"The surface has {handles} and fits into no plane without overlap."
+        message = f"The surface has {handles} and cannot be mapped into the plane without overlap."
         forbids = Forbids.INJECTIVE if proper else Forbids.BIJECTIVE
         yield Obstruction(Kind.GENUS, forbids, message)
     if ranges is not None and curves.simple and not proper:
@@ -190,7 +192,7 @@ def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> It
     if turning is not None and sum(turning) != euler and not curves.simple:
         fewer = sum(turning) < euler
         message = (
-            f"The target's loops turn {sum(turning)} times in all, "
+            f"The target's loops turn {sum(turning)} times in total, "
             f"and {'at least ' if fewer else ''}{euler} {'is' if euler == 1 else 'are'} needed for this surface."
         )
         forbids = Forbids.INJECTIVE if fewer else Forbids.UNBRANCHED
@@ -212,14 +214,14 @@ def _misnested(curves: TargetCurves, euler: int) -> Obstruction:
     forbids = Forbids.INJECTIVE if hopeless else Forbids.UNBRANCHED
     if not hopeless and sum(curves.turning) == euler:
         forbids = Forbids.BIJECTIVE
-    message = f"The target's loops are not holes in one outer loop: see {_named_loops(wrong)}."
+    message = f"The target's loops are not one outer loop with holes inside: see {_named_loops(wrong)}."
     return Obstruction(Kind.NESTING, forbids, message, loops=wrong)
 
 
 def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
     """Yield obstructions where the curves fold, cross or touch; they forbid bijective maps only."""
     if curves.folds.size:
-        message = f"At the boundary {named_vertices(curves.folds)} the target goes back the way it came."
+        message = f"At the boundary {named_vertices(curves.folds)} the target folds back onto itself."
         yield Obstruction(Kind.FOLD, Forbids.BIJECTIVE, message, vertices=curves.folds)
     meet = curves.contacts
     consecutive = (curves.ends[meet.pairs][:, 0, :, None] == curves.ends[meet.pairs][:, 1, None, :]).any(axis=(1, 2))
@@ -245,7 +247,7 @@ def _unchecked(curves: TargetCurves, proper: bool) -> Iterator[str]:
     """Yield descriptions of the conditions that were not checked, and why."""
     if proper:
         return
-    yield "edges between fixed vertices and what vertices see, which matters where the target is simple"
+    yield "edges between fixed vertices and visibility from vertices, which need a simple target"
     if curves.turning is None:
         yield "turning numbers, which boundary edges of length zero leave undefined"
     if curves.winding_range is None:

@@ -25,7 +25,7 @@ class Forbids(Enum):
 
     INJECTIVE = "no map without inverted triangles exists"
     UNBRANCHED = "a map without inverted triangles winds more than once around one of its vertices"
-    BIJECTIVE = "no bijective map exists, though one without inverted triangles may"
+    BIJECTIVE = "no bijective map exists, but a map without inverted triangles may"
 
 
 class Kind(Enum):
@@ -38,15 +38,15 @@ class Kind(Enum):
     HALF_PLANES = "Split the edges between the vertex and the edges it should lie to the left of."
     REVERSED = "Reverse the winding of the triangles, F[:, ::-1], or reflect the target."
     TURNING_NUMBER = "Untwist the target: reverse or move the loops until their turning numbers add up."
-    NEGATIVE_WINDING = "Untwist the target, or move the loops so that holes lie inside and are wound as holes."
+    NEGATIVE_WINDING = "Untwist the target, or move the loops so that holes lie inside and run clockwise."
     GENUS = "Cut the handles of the surface open."
     CROSSING = "Move the named boundary edges apart if the map must not overlap itself."
     FOLD = "Open the angle at the named vertices if the map must not overlap itself."
     NESTING = "Move the loops so that one lies outside all others and these outside each other."
-    CHORD = "Split the edge, so that it may bend, or move its ends."
+    CHORD = "Split the edge so that it can bend, or move its ends."
     PIN = "Move the pin."
     LINK_DISTANCE = "Split the edges on the shortest paths between the two vertices, or move them."
-    HIDDEN = "Split the edges between the vertex and the fixed vertices it cannot all see."
+    HIDDEN = "Split the edges between the vertex and the fixed vertices, because no point sees all of them."
 
 
 def _ints(values: ArrayLike, *shape: int) -> IntArray:
@@ -162,7 +162,7 @@ class Diagnosis(Displayable):
         if self.forbids_injective:
             lines = ["No injective map exists: every map with these positions inverts a triangle."]
         elif self.obstructions:
-            lines = ["No bijective map exists, though one without inverted triangles may."]
+            lines = ["No bijective map exists. A map without inverted triangles may exist."]
         else:
             lines = ["No known obstruction: a map may exist."]
         counts = Counter(o.kind for o in self.obstructions)

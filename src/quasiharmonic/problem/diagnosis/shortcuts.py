@@ -143,7 +143,7 @@ class Shortcuts:
         ends = self._loop[[a, b]]
         message = (
             f"A path of {k} edges inside the mesh joins the boundary {named_vertices(ends)}, and inside the target "
-            f"it takes more than {k} segments from one to the other."
+            f"every path from one to the other needs more than {k} segments."
         )
         path = self._paths(a, b, k)
         return Obstruction(Kind.LINK_DISTANCE, Forbids.INJECTIVE, message, vertices=ends, edges=path, split=path)

@@ -107,7 +107,7 @@ class Sight:
             Kind.HIDDEN,
             Forbids.INJECTIVE,
             f"{named_vertices(vertex).capitalize()} is joined to the fixed {named_vertices(seen)}, "
-            f"which no point of the target sees together{beside}.",
+            f"but no point of the target sees all of them{beside}.",
             vertices=np.concatenate([vertex, seen]),
             edges=edges,
             split=np.stack([np.full(len(ends), star.vertex), ends], axis=1),

@@ -193,7 +193,7 @@ def beltrami_coefficients(mu: ArrayLike | None, f: int) -> ComplexArray:
     """
     coefficients = np.zeros(f) if mu is None else np.asarray(mu)
     if coefficients.shape != (f,) or coefficients.dtype.kind not in "iufc":
-        raise ValueError(f"mu must hold {f} numbers, one a triangle, not an array of {coefficients.shape}")
+        raise ValueError(f"mu must contain {f} numbers, one for each triangle, not an array of {coefficients.shape}")
     bad = np.flatnonzero(~(np.abs(coefficients) < 1))
     if bad.size:
         raise ValueError(f"mu is not below 1 in modulus at {named('triangle', 'triangles', bad)}")

@@ -61,7 +61,7 @@ class VectorAdam(FunctionalDescent):
             times, lengths = np.zeros(2), np.zeros(2)
         if not np.all(np.diff(times) > 0) or not np.all((times >= 0) & (lengths > 0) & np.isfinite(times + lengths)):
             raise ValueError(
-                "schedule must be pairs (iteration, step length), iterations ascending and lengths positive, "
+                "schedule must be pairs (iteration, step length) with ascending iterations and positive lengths, "
                 f"not {self.schedule!r}"
             )
         try:

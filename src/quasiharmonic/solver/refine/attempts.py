@@ -88,7 +88,7 @@ def solve_refining(
     lower = None if polish is None else energy_named(polish)
     if slide is not False:
         if lower is None:
-            raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
+            raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
         problem = moved_onto(slide, problem)
 
     def search(on: Problem, first: ArrayLike | None, budget: int, some: _Choice) -> MapResult:

@@ -201,9 +201,9 @@ def harmonise_map(
     schedule = _schedule(eta, barrier)
     not_negative("conformal", conformal)
     if chosen is None and conformal == 0:
-        raise ValueError("conformal must be positive where there is no energy, not 0")
+        raise ValueError("conformal must be positive if energy is None, not 0")
     if weights is not None and chosen is None:
-        raise ValueError("weights are the energy's, and there is none")
+        raise ValueError("weights belong to the energy, but energy is None")
     check_choice("reference", reference, get_args(Reference))
     whole_number("max_iterations", max_iterations, least=1)
     not_negative("tolerance", tolerance)
@@ -213,15 +213,15 @@ def harmonise_map(
     inverted = inverted_triangles(domain.F, start)
     if barrier and inverted.size:
         raise ValueError(
-            f"uv is not injective: {named('triangle', 'triangles', inverted)} inverted or without area, where "
-            "this energy is infinite; begin with an injective map, or lower R₁ (energy=None)"
+            f"uv is not injective: {named('triangle', 'triangles', inverted)} inverted or degenerate, where "
+            "this energy is infinite; start from an injective map, or lower R₁ (energy=None)"
         )
     name = energy if isinstance(energy, str) else "R₁" if energy is None else type(energy).__name__
     problem = Problem.on(domain, start[domain.fixed])
     with problem.exclusive() as own, np.errstate(all="ignore"):
         area = float(signed_areas(own.F, own.frame.inward(start)).sum())
         if not area > 0:
-            raise ValueError("the boundary encloses no area in uv, or is wound the wrong way")
+            raise ValueError("the boundary encloses no area in uv, or has the wrong orientation")
         deformation = None
         if chosen is not None:
             # The map is in the frame's unit. Scale the surface accordingly so that both compare as in the caller's
@@ -288,5 +288,5 @@ def _schedule(eta: float | Sequence[float] | None, barrier: bool) -> tuple[float
         return BARRIER_ETA if barrier else ETA
     schedule = np.atleast_1d(real_array("eta", eta))
     if schedule.ndim != 1 or not schedule.size or not np.all((schedule > 0) & (schedule < np.inf)):
-        raise ValueError(f"eta must be a positive number, or one for every round, not {eta!r}")
+        raise ValueError(f"eta must be a positive number, or one for each round, not {eta!r}")
     return tuple(float(value) for value in schedule)

@@ -77,11 +77,13 @@ def solve(
     check_callback(callback)
     lower = None if polish is None else energy_named(polish)
     if not isinstance(problem, Problem):
-        raise TypeError(f"solve takes a Problem, not {kind_of(problem)}: injective_map takes the arrays of one")
+        raise TypeError(
+            f"solve takes a Problem, not {kind_of(problem)}: use injective_map for the arrays V, F, fixed and target"
+        )
     first = None if start is None else _first_map(problem, start)
     if slide is not False:
         if lower is None:
-            raise ValueError("the boundary slides while distortion is lowered: name an energy for that too")
+            raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
         problem = moved_onto(slide, problem)
     with problem.exclusive() as own:
         search = Search(own, linear_solver, callback, max_iterations, record_every, first)

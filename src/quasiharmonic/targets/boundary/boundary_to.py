@@ -187,7 +187,7 @@ def _check_simple(loops: list[IntArray], target: FloatArray, n: int) -> None:
     _, reasons = judge_loops(loops, places)
     if reasons:
         raise ValueError(
-            f"laid along the outline, the boundary is no outline itself: {reasons[0]}. Its vertices are too few "
-            "for the shape, or crowd elsewhere: split boundary edges (refine with boundary=True), choose other "
+            f"the boundary placed along the outline crosses or touches itself: {reasons[0]}. Its vertices are too few "
+            "for the shape, or unevenly spaced: split boundary edges (refine with boundary=True), choose other "
             "corners, or an outline with less detail"
         )

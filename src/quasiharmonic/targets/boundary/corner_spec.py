@@ -124,11 +124,11 @@ def read_corners(text: str) -> AskedCorners:
     else:
         entries = [_entry(part) for part in _parted(text)]
     if not entries:
-        raise ValueError(f"the file names none: on each line it should have one of {FORMS}")
+        raise ValueError(f"the file names no corners: each line needs one of {FORMS}")
     lone = [who for who, goal in entries if goal is None]
     if lone and len(lone) < len(entries):
-        who = f"vertex {lone[0]}" if isinstance(lone[0], int) else f"what is near {lone[0]}"
-        raise ValueError(f"where does {who} go? Others have a corner or a point")
+        who = f"vertex {lone[0]}" if isinstance(lone[0], int) else f"the vertex near {lone[0]}"
+        raise ValueError(f"{who} has no corner or point, but other vertices have one: give one for each")
     return AskedCorners(tuple(entries))
 
 
@@ -193,7 +193,7 @@ def _entry(text: str) -> tuple[int | Place, Goal | None]:
         x, y = map(float, goal)
         return who, (x, y)
     except ValueError:
-        raise ValueError(f"{text[:40]!r} is none of {FORMS}") from None
+        raise ValueError(f"{text[:40]!r} is not one of {FORMS}") from None
 
 
 def _place(text: str) -> Place:

@@ -111,7 +111,9 @@ def places_along(
             pair = f"vertices {names[run[stuck[0]]]} and {names[run[stuck[0] + 1]]} of the loop"
             if along[stuck[0]] == along[stuck[0] + 1]:
                 raise ValueError(f"{pair} coincide")
-            raise ValueError(f"{pair} come to one place: sides of the outline are too short beside the others")
+            raise ValueError(
+                f"{pair} get the same position: some sides of the outline are too short compared with the others"
+            )
         place[run[:-1]] = (stretch.begin + stretch.gap * way[:-1]) % 1.0
         # Assign corners without rounding, so that they are met exactly.
         place[run[chosen]] = t[here]

@@ -81,10 +81,12 @@ class Pins:
             contour, along = self._nearest(np.asarray(goal, dtype=np.float64), int(vertex))
             self.wanted.setdefault(loop, {})[position] = along
             if self.contour_of.setdefault(loop, contour) != contour:
-                raise ValueError(f"vertex {vertex} goes to another contour than others of its boundary loop")
+                raise ValueError(
+                    f"vertex {vertex} goes to a different contour than other vertices of its boundary loop"
+                )
         if self.all_corners and len(self.wanted) > 1:
             raise ValueError(
-                f"corners in order are those of one boundary loop, but {len(self.wanted)} loops have some: "
+                f"corners in order must lie on one boundary loop, but {len(self.wanted)} loops have some: "
                 "say which corner each vertex goes to"
             )
         if len(set(self.contour_of.values())) < len(self.contour_of):
@@ -128,11 +130,13 @@ class Pins:
         places, positions = [goal for goal, _ in found], np.array([position for _, position in found], dtype=np.int64)
         for one, other in itertools.pairwise(found):
             if one[0] == other[0]:
-                raise ValueError(f"vertices {names[one[1]]} and {names[other[1]]} go to the same place on the outline")
+                raise ValueError(
+                    f"vertices {names[one[1]]} and {names[other[1]]} have the same target position on the outline"
+                )
         if positions.size and (np.diff((positions - positions[0]) % len(names)) < 0).any():
             there = positions[np.argsort((positions - positions[0]) % len(names))]
             against = (np.diff((positions[::-1] - positions[-1]) % len(names)) > 0).all()
-            remedy = ": name them the other way around" if against else ""
+            remedy = ": reverse their order" if against else ""
             raise ValueError(
                 f"corner vertices {', '.join(map(str, names[positions]))} follow each other in this order around the "
                 f"outline, but in the order {', '.join(map(str, names[there]))} along the boundary, which has the "

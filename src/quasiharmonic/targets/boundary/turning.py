@@ -78,7 +78,7 @@ class BoundaryLoop:
         whole_number("count", count, least=1)
         if count > len(self.vertices):
             raise ValueError(
-                f"the loop has {len(self.vertices)} vertices, too few for {count} corners: refine the boundary"
+                f"the loop has {len(self.vertices)} vertices, too few for {count} corners: split boundary edges"
             )
         longest = self.lengths.max()
         if longest == 0:

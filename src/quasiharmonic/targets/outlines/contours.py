@@ -109,7 +109,9 @@ def flatten(pieces: Pieces, tolerance: float) -> FloatArray:
     """
     steps = [_steps(control, tolerance) for control in pieces]
     if sum(steps) > MOST_POINTS:
-        raise ValueError(f"an outline of more than {MOST_POINTS:,} points at a tolerance of {tolerance:.3g}")
+        raise ValueError(
+            f"the outline has more than {MOST_POINTS:,} points at a tolerance of {tolerance:.3g}: raise the tolerance"
+        )
     points = [pieces[0][:1], *(_bezier(control, n) for control, n in zip(pieces, steps, strict=True))]
     return distinct(np.concatenate(points), tolerance)
 

@@ -48,7 +48,7 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
         When the font file does not exist.
     """
     if len(character) != 1:
-        raise ValueError(f"an outline is made of one character, not of {character!r}")
+        raise ValueError(f"character must be a single character, not {character!r}")
     found = _contours(character, font, tolerance)
     try:
         contours = nested(found)
@@ -81,7 +81,7 @@ def _by_matplotlib(file: FilePath, character: str) -> list[Pieces]:
     try:
         face = get_font(file)
     except RuntimeError as error:
-        raise ValueError(f"{file} is not a font that can be read: {error}") from error
+        raise ValueError(f"{file} is not a readable font: {error}") from error
     if not face.get_char_index(ord(character)):
         raise ValueError(f"{file.name} has no glyph for {character!r}")
     points, codes = text_to_path.get_text_path(FontProperties(fname=file), character)
@@ -113,7 +113,7 @@ def _font_file(font: Font | None) -> FilePath:
     if file.is_file():
         return file
     if file.suffix.lower() in _FONT_FILES or len(file.parts) > 1:
-        raise FileNotFoundError(f"no font file {file}")
+        raise FileNotFoundError(f"there is no font file {file}")
     return _installed(str(font))
 
 
@@ -139,5 +139,5 @@ def _installed(name: str) -> FilePath:
         return FilePath(findfont(FontProperties(name), fallback_to_default=False))
     except ValueError as error:
         near = get_close_matches(name.split(":")[0], get_font_names(), n=3)
-        hint = f"; there is {', '.join(near)}" if near else ""
-        raise ValueError(f"no font of the name {name!r} is installed{hint}") from error
+        hint = f"; similar names: {', '.join(near)}" if near else ""
+        raise ValueError(f"no font named {name!r} is installed{hint}") from error

@@ -153,7 +153,7 @@ def _check_simple(contours: list[FloatArray]) -> None:
         at = j if following[i] == j else i
         x, y = points[at].tolist()
         raise ValueError(
-            f"contour {one} of the outline goes back along itself at point {at - start[one]} ({x:.6g}, {y:.6g}){more}: "
+            f"contour {one} of the outline folds back onto itself at point {at - start[one]} ({x:.6g}, {y:.6g}){more}: "
             "remove the spike"
         )
     if one == other:
@@ -163,5 +163,5 @@ def _check_simple(contours: list[FloatArray]) -> None:
         )
     raise ValueError(
         f"contours {one} and {other} of the outline meet: the first one's {side(i)} {how} the other's "
-        f"{side(j)}{more}: holes must lie apart, within what is around them"
+        f"{side(j)}{more}: holes must be disjoint and lie inside the contour around them"
     )

@@ -50,7 +50,7 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
         if line == 1 and not any(map(is_number, words)):
             continue
         if len(words) != 2:
-            raise MeshFileError(path, f"{len(words)} values in place of two, x and y,", line)
+            raise MeshFileError(path, f"{len(words)} values instead of two, x and y,", line)
         try:
             x, y = map(number, words)
         except ValueError as error:
@@ -60,7 +60,7 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
         loops[-1].append((x, y))
         count += 1
         if count > MOST_POINTS:
-            raise MeshFileError(path, f"more than {MOST_POINTS:,} points", line, "thin them out")
+            raise MeshFileError(path, f"more than {MOST_POINTS:,} points", line, "use fewer points")
     contours, begins = [], []
     for loop, start in zip(loops, starts, strict=True):
         if not loop:
@@ -68,7 +68,7 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
         contour = distinct(np.array(loop), 0.0)
         if len(contour) < 3 or collinear(contour):
             what = f"a contour of {len(contour)} different points that encloses no area begins"
-            raise MeshFileError(path, what, start, "blank lines separate contours, and nothing else")
+            raise MeshFileError(path, what, start, "use blank lines only between contours")
         contours.append(contour)
         begins.append(start)
     if not contours:

@@ -118,7 +118,7 @@ def star(tips: int, inner: float = 0.5) -> FloatArray:
         When there are fewer than three tips or ``inner`` is not between 0 and 1.
     """
     if not 0 < inner < 1:
-        raise ValueError(f"the inner radius of a star is between 0 and 1, not {inner}")
+        raise ValueError(f"the inner radius of a star must be between 0 and 1, not {inner}")
     whole_number("tips", tips, least=3)
     outline = _polar(2 * tips, start=np.pi / 2)
     outline[1::2] *= inner
@@ -146,7 +146,7 @@ def ring(inner: float = 0.5, points: int = 256) -> list[FloatArray]:
         When ``inner`` is not between 0 and 1, or ``points`` is less than three.
     """
     if not 0 < inner < 1:
-        raise ValueError(f"the inner radius of a ring is between 0 and 1, not {inner}")
+        raise ValueError(f"the inner radius of a ring must be between 0 and 1, not {inner}")
     circle = _polar(points)
     return [circle, inner * circle[::-1]]
 

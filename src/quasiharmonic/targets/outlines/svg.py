@@ -77,11 +77,13 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
         When the tolerance is out of range.
     """
     if not 1e-7 <= tolerance < 1:
-        raise ValueError(f"the tolerance is a share of the drawing's size, from 1e-7 to below 1, not {tolerance}")
+        raise ValueError(
+            f"tolerance must be a fraction of the drawing's size, at least 1e-7 and less than 1, not {tolerance}"
+        )
     subpaths = svg_paths(path)
     controls = [control for pieces in subpaths for control in pieces]
     if not controls:
-        raise MeshFileError(path, "draws no path or shape")
+        raise MeshFileError(path, "has no path or shape")
     every = np.concatenate(controls)
     if not np.abs(every).max() < _LARGEST:
         raise MeshFileError(path, "has coordinates that are too large")
@@ -95,7 +97,7 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     except ValueError as error:
         raise MeshFileError(path, str(error)) from None
     if not contours:
-        raise MeshFileError(path, "draws nothing that encloses an area")
+        raise MeshFileError(path, "has no path or shape that encloses an area")
     try:
         return [one.points for one in arranged(contours)]
     except ValueError as error:
@@ -160,7 +162,7 @@ class _Drawing:
         return MeshFileError(self.path, what, self.parser.CurrentLineNumber, remedy)
 
     def _entity(self, name: str, *_: object) -> None:
-        raise self._error(f"declares the entity {name[:40]!a}, and entities are not read", "save it as plain SVG")
+        raise self._error(f"declares the entity {name[:40]!a}, but entities are not supported", "save it as plain SVG")
 
     def _text(self, text: str) -> None:
         if self.sheet is not None:
@@ -169,7 +171,7 @@ class _Drawing:
     def _check_style(self, tag: str, style: str) -> None:
         if found := _SHAPING.search(style):
             remedy = "write it as an attribute, or apply the transform to the paths in a drawing program"
-            raise self._error(f"<{tag}>: {found.group(1)!r} in a style is not read", remedy)
+            raise self._error(f"<{tag}>: {found.group(1)!r} in a style is not supported", remedy)
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self.depth += 1
@@ -191,10 +193,10 @@ class _Drawing:
             self.skipped = self.depth
             return
         if tag in _FOREIGN:
-            raise self._error(f"a <{tag}> has no outline that could be read", _FOREIGN[tag])
+            raise self._error(f"the outline of a <{tag}> is not supported", _FOREIGN[tag])
         self._check_style(tag, attributes.get("style", ""))
         if "transform" in attributes and "transform-origin" in attributes:
-            raise self._error(f"<{tag}>: transform-origin is not read", "apply the transform in a drawing program")
+            raise self._error(f"<{tag}>: transform-origin is not supported", "apply the transform in a drawing program")
         try:
             transform = self.transforms[-1]
             if "transform" in attributes:
@@ -249,14 +251,14 @@ def _transform(text: str) -> FloatArray:
         if count > _MOST_TRANSFORMS:
             raise ValueError(f"more than {_MOST_TRANSFORMS:,} transforms of one element")
         if found is None:
-            raise ValueError(f"the transform {text[at : at + 40]!a} is not understood")
+            raise ValueError(f"the transform {text[at : at + 40]!a} is not supported")
         name, at = found.group(1), found.end()
         try:
             values = [float(word) for word in found.group(2).replace(",", " ").split()]
         except ValueError:
             values = []
         if name not in _TRANSFORMS or len(values) not in _TRANSFORMS[name][0] or not all(map(math.isfinite, values)):
-            raise ValueError(f"the transform {found.group().strip()[:40]!a} is not understood")
+            raise ValueError(f"the transform {found.group().strip()[:40]!a} is not supported")
         product = product @ _TRANSFORMS[name][1](*values)
     return np.asarray(product)
 

@@ -20,8 +20,8 @@ _STEPS, _MEET = 30, 1e-14
 # intersection of the curves may be far away: at most this many tolerances.
 _ALIKE, _STRAYS = 0.01, 100.0
 _FLATLY = (
-    "letters of the word touch so flatly that their curves cannot be joined: choose others, or have the boundary slide "
-    "along the polygon that it is"
+    "letters of the word are almost tangent where they touch, so their curves cannot be joined: choose other letters, "
+    "or slide the boundary along a polygon"
 )
 
 
@@ -61,7 +61,7 @@ def word(text: str, font: Font | None = None, *, overlap: float = 0.03, toleranc
     if loose:
         raise ValueError(
             f"{loose} {'part' if loose == 1 else 'parts'} of {text!r} (a dot, an accent) "
-            f"{'touches' if loose == 1 else 'touch'} no other; choose other letters, capitals for instance"
+            f"{'touches' if loose == 1 else 'touch'} no other part: choose other letters, such as capitals"
         )
     return contours
 
@@ -101,7 +101,7 @@ def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tupl
     if not 0 < overlap < np.inf:
         raise ValueError(f"overlap must be positive and finite, not {overlap}")
     if not text:
-        raise ValueError("a word needs a letter")
+        raise ValueError("a word needs at least one letter")
     letters = [letter(character, font, tolerance=tolerance) for character in text]
     shifts = [0.0]
     for before, after in itertools.pairwise(letters):

@@ -18,9 +18,7 @@ _TICK = 0.2
 # Seconds between two queries of the cluster's size, which may change.
 _LOOK = 2.0
 
-_GONE = (
-    "the Dask scheduler has gone, or has dropped a problem; what is finished is kept: the same call goes on from there"
-)
+_GONE = "the Dask scheduler ended or dropped a problem; finished results are kept: run the same call again to continue"
 
 _mine = threading.local()
 
@@ -64,7 +62,7 @@ def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> 
             resolve_address(scheduler)
         client = Client(scheduler, set_as_default=False)
     except ValueError as error:
-        wanted = "the address of a Dask scheduler, which looks like tcp://HOST:8786"
+        wanted = "the address of a Dask scheduler, such as tcp://HOST:8786"
         raise ValueError(f"{scheduler!r} is not {wanted}: {error}") from error
     except (OSError, TimeoutError) as error:
         raise ConnectionError(f"there is no Dask scheduler at {scheduler}: {error}") from error
@@ -131,7 +129,8 @@ def attend(files: ProblemFiles, orders: Orders) -> Finished | Exception:
     """
     if not (orders.output / MARKER).exists():
         return OSError(
-            f"a worker of the cluster sees no {orders.output}: data set and output must lie on a file system that all "
+            f"a worker of the cluster cannot see {orders.output}: data set and output must lie on "
+            f"a file system that all "
             "machines share, under the same paths"
         )
     try:

@@ -192,13 +192,13 @@ def _checked(settings: Settings) -> Settings:
             raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {given!r}")
     _check_flatten(settings)
     if settings.slide and settings.polish is None:
-        raise ValueError("the boundary slides while distortion is lowered: name an energy for that too, by polish")
+        raise ValueError("the boundary slides only while distortion is lowered: give an energy as well, by polish")
     if settings.max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, not {settings.max_iterations}")
     if settings.to is None:
         for name in ("cut", "corners"):
             if getattr(settings, name) and not (name == "cut" and settings.flatten):
-                raise ValueError(f"{name} is of plain meshes and the outline that they go to: name one by to")
+                raise ValueError(f"{name} applies only to plain meshes with an outline: give the outline by to")
         return settings
     from quasiharmonic.targets import outline
     from quasiharmonic.targets.boundary.corner_spec import read_corners
@@ -218,21 +218,17 @@ def _check_flatten(settings: Settings) -> None:
     """Raise ValueError if fixed-boundary settings are combined with ``flatten``, or ``energy`` is given without it."""
     if not settings.flatten:
         if settings.energy is not None:
-            raise ValueError(
-                "energy is for flatten, and flatten was not asked for: ask for it, or give polish its own energy"
-            )
+            raise ValueError("energy applies only to flatten: set flatten, or give an energy by polish")
         return
     plain = Settings()
     for name in ("to", "corners", "refine", "strategy", "polish", "slide", "reference"):
         if getattr(settings, name) != getattr(plain, name):
-            raise ValueError(
-                f"{name} is of maps onto a given boundary, and flatten sets it free: leave one of them out"
-            )
+            raise ValueError(f"{name} needs a given boundary, but flatten leaves the boundary free: omit one of them")
 
 
 def _check(jobs: int | None, threads: int, time_limit: float | None, memory_limit: int | None, scheduler: Any) -> None:
     if scheduler is not None and jobs is not None:
-        raise ValueError("jobs is for this machine's processes; a Dask cluster has the workers that it has")
+        raise ValueError("jobs applies only to processes on this machine, not to a Dask cluster: omit one of them")
     for name, value in (("jobs", jobs), ("threads", threads)):
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, not {value}")
@@ -248,12 +244,12 @@ def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> 
     count, inside = 0, folder.is_relative_to(os.path.abspath(source))
     for files in find_problems(source, plain=settings.plain):
         if inside and files.mesh.is_relative_to(folder):
-            raise ValueError(f"{folder} holds a problem, {files.mesh}: name another folder for the results")
+            raise ValueError(f"{folder} contains a problem, {files.mesh}: choose another folder for the results")
         count += 1
     if not count:
         raise ValueError(
             f"there are no problems in {source}: a problem is a folder with input.obj and handles.txt"
-            + ("" if settings.plain else "; to take plain meshes, say what to map them to, or to flatten them")
+            + ("" if settings.plain else "; for plain meshes, give an outline or flatten them")
         )
     return count
 
@@ -261,13 +257,13 @@ def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> 
 def _check_folder(folder: Path) -> None:
     """Raise OutputError if the path exists but is not a run's folder."""
     if os.path.lexists(folder) and not folder.is_dir():
-        raise OutputError(f"cannot write to {folder}: it is no folder")
+        raise OutputError(f"cannot write to {folder}: it is not a folder")
     try:
         tables = [name for name in records.TABLES if (folder / name).exists()]
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     if tables and not (folder / MARKER).exists():
-        raise OutputError(f"{folder} has a {tables[0]} that is of no run: name another folder for the results")
+        raise OutputError(f"{folder} has a {tables[0]} that belongs to no run: choose another folder for the results")
 
 
 def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings) -> None:

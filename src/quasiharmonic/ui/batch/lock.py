@@ -36,7 +36,9 @@ def alone(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise OutputError(f"another run is writing to {folder}: wait for its end, or name another folder") from None
+            raise OutputError(
+                f"another run is writing to {folder}: wait for its end, or choose another folder"
+            ) from None
         except OSError:
             pass  # a file system without locks
         yield

@@ -152,7 +152,7 @@ def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
             if not (place.is_dir() or (place.suffix.lower() in READERS and place.is_file())):
                 raise ValueError(
                     f"{path}: line {number}: there is no folder and no mesh file {text[:100]!r}; "
-                    "a list names one in every line"
+                    "give one on each line of the list"
                 )
             base = path.parent if place.is_relative_to(path.parent) else Path(place.anchor)
             name = place.relative_to(base).as_posix()
@@ -169,6 +169,6 @@ def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
             if none:
                 wanted = "a mesh" if plain else "a folder with input.obj"
                 raise ValueError(
-                    f"{path}: line {number}: there is no problem in the folder {text[:100]!r}: name {wanted}, or a "
-                    "folder above one"
+                    f"{path}: line {number}: there is no problem in the folder {text[:100]!r}: give {wanted}, or a "
+                    "folder that contains such folders"
                 )

@@ -218,14 +218,14 @@ def read_table(path: str | os.PathLike[str]) -> Iterator[Record]:
     rows = _csv_rows(path) if _suffix(path) == ".csv" else _parquet_rows(path)
     for number, row in enumerate(rows, 1):
         if row.get("problem") in (None, ""):
-            raise MeshFileError(path, f"record {number} names no problem", remedy="a column `problem` is needed")
+            raise MeshFileError(path, f"record {number} has no problem", remedy="a column `problem` is needed")
         yield {column: _typed(path, number, column, value) for column, value in row.items()}
 
 
 def _suffix(path: str | os.PathLike[str]) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in (".csv", ".parquet"):
-        raise ValueError(f"{os.fspath(path)!r}: tables of records are .csv or .parquet")
+        raise ValueError(f"{os.fspath(path)!r}: a table of records must be .csv or .parquet")
     return suffix
 
 
@@ -295,4 +295,4 @@ def _typed(path: str | os.PathLike[str], number: int, column: str, value: Any) -
     try:
         return {"true": True, "false": False}[value.lower()] if kind is bool else kind(value)
     except (ValueError, KeyError):
-        raise MeshFileError(path, f"record {number}: {value!r} is no {kind.__name__} for {column}") from None
+        raise MeshFileError(path, f"record {number}: {value!r} is not a valid {kind.__name__} for {column}") from None

@@ -74,7 +74,7 @@ def posed(surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings
     to, reference = settings["to"], settings["reference"]
     islands = faced(surface, reflect=to is None)
     if to is not None and settings["slide"] and len(islands) > 1:
-        raise ValueError(f"boundaries slide along the outline of one island, and there are {len(islands)}")
+        raise ValueError(f"a boundary can slide only if the mesh has one island, but it has {len(islands)}")
     asked = None if settings["corners"] is None else read_corners(settings["corners"])
     found = []
     for k, (island, _) in enumerate(islands):

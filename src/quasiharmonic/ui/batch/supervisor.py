@@ -334,10 +334,10 @@ class _Process:
 
     def _exceeded(self, orders: Orders) -> Record | None:
         if orders.time_limit is not None and time.monotonic() - self._began > orders.time_limit:
-            return {"outcome": "timeout", "error": f"not done within {orders.time_limit:g} s"}
+            return {"outcome": "timeout", "error": f"not finished within {orders.time_limit:g} s"}
         self._peak = max(self._peak, resident(self._process.pid) or 0)
         if orders.memory_limit is not None and self._peak > orders.memory_limit:
-            return {"outcome": "memory", "error": f"took more than {orders.memory_limit / 2**20:.0f} MiB of memory"}
+            return {"outcome": "memory", "error": f"used more than {orders.memory_limit / 2**20:.0f} MiB of memory"}
         return None
 
     def _seen(self) -> Record:

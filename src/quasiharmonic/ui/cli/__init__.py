@@ -117,7 +117,7 @@ def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
         prog="qhm",
         description="Map triangle meshes into the plane with no inverted triangle, certified exactly.",
         epilog="Exit status: 0 certified injective, 1 not injective, 2 wrong input or call (nothing written), 3 "
-        "written, but not what should be told about it.",
+        "written, but the report failed.",
     )
     parser.add_argument("--version", action=Version)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)

@@ -34,7 +34,9 @@ def add_report(parser: argparse.ArgumentParser) -> None:
 
 def add_linear_solver(parser: argparse._ActionsContainer) -> None:
     """Add ``--linear-solver``."""
-    parser.add_argument("--linear-solver", default="auto", choices=LINEAR_SOLVERS, help="(default: the best present)")
+    parser.add_argument(
+        "--linear-solver", default="auto", choices=LINEAR_SOLVERS, help="(default: the fastest one installed)"
+    )
 
 
 def add_strategy(parser: argparse._ActionsContainer) -> None:
@@ -42,7 +44,7 @@ def add_strategy(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--strategy",
         choices=STRATEGIES,
-        help="what finds a map soonest, or the paper's own pipeline, si-log first (default: speed)",
+        help="the fastest method, or the paper's pipeline, which starts with si-log (default: speed)",
     )
 
 
@@ -52,7 +54,7 @@ def add_rings(parser: argparse._ActionsContainer) -> None:
         "--rings",
         type=count,
         metavar="N",
-        help="distances: how many edges apart vertices are at most (default: 20)",
+        help="for distances: largest number of edges between two vertices (default: 20)",
     )
 
 
@@ -81,7 +83,7 @@ def settle(options: argparse.Namespace, name: str, default: object, *, asked: bo
         setattr(options, name, default)
     elif not asked:
         option = "--" + name.replace("_", "-")
-        raise ValueError(f"{option} belongs to {belongs}, which was not asked for: add that, or leave {option} out")
+        raise ValueError(f"{option} needs {belongs}: add {belongs}, or omit {option}")
 
 
 def steps(text: str) -> int:

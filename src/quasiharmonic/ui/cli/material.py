@@ -17,7 +17,7 @@ def add_options(parser: argparse._ActionsContainer) -> None:
         action="store_true",
         help="write the file with a checkerboard on it: an OBJ with an .mtl and a .png beside it, a GLB with all in it",
     )
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="the same with a picture, PNG or JPEG")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="the same with an image, PNG or JPEG")
 
 
 def read_mesh(options: argparse.Namespace, path: Path) -> MeshData:

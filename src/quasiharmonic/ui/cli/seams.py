@@ -38,7 +38,7 @@ def add_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--cut",
         action="store_true",
-        help="cut what does not lie flat, along seams: vertices and faces stay as they are",
+        help="cut surfaces that cannot be flattened, along seams; vertices and faces of the model are unchanged",
     )
     parser.add_argument(
         "--seams",
@@ -52,13 +52,13 @@ def add_options(parser: argparse._ActionsContainer) -> None:
 def add_packing(parser: argparse._ActionsContainer) -> None:
     """Add ``--pack`` and ``--margin``."""
     parser.add_argument(
-        "--pack", action="store_true", help="lay the islands into the unit square, all at one texel density"
+        "--pack", action="store_true", help="pack the islands into the unit square, all at one texel density"
     )
     parser.add_argument(
         "--margin",
         type=float,
         metavar="SHARE",
-        help="for --pack: least room between islands, as a share of the square's side (default: 1/256)",
+        help="for --pack: minimum distance between islands, as a fraction of the square's side (default: 1/256)",
     )
 
 
@@ -121,12 +121,14 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
             found.notes.append(
                 f"cut along {counted('edge', 'edges', cut)}: seams of the map, the model's vertices and faces stay"
                 if cut
-                else "nothing to cut: it lies flat as it is"
+                else "nothing to cut: the surface can be flattened without cuts"
             )
     islands = len(found.mesh.islands)
     if islands > 1:
         found.facts["island_count"] = islands
-        found.notes.append(f"{islands} islands, each mapped on its own (--seams none takes the surface whole)")
+        found.notes.append(
+            f"{islands} islands, each mapped on its own (use --seams none to map the surface as one island)"
+        )
     return found
 
 

@@ -17,7 +17,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--slide",
         action="store_true",
-        help="let boundary vertices glide along the outline while distortion is lowered, its corners held",
+        help="let boundary vertices slide along the outline while distortion is lowered; corners stay fixed",
     )
     parser.add_argument(
         "--pieces",
@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def check_options(options: argparse.Namespace) -> None:
     """Raise ValueError if ``--pieces`` is given without ``--slide`` and ``--to``."""
     if options.pieces is not None and not (options.slide and options.to is not None):
-        raise ValueError("--pieces tells vertices their side of the outline to slide along: add --slide and --to")
+        raise ValueError("--pieces assigns vertices to sides of the outline: add --slide and --to")
 
 
 def along(
@@ -104,6 +104,6 @@ def read_pieces(path: Path, sides: int) -> dict[int, int]:
             there = f"only sides 0 … {sides - 1}" if sides > 1 else "only one side, 0"
             raise MeshFileError(path, f"says side {side}, but the outline has {there}", number)
         if vertex in told:
-            raise MeshFileError(path, f"names vertex {vertex} a second time", number)
+            raise MeshFileError(path, f"lists vertex {vertex} a second time", number)
         told[vertex] = side
     return told

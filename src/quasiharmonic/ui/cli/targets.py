@@ -50,11 +50,14 @@ class Posed:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--fixed``, ``--to`` and the related options."""
     group = parser.add_argument_group(
-        "where the boundary goes", "By default to where the texture coordinates (vt) of the input have it."
+        "targets of the boundary", "By default the targets are the texture coordinates (vt) of the input."
     )
     where = group.add_mutually_exclusive_group()
     where.add_argument(
-        "--fixed", type=Path, metavar="FILE", help="fixed vertices, 0-based, one a line (default: the boundary)"
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
     )
     where.add_argument("--to", metavar="OUTLINE", help=FORMS)
     group.add_argument("--font", metavar="FONT", help="for letters and words: a font file or the name of a font")
@@ -76,7 +79,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--refine",
         action="store_true",
-        help="split inner edges where there is no map without, as few as need be (adds vertices at the end)",
+        help="if no map exists, split as few inner edges as necessary (adds vertices at the end)",
     )
 
 
@@ -95,18 +98,18 @@ def check_options(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np
         value = getattr(options, name)
         if value is not None and value is not False:
             option = name.replace("_", "-")
-            raise ValueError(f"--{option} says how the boundary goes to an outline: name one by --to")
+            raise ValueError(f"--{option} applies only to an outline: give one by --to")
     if options.seams != "file":
-        raise ValueError("without --to the boundary goes where the input's vt have it, and so do its seams")
+        raise ValueError("without --to the targets and the seams are those of the input's vt: add --to")
     if mesh.FT is None and fixed is None:
         raise ValueError(
-            f"{mesh.source}: no face refers to texture coordinates (vt), which would say where the boundary goes: "
-            "write some, or name an outline, as --to disk"
+            f"{mesh.source}: no face refers to texture coordinates (vt), so the boundary has no targets: "
+            "add them, or give an outline, as in --to disk"
         )
     if mesh.FT is None:
         raise ValueError(
-            f"{mesh.source}: no face refers to texture coordinates (vt), so nothing says where the fixed vertices go: "
-            "write it with uv coordinates, in OBJ vt lines and faces like 1/1 2/2 3/3"
+            f"{mesh.source}: no face refers to texture coordinates (vt), so the fixed vertices have no targets: "
+            "export it with uv coordinates (in OBJ: vt lines and faces like 1/1 2/2 3/3)"
         )
 
 
@@ -207,7 +210,7 @@ def _check_room(problem: Problem, to: str) -> None:
     if len(flat):
         raise ValueError(
             f"the inner {named_edges(flat)} {'joins' if len(flat) == 1 else 'join'} boundary vertices between which "
-            f"{to} does not bend outwards, so that what is cut off has no room: split with --refine, or send a vertex "
+            f"{to} does not bend outwards, so the triangles it cuts off degenerate: use --refine, or assign a vertex "
             "in between to a corner with --corners"
         )
 

@@ -13,7 +13,9 @@ class Version(argparse.Action):
     """Print the text of `told` and exit."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **_: Any) -> None:
-        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help="show version and surroundings, and exit")
+        super().__init__(
+            option_strings, argparse.SUPPRESS, nargs=0, help="show the version and the environment, and exit"
+        )
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         require_output()

@@ -49,7 +49,7 @@ def draw(shown: Displayable, kind: str, *, measure: str = "isometric") -> Figure
             return _certificate(shown)
         case Diagnosis():
             return _diagnosis(shown)
-    raise TypeError(f"nothing is known to draw of a {type(shown).__name__}")
+    raise TypeError(f"cannot draw a {type(shown).__name__}")
 
 
 def _result(result: MapResult, kind: str, measure: str) -> Figure:
@@ -58,7 +58,7 @@ def _result(result: MapResult, kind: str, measure: str) -> Figure:
     if kind == "convergence":
         return plot.plot_convergence(result)
     if result.V is None:
-        raise ValueError("the result does not know its surface: use quasiharmonic.plot, which is told V and F")
+        raise ValueError("the result has no surface: use quasiharmonic.plot with V and F")
     if kind == "distortion":
         return plot.plot_distortion(result.V, result.F, result.uv, measure)
     if kind == "texture":
@@ -84,7 +84,7 @@ def _certificate(certificate: Certificate) -> Figure:
 def _diagnosis(diagnosis: Diagnosis) -> Figure:
     problem = diagnosis.problem
     if problem is None:
-        raise ValueError("the diagnosis does not know its problem")
+        raise ValueError("the diagnosis has no problem to draw")
     # Obstructions of whole loops are not marked, because no part of a loop is the cause.
     vertices = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *(o.vertices for o in diagnosis.obstructions)]))
     triangles = [problem.F[o.triangles][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2) for o in diagnosis.obstructions]

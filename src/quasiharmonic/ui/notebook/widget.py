@@ -147,10 +147,10 @@ def _sheet(surface: Any, F: ArrayLike | None) -> Sheet:
         return sheet_of(MeshData(surface.V, surface.F).with_map(uv), "problem", surface.fixed)
     if isinstance(surface, MapResult):
         if surface.V is None:
-            raise ValueError("the result does not know its surface: hand over its Problem, or V and F")
+            raise ValueError("the result has no surface: pass its Problem, or V and F")
         return sheet_of(MeshData(surface.V, surface.F).with_map(surface.uv), "result")
     if isinstance(surface, str | PathLike):
         return read_sheet(Path(fspath(surface)))
     if stands_for_mesh(surface):
         return sheet_of(MeshData(*mesh_arrays(surface)), "mesh")
-    raise ValueError(f"{kind_of(surface)} is no surface: hand over V and F, a mesh, a path, a Problem or a MapResult")
+    raise ValueError(f"{kind_of(surface)} is not a surface: pass V and F, a mesh, a path, a Problem or a MapResult")

@@ -107,7 +107,7 @@ def check_animation(path: str | PathLike[str], frames_per_second: int) -> str:
 
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
-        raise ValueError(f"{path}: animations are written as .gif or .mp4")
+        raise ValueError(f"{path}: an animation must be .gif or .mp4")
     whole_number("frames_per_second", frames_per_second, least=1)
     most = _HUNDREDTHS // _SHORTEST
     if suffix == ".gif" and frames_per_second > most:

@@ -44,7 +44,7 @@ def grip(
     """
     row = np.flatnonzero(fixed == vertex)
     if not row.size:
-        raise ValueError(f"vertex {vertex} is held by nothing: pin it first")
+        raise ValueError(f"vertex {vertex} is not fixed: pin it first")
     share = np.zeros(len(fixed))
     share[row] = 1.0
     loop = next((loop for loop in loops if vertex in loop), None)

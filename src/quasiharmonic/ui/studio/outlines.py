@@ -63,7 +63,7 @@ def outline_named(word: object) -> Outline:
     """
     if not isinstance(word, str) or not _WORDS.fullmatch(word):
         raise ValueError(
-            f"{str(word)[:40]!r} is no outline; there are disk, ellipse:2x1, ring:0.5, rect:2x1, polygon:6, star:5, "
+            f"unknown outline {str(word)[:40]!r}: use disk, ellipse:2x1, ring:0.5, rect:2x1, polygon:6, star:5, "
             "letter:R and word:QH"
         )
     return Outline(word, outline(word))
@@ -79,7 +79,7 @@ def outline_drawn(name: str, content: bytes) -> Outline:
     """
     shown = re.sub(r"[^\w.-]", "_", PurePosixPath(name.replace("\\", "/")).stem)[:60].strip(".") or "drawing"
     if len(content) > MOST_BYTES:
-        raise ValueError(f"{shown}.svg has {len(content):,} bytes, and {MOST_BYTES:,} are taken")
+        raise ValueError(f"{shown}.svg has {len(content):,} bytes; at most {MOST_BYTES:,} are allowed")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "dropped.svg"
         path.write_bytes(content)
@@ -101,6 +101,6 @@ def outline_by_hand(points: FloatArray) -> Outline:
     if points.ndim != 2 or points.shape[1:] != (2,) or not 3 <= len(points) <= MOST_POINTS:
         raise ValueError(f"a polygon has 3 to {MOST_POINTS:,} corners")
     if not np.isfinite(points).all():
-        raise ValueError("a corner of the polygon is nowhere")
+        raise ValueError("a corner of the polygon is not finite")
     content = "".join(f"{x!r}, {y!r}\n" for x, y in points.tolist()).encode()
     return Outline("polygon.txt", [np.array(points, dtype=np.float64)], content)

@@ -74,7 +74,7 @@ class Page:
                 await self._tell(message)
         except asyncio.IncompleteReadError:
             code = await self._process.wait()
-            return self._why or f"what computes for this page has ended by itself (exit status {code})"
+            return self._why or f"the process of this page has ended (exit status {code})"
         finally:
             watch.cancel()
 
@@ -84,9 +84,9 @@ class Page:
         while True:
             await asyncio.sleep(_LOOK)
             if (resident(self._process.pid) or 0) > MOST_MEMORY:
-                self._why = f"this surface took more than {MOST_MEMORY >> 30} GiB of memory"
+                self._why = f"this surface used more than {MOST_MEMORY >> 30} GiB of memory"
             elif self._stop_asked is not None and clock() - self._stop_asked > _DEAF:
-                self._why = "what was being computed could not be stopped"
+                self._why = "the computation could not be stopped"
             else:
                 continue
             self.end()

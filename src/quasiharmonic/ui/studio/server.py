@@ -101,7 +101,7 @@ class Studio:
         """Refuse a request, answer it with a file, or return None to open a socket."""
         hosts = request.headers.get_all("Host")
         if len(hosts) != 1 or hosts[0] not in {f"{HOST}:{self.port}", f"localhost:{self.port}"}:
-            return _answer(HTTPStatus.MISDIRECTED_REQUEST, "this address is not served here")
+            return _answer(HTTPStatus.MISDIRECTED_REQUEST, "unknown address")
         if getattr(request, "method", "GET") != "GET":
             return _answer(HTTPStatus.METHOD_NOT_ALLOWED, "files are read with GET", allow="GET")
         path = request.path.partition("?")[0]
@@ -117,7 +117,7 @@ class Studio:
         if name == "socket":
             origins = request.headers.get_all("Origin")
             if origins != [f"http://{hosts[0]}"]:
-                return _answer(HTTPStatus.FORBIDDEN, "the page of another site must not speak to this one")
+                return _answer(HTTPStatus.FORBIDDEN, "requests from other sites are not allowed")
             return None
         asset = assets().get(name or "index.html")
         if asset is None:
@@ -157,7 +157,7 @@ class Studio:
         listening = asyncio.ensure_future(self._listen(connection, page))
         try:
             why = await page.run()
-            await tell(encode({"kind": "note", "level": "gone", "text": f"{why}. The page begins anew."}))
+            await tell(encode({"kind": "note", "level": "gone", "text": f"{why}. The page restarts."}))
             await connection.close(1011, "the process has ended")
         finally:
             listening.cancel()

@@ -124,7 +124,7 @@ class Session:
         do = self._DOERS.get(what) if isinstance(what, str) else None
         try:
             if do is None:
-                raise Refused(f"the page asks for {str(what)[:40]!r}, which is nothing that is done here")
+                raise Refused(f"unknown request {str(what)[:40]!r}")
             do(self, frame)
         except KeyboardInterrupt:
             self._show()
@@ -154,12 +154,12 @@ class Session:
     def _corners(self, frame: Frame) -> None:
         outline = self.moment.recipe.outline
         if outline is None:
-            raise Refused("corners are those of an outline: choose one first")
+            raise Refused("corners need an outline: choose one first")
         self._settle(laid(self._sheet, outline, "auto"))
 
     def _flatten(self, frame: Frame) -> None:
         moment = self.moment
-        self._busy("laying it flat")
+        self._busy("flattening")
         self._keep(freed(moment.problem, moment.recipe, moment.pins, self._step), fit=True)
 
     # --- drags and edits ---------------------------------------------------------------------------------------------
@@ -167,9 +167,9 @@ class Session:
     def _pin(self, frame: Frame) -> None:
         moment, vertex = self.moment, asking.vertex(frame, self.moment.problem.n)
         if vertex in np.concatenate(moment.problem.domain.loops):
-            raise Refused("that vertex is on the boundary, which is held already: drag it in the map")
+            raise Refused("that vertex is on the boundary, which is already fixed: drag it in the map")
         if not moment.result.injective:
-            raise Refused("pins are put where the map is, and there is none without inverted triangles")
+            raise Refused("pins need a map without inverted triangles, but none was found")
         if vertex not in moment.pins:
             self._keep(holding(moment, [*moment.pins, vertex]))
 
@@ -215,7 +215,7 @@ class Session:
     def _polish(self, frame: Frame) -> None:
         energy, slide = asking.text(frame, "energy"), frame.header.get("slide") is True
         if energy not in ENERGIES:
-            raise Refused(f"{energy[:40]!r} is no energy; there are {', '.join(ENERGIES)}")
+            raise Refused(f"unknown energy {energy[:40]!r}: use {', '.join(ENERGIES)}")
         moment = self.moment
         rails: bool | BoundaryCurves = False
         if slide:

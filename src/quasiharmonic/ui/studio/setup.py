@@ -88,7 +88,7 @@ def with_corner(moment: SessionState, vertex: int) -> SessionState:
     """
     recipe, problem = moment.recipe, moment.problem
     if recipe.outline is None:
-        raise Refused("corners are those of an outline: choose one first")
+        raise Refused("corners need an outline: choose one first")
     near = int(nearest_on_boundary(problem.V, problem.F, problem.V[vertex][None])[0])
     before = tuple((v, k) for v, k in moment.chosen if v != near)
     count = max(len(moment.corners), 1)

@@ -101,7 +101,7 @@ def dropped_sheet(name: str, content: bytes) -> Sheet:
     shown = PurePosixPath(name.replace("\\", "/")).name[:100]
     suffix = PurePosixPath(shown).suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"{shown}: no mesh that is read here; these are {', '.join(SUFFIXES)}")
+        raise ValueError(f"{shown}: unsupported mesh format; supported: {', '.join(SUFFIXES)}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"dropped{suffix}"
         path.write_bytes(content)
@@ -123,7 +123,7 @@ def sheet_of(mesh: io.MeshData, name: str, fixed: np.ndarray | None = None) -> S
     if len(mesh.F) > MOST_TRIANGLES:
         raise ValueError(
             f"{name} has {len(mesh.F):,} triangles, and the page shows {MOST_TRIANGLES:,} at most: "
-            "map it by the command, qhm map, or coarsen it first"
+            "use the command qhm map, or coarsen it first"
         )
     if not len(mesh.F):
         raise ValueError(f"{name} has no triangles")

@@ -37,7 +37,7 @@ def place(frame: Frame) -> FloatArray:
         raise Refused("a message without the place that a vertex is moved to, two numbers")
     for one in value:
         if isinstance(one, bool) or not isinstance(one, int | float) or not math.isfinite(one) or abs(one) > 1e150:
-            raise Refused("a vertex was moved to a place that is none")
+            raise Refused("a vertex was moved to a position that is not finite")
     return np.array(value, dtype=np.float64)
 
 

@@ -55,5 +55,7 @@ def compiled(twin: Kernel) -> Kernel:
         return twin
     kernel: Kernel | None = getattr(extension, twin.__name__, None)
     if kernel is None:
-        raise ImportError(f"{extension.__file__} is too old to have {twin.__name__}; build it again: pip install -e .")
+        raise ImportError(
+            f"{extension.__file__} is too old: it has no {twin.__name__}; build it again: pip install -e ."
+        )
     return kernel

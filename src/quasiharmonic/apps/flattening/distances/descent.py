@@ -123,7 +123,7 @@ def keep_distances(
     places = map_array("uv", uv, n)
     judged = certify(piece.F, places, loops=piece.loops)
     if not judged.bijective:
-        raise ValueError(f"the descent starts from a bijective map, and uv is not. {judged.summary()}")
+        raise ValueError(f"uv is not bijective: the descent needs a bijective map. {judged.summary()}")
     settings = Settings(
         SymmetricDirichlet(), "distances", tolerance, max_iterations, linear_solver, callback, record_every
     )

@@ -49,7 +49,7 @@ def pin_obstructions(F: IntArray, n: int, found: Edges, fixed: IntArray, target:
         *_crossing(held, where, found, fixed),
         *_covered(F, held, where, fixed),
     ]
-    return Diagnosis(tuple(obstructions), ("the outline, which is free, was not looked at",))
+    return Diagnosis(tuple(obstructions), ("the boundary, because it is free",))
 
 
 def _shared_places(fixed: IntArray, target: FloatArray) -> Iterator[Obstruction]:
@@ -58,7 +58,7 @@ def _shared_places(fixed: IntArray, target: FloatArray) -> Iterator[Obstruction]
     first = np.flatnonzero(np.concatenate([[True], (placed[1:] != placed[:-1]).any(axis=1)]))
     for group in np.split(fixed[order], first[1:]):
         if group.size > 1:
-            message = f"{named('Vertex', 'Vertices', group)} are held in one place."
+            message = f"{named('Vertex', 'Vertices', group)} are fixed at the same position."
             yield Obstruction(Kind.PIN, Forbids.BIJECTIVE, message, vertices=group)
 
 
@@ -71,8 +71,8 @@ def _wound_wrongly(F: IntArray, held: NDArray[np.bool_], where: FloatArray, foun
     for t, abc, s in zip(whole[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
         sides = np.stack([abc, np.roll(abc, -1)], axis=1)
         message = (
-            f"All vertices of {named('triangle', 'triangles', t[None])} are held, "
-            f"and their places {'invert' if s < 0 else 'flatten'} it."
+            f"All vertices of {named('triangle', 'triangles', t[None])} are fixed, "
+            f"and their targets {'invert' if s < 0 else 'flatten'} it."
         )
         split = sides[~np.isin(edge_keys(sides[:, 0], sides[:, 1], n), boundary)]
         yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
@@ -91,7 +91,7 @@ def _crossing(held: NDArray[np.bool_], where: FloatArray, found: Edges, fixed: I
     for i, j in pairs[(pairs[:, 0] < joined) & apart[pairs].all(axis=1)].tolist():
         ends = segments[[i, j]]
         other = named_edges(ends[1:]) if j < joined else named("vertex", "vertices", ends[1, :1])
-        message = f"Both ends of {named_edges(ends[:1])} are held, and the segment between them meets {other}."
+        message = f"Both ends of {named_edges(ends[:1])} are fixed, and the segment between them meets {other}."
         split = ends[[k < len(inner) for k in (i, j)]]
         kind = Kind.CHORD if len(split) else Kind.CROSSING
         edges_ = ends if j < joined else ends[:1]
@@ -107,7 +107,7 @@ def _covered(F: IntArray, held: NDArray[np.bool_], where: FloatArray, fixed: Int
         sign = [orientation(corners[i, k], corners[i, k - 2], places[j]) for k in range(3)]
         inside = (np.minimum.reduce(sign) > 0).nonzero()[0]
         for t, pin in zip(whole[i[inside]].tolist(), fixed[j[inside]].tolist(), strict=True):
-            message = f"Vertex {pin} is held within triangle {t}, all of whose vertices are held, too."
+            message = f"Vertex {pin} is fixed inside triangle {t}, whose vertices are all fixed as well."
             yield Obstruction(
                 Kind.PIN, Forbids.BIJECTIVE, message, vertices=np.array([pin, *F[t]]), triangles=np.array([t])
             )

@@ -148,7 +148,7 @@ def checked_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray,
     """
     vertices = held_vertices(fixed, n)
     if not vertices.size:
-        raise ValueError("fixed names no vertex: leave it and target out, or name one")
+        raise ValueError("fixed has no vertex: omit fixed and target, or give at least one vertex")
     return vertices, held_places(target, vertices.size)
 
 

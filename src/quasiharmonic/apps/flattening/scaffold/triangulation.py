@@ -35,7 +35,7 @@ _BULGE = 0.05
 # Number of the tree's largest squares along the longer side of the frame.
 _ACROSS = 8
 _SMOOTHINGS = 3
-_MEETS_ITSELF = "the boundary meets itself, and no air fits around it: certify(F, uv) names where"
+_MEETS_ITSELF = "the boundary meets itself, so the air around it cannot be meshed: certify(F, uv) lists where"
 # Smoothing may reduce shape qualities above this; 1 is an equilateral triangle.
 _GOOD = 0.5
 
@@ -118,7 +118,9 @@ def air_around(
     air = Air(np.ldexp(points[used], exponent), number[triangles], number[len(outline) + np.arange(len(frame))])
     bad = inverted_triangles(air.F, np.concatenate([places, air.points]))
     if bad.size:
-        raise ValueError(f"the boundary is too near to itself for air, at {named('vertex', 'vertices', air.F[bad, 0])}")
+        raise ValueError(
+            f"the boundary is too close to itself to mesh the air, at {named('vertex', 'vertices', air.F[bad, 0])}"
+        )
     return air
 
 

@@ -26,11 +26,11 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "animate",
-        help="map a surface to a sequence of targets, each frame certified, none leaping",
+        help="map a surface to a sequence of targets, each frame certified, without jumps",
         description="Map a surface to a sequence of targets, each frame from the one before it. With --polish every "
-        "frame has little distortion, and vertices do not leap from one to the next.",
+        "frame has little distortion, and vertices do not jump between frames.",
         epilog="Exit status: 0 every frame is written and certified injective as written; 1 one is not; 2 wrong input "
-        "or call, nothing written; 3 written, but not what should be told about it. Ctrl-C writes the frames so far.",
+        "or call, nothing written; 3 written, but the report failed. Ctrl-C writes the frames so far.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, OFF, PLY, GLB, glTF or STL file: the surface")
     parser.add_argument(
@@ -38,7 +38,7 @@ def add_parser(commands: Commands) -> None:
         type=Path,
         nargs="+",
         metavar="FRAMES",
-        help="where fixed vertices go: meshes with the same vertices and a map (vt), in their order; or a folder of "
+        help="targets of the fixed vertices: meshes with the same vertices and a map (vt), in order; or a folder of "
         "them, by name; or a .npy array (frames, vertices, 2), of all vertices or of those that --fixed lists",
     )
     parser.add_argument(
@@ -50,20 +50,23 @@ def add_parser(commands: Commands) -> None:
         help="folder to write the frames to as 0000.obj, 0001.obj, …, or a moving picture, .gif or .mp4; repeatable",
     )
     parser.add_argument(
-        "--fixed", type=Path, metavar="FILE", help="fixed vertices, 0-based, one a line (default: the boundary)"
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
     )
     parser.add_argument("--polish", choices=arguments.ENERGIES, help="lower this distortion energy in every frame")
     parser.add_argument(
         "--max-motion-ratio",
         type=float,
         metavar="TIMES",
-        help="for --polish: no vertex moves more than so many times as far as the boundary does (default: 3)",
+        help="for --polish: maximum vertex motion, relative to the maximum boundary motion (default: 3)",
     )
     parser.add_argument(
-        "--fill-gaps", action="store_true", help="go past frames that allow no map halfway between those around them"
+        "--fill-gaps", action="store_true", help="replace frames without a map by the average of the frames around them"
     )
     parser.add_argument(
-        "--frames-per-second", type=arguments.count, metavar="N", help="of a moving picture (default: 24)"
+        "--frames-per-second", type=arguments.count, metavar="N", help="frame rate of a moving picture (default: 24)"
     )
     parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
     arguments.add_linear_solver(parser)
@@ -92,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
     report.check_new({f"-o {path}": path for path in drawn}, options.json, inputs=inputs)
     folders = [_checked_folder(path, inputs) for path in options.output if path not in drawn]
     if len(set(options.output)) < len(options.output):
-        raise ValueError("-o: the same output is named twice")
+        raise ValueError("-o: the same output is given twice")
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input):
@@ -132,11 +135,11 @@ def run(options: argparse.Namespace) -> int:
         }
         lines = [f"wrote {', '.join(map(str, options.output))}", animation.summary()]
         if missing:
-            lines.append(f"{missing} further frames were asked for")
+            lines.append(f"{missing} further frames were requested")
         for folder, (_, others) in written.items():
             if others:
                 names = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
-                lines.append(f"not of this run, but in {folder}: {names}")
+                lines.append(f"not written by this run, but in {folder}: {names}")
         report.emit(facts, options.json, "\n".join(lines))
     certified = all(every for every, _ in written.values())
     return 0 if not missing and certified and animation.found.all() else 1
@@ -150,18 +153,18 @@ def _files(given: list[Path]) -> list[Path]:
             raise ValueError(f"{given[0]}: no mesh in this folder ({', '.join(_MESHES)})")
         return found
     if len(given) > 1 and any(path.suffix.lower() == ".npy" for path in given):
-        raise ValueError("an array .npy has all frames: name no other file beside it")
+        raise ValueError("an .npy array has all frames: give no other file with it")
     return given
 
 
 def _checked_folder(path: Path, inputs: tuple[Path | None, ...]) -> Path:
     """Return the path if it can be an output folder: writable or new, and without input files."""
     if path.suffix and not path.is_dir():
-        raise ValueError(f"-o {path}: neither a moving picture ({', '.join(PICTURES)}) nor the name of a folder")
+        raise ValueError(f"-o {path}: give a moving picture ({', '.join(PICTURES)}) or a folder")
     if any(source is not None and source.resolve().parent == path.resolve() for source in inputs):
-        raise ValueError(f"-o {path}: frames are not written where the input is")
+        raise ValueError(f"-o {path}: choose a folder without input files")
     if path.exists() and not path.is_dir():
-        raise ValueError(f"-o {path}: it is no folder")
+        raise ValueError(f"-o {path}: it is not a folder")
     return path
 
 
@@ -178,12 +181,12 @@ def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDAr
     for path in files:
         frame = io.read_mesh(path)
         if len(frame.V) != len(mesh.V):
-            raise ValueError(f"{path}: {len(frame.V)} vertices, where the surface has {len(mesh.V)}")
+            raise ValueError(f"{path}: {len(frame.V)} vertices, but the surface has {len(mesh.V)}")
         with report.about(path):
             mapped = io.mapped(frame)
         opened = mapped.opened()
         if opened.uv is None or not mapped.seamless:
-            raise ValueError(f"{path}: its map has seams, and frames are of a surface without")
+            raise ValueError(f"{path}: its map has seams, which frames do not support")
         places.append(opened.uv[held])
     return np.stack(places)
 
@@ -201,7 +204,7 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
     except (ValueError, EOFError, MemoryError) as error:
         # The first line names the error; further lines address programmers.
         said = str(error).partition("\n")[0]
-        raise ValueError(f"{path}: no array of numbers in NumPy's format: {said}") from error
+        raise ValueError(f"{path}: not an array of numbers in NumPy's format: {said}") from error
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, held.size) and array.shape[2] == 2
     if not shaped or array.dtype.kind not in "iuf":
         raise ValueError(

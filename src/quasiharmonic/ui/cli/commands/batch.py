@@ -27,63 +27,66 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "batch",
         help="map all problems of a data set, on all cores or a cluster",
-        description="Map every problem of a data set, each in a process that may fail without harm to the others. "
+        description="Map every problem of a data set, each in a separate process: a failure does not affect "
+        "other problems. "
         "Maps and records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has "
-        "all records. The same command again goes on where the last one ended, however it ended. `qhm report OUT` "
+        "all records. To continue an interrupted run, give the same command again. `qhm report OUT` "
         "makes a page of it.",
         epilog="Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not "
-        "(the records say why); 2 wrong call, or stopped: what was finished is kept; 3 "
-        "finished, but that could not be told.",
+        "(the records give the reason); 2 wrong call, or stopped: finished results are kept; 3 "
+        "finished, but the report failed.",
     )
     parser.add_argument(
         "source",
         metavar="DIR_OR_LIST",
         type=Path,
         help="folder with problems (input.obj and handles.txt) at any depth, or a text file that lists folders and "
-        "meshes, one a line",
+        "meshes, one per line",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
     parser.add_argument(
-        "--table", choices=("csv", "parquet"), default="csv", help="form of the table of records (default: csv)"
+        "--table", choices=("csv", "parquet"), default="csv", help="format of the table of records (default: csv)"
     )
-    parser.add_argument("--retry", action="store_true", help="try again what failed by an error, a crash or a limit")
+    parser.add_argument(
+        "--retry", action="store_true", help="retry problems that failed by an error, a crash or a limit"
+    )
 
-    work = parser.add_argument_group("who works, and how long")
+    work = parser.add_argument_group("workers and limits")
     work.add_argument(
-        "-j", "--jobs", type=arguments.count, metavar="N", help="problems at a time (default: a core each)"
+        "-j", "--jobs", type=arguments.count, metavar="N", help="problems solved in parallel (default: one per core)"
     )
     work.add_argument(
-        "--threads", type=arguments.count, default=1, metavar="N", help="solver threads for each (default: 1)"
+        "--threads", type=arguments.count, default=1, metavar="N", help="solver threads per problem (default: 1)"
     )
     work.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="have the workers of a Dask cluster do it, whose scheduler is at tcp://HOST:PORT",
+        help="use the workers of the Dask cluster with this scheduler, tcp://HOST:PORT",
     )
     work.add_argument(
         "--time-limit",
         type=_seconds,
         default=600.0,
         metavar="SECONDS",
-        help="for one problem; 0 for none (default: 600)",
+        help="time limit per problem in seconds; 0 for no limit (default: 600)",
     )
     work.add_argument(
-        "--memory-limit", type=_bytes, metavar="SIZE", help="resident memory for one problem, such as 800M or 4G"
+        "--memory-limit", type=_bytes, metavar="SIZE", help="limit of resident memory per problem, such as 800M or 4G"
     )
 
-    solver = parser.add_argument_group("how each is solved")
+    solver = parser.add_argument_group("solution of each problem")
     solver.add_argument(
         "--to",
         metavar="OUTLINE",
-        help=f"take every mesh file, its boundary to go to {targets.FORMS}",
+        help=f"map every mesh file onto an outline: {targets.FORMS}",
     )
     solver.add_argument(
         "--flatten",
         action="store_true",
-        help="take every mesh file and lay it flat, its boundary free, without overlap",
+        help="flatten every mesh file with a free boundary, without overlap",
     )
     solver.add_argument(
-        "--cut", action="store_true", help="with --to and --flatten: cut what does not lie flat, along seams"
+        "--cut", action="store_true", help="with --to and --flatten: cut surfaces that cannot be flattened, along seams"
     )
     solver.add_argument(
         "--corners",
@@ -93,12 +96,12 @@ def add_parser(commands: Commands) -> None:
     solver.add_argument(
         "--refine",
         action="store_true",
-        help="split inner edges where there is no map without, as few as need be (adds vertices)",
+        help="if no map exists, split as few inner edges as necessary (adds vertices)",
     )
     solver.add_argument(
         "--energy",
         choices=arguments.FLATTENED,
-        help="what --flatten lowers (default: symmetric-dirichlet)",
+        help="energy that --flatten lowers (default: symmetric-dirichlet)",
     )
     arguments.add_strategy(solver)
     solver.add_argument(
@@ -107,7 +110,7 @@ def add_parser(commands: Commands) -> None:
     solver.add_argument(
         "--slide",
         action="store_true",
-        help="let boundary vertices glide along the outline while --polish lowers distortion, its corners held",
+        help="let boundary vertices slide along the outline while --polish lowers distortion; corners stay fixed",
     )
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
     solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
@@ -121,9 +124,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.ui.cli import report
 
     if options.flatten and options.strategy is not None:
-        raise ValueError(
-            "--strategy is of maps onto a given boundary, and --flatten sets it free: leave one of them out"
-        )
+        raise ValueError("--strategy needs a given boundary, but --flatten leaves the boundary free: omit one of them")
     settings = batch.Settings(
         to=options.to,
         flatten=options.flatten,
@@ -155,7 +156,9 @@ def run(options: argparse.Namespace) -> int:
         )
     except KeyboardInterrupt:
         show.clear()
-        tell(f"qhm batch: interrupted; what was finished is kept in {options.output}, and the same command goes on")
+        tell(
+            f"qhm batch: interrupted; finished results are kept in {options.output}; give the same command to continue"
+        )
         return 2
     finally:
         show.clear()

@@ -16,30 +16,30 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "check",
-        help="judge a map: every triangle positive? no overlap?",
-        description="Judge a planar map exactly: the texture coordinates (vt) of an OBJ file whose faces refer to "
-        "them, else the first two coordinates of its vertices. A map with seams is judged as it lies in the plane.",
-        epilog="Exit status: 0 injective (every triangle strictly positive), or the boundary is told; 1 not; 2 the "
-        "file cannot be judged.",
+        help="verify a map: inverted triangles and overlaps",
+        description="Verify a planar map exactly: the texture coordinates (vt) of an OBJ file whose faces refer to "
+        "them, else the first two coordinates of its vertices. A map with seams is verified in the plane.",
+        epilog="Exit status: 0 injective (every triangle strictly positive), or the boundary is listed; 1 not; 2 the "
+        "file cannot be verified.",
     )
     parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB, glTF or OFF file")
     parser.add_argument(
         "--as",
         dest="precision",
         choices=("float64", "float32"),
-        help="judge the positions as a reader in this precision sees them (default: float64)",
+        help="round the positions to this precision first (default: float64)",
     )
     parser.add_argument(
         "--any-triangulation",
         action="store_true",
-        help="ask too that every face is convex in the plane, so that the verdict holds however it is triangulated",
+        help="also require that every face is convex in the plane, so that the result holds for any triangulation",
     )
     parser.add_argument(
         "--boundary",
         action="store_true",
-        help="judge nothing, but number the boundary of the surface: its loops, and corners for qhm map --corners",
+        help="only list the boundary of the surface: its loops, and corners for qhm map --corners",
     )
-    parser.add_argument("--plot", type=Path, metavar="PICTURE", help="draw the boundary that --boundary numbers")
+    parser.add_argument("--plot", type=Path, metavar="PICTURE", help="draw the boundary that --boundary lists")
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 
@@ -55,11 +55,11 @@ def run(options: argparse.Namespace) -> int:
     report.check_json(options.json, inputs=(options.input,))
     if options.boundary:
         if options.precision is not None or options.any_triangulation:
-            raise ValueError("--boundary judges no map: leave --as and --any-triangulation out")
+            raise ValueError("--boundary verifies no map: omit --as and --any-triangulation")
         return boundary.run(options)
     precision = options.precision or "float64"
     if options.plot is not None:
-        raise ValueError("--plot draws what --boundary numbers: ask for that too, or for qhm plot")
+        raise ValueError("--plot needs --boundary: add it, or use qhm plot")
     mesh = io.read_mesh(options.input)
     judged = judging.judge(mesh, precision=precision)
     further = len(judged.V) - len(mesh.V)
@@ -76,17 +76,18 @@ def run(options: argparse.Namespace) -> int:
     if judged.summary() != judged.certificate.summary():
         lines.append(judged.summary().removeprefix(judged.certificate.summary()).strip())
     if further:
-        lines.append(f"The map has seams: vertices from {len(mesh.V)} on are further places of vertices there.")
+        lines.append(f"The map has seams: vertices from {len(mesh.V)} on are copies of vertices on the seams.")
     good = judged.certificate.injective
     if options.any_triangulation:
         bent = not_convex(mesh.polygons, judged.F, judged.uv)
         facts["not_convex"] = bent.tolist()
         good = good and not bent.size
         lines.append(
-            f"Not injective however it is triangulated: {named('face', 'faces', bent)} not convex in the plane."
+            f"Not injective for every triangulation: {named('face', 'faces', bent)} not convex in the plane."
             if bent.size
-            else f"Every one of {counted('face', 'faces', mesh.faces)} is convex in the plane: that holds however they "
-            "are triangulated."
+            else f"Every one of {counted('face', 'faces', mesh.faces)} is convex in the plane: the "
+            f"result holds for any "
+            "triangulation."
         )
     report.emit_verdict(facts, options.json, "\n".join(lines))
     return 0 if good else 1

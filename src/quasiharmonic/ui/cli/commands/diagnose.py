@@ -16,7 +16,7 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "diagnose",
-        help="say what forbids a map, and what would help",
+        help="find obstructions to a map, and remedies",
         description="Look for obstructions: conditions that every injective (or bijective) map of this mesh onto this "
         "target would have to meet and cannot. Finding none proves nothing.",
         epilog="Exit status: 0 nothing forbids an injective map; 1 something does; 2 wrong input or call.",
@@ -28,7 +28,10 @@ def add_parser(commands: Commands) -> None:
         help="OBJ, PLY, GLB or glTF file, or a folder with input.obj and handles.txt",
     )
     parser.add_argument(
-        "--fixed", type=Path, metavar="FILE", help="fixed vertices, 0-based, one a line (default: the boundary)"
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
     )
     arguments.add_report(parser)
     parser.set_defaults(run=run)

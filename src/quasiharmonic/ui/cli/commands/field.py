@@ -19,13 +19,13 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "field",
-        help="make a displacement field of a picture invertible",
-        description="Make a displacement field invertible, and change it as little as that takes: away from what folds "
-        "it stays as it is, to the last bit. The field is an array .npy of shape (height, width, 2), displacements "
+        help="make a displacement field of an image invertible",
+        description="Make a displacement field invertible, with the least change: away from folds "
+        "every bit is unchanged. The field is an array .npy of shape (height, width, 2), displacements "
         "along x, to the right, and y, down, in the unit of --spacing.",
         epilog="Exit status: 0 written, and certified to fold nowhere, as written; 1 written, but an inverse was asked "
         "for and there is none, since the border overlaps itself; 2 wrong input or call, or no such field was found, "
-        "nothing written; 3 written, but not what should be told about it.",
+        "nothing written; 3 written, but the report failed.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help=".npy file")
     parser.add_argument("-o", "--output", type=Path, required=True, help=".npy file to write")
@@ -48,7 +48,7 @@ def add_parser(commands: Commands) -> None:
         type=float,
         default=0.01,
         metavar="DET",
-        help="what all Jacobian determinants are to be above (default: 0.01)",
+        help="lower bound of all Jacobian determinants (default: 0.01)",
     )
     parser.add_argument("--hold-border", action="store_true", help="keep the displacements of the border's pixels")
     arguments.add_report(parser)
@@ -104,7 +104,7 @@ def _read(path: Path) -> NDArray[Any]:
         try:
             array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
         except (ValueError, EOFError) as error:
-            raise ValueError(f"{path}: no array of numbers in NumPy's format .npy: {error}") from error
+            raise ValueError(f"{path}: not an array of numbers in NumPy's format .npy: {error}") from error
     return array
 
 

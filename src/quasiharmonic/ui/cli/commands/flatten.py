@@ -23,11 +23,12 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "flatten",
-        help="lay a surface flat, its boundary free, without overlap",
-        description="Map a surface with a boundary into the plane, its boundary going where distortion is least. No "
+        help="flatten a surface with a free boundary, without overlap",
+        description="Map a surface with a boundary into the plane. The boundary is free and moves to lower "
+        "distortion. No "
         "triangle is inverted, and nothing overlaps.",
         epilog="Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing "
-        "written; 3 written, but not what should be told about it. Ctrl-C writes the best map so far.",
+        "written; 3 written, but the report failed. Ctrl-C writes the best map so far.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, OFF, PLY, GLB, glTF or STL file")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
@@ -35,38 +36,44 @@ def add_parser(commands: Commands) -> None:
         "--energy",
         choices=arguments.FLATTENED,
         default="symmetric-dirichlet",
-        help="what is lowered; mips is for angles alone, distances for those between vertices some edges apart "
+        help="energy to lower; mips preserves only angles, distances preserves distances between nearby vertices "
         "(default: symmetric-dirichlet)",
     )
     arguments.add_rings(parser)
     parser.add_argument(
-        "--weights", type=Path, metavar="FILE", help="how much each triangle counts, a positive number on each line"
+        "--weights", type=Path, metavar="FILE", help="file of triangle weights, one positive number per line"
     )
     parser.add_argument(
-        "--start", action="store_true", help="begin with the map in the input's texture coordinates (vt)"
+        "--start", action="store_true", help="start from the map in the input's texture coordinates (vt)"
     )
     parser.add_argument(
         "--fixed",
         type=Path,
         metavar="FILE",
-        help="vertices, 0-based, one a line, that are held where the input's vt have them",
+        help="file of vertices, 0-based, one per line, to fix at the input's vt",
     )
     parser.add_argument("--unit-square", action="store_true", help="scale the map evenly into the unit square")
     seams.add_options(parser)
     seams.add_packing(parser)
     parser.add_argument(
-        "--pattern", type=Path, metavar="FILE", help="draw the outline true to scale too, as .svg or .dxf"
+        "--pattern", type=Path, metavar="FILE", help="also draw the outline true to scale, as .svg or .dxf"
     )
-    parser.add_argument("--unit", choices=("mm", "cm", "m", "in"), help="of the surface, for --pattern (default: mm)")
     parser.add_argument(
-        "--allowance", type=float, default=0.0, metavar="WIDTH", help="cut so far outside of the outline, in that unit"
+        "--unit", choices=("mm", "cm", "m", "in"), help="length unit of the surface, for --pattern (default: mm)"
+    )
+    parser.add_argument(
+        "--allowance",
+        type=float,
+        default=0.0,
+        metavar="WIDTH",
+        help="distance of the cutting line outside the outline, in that unit",
     )
     parser.add_argument(
         "--max-iterations",
         type=arguments.steps,
         default=500,
         metavar="N",
-        help="steps on each connected surface; 0 leaves the start as it is (default: 500)",
+        help="maximum steps on each connected surface; 0 keeps the start (default: 500)",
     )
     arguments.add_linear_solver(parser)
     material.add_options(parser)
@@ -97,12 +104,12 @@ def run(options: argparse.Namespace) -> int:
     report.check_outputs(options.output, None, options.json, inputs, pattern=options.pattern)
     _check_pattern(options)
     if options.pack and (options.unit_square or options.fixed is not None or options.pattern is not None):
-        raise ValueError("--pack decides size and place: leave --unit-square, --fixed and --pattern out")
+        raise ValueError("--pack determines size and position: omit --unit-square, --fixed and --pattern")
     mesh = material.read_mesh(options, options.input)
     given: dict[str, Any] = {}
     if options.start or options.fixed is not None:
         if options.cut or options.seams != "file":
-            raise ValueError("--start and --fixed are of the input's own map, and new seams leave nothing of it")
+            raise ValueError("--start and --fixed need the input's map, which new seams discard: omit them")
         # Raises an error that names the missing part of the map.
         io.mapped(mesh)
     if options.fixed is not None:
@@ -142,7 +149,7 @@ def run(options: argparse.Namespace) -> int:
             "seconds_in_all": time.perf_counter() - began,
         }
         worst = measured.summary("isometric").maximum
-        lines = [report.of_maps(mapped, judged, options.output), *found.notes, f"stretched {worst:.3g} times at worst"]
+        lines = [report.of_maps(mapped, judged, options.output), *found.notes, f"maximum stretch {worst:.3g}"]
         if measured.distances is not None:
             lines.append(measured.distances.summary())
         if options.pattern is not None:
@@ -160,10 +167,10 @@ def _check_pattern(options: argparse.Namespace) -> None:
 
     if options.pattern is None:
         if options.allowance:
-            raise ValueError("--allowance is of a pattern: name its file by --pattern")
+            raise ValueError("--allowance needs --pattern: add it")
         return
     if options.unit_square:
-        raise ValueError("a pattern is true to scale, and --unit-square is not: leave one of them out")
+        raise ValueError("--pattern is true to scale, but --unit-square scales the map: omit one of them")
     check_pattern(options.pattern, unit=options.unit, allowance=options.allowance)
 
 

@@ -23,17 +23,20 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "harmonise",
-        help="lower an energy that does not mind inversions, within the injective maps",
-        description="Lower the distortion of the map that the input's texture coordinates (vt) give, by an energy that "
-        "need not mind inversions, and keep it injective or make it so. Where polish has the energy it is faster.",
+        help="lower an energy without a barrier, and keep the map injective",
+        description="Lower the distortion of the map in the input's texture coordinates (vt), by an energy that "
+        "needs no barrier, and keep or make the map injective. If qhm polish has the energy, it is faster.",
         epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (for mips "
-        "and symmetric-dirichlet, a map that is not injective included), nothing written; 3 written, but not what "
-        "should be told about it.",
+        "and symmetric-dirichlet, a map that is not injective included), nothing written; 3 written, but the "
+        "report failed.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with a map")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
     parser.add_argument(
-        "--fixed", type=Path, metavar="FILE", help="vertices that stay, 0-based, one a line (default: the boundary)"
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
     )
     parser.add_argument("--energy", choices=arguments.HARMONISED, default="arap", help="(default: arap)")
     parser.add_argument(
@@ -41,15 +44,16 @@ def add_parser(commands: Commands) -> None:
         type=float,
         nargs="+",
         metavar="ETA",
-        help="weight of the energy against injectivity, one for each round (default: four rounds, as suits the energy)",
+        help="weight of the energy against injectivity, one for each round (default: four rounds, "
+        "depending on the energy)",
     )
     parser.add_argument(
         "--unscaled",
         action="store_true",
-        help="compare lengths and areas as they are, not after scaling the map to the surface's area",
+        help="compare lengths and areas without first scaling the map to the surface's area",
     )
     parser.add_argument(
-        "--max-iterations", type=arguments.count, default=40, metavar="N", help="linear solves of a round (default: 40)"
+        "--max-iterations", type=arguments.count, default=40, metavar="N", help="linear solves per round (default: 40)"
     )
     seams.add_packing(parser)
     arguments.add_linear_solver(parser)

@@ -29,10 +29,11 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "map",
         help="map a mesh into the plane without inverted triangles",
-        description="Place the free vertices of a mesh such that no triangle is inverted. Where the fixed vertices "
-        "go is read from the input's texture coordinates (vt), or chosen by --to.",
+        description="Place the free vertices of a mesh such that no triangle is inverted. The targets of the "
+        "fixed vertices "
+        "are the input's texture coordinates (vt), or an outline given by --to.",
         epilog="Exit status: 0 the written file is certified injective; 1 a map was written that is not; "
-        "2 wrong input or call, nothing written; 3 a map was written, but not what should be told about it.",
+        "2 wrong input or call, nothing written; 3 a map was written, but the report failed.",
     )
     parser.add_argument(
         "input",
@@ -59,9 +60,9 @@ def add_parser(commands: Commands) -> None:
         help="then lower distortion until it converges: %(choices)s (default: 20 steps of blend, up to "
         "100,000 triangles)",
     )
-    distortion.add_argument("--no-polish", action="store_true", help="leave the first injective map as it is found")
+    distortion.add_argument("--no-polish", action="store_true", help="keep the first injective map")
     sliding.add_options(parser)
-    solver = parser.add_argument_group("how it is solved")
+    solver = parser.add_argument_group("solution")
     arguments.add_strategy(solver)
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
     solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
@@ -80,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
 
     began = time.perf_counter()
     if options.slide and options.no_polish:
-        raise ValueError("--slide moves the boundary while distortion is lowered, which --no-polish forbids")
+        raise ValueError("--slide needs polishing: omit --no-polish")
     sliding.check_options(options)
     seams.check_packing(options)
     arguments.settle(options, "plot_kind", "map", asked=options.plot is not None, belongs="--plot")
@@ -97,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
     found = seams.surface(options, mesh, disks_too=False)
     islands = found.mesh.islands
     if len(islands) > 1 and options.slide and options.to is not None:
-        raise ValueError(f"--slide is for one island on the outline, and there are {len(islands)}")
+        raise ValueError(f"--slide supports one island, but the mesh has {len(islands)}")
     posed: list[Posed] = []
 
     def solved(island: Island) -> MapResult:
@@ -208,7 +209,7 @@ def crowded_note(vertices: NDArray[np.int64]) -> str:
     """Return a sentence about vertices where double precision is too coarse for a map."""
     from quasiharmonic.util.arrays import named
 
-    return f"no room next to the fixed {named('vertex', 'vertices', vertices)}"
+    return f"double precision is insufficient next to the fixed {named('vertex', 'vertices', vertices)}"
 
 
 def summed(facts: list[dict[str, int]]) -> dict[str, int]:

@@ -17,11 +17,11 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "measure",
-        help="measure a map's distortion, and export it triangle by triangle",
+        help="measure a map's distortion, and export it for each triangle",
         description="Measure what the map that the input's texture coordinates (vt) give does to every triangle. "
         "Means and quantiles are weighted by the surface's area; measures of size are taken after the map has been "
         "scaled to it.",
-        epilog="Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but not told.",
+        epilog="Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but the report failed.",
     )
     parser.add_argument(
         "input", type=Path, metavar="FILE", help="OBJ, PLY, GLB, glTF or OFF file with a map, injective or not"
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
     lines = [_table(found, len(mesh.F))]
     if mirrored.size:
-        lines.append(f"mirrored {named('island', 'islands', mirrored)} measured as the other side shows them")
+        lines.append(f"mirrored {named('island', 'islands', mirrored)} measured with reversed orientation")
     if found.distances is not None:
         lines.append(found.distances.summary())
     text = "\n".join(lines)
@@ -93,7 +93,5 @@ def _table(found: Distortion, count: int) -> str:
         s = found.summary(name)
         numbers = "".join(f"{value:12.4g}" for value in (s.mean, s.median, s.p95, s.minimum, s.maximum))
         lines.append(f"{name:20}{numbers}  {s.highest}")
-    lines.append(
-        f"{len(found.inverted)} of {count} triangles inverted, {len(found.flat)} without area in the rest mesh"
-    )
+    lines.append(f"{len(found.inverted)} of {count} triangles inverted, {len(found.flat)} degenerate in the rest mesh")
     return "\n".join(lines)

@@ -35,8 +35,8 @@ def add_parser(commands: Commands) -> None:
         "of three or six nodes, quadrilaterals of four. Boundary nodes that are not moved stay; mid-side nodes go "
         "along with their sides. Positions are changed within the file; every other byte of it stays, data, times and "
         "physical groups included.",
-        epilog="Exit status: 0 no element of the written mesh is inverted, decided exactly; 1 not so; 2 wrong "
-        "input or call, nothing written; 3 written, but not what should be told about it.",
+        epilog="Exit status: 0 no element of the written mesh is inverted, verified exactly; 1 some are; 2 wrong "
+        "input or call, nothing written; 3 written, but the report failed.",
     )
     parser.add_argument(
         "input", type=Path, metavar="MESH", help="Gmsh .msh (2 or 4), legacy .vtk or .vtu; text or binary"
@@ -46,18 +46,18 @@ def add_parser(commands: Commands) -> None:
     )
     given = parser.add_mutually_exclusive_group(required=True)
     given.add_argument(
-        "--positions", type=Path, metavar="CSV", help="where vertices go: lines 'vertex,x,y', counting from 0"
+        "--positions", type=Path, metavar="CSV", help="file of target positions: lines 'vertex,x,y', counting from 0"
     )
     given.add_argument(
         "--field",
         metavar="NAME",
-        help="point data of the mesh that say how far the boundary's vertices go; of several times, the last",
+        help="point data of the mesh with the displacements of boundary vertices; of several times, the last",
     )
     parser.add_argument(
         "--energy",
         choices=(*arguments.ENERGIES, "none"),
         default="symmetric-dirichlet",
-        help="what the placement minimises; none: the first valid mesh (default: symmetric-dirichlet)",
+        help="energy to lower; none: the first valid mesh (default: symmetric-dirichlet)",
     )
     parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
     parser.add_argument(
@@ -138,7 +138,7 @@ def _rest(path: Path, mesh: FemMesh) -> FloatArray:
 
     first = read_fem(path)
     if first.points.shape != mesh.points.shape or not np.array_equal(first.F, mesh.F):
-        raise MeshFileError(path, f"is not the mesh of {mesh.source}: the same nodes and elements in order are needed")
+        raise MeshFileError(path, f"must have the same nodes and elements, in the same order, as {mesh.source}")
     return first.points
 
 
@@ -156,9 +156,9 @@ def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output:
         lines.append(f"{_QUALITY[morphed.F.shape[1]]} {name}: {worst}, mean {quality.mean():.3g}")
     if drift is not None:
         lines.append(
-            f"no node is further than {drift:.3g} from where one step from the mesh at rest puts it"
+            f"maximum drift {drift:.3g}, relative to one step from the rest mesh"
             if isfinite(drift)
-            else "one step from the mesh at rest finds no valid mesh: how far this one has drifted is not known"
+            else "one step from the rest mesh finds no valid mesh, so the drift is unknown"
         )
     return "\n".join(lines)
 
@@ -173,9 +173,9 @@ def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float6
     places: dict[int, list[float]] = {}
     for line, (vertex, *place) in read_rows(path, 3):
         if not (0 <= vertex < n and vertex.is_integer()):
-            raise MeshFileError(path, f"{vertex:g} is not a vertex from 0 to {n - 1}", line, "lines are 'vertex,x,y'")
+            raise MeshFileError(path, f"{vertex:g} is not a vertex from 0 to {n - 1}", line, "write lines 'vertex,x,y'")
         if int(vertex) in places:
-            raise MeshFileError(path, f"names vertex {int(vertex)} a second time", line)
+            raise MeshFileError(path, f"lists vertex {int(vertex)} a second time", line)
         places[int(vertex)] = place
     if not places:
         raise MeshFileError(path, "moves no vertex")

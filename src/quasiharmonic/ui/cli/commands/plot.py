@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     shows_measure = options.kind == "distortion"
     arguments.settle(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
     if options.picture is not None and options.kind not in (None, "texture"):
-        raise ValueError(f"--picture is drawn on the surface, which --kind {options.kind} does not: leave that out")
+        raise ValueError(f"--picture is not supported by --kind {options.kind}: use --kind texture, or omit it")
     V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))
     with report.about(options.input):
         if options.kind == "distortion":

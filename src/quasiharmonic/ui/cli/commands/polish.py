@@ -27,15 +27,18 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "polish",
-        help="lower the distortion of an injective map, which stays injective",
+        help="lower the distortion of an injective map, and keep it injective",
         description="Lower the distortion of the injective map that the input's texture coordinates (vt) give.",
         epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (a map "
-        "that is not injective included), nothing written; 3 written, but not what should be told about it.",
+        "that is not injective included), nothing written; 3 written, but the report failed.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with an injective map")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
     parser.add_argument(
-        "--fixed", type=Path, metavar="FILE", help="vertices that stay, 0-based, one a line (default: the boundary)"
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
     )
     parser.add_argument(
         "--energy", choices=arguments.ENERGIES, default="symmetric-dirichlet", help="(default: symmetric-dirichlet)"
@@ -44,13 +47,13 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--free",
         action="store_true",
-        help="let the boundary go where distortion is least, each island staying about where it is",
+        help="free the boundary; each island stays about where it is",
     )
     sliding.add_options(parser)
     parser.add_argument(
         "--to",
         metavar="OUTLINE",
-        help="the outline that the boundary is on, as qhm map names it (default: the polygon that the boundary is)",
+        help="the outline of the boundary, as for qhm map (default: the polygon of the boundary)",
     )
     seams.add_packing(parser)
     arguments.add_linear_solver(parser)
@@ -64,9 +67,9 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.ui.cli import sliding
 
     if options.to is not None and not options.slide:
-        raise ValueError("--to names the outline to slide along: add --slide")
+        raise ValueError("--to gives the outline to slide along: add --slide")
     if options.free and (options.slide or options.fixed is not None):
-        raise ValueError("with --free nothing holds the boundary: leave --slide and --fixed out")
+        raise ValueError("--free frees the boundary: omit --slide and --fixed")
     sliding.check_options(options)
 
     notes: list[str] = []
@@ -83,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
         if options.free:
             return atlas.polish(mesh, free=True, **given)
         if options.to is not None and len(mesh.islands) > 1:
-            raise ValueError(f"--slide --to is for one island on the outline, and there are {len(mesh.islands)}")
+            raise ValueError(f"--slide --to supports one island, but the mesh has {len(mesh.islands)}")
         if options.to is None:
             return atlas.polish(mesh, fixed=fixed, slide=options.slide, **given)
         rails = sliding.along(options.to, pieces=options.pieces)

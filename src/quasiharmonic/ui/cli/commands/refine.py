@@ -22,7 +22,7 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "refine",
-        help="split the edges that stand in the way of a map",
+        help="split the edges that prevent a map",
         description="Split the edges that qhm diagnose names, and no others, until it names none. Beside the mesh "
         "with its first guess (vt), which qhm map then takes, the fixed vertices are written to OUTPUT.handles, and "
         "how the new mesh came from the old one to OUTPUT.origin.json (OUTPUT without its suffix).",
@@ -35,7 +35,10 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ file to write")
     parser.add_argument(
-        "--fixed", type=Path, metavar="FILE", help="fixed vertices, 0-based, one a line (default: the boundary)"
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
     )
     arguments.add_report(parser)
     parser.set_defaults(run=run)
@@ -50,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
 
     output: Path = options.output
     if output.suffix.lower() != ".obj":
-        raise ValueError(f"{output}: a mesh with a first guess of its map is written as .obj")
+        raise ValueError(f"{output}: the refined mesh must be written as .obj")
     handles, origin = output.with_suffix(".handles"), output.with_suffix(".origin.json")
     mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
     outputs = {"-o": output, "the list of handles": handles, "the origin": origin}

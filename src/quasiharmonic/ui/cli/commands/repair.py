@@ -16,12 +16,12 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "repair",
-        help="right the inverted triangles of a UV map, its boundary kept",
-        description="Right the inverted triangles of the map that the input's texture coordinates (vt) give. The map "
+        help="untangle the inverted triangles of a UV map, with a fixed boundary",
+        description="Untangle the inverted triangles of the map in the input's texture coordinates (vt). The map "
         "may have seams; each of its islands is repaired on its own. Boundaries stay, and so does every vertex that "
         "need not move.",
         epilog="Exit status: 0 every triangle in the written file is certified positive; 1 some are not; 2 wrong input "
-        "or call, nothing written; 3 written, but not what should be told about it.",
+        "or call, nothing written; 3 written, but the report failed.",
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with texture coordinates")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB or glTF file to write")
@@ -29,12 +29,12 @@ def add_parser(commands: Commands) -> None:
         "--all",
         dest="whole",
         action="store_true",
-        help="map islands that have inverted triangles anew as a whole (default: only patches around them)",
+        help="recompute whole islands that have inverted triangles (default: only patches around them)",
     )
     parser.add_argument(
         "--unmirror",
         action="store_true",
-        help="turn over islands that are mirrored, each in its place (default: left, as some are on purpose)",
+        help="reflect mirrored islands in place (default: keep them, because some are intentional)",
     )
     parser.add_argument(
         "--max-iterations",
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.ui.cli import verdict as judging
 
     if options.output.suffix.lower() == ".off":
-        raise ValueError(f"{options.output}: OFF has no room for seams: write .obj, .ply or .glb")
+        raise ValueError(f"{options.output}: OFF does not support seams: write .obj, .ply or .glb")
     report.check_outputs(options.output, None, options.json, inputs=(options.input,))
     mesh = material.read_mesh(options, options.input)
     if mesh.vt is None or mesh.FT is None or (mesh.FT < 0).any(axis=1).all():

@@ -14,8 +14,8 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "report",
-        help="make a page of what qhm batch did",
-        description="Write one HTML file about a run of qhm batch, finished or going on: success, distortion, times, "
+        help="write a report page of a qhm batch run",
+        description="Write one HTML file about a finished or unfinished run of qhm batch: success, distortion, times, "
         "the slowest, worst and failed problems with pictures. It opens without network.",
         epilog="Exit status: 0 written; 2 the records cannot be read or the page cannot be written.",
     )

@@ -14,7 +14,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "studio",
-        help="take hold of a map in the browser",
+        help="edit a map in the browser",
         description="Open a page with a surface beside its map: drag corners, pins and the boundary, and the map "
         "follows, each picture of it certified. Needs the extra 'studio'. Only this machine can open the page, by the "
         "address that is printed. Ctrl-C ends it.",
@@ -28,8 +28,8 @@ def add_parser(commands: Commands) -> None:
         help="OBJ, OFF, PLY, GLB, glTF or STL file, or a folder with input.obj and handles.txt (default: a surface of "
         "ours)",
     )
-    parser.add_argument("--port", type=int, default=0, metavar="N", help="listen there (default: any that is free)")
-    parser.add_argument("--no-browser", action="store_true", help="print the address and leave the browser alone")
+    parser.add_argument("--port", type=int, default=0, metavar="N", help="port to listen on (default: any free port)")
+    parser.add_argument("--no-browser", action="store_true", help="print the address and do not open the browser")
     parser.set_defaults(run=run)
 
 

@@ -14,14 +14,17 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "view",
-        help="look at a surface and its map in a window",
+        help="show a surface and its map in a window",
         description="Open a window on a surface and the map that its texture coordinates (vt) give, with a "
         "checkerboard, distortion and inverted triangles. Needs the extra 'view'.",
         epilog="Exit status: 0 shown; 2 wrong input or call, or no window can be opened.",
     )
     parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB or glTF file with a map")
     parser.add_argument(
-        "--screenshot", type=Path, metavar="PNG", help="write what the window would show instead; needs no display"
+        "--screenshot",
+        type=Path,
+        metavar="PNG",
+        help="write the view to this file instead of opening a window; needs no display",
     )
     parser.set_defaults(run=run)
 

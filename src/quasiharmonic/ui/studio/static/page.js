@@ -30,7 +30,7 @@ class Page {
     this.socket.onmessage = (event) => this.receive(decodeFrame(event.data));
     this.socket.onclose = (event) => {
       this.view.hands.forget();
-      if (event.code === 1009) this.panel.note("That file is larger than what is taken. The page begins anew.");
+      if (event.code === 1009) this.panel.note("That file is too large. The page restarts.");
       else if (event.code === 1013) this.panel.refused(event.reason);
       else if (event.code === 1006) this.panel.disconnected();
       if (event.code === 1009 || event.code === 1011) setTimeout(() => this.connect(), 1500);
