@@ -126,7 +126,7 @@ SCENES: dict[str, Callable[[int], Scene]] = {
 
 
 def moves(uv: FloatArray, targets: FloatArray) -> FloatArray:
-    """Return the maximum vertex displacement per step, relative to the boundary's; NaN if the boundary does not move."""
+    """Return the maximum vertex displacement per step, relative to the boundary's; NaN if the boundary is static."""
     vertex = np.linalg.norm(np.diff(uv, axis=0), axis=2).max(axis=1)
     boundary = np.linalg.norm(np.diff(targets, axis=0), axis=2).max(axis=1)
     return vertex / np.where(boundary > 0, boundary, np.nan)
@@ -157,7 +157,7 @@ def ways(scene: Scene) -> dict[str, tuple[FloatArray, FloatArray, float]]:
 
 
 def unpolished(frames: int) -> None:
-    """Print CPU milliseconds per frame for about 20,000 triangles; the first frame, solved from scratch, is excluded."""
+    """Print CPU milliseconds per frame for about 20,000 triangles; the first, solved from scratch, is excluded."""
     print("| scene | triangles | median, ms a frame | mean | longest | largest move |")
     print("|---|---|---|---|---|---|")
     fine = {"star": cat_star(frames, 58), "bar": bending_bar(frames, 32), "hole": travelling_hole(frames, 116)}
