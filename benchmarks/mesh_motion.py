@@ -131,8 +131,8 @@ def forbidden_beyond(scene: Scene) -> float:
     """Return an upper bound, in degrees, of the rotation of a body around the origin, for any mesh motion.
 
     Seen from the origin, an edge spans less than 2 arccos(r / R), where r is the radius of a disk inside the body and
-    R that of one around the walls. A chain of edges from the body to a fixed vertex of the walls winds by the rotation plus
-    its initial winding. The sum of its edges' spans therefore bounds the rotation.
+    R that of one around the walls. A chain of edges from the body to a fixed vertex of the walls winds by the rotation
+    plus its initial winding. The sum of its edges' spans therefore bounds the rotation.
     """
     F, z = scene.F, scene.V @ (1, 1j)
     span = 2 * np.arccos(np.abs(z[scene.body]).min() / np.abs(z).max())
