@@ -3,9 +3,9 @@
     python benchmarks/gradients.py [--size CELLS] [-r REPEATS] [--unrolled ITERATIONS]
 
 For each kind of map, measure CPU seconds of the map alone, of preparing its derivative, and of one gradient by all
-inputs. The last columns are ratios of both passes to the map alone and to the forward pass. To prepare the derivative, a polished or
-flattened map is converged to rounding and factored once more. Runs are interleaved in one process; the minimum of the
-repeats counts.
+inputs. The last columns are ratios of both passes to the map alone and to the forward pass. To prepare the derivative,
+a polished or flattened map is converged to rounding and factored once more. Runs are interleaved in one process; the
+minimum of the repeats counts.
 
 ``--unrolled`` (requires PyTorch) writes the map as research code does: tensors, a symmetric Dirichlet energy, and a
 descent whose iterations autograd records. Both start from the same map near the optimum. Iterations continue until the

@@ -6,8 +6,8 @@
 Each variant is installed from this checkout into a fresh environment, with the README's first command, and makes the
 demo's image there. If `uv` is installed, it is measured too. Seconds depend on whether packages come from a cache or
 the network. Therefore each installation runs twice; both times are reported, and CPU seconds of the second. Megabytes
-(10⁶ bytes) are the growth of the environment: its files, their blocks on this disk, and the part that pip compiles (`.pyc`;
-uv leaves compilation to the first use).
+(10⁶ bytes) are the growth of the environment: its files, their blocks on this disk, and the part that pip compiles
+(`.pyc`; uv leaves compilation to the first use).
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@
 The files contain huge counts, deep nesting, entities and compressed data that expand without limit, invalid numbers,
 references out of the folder or to themselves, pickles, wrong encodings, and missing ends. A *failure* is any of: an
 exit status other than 2 (or 0 and 1 if the file may be accepted); a message of more than one line or without the
-program's name; a traceback or a warning; files left behind. `damage.py` tests randomly damaged files. Time is CPU time. Requires
-a system with fork.
+program's name; a traceback or a warning; files left behind. `damage.py` tests randomly damaged files. Time is CPU time.
+Requires a system with fork.
 """
 
 from __future__ import annotations

@@ -3,8 +3,9 @@
     V, F, fixed, target = make("swirl:7", scans)[:4]
 
 A surface is flattened. A known map of the plane then deforms the flat map as far as it stays bijective, which is
-certified exactly. Between 1 and 200 vertices are pinned at their positions in the result, which is stored as ``hidden``.
-A family and a number name a problem. With scans, a folder of OBJ files, half of the surfaces are patches of these.
+certified exactly. Between 1 and 200 vertices are pinned at their positions in the result, which is stored as
+``hidden``. A family and a number name a problem. With scans, a folder of OBJ files, half of the surfaces are patches of
+these.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def make(name: str, scans: Sequence[Path] = ()) -> Pinned:
             break
     else:
         raise AssertionError(f"no surface bears {name}")
-    # Move, rotate and slightly scale the target.
+    # Move, rotate and scale the target.
     image = size * (image * np.exp(2j * np.pi * rng.random() + rng.uniform(-0.7, 0.7)) + rng.normal(0, 2, 2) @ (1, 1j))
     hidden = planar.points(image)
     if not certify(F, hidden).bijective:

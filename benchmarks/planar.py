@@ -146,7 +146,7 @@ def split(rng: Generator, quads: IntArray) -> IntArray:
 
 
 def maze(rng: Generator, rooms: int, width: int, ways: int, winding: float) -> NDArray[np.bool_]:
-    """Return a maze of ``rooms`` × ``rooms`` rooms with ``ways`` extra openings; corridors get longer with ``winding``."""
+    """Return a maze of ``rooms`` × ``rooms`` rooms with ``ways`` extra openings; ``winding`` makes corridors longer."""
     pitch = width + 1
     mask = np.zeros((rooms * pitch - 1,) * 2, dtype=bool)
     seen = np.zeros((rooms, rooms), dtype=bool)

@@ -115,7 +115,7 @@ def on_common_problems(runs: Iterable[Run]) -> dict[str, dict[str, Run]]:
     for run in runs:
         if run.program in PROGRAMS + ANEW:
             by_problem.setdefault(run.problem, {})[run.program] = run
-    # If SBP never found an injective map, it has no run until the first injective map.
+    # If SBP never found an injective map, it has no run "until first injective".
     needed = set(PROGRAMS[:-1])
     return {name: row for name, row in by_problem.items() if needed <= row.keys()}
 

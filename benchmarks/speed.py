@@ -92,7 +92,7 @@ def cat(triangles: int, character: str) -> Arrays:
 
 
 def halved(arrays: Arrays) -> Arrays:
-    """Return the problem with every edge halved; the target of new boundary vertices is halved likewise."""
+    """Return the problem with every edge halved; new boundary vertices get their edge's target midpoint."""
     V, F, fixed, target = arrays
     places = np.full((len(V), 2), np.nan)
     places[fixed] = target

@@ -2,8 +2,8 @@
 
     python benchmarks/warps.py [-o FOLDER] [--resolutions 16 32 64 128 256]
 
-Three scenes on an image of 257 × 257 pixels: one landmark that moves by 48 pixels, six that move along a circle, a curve
-that bends. *Stretch* is the larger of σ₁ and 1/σ₂, the maximum over all triangles. `cusps` is ``smoothness=0``, a
+Three scenes on an image of 257 × 257 pixels: one landmark that moves by 48 pixels, six that move along a circle, a
+curve that bends. *Stretch* is the larger of σ₁ and 1/σ₂, the maximum over all triangles. `cusps` is ``smoothness=0``, a
 deformation energy of first derivatives alone; `smooth` is the default. Write a table and a plot.
 """
 
