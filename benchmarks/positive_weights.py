@@ -108,7 +108,7 @@ def area_gradient(F: IntArray, w: ComplexArray, sharp: float) -> ComplexArray:
 
 
 def mean_values(problem: Problem, uv: FloatArray) -> float:
-    """Return the error with which an injective map's mean-value weights reproduce it, in its frame; small meshes only."""
+    """Return the error with which a map's mean-value weights reproduce it, in its frame; for small meshes only."""
     means = Means(problem, symmetric=False)
     w = problem.frame.inward(uv)
     weight = np.zeros((problem.n, problem.n))
