@@ -1,6 +1,6 @@
-"""The extension of compiled kernels; all else about the package is in pyproject.toml.
+"""Build of the compiled kernels; all other settings of the package are in pyproject.toml.
 
-Without a compiler, or with ``QUASIHARMONIC_PURE=1``, the package is built without it and runs on NumPy alone.
+Without a compiler, or with ``QUASIHARMONIC_PURE=1``, the package is built without them and uses NumPy alone.
 """
 
 import os
@@ -11,11 +11,11 @@ from pathlib import Path
 from setuptools import Extension, setup
 
 KERNELS = Path("src/quasiharmonic/util/kernels/c")
-# A product and a sum rounded as one, where the processor can, would make results differ from machine to machine.
-# The rest changes no result: nobody asks for errno or for the processor's flags, so choices need no jumps.
+# Fused multiply-add would make results differ between machines, so it is disabled.
+# The other flags do not change results: errno and floating-point flags are not read, so branches can be avoided.
 PRECISE = "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"
 FLAGS = ["/std:c11"] if sys.platform == "win32" else ["-std=c11", "-O3", "-fvisibility=hidden", *PRECISE]
-# One wheel serves this Python and all later ones, but for those without the global lock.
+# One wheel serves this Python version and all later ones, except free-threaded builds.
 STABLE = not sysconfig.get_config_var("Py_GIL_DISABLED")
 
 if os.environ.get("QUASIHARMONIC_PURE", "0") not in ("", "0"):

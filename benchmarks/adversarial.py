@@ -1,6 +1,7 @@
-"""Families of problems that aim at where programs break, for `problems`: extreme in one thing each.
+"""Families of problems for `problems` that are extreme in one respect each, to find where programs fail.
 
-All but the last two are made from a solution and so are feasible; those lay the boundary of any mesh along an outline.
+All but the last two families are made from a solution, so they are feasible. The last two map the boundary of any mesh
+to an outline.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Generator = np.random.Generator
 
 
 def _needles(rng: Generator, d: float, size: int) -> Draft:
-    """A target as flat as 1e-6, turned by any angle, and warped again."""
+    """A target as flat as 1e-6, rotated by any angle and deformed again."""
     z, F = blank(rng, size, int(rng.integers(3)))
     w = roughen(rng, flow(rng, z, F, 1 + int(3 * d), 0.5), F, 1 + int(3 * d))
     flat = (w.real + 1j * 10 ** (-6 * d) * w.imag) * np.exp(2j * np.pi * rng.random())
@@ -29,9 +30,9 @@ def _needles(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _sizes(rng: Generator, d: float, size: int) -> Draft:
-    """Rings that shrink geometrically, down to 1e-8 of the outermost, around a vertex or a hole."""
+    """Rings around a vertex or a hole that shrink geometrically, down to 1e-8 of the outermost ring."""
     spokes = int(rng.integers(6, 13))
-    # Not below 0.3 from a ring to the next.
+    # Radii of consecutive rings have a ratio of at least 0.3.
     rings = max(16, size // (2 * spokes))
     ratio = 10 ** (-(2 + 6 * d) / (rings - 1))
     ray = np.exp(2j * np.pi * np.arange(spokes) / spokes)
@@ -44,7 +45,7 @@ def _sizes(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _hub(rng: Generator, d: float, size: int) -> Draft:
-    """A vertex with up to 5,000 neighbours, in one ring or two, in an outline whose radii are wildly distributed."""
+    """A vertex with up to 5,000 neighbours, in one or two rings, in an outline with widely varying radii."""
     spokes = round(10 ** (1 + 2.699 * d))
     rings = int(rng.integers(1, 3))
     ray = np.exp(2j * np.pi * np.arange(spokes) / spokes)
@@ -56,19 +57,19 @@ def _hub(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _between(rings: IntArray) -> IntArray:
-    """Triangles between closed rings of vertices, (r, k), each around the one before."""
+    """Return the triangles between closed rings of vertices (r, k), each ring around the previous one."""
     inner, outer = rings[:-1], rings[1:]
     quads = np.stack([inner, outer, np.roll(outer, -1, axis=1), np.roll(inner, -1, axis=1)], axis=2).reshape(-1, 4)
     return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def _fan(ring: IntArray, hub: int) -> IntArray:
-    """Triangles from the sides of a ring to a vertex in its middle."""
+    """Return the triangles from the sides of a ring to a vertex in its middle."""
     return np.stack([np.full_like(ring, hub), ring, np.roll(ring, -1)], axis=1)
 
 
 def _hilbert(rng: Generator, d: float, size: int) -> Draft:
-    """A straight strip laid along Hilbert's curve, round at the turns."""
+    """A straight strip mapped along Hilbert's curve, with round turns."""
     curve = outlines.hilbert(1 + int(3.99 * d))
     across, steps, half = int(rng.integers(2, 4)), int(rng.integers(2, 5)), rng.uniform(0.2, 0.45)
     z, quads = planar.cells(np.ones((across, steps * len(curve)), dtype=bool))
@@ -78,7 +79,7 @@ def _hilbert(rng: Generator, d: float, size: int) -> Draft:
     part, left = z.real / steps - at, half * (2 * z.imag / across - 1)
     way, turn = into[at], np.round((into.conj() * out).imag)[at]
     start = curve[at] - way / 2
-    # A turn is a quarter of a circle around the corner of its cell.
+    # A turn is a quarter circle around the corner of its cell.
     pivot = start + 0.5j * turn * way
     round_it = pivot - 1j * (0.5 * turn - left) * way * np.exp(0.5j * np.pi * turn * part)
     image = np.where(turn == 0, start + (part + 1j * left) * way, round_it)
@@ -87,9 +88,9 @@ def _hilbert(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _koch(rng: Generator, d: float, size: int) -> Draft:
-    """A disk onto Koch's snowflake: a lattice with split edges at the end, Tutte's embedding of it at rest."""
+    """A disk mapped to Koch's snowflake; the target is a partly split lattice, the rest mesh its Tutte embedding."""
     corners = outlines.koch(1 + int(3.99 * d))
-    # Measured from a corner the corners are on the lattice, whose second direction leans by half of its height.
+    # Relative to a corner, the corners are lattice points; the second direction leans by half of its height.
     reach = 3 * int(abs(corners).max() + 2)
     a, b = (k.ravel() for k in np.meshgrid(*2 * [np.arange(-reach, reach)]))
     lattice = corners[0] + a + b * np.exp(1j * np.pi / 3)
@@ -100,20 +101,20 @@ def _koch(rng: Generator, d: float, size: int) -> Draft:
     inside = _within(lattice[triangles].mean(axis=1), corners)
     used, F = np.unique(triangles[inside], return_inverse=True)
     image, F = lattice[used], F.reshape(-1, 3)
-    # A lattice is harmonic as it is; half of its edges split, it is not.
+    # A regular lattice is already harmonic; after splitting half of its edges it is not.
     inner = edges(F, len(image)).interior
     refined = refine(planar.points(image), F, inner[rng.random(len(inner)) < 0.5])
     image, F = refined.V[:, 0] + 1j * refined.V[:, 1], refined.F
     (loop,) = boundary_loops(F, len(image))
     circle = np.exp(2j * np.pi * np.arange(loop.size) / loop.size)
-    # Of equilateral triangles the cotangents are all the same.
+    # All cotangents of equilateral triangles are equal.
     on_circle = Problem(planar.points(image), F, loop, planar.points(circle), reference="equilateral")
     rest = quasi_harmonic_map(on_circle)
     return Draft(rest[:, 0] + 1j * rest[:, 1], F, image)
 
 
 def _within(z: ComplexArray, corners: ComplexArray) -> IntArray:
-    """Which points lie in a polygon: those with an odd number of its sides to their right."""
+    """Return which points lie in a polygon, by the parity of the number of its sides to their right."""
     odd = np.zeros(z.shape, dtype=bool)
     for p, q in zip(corners, np.roll(corners, -1), strict=True):
         beside = (p.imag > z.imag) != (q.imag > z.imag)
@@ -122,11 +123,11 @@ def _within(z: ComplexArray, corners: ComplexArray) -> IntArray:
 
 
 def _coil(rng: Generator, d: float, size: int) -> Draft:
-    """A straight strip wound up to 20 times, each coil by the same factor smaller, down to 1e-6."""
+    """A straight strip wound up to 20 times; each coil is smaller by the same factor, down to 1e-6."""
     turns, steps, across = 2 + int(18 * d), int(rng.integers(8, 17)), int(rng.integers(1, 5))
     z, quads = planar.cells(np.ones((across, turns * steps), dtype=bool))
     shrink = np.log(10.0) * (1 + 5 * d) / turns
-    # On the same rays in every coil, chords lie between their neighbours' as arcs do.
+    # The vertices of all coils lie on the same rays, so chords are nested as arcs are.
     turn = z.real / steps
     image = np.exp(-shrink * (turn + rng.uniform(0.5, 0.95) * z.imag / across) + 2j * np.pi * turn)
     F = planar.split(rng, quads)
@@ -134,7 +135,7 @@ def _coil(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _gaps(rng: Generator, d: float, size: int) -> Draft:
-    """A straight strip wound up so tightly that 1e-10 is left between its coils."""
+    """A straight strip wound up with gaps down to 1e-10 between its coils."""
     turns, steps, across = 2 + int(4 * rng.random()), int(rng.integers(8, 17)), int(rng.integers(2, 5))
     z, quads = planar.cells(np.ones((across, turns * steps), dtype=bool))
     turn = z.real / steps
@@ -144,7 +145,7 @@ def _gaps(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _sieve(rng: Generator, d: float, size: int) -> Draft:
-    """A sheet with up to 90 holes, dragged about."""
+    """A sheet with up to 90 holes, deformed by drags."""
     count = max(1, round(90 * d))
     columns = int(np.ceil(np.sqrt(count)))
     hole = np.arange(count)
@@ -156,7 +157,7 @@ def _sieve(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _nailed(rng: Generator, d: float, size: int) -> Draft:
-    """Up to 3,000 interior vertices held, about a third of them all."""
+    """Up to 3,000 fixed interior vertices, about a third of all vertices."""
     count = round(10 ** (1 + 2.477 * d))
     z, F = blank(rng, 7 * count, 0)
     inside = np.setdiff1d(np.arange(len(z)), np.concatenate(boundary_loops(F, len(z))))
@@ -165,7 +166,7 @@ def _nailed(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _scales(rng: Generator, d: float, size: int) -> Draft:
-    """Mesh and target each of a size between 1e-300 and 1e300."""
+    """Mesh and target, each of a size between 1e-300 and 1e300."""
     z, F = blank(rng, size, int(rng.integers(3)))
     image = roughen(rng, flow(rng, z, F, 1 + int(5 * d), 0.5 + 0.4 * d), F, 1 + int(2 * d))
     unit, scale = 10.0 ** (300 * d * rng.choice([-1, 1], size=2))
@@ -173,12 +174,12 @@ def _scales(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _held_still(rng: Generator, image: ComplexArray, F: IntArray, sweeps: int) -> ComplexArray:
-    """A map roughened inside, its boundary left alone."""
+    """Perturb the interior of a map at random; boundary vertices stay unchanged."""
     return roughen(rng, image, F, sweeps, held=np.concatenate(boundary_loops(F, len(image))))
 
 
 def _along(draw: Callable[[Generator, float], list[FloatArray]]) -> Callable[[Generator, float, int], Draft]:
-    """The family of meshes whose rim is split until it can be laid along every corner of an outline."""
+    """Return the family of meshes whose boundary is split until it can follow every corner of an outline."""
 
     def family(rng: Generator, d: float, size: int) -> Draft:
         (contour,) = draw(rng, d)

@@ -1,15 +1,16 @@
-"""Sequences of maps: how far vertices move from a frame to the next, polished alone and kept near to each other.
+"""Sequences of maps: vertex motion between frames, for frames polished independently and for `animate`.
 
     python benchmarks/animation.py [-o FOLDER] [--hand FILE] [--only SCENE ...]
 
-Five scenes: an outline that becomes a star and turns (of a cat's head, and with ``--hand`` of a surface in a file), an
-outline that breathes, a bar that bends, a hole that travels through a square, a square that becomes a letter. For each
-frame the largest move of a vertex over the largest of the boundary, with every frame polished on its own, from the
-frame before it, and by `animate`; the mean energy of each, and seconds of the processor. Writes a table and a plot.
+Scenes: an outline that becomes a star and turns (of a cat's head, and with ``--hand`` of a surface in a file), an
+outline that breathes, a bar that bends, a hole that travels through a disk, a circle that becomes a letter. Each frame
+is polished independently, from the previous frame, and by `animate`. For each frame, report the maximum vertex
+displacement relative to the maximum boundary displacement. Report also the mean energy and CPU seconds. Write a table
+and a plot.
 
     python benchmarks/animation.py --unpolished
 
-The star, the bar and the hole with some 20,000 triangles each, unpolished: milliseconds of the processor for a frame.
+Report CPU milliseconds per unpolished frame for the star, the bar and the hole with about 20,000 triangles each.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ def turning_star(V: FloatArray, F: IntArray, loop: IntArray, frames: int) -> Sce
 
 
 def cat_star(frames: int, fineness: int = 20) -> Scene:
-    """The star, of a cat's head."""
+    """The star scene on a cat's head."""
     V, F = cat(fineness)
     return turning_star(V, F, boundary_loops(F, len(V))[0], frames)
 
 
 def breathing(frames: int) -> Scene:
-    """An hourglass whose waist narrows to a tenth and opens again, twice, as it shears."""
+    """An hourglass whose waist narrows to a tenth and widens again, twice, while it shears."""
     V, F = cat(20)
     loop = boundary_loops(F, len(V))[0]
     angle = 2 * np.pi * np.arange(loop.size) / loop.size
@@ -65,7 +66,7 @@ def breathing(frames: int) -> Scene:
 
 
 def bending_bar(frames: int, across: int = 10) -> Scene:
-    """A bar of ten by one that bends into nearly a ring, and the other way."""
+    """A bar of size 10 × 1 that bends almost into a ring, in both directions."""
     V, F = grid(10 * across, across)
     V = V * [10, 1]
     loop = boundary_loops(F, len(V))[0]
@@ -80,7 +81,7 @@ def bending_bar(frames: int, across: int = 10) -> Scene:
 
 
 def travelling_hole(frames: int, fineness: int = 24) -> Scene:
-    """A round hole that goes around in a disk, nearly to its rim."""
+    """A round hole that circles in a disk, close to its boundary."""
     V, F = annulus(fineness)
     loops = sorted(boundary_loops(F, len(V)), key=lambda loop: -np.abs(V[loop]).max())
     held = np.concatenate(loops)
@@ -94,12 +95,12 @@ def travelling_hole(frames: int, fineness: int = 24) -> Scene:
 
 
 def becoming_letter(frames: int) -> Scene:
-    """A circle, every point of which goes straight to its place on a letter."""
+    """A circle that becomes a letter; every boundary vertex moves on a straight line."""
     V, F = cat(20)
     loop, first = boundary_to(V, F, letter("S"))
     angle = 2 * np.pi * np.argsort(np.argsort(_around(F, len(V), loop))) / loop.size
     disk = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    # The circle is turned to where its way to the letter is shortest.
+    # Rotate the circle so that its vertices are closest to their positions on the letter.
     w, z = first[:, 0] + 1j * first[:, 1], disk[:, 0] + 1j * disk[:, 1]
     w = w - w.mean()
     z = z * np.abs(w).mean() * np.exp(1j * np.angle(np.vdot(z, w)))
@@ -108,7 +109,7 @@ def becoming_letter(frames: int) -> Scene:
 
 
 def _around(F: IntArray, n: int, fixed: IntArray) -> IntArray:
-    """Where along the boundary each of the fixed vertices is."""
+    """Return the rank of each fixed vertex along the boundary."""
     rank = np.full(n, -1)
     loop = boundary_loops(F, n)[0]
     rank[loop] = np.arange(loop.size)
@@ -125,14 +126,14 @@ SCENES: dict[str, Callable[[int], Scene]] = {
 
 
 def moves(uv: FloatArray, targets: FloatArray) -> FloatArray:
-    """Largest move of a vertex over that of the boundary, from frame to frame; NaN where the boundary rests."""
+    """Return the maximum vertex displacement per step, relative to the boundary's; NaN if the boundary is static."""
     vertex = np.linalg.norm(np.diff(uv, axis=0), axis=2).max(axis=1)
     boundary = np.linalg.norm(np.diff(targets, axis=0), axis=2).max(axis=1)
     return vertex / np.where(boundary > 0, boundary, np.nan)
 
 
 def ways(scene: Scene) -> dict[str, tuple[FloatArray, FloatArray, float]]:
-    """Moves, mean energies and seconds of the processor, by each way of coming by the frames."""
+    """Return the relative displacements, mean energies and CPU seconds of each method, by name."""
     V, F, held, targets = scene
     problem = Problem(V, F, held, targets[0])
     found = {}
@@ -156,7 +157,7 @@ def ways(scene: Scene) -> dict[str, tuple[FloatArray, FloatArray, float]]:
 
 
 def unpolished(frames: int) -> None:
-    """What a frame of some 20,000 triangles takes; the first, which is found from nothing, left out."""
+    """Print CPU milliseconds per frame for about 20,000 triangles; the first, solved from scratch, is excluded."""
     print("| scene | triangles | median, ms a frame | mean | longest | largest move |")
     print("|---|---|---|---|---|---|")
     fine = {"star": cat_star(frames, 58), "bar": bending_bar(frames, 32), "hole": travelling_hole(frames, 116)}
@@ -176,7 +177,7 @@ def unpolished(frames: int) -> None:
 
 
 def main() -> None:
-    """Run the scenes, print the table, draw the plot."""
+    """Run the scenes, print the table and draw the plot."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("-o", "--output", type=Path, help="folder for animation.md and animation.png")
     parser.add_argument("--hand", type=Path, help="a further surface for the turning star")
@@ -217,7 +218,7 @@ def main() -> None:
 
 
 def draw(found: dict[str, dict[str, tuple[FloatArray, FloatArray, float]]], path: Path) -> None:
-    """The moves of every scene, frame by frame, before and after."""
+    """Plot the relative displacements of every scene, frame by frame, for each method."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 2.1 * len(found)), layout="constrained")

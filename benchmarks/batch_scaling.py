@@ -1,9 +1,9 @@
-"""What `qhm batch` costs beside the problems: rate by number of processes, time between problems, driver's memory.
+"""Overhead of `qhm batch`: rate by number of processes, time between problems, memory of the driver.
 
     python benchmarks/batch_scaling.py [-n 400] [-w 1,2,4] [-r 3]
 
-The problems are small ones, alike. Runs with different numbers of processes are interleaved and medians are taken; the
-start of the processes is left out. For figures that mean anything the machine has to be calm.
+The problems are small and similar. Runs with different numbers of processes are interleaved; the table has medians. The
+start of the processes is excluded. Run it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from quasiharmonic.surfaces import disk
 
 
 def write_set(root: Path, count: int, rings: int) -> None:
-    """Disks onto stars."""
+    """Write problems that map disks to stars."""
     V, F = disk(rings)
     (loop,) = boundary_loops(F, len(V))
     angle = np.linspace(0, 2 * np.pi, len(loop), endpoint=False)
@@ -43,7 +43,7 @@ def write_set(root: Path, count: int, rings: int) -> None:
 
 
 def timed(source: Path, output: Path, workers: int) -> tuple[float, float]:
-    """Problems a second once all processes are at work, and seconds a problem beyond those of its record."""
+    """Return problems per second once all processes work, and seconds per problem in excess of its record."""
     shutil.rmtree(output, ignore_errors=True)
     ends: list[float] = []
 
@@ -59,7 +59,7 @@ def timed(source: Path, output: Path, workers: int) -> tuple[float, float]:
 
 
 def driver_memory(source: Path, output: Path) -> float:
-    """Highest resident memory of a driver, MiB."""
+    """Return the peak resident memory of a driver, in MiB."""
     code = (
         "import resource, sys; from quasiharmonic import batch; batch.run(sys.argv[1], sys.argv[2], jobs=1); "
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
@@ -69,7 +69,7 @@ def driver_memory(source: Path, output: Path) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=400)
     parser.add_argument("--rings", type=int, default=8, help="6 rings² triangles in each problem (default: 384)")

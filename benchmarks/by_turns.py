@@ -1,12 +1,12 @@
-"""Small problems beside TLC-QN: today's version and 0.1.0 by turns, and what TLC-QN was recorded to take.
+"""Compare today's version with 0.1.0 on small problems, interleaved, and with the recorded times of TLC-QN.
 
     git archive 0.1.0's-commit src | tar -x -C OLD
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/by_turns.py OLD/src [--new src] [-r 9] [-o runs.json]
 
-The records (`records/README.md`) have the seconds of TLC-QN and of version 0.1.0, measured beside each other on another
-machine. Here 0.1.0 is run again, on the same problems, by turns with another version, each in a process of its own that
-is warm; the least CPU seconds of the turns count. *Scaled* are the seconds that TLC-QN would take here were it as much
-slower or quicker than 0.1.0 as it was there. Problems count that both solve and Tutte's embedding does not.
+The records (`records/README.md`) contain the seconds of TLC-QN and of version 0.1.0, measured on one other machine.
+This program runs 0.1.0 again on the same problems, interleaved with another version. Each version has its own warm
+process; the least CPU seconds of the repetitions count. *Scaled* seconds estimate TLC-QN on this machine: its recorded
+ratio to 0.1.0, times the seconds of 0.1.0 here. Only problems that both solve and Tutte's embedding does not count.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import rivals
 
 Record = dict[str, Any]
 
-#: What a process does that solves the problems of a file of arrays, a source folder on its path before all others.
+#: Code of a process that solves the problems of a file of arrays; a source folder comes first on its path.
 _SERVE = """
 import json, sys, time
 sys.path.insert(0, sys.argv[1])
@@ -45,7 +45,7 @@ for line in sys.stdin:
 
 
 class Server:
-    """A version of the package in a process of its own."""
+    """A version of the package in its own process."""
 
     def __init__(self, source: Path, arrays: Path) -> None:
         self._process = subprocess.Popen(
@@ -56,7 +56,7 @@ class Server:
         )
 
     def solve(self, name: str) -> tuple[float, bool, list[str]]:
-        """CPU seconds, whether a map was found, and the stages that ran."""
+        """Return CPU seconds, whether a map was found, and the stages that ran."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         print(name, file=self._process.stdin, flush=True)
@@ -69,7 +69,7 @@ class Server:
 
 
 def common() -> dict[str, tuple[rivals.Run, rivals.Run]]:
-    """The runs of TLC-QN and of version 0.1.0 on each problem that both solved and that Tutte's embedding does not."""
+    """Return the runs of TLC-QN and 0.1.0 on problems that both solved and Tutte's embedding does not solve."""
     rows = rivals.on_common_problems(rivals.recorded())
     pairs = {name: (row["TLC-QN"], row["ours speed"]) for name, row in rows.items()}
     return {
@@ -80,7 +80,7 @@ def common() -> dict[str, tuple[rivals.Run, rivals.Run]]:
 
 
 def measured(old: Path, new: Path, turns: int, arrays: Path) -> Iterator[Record]:
-    """Both versions by turns on each of the problems."""
+    """Run both versions, interleaved, on each problem; yield the records."""
     chosen, made = common(), {}
     for name in chosen:
         plain, _, triangles = name.partition(" triangles=")
@@ -106,7 +106,7 @@ def measured(old: Path, new: Path, turns: int, arrays: Path) -> Iterator[Record]
 
 
 def summary(records: list[Record]) -> str:
-    """How often TLC-QN is quicker, and the problems on which it is by most."""
+    """Return how often TLC-QN is faster, and the problems where it is faster by the largest factors."""
     ratio = np.array([record["over TLC-QN"] for record in records])
     speedup = np.median([record["0.1.0"] / record["now"] for record in records])
     lines = [
@@ -125,7 +125,7 @@ def summary(records: list[Record]) -> str:
 
 
 def main() -> None:
-    """Measure, or tell what was measured."""
+    """Measure, or summarise earlier measurements."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("old", type=Path, help="folder with the package of version 0.1.0")
     parser.add_argument("--new", type=Path, default=Path("src"), help="folder with the other version (%(default)s)")

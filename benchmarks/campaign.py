@@ -1,4 +1,4 @@
-"""Thousands of generated problems, unattended: what is solved, how soon, and what is not.
+"""Solve thousands of generated problems unattended; report success, time and failures.
 
     python benchmarks/campaign.py -n 10000 -o results.jsonl [--families maze,pins] [-j 2]
     python benchmarks/campaign.py -n 1000 -o hard.jsonl --adversarial
@@ -6,12 +6,14 @@
     python benchmarks/campaign.py --summary results.jsonl
     python benchmarks/campaign.py --case maze:7:0.8
 
-A campaign writes one line of JSON a problem as soon as that is done, and skips what the file already has: it may be
-interrupted or killed at any moment and started again. Problems are solved in processes of their own, so that a crash or
-a hang is one more result. A *failure* is a problem with a known solution and no certified injective map, and
-whatever raises, warns, returns numbers that are not finite, crashes or exceeds its time. With ``--refine``, which may
-split edges, it is also a problem with a simple target and no certified bijective map, for which doubles have room;
-``--only-simple`` passes over all others, which take most of the time and of which nothing is promised.
+A campaign writes one line of JSON per problem when the problem is done, and skips problems that the file contains. It
+may be interrupted or killed at any time and started again. Each problem is solved in a worker process, so a crash or a
+timeout is recorded as a result.
+
+A *failure* is a problem with a known solution and no certified injective map. An exception, a warning, non-finite
+numbers, a crash or a timeout is also a failure. ``--refine`` may split edges. With it, a problem with a simple target
+and no certified bijective map also fails, if double precision can represent such a map. ``--only-simple`` skips all
+problems without a simple target: they take most of the time, and a bijective map is not guaranteed.
 """
 
 from __future__ import annotations
@@ -43,15 +45,15 @@ Record = dict[str, Any]
 BANDS = 5
 _ALL = FAMILIES | ADVERSARIAL
 _DEFAULTS = {"strategy": "speed", "max_iterations": 2000, "refine": False}
-# Outcomes that are failures whether or not a solution is known to exist.
+# Outcomes that are failures even if no solution is known.
 _ALWAYS = "exception", "warning", "not finite", "crash", "timeout"
 
 
 def names(count: int, families: Sequence[str]) -> Iterator[str]:
-    """Names of the first problems of a campaign: families in turn, difficulties spread evenly."""
+    """Yield names of the first problems of a campaign: families in turn, difficulties spread evenly."""
     for i in range(count):
         seed, family = divmod(i, len(families))
-        # Multiples of the golden ratio fill the unit interval evenly, however many there are.
+        # Multiples of the golden ratio fill the unit interval evenly for any count.
         difficulty = round((0.5 + seed * 0.6180339887498949) % 1.0, 3)
         yield f"{families[family]}:{seed}:{difficulty!r}"
 
@@ -64,7 +66,7 @@ def run(
     refine: bool = False,
     only_simple: bool = False,
 ) -> Record:
-    """Make and solve one problem; never raises but for what ends the process."""
+    """Make and solve one problem; catch every exception except those that end the process."""
     family, seed, difficulty = parse(name)
     record: Record = {"name": name, "family": family, "difficulty": difficulty}
     record |= {"strategy": strategy, "max_iterations": max_iterations, "refine": refine}
@@ -93,7 +95,7 @@ def _solved(problem: Problem, strategy: str, max_iterations: int, refine: bool) 
     seconds, cpu = time.perf_counter() - began, time.process_time() - effort
     told = {}
     if refine:
-        # What is sure to have a bijective map, on a mesh that is fine enough, if doubles have room for one.
+        # These problems have a bijective map on a sufficiently fine mesh, if double precision can represent it.
         told = {"promised": is_simple(problem), "no_room": result.status is Status.PRECISION_LIMIT}
         told |= {"added": result.added, "rung": result.refinement_attempts[-1].name}
     verdict = "injective" if result.injective else "not injective"
@@ -124,8 +126,8 @@ def failed(record: Record) -> bool:
 
 
 def _serve(pipe: Connection, options: dict[str, Any]) -> None:
-    """Solve what comes through a pipe, in a process of its own."""
-    # Ctrl-C reaches the whole group; the parent decides what becomes of this one.
+    """Solve the problems received through a pipe; runs in a worker process."""
+    # Ctrl-C reaches the whole process group; the parent decides whether to end this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
@@ -136,7 +138,7 @@ def _serve(pipe: Connection, options: dict[str, Any]) -> None:
 
 
 class Worker:
-    """A process that solves one problem after another, and is replaced when it crashes or hangs."""
+    """A process that solves problems one by one and is replaced when it crashes or hangs."""
 
     def __init__(self, limit: float, options: dict[str, Any]) -> None:
         self.limit, self.options = limit, options
@@ -148,7 +150,7 @@ class Worker:
         self.process = context.Process(target=_serve, args=(theirs, self.options), daemon=True)
         self.process.start()
         theirs.close()
-        # A process imports its libraries before its first answer; that is not the problem's time.
+        # A process imports its libraries before its first answer; this time does not count for the problem.
         self.spare = 30.0
 
     def ask(self, name: str) -> None:
@@ -156,7 +158,7 @@ class Worker:
         self.pipe.send(name)
 
     def answer(self) -> Record | None:
-        """The record of the problem asked for, or None while it is being solved."""
+        """Return the record of the requested problem, or None while it is being solved."""
         try:
             if self.pipe.poll():
                 self.spare = 0.0
@@ -183,22 +185,22 @@ class Worker:
 def campaign(
     todo: Sequence[str], output: Path, *, processes: int = 1, limit: float = 120.0, **options: Any
 ) -> Iterator[Record]:
-    """Solve what ``output`` does not have yet, append every record to it and yield it.
+    """Solve the problems missing from ``output``, append every record to it and yield it.
 
     Parameters
     ----------
     todo : sequence of str
         Names of problems.
     output : path
-        A file of records, one a line; need not exist.
+        A file with one record per line; it need not exist.
     processes : int
     limit : float
         Seconds for one problem.
     **options
-        As `run` takes them.
+        Options of `run`.
     """
     options = _DEFAULTS | options
-    # What was solved in another way is not done in this one.
+    # Problems solved with other options are not solved again.
     done = {
         record["name"]
         for record in read(output)
@@ -208,7 +210,7 @@ def campaign(
     left = [name for name in todo if name not in done][::-1]
     workers = [Worker(limit, options) for _ in range(min(processes, len(left)))]
     try:
-        # A line that a kill has cut short stays alone, and is not read.
+        # A line truncated by a kill stays on its own and is not read.
         torn = output.exists() and output.stat().st_size > 0 and output.read_bytes()[-1:] != b"\n"
         with output.open("a", encoding="utf-8") as file:
             file.write("\n" * torn)
@@ -232,7 +234,7 @@ def campaign(
 
 
 def read(path: Path) -> list[Record]:
-    """Records of a file, the last one for every name; lines cut short are left out."""
+    """Return the records of a file, the last one for every name; skip truncated lines."""
     records: dict[str, Record] = {}
     if path.exists():
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -245,7 +247,7 @@ def read(path: Path) -> list[Record]:
 
 
 def summary(records: Sequence[Record]) -> str:
-    """Success by family and difficulty, effort, stages, and the failures with how to run them again."""
+    """Return success by family and difficulty, effort, stages, and the failures with commands to repeat them."""
     passed = sum(record["outcome"] == "passed over" for record in records)
     records = [record for record in records if record["outcome"] != "passed over"]
     edges = [f"{b / BANDS:.1f}–{(b + 1) / BANDS:.1f}" for b in range(BANDS)]
@@ -257,7 +259,7 @@ def summary(records: Sequence[Record]) -> str:
     groups: dict[str, list[Record]] = defaultdict(list)
     for record in records:
         groups[record["family"]].append(record)
-    # What crashed or ran out of time could not say so itself, but a family is feasible as a whole.
+    # Records of crashes and timeouts lack feasibility, but it is the same for a whole family.
     solvable = {r["family"] for r in records if r.get("feasible")}
     feasible = [r for r in records if r["family"] in solvable]
     for family in [f for f in _ALL if f in groups]:
@@ -295,7 +297,7 @@ def summary(records: Sequence[Record]) -> str:
 
 
 def _by_stage(records: Sequence[Record]) -> list[str]:
-    """How many problems were solved before each fallback: after the first stage, the second and so on, by family."""
+    """Return how many problems were solved up to each stage, by family."""
     solved = [r for r in records if r["outcome"] == "injective"]
     if not solved:
         return []
@@ -329,7 +331,7 @@ def _row(title: str, records: Sequence[Record]) -> str:
 
 
 def _by_rung(records: Sequence[Record]) -> list[str]:
-    """How many problems came to a map by which rung of the ladder, vertices added, and time."""
+    """Return problems solved by each refinement stage, vertices added and time."""
     lines = []
     for title, kind in (("simple targets", True), ("others", False)):
         group = [r for r in records if r["promised"] is kind]
@@ -349,12 +351,12 @@ def _by_rung(records: Sequence[Record]) -> list[str]:
 
 
 def _spread(values: Sequence[float], upper: int, form: str) -> str:
-    """Median, an upper percentile, and the most."""
+    """Return the median, an upper percentile and the maximum."""
     return ", ".join(f"{value:{form}}" for value in np.percentile(values, [50, upper, 100], method="higher"))
 
 
 def _story(record: Record) -> str:
-    """What became of a failure, in a few words."""
+    """Describe a failure in a few words."""
     if "stages" not in record:
         return f"{record['outcome']}: {record.get('message', '')}"
     course = ", ".join(f"{before}→{after} ({count})" for _, count, before, after, _ in record["stages"])
@@ -364,7 +366,7 @@ def _story(record: Record) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, summarise or repeat; 1 when there is a failure among the problems looked at."""
+    """Run, summarise or repeat; return 1 if any of the problems failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=1000, help="problems of the campaign (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, default=Path("results.jsonl"), help="records (%(default)s)")

@@ -1,10 +1,10 @@
-"""What each choice costs and brings: functional, parameterisation, method of descent, strategy, energy.
+"""Cost and benefit of each choice: functional, parameterisation, descent method, strategy, energy.
 
     OMP_NUM_THREADS=1 python benchmarks/choices.py -o docs/choose [--scans FOLDER …]
 
-Seven surfaces go onto letters (``examples/sculptures.py``), everything the same but for the one choice; beside them, if
-there is a folder of them, problems of one's own. Writes a table for each choice, in Markdown, which the page *How to
-choose* includes. Figures are medians; times are of the CPU and relative to the first row, since machines differ.
+Seven surfaces are mapped to letters (``examples/sculptures.py``); only one choice varies at a time. ``--scans`` adds
+the problems of folders. Write a Markdown table for each choice, which the page *How to choose* includes. Figures are
+medians. Times are CPU times relative to the first row, since machines differ.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))
 from sculptures import seven
 
 Row = list[str]
-#: Rows of cells, the first of which says what they are of.
+#: Rows of cells; the first cell is the row's label.
 Table = list[Row]
 LIMIT = 600
 
 
 def afresh(problem: Problem) -> Problem:
-    """The same problem with nothing worked out in advance."""
+    """Return the same problem without cached results."""
     return Problem(problem.V, problem.F, problem.fixed, problem.target)
 
 
 def clocked(run: Callable[[], MapResult]) -> tuple[MapResult, float]:
-    """What a call returns, and its CPU seconds."""
+    """Return the result of a call, and its CPU seconds."""
     start = time.process_time()
     return run(), time.process_time() - start
 
 
 def mips(problem: Problem, uv: np.ndarray) -> float:
-    """Mean over the surface."""
+    """Return the mean MIPS energy over the surface."""
     return float(distortion(problem.V, problem.F, uv).summary("mips").mean)
 
 
 def searched(problems: list[Problem], strategy: str | list[Descent]) -> list[tuple[MapResult, float]]:
-    """Each problem from scratch."""
+    """Solve each problem from scratch."""
     most = 2000 if isinstance(strategy, str) else LIMIT
     return [clocked(lambda p=p: solve(afresh(p), strategy=strategy, max_iterations=most)) for p in problems]
 
 
 def compared(problems: list[Problem], choices: dict[str, str | list[Descent]]) -> Table:
-    """A row for each choice: how many were solved; of all, medians of iterations and time; of those solved, of MIPS."""
+    """Return a row for each choice: number solved, median iterations and time of all, median MIPS of those solved."""
     rows, unit = [HEAD], 0.0
     for name, strategy in choices.items():
         runs = searched(problems, strategy)
@@ -78,7 +78,7 @@ HEAD = ["", "solved", "iterations", "time", "MIPS of those solved"]
 
 
 def functionals(problems: list[Problem]) -> Table:
-    """The four functionals, si-log on the rest mesh's triangles."""
+    """Return the table of the four functionals, with si-log on the rest mesh's triangles."""
     names = {
         "V₃ `dirichlet`": "dirichlet",
         "V₂ `sobolev`": "sobolev",
@@ -93,7 +93,7 @@ def functionals(problems: list[Problem]) -> Table:
 
 
 def parameterisations(problems: list[Problem]) -> Table:
-    """Both parameterisations, each on two kinds of triangles."""
+    """Return the table of both parameterisations, each on two kinds of triangles."""
     choices: dict[str, str | list[Descent]] = {
         f"`{word}`, {reference}": [VectorAdam(parameterisation=word, reference=reference, iterations=LIMIT)]
         for word in ("tanh", "si-log")
@@ -103,7 +103,7 @@ def parameterisations(problems: list[Problem]) -> Table:
 
 
 def exchanged(problem: Problem) -> Problem:
-    """Two points inside change places: the one farthest from the boundary, and one halfway to there."""
+    """Swap two interior vertices: the one farthest from the boundary and one halfway to it."""
     uv = solve(afresh(problem)).uv
     inside = np.setdiff1d(np.arange(problem.n), problem.fixed)
     room, _ = KDTree(uv[problem.fixed]).query(uv[inside])
@@ -115,7 +115,7 @@ def exchanged(problem: Problem) -> Problem:
 
 
 def pins(problems: list[Problem]) -> Table:
-    """Two points inside of each change places."""
+    """Return the table of problems with two interior vertices swapped."""
     choices: dict[str, str | list[Descent]] = {
         f"`{word}`": [VectorAdam(parameterisation=word, iterations=LIMIT)] for word in ("tanh", "si-log")
     }
@@ -124,7 +124,7 @@ def pins(problems: list[Problem]) -> Table:
 
 
 def methods(problems: list[Problem]) -> Table:
-    """The methods of descent, tanh on equilateral triangles where nothing is said, each from ξ = 0."""
+    """Return the table of descent methods, each from ξ = 0; tanh on equilateral triangles unless stated otherwise."""
     choices: dict[str, str | list[Descent]] = {
         f"`{method.word}`": [method(iterations=LIMIT)] for method in (VectorAdam, LBFGS, Newton, Alternating)
     }
@@ -134,12 +134,12 @@ def methods(problems: list[Problem]) -> Table:
 
 
 def strategies(problems: list[Problem]) -> Table:
-    """All strategies, as they are."""
+    """Return the table of all strategies with their default settings."""
     return compared(problems, {f"`{name}`": name for name in STRATEGIES})
 
 
 def lowered(problem: Problem, uv: np.ndarray) -> Iterator[tuple[str, Callable[[], MapResult]]]:
-    """Every way to lower distortion that has a name, not yet run."""
+    """Yield the name and the call of every method that lowers distortion."""
     given = problem.V, problem.F, uv
     for energy in ("symmetric-dirichlet", "arap-barrier", "blend", "mips"):
         yield f'`polish`, "{energy}"', lambda e=energy: polish(*given, fixed=problem.fixed, energy=e)
@@ -148,7 +148,7 @@ def lowered(problem: Problem, uv: np.ndarray) -> Iterator[tuple[str, Callable[[]
 
 
 def energies(problems: list[Problem]) -> Table:
-    """What becomes of the first map."""
+    """Return the table of methods that lower the distortion of the first map."""
     columns: dict[str, list[tuple[float, ...]]] = {}
     for problem in problems:
         first, took = clocked(lambda p=problem: solve(afresh(p)))
@@ -170,7 +170,7 @@ def energies(problems: list[Problem]) -> Table:
 
 
 def quantile(values: np.ndarray, share: np.ndarray) -> float:
-    """The value below which half of the surface lies."""
+    """Return the value below which half of the surface's area lies."""
     order = np.argsort(values)
     return float(values[order][np.searchsorted(np.cumsum(share[order]), 0.5)])
 
@@ -179,7 +179,7 @@ TABLES = functionals, parameterisations, pins, methods, strategies, energies
 
 
 def beside(own: Table, scans: Table | None) -> str:
-    """In Markdown, the figures of scans beside those of our own surfaces."""
+    """Return a Markdown table with the figures of scans beside those of the project's own surfaces."""
     if scans is not None:
         first = [own[0][0], *own[0][1:], *(f"scans: {scans[0][1]}", *scans[0][2:])]
         own = [first, *([*left, *right[1:]] for left, right in zip(own[1:], scans[1:], strict=True))]
@@ -188,7 +188,7 @@ def beside(own: Table, scans: Table | None) -> str:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="where tables go (else to the screen)")
     parser.add_argument("--size", type=int, default=40, help="height of the surfaces' grid (40)")
@@ -202,7 +202,7 @@ def main() -> None:
     problems = list(seven(options.size).values())
     folders = [path.parent for folder in options.scans for path in sorted(folder.rglob("input.obj"))]
     scans = [Problem(*io.read_problem(folder)) for folder in folders]
-    solve(problems[0])  # whatever has to be imported is
+    solve(problems[0])  # import all modules before the measurements
     for measure in TABLES:
         if options.only and measure.__name__ not in options.only:
             continue

@@ -1,10 +1,10 @@
-"""Every functional, parameterisation and first-order method on every problem folder (§7.3, §8, §9).
+"""Run every functional, parameterisation and first-order method on every problem folder (§7.3, §8, §9).
 
     python benchmarks/combinations.py FOLDER [FOLDER …] [-n ITERATIONS] [--newton STEPS] [-o TABLE.csv]
 
-A folder is a problem (``input.obj`` + ``handles.txt``) or holds problems at any depth. Each combination runs alone
-from ξ = 0, on the rest mesh's corrected triangles for si-log and on equilateral ones for tanh, until the first
-injective map or for so many iterations.
+A folder is a problem (``input.obj`` + ``handles.txt``) or contains problems at any depth. Each combination runs alone
+from ξ = 0, with si-log on the rest mesh's corrected triangles and tanh on equilateral triangles. It stops at the first
+injective map or after the given number of iterations.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ METHODS = {"vector-adam": VectorAdam, "l-bfgs": LBFGS}
 
 
 def main() -> None:
-    """Write a table."""
+    """Run the combinations and write a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("-n", "--iterations", type=int, default=300)

@@ -1,10 +1,10 @@
-"""What compiled loops save: the same calls with and without, in processes that take turns.
+"""CPU time with and without compiled loops, for the same calls in interleaved processes.
 
     OMP_NUM_THREADS=1 python benchmarks/compiled_loops.py [FOLDER …]
 
-A made problem maps the head of a cat onto the letters C, R and S; a folder is a problem (``input.obj`` and
-``handles.txt``) or holds problems at any depth. CPU seconds from arrays to the certified map, and of ten Newton steps
-of a polish from there; the least of the repetitions. Written to ``--output``: ``compiled_loops.md``.
+Generated problems map a cat's head to the letters C, R and S. A folder is a problem (``input.obj`` and
+``handles.txt``) or contains problems at any depth. Measure CPU seconds from arrays to the certified map, and of ten
+Newton steps of a polish from there; take the minimum of the repetitions. Write ``compiled_loops.md`` to ``--output``.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ SWITCH = "QUASIHARMONIC_PURE"
 
 
 def timed(sizes: list[int], folders: list[Path], repetitions: int) -> Iterator[tuple[str, int, float, float]]:
-    """Of each problem its name, its triangles, seconds of a map and of polishing; the least of so many."""
+    """Yield name, triangles, and seconds of mapping and polishing of each problem; the minimum of the repetitions."""
     for name, arrays in problems(sizes, LETTERS, folders):
         V, F, fixed, _ = arrays
         mapping, polishing = [], []
-        # The first call of all loads what is loaded once.
+        # The first call loads libraries, so it is not measured.
         for _ in range(repetitions + 1):
             began = time.process_time()
             found = injective_map(*arrays)
@@ -45,7 +45,7 @@ def timed(sizes: list[int], folders: list[Path], repetitions: int) -> Iterator[t
 
 
 def in_turns(arguments: list[str], turns: int) -> list[list[list[float]]]:
-    """Rows of `timed` by processes without and with compiled loops, turn by turn; (turns, 2, rows)."""
+    """Return rows of `timed` from interleaved processes without and with compiled loops; (turns, 2, rows)."""
     found = []
     for _ in range(turns):
         both = []
@@ -60,7 +60,7 @@ def in_turns(arguments: list[str], turns: int) -> list[list[list[float]]]:
 
 
 def table(found: list[list[list[float]]]) -> str:
-    """In Markdown, milliseconds and how many times as fast."""
+    """Return a Markdown table with milliseconds and speed-up."""
     lines = [
         "| problem | triangles | map, ms: NumPy | compiled | gain | ten steps, ms: NumPy | compiled | gain |",
         "|---|---|---|---|---|---|---|---|",

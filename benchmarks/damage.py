@@ -1,12 +1,12 @@
-"""Thousands of damaged files, each given to the command: it is refused kindly, or what comes of it is right.
+"""Run the command on thousands of damaged files; each must be rejected properly or give a correct result.
 
     python benchmarks/damage.py -n 2000
     python benchmarks/damage.py --case mesh.ply:41 --keep FOLDER
 
-Files of every kind that the command reads are cut short, spliced, repeated, and have numbers and bytes replaced. A
-*failure* is anything but an exit status of 0, 1 or 2 within bounded time and memory: a traceback, a warning, a crash; a
-refusal that does not say who refuses, or leaves something behind; a status 0 whose map is not injective when it is
-read again, judged in rational numbers. Each file is tried in a process of its own. Needs a system that can fork.
+Files of every kind that the command reads are truncated, spliced, repeated, and have numbers and bytes replaced. A
+*failure* is any of: an exit status other than 0, 1 or 2; excessive time or memory; a traceback, a warning or a crash; a
+rejection that does not name the program or leaves files behind; status 0 with a map that is not injective when read
+again, verified in rational arithmetic. Each file is tried in its own process. Requires a system with fork.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 SECONDS, GIGABYTES = 150.0, 1.5
 
-# What takes a kind of file: its name stands for {}, and what is written is called "out".
+# Calls for each kind of file: {} stands for its name, and the output is named "out".
 CALLS: dict[str, list[str]] = {
     "mesh.obj": ["check {}", "map {} -o out.obj", "map {} --to star:5 --refine -o out.ply", "flatten {} -o out.obj"],
     "mesh.off": ["check {}", "flatten {} -o out.off"],
@@ -91,7 +91,7 @@ _BYTES = (b"\0", b"\n", b"\r", b"/", b"\\\n", b"#", b"\xff\xff\xff\x7f", b"\xff"
 
 
 def valid_files() -> dict[str, bytes]:
-    """A file of every kind of `CALLS`, each right."""
+    """Return a valid file of every kind in `CALLS`."""
     flat, F = disk(4)
     z = flat @ (1, 1j)
     mesh = MeshData(np.column_stack([flat, 0.3 * (flat**2).sum(axis=1)]), F)
@@ -129,7 +129,7 @@ def _table(rows: FloatArray | IntArray, before: str = "") -> str:
 
 
 def _planar(V: FloatArray, F: IntArray) -> dict[str, bytes]:
-    """A planar mesh as VTU, compressed and as text, as legacy VTK, and as MSH."""
+    """Return a planar mesh as compressed VTU, text VTU, legacy VTK and MSH."""
     n, f = len(V), len(F)
     arrays = {
         "Points": (V, "Float64", 3),
@@ -168,7 +168,7 @@ def _planar(V: FloatArray, F: IntArray) -> dict[str, bytes]:
 
 
 def damaged(rng: np.random.Generator, data: bytes) -> bytes:
-    """Bytes of a file cut short, left out, repeated, swapped, or replaced by others; numbers by odd ones."""
+    """Return a file's bytes truncated, cut out, repeated, swapped or replaced; numbers are replaced by unusual ones."""
     for _ in range(int(rng.integers(1, 4))):
         low, high = np.sort(rng.integers(len(data) + 1, size=2)).tolist()
         near = min(len(data), low + int(rng.integers(9)))
@@ -195,7 +195,7 @@ def damaged(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 class Trial(NamedTuple):
-    """What became of a damaged file: ``fault`` says what is wrong, and is empty where nothing is."""
+    """The result for a damaged file; ``fault`` describes the failure and is empty if there is none."""
 
     name: str
     call: str
@@ -207,7 +207,7 @@ class Trial(NamedTuple):
 
 
 def attempt(name: str, files: dict[str, bytes], folder: Path) -> Trial:
-    """Damage a file, ``kind:seed``, and give it to the command, in an empty folder."""
+    """Damage a file, named ``kind:seed``, and run the command on it in an empty folder."""
     kind, seed = name.split(":")
     rng = np.random.default_rng([zlib.crc32(kind.encode()), int(seed)])
     calls = CALLS[kind]
@@ -232,7 +232,7 @@ def attempt(name: str, files: dict[str, bytes], folder: Path) -> Trial:
 
 
 def _command(arguments: list[str], folder: Path) -> None:
-    """The command in this process, which ends."""
+    """Run the command in this process and end the process."""
     status = 70
     try:
         os.chdir(folder)
@@ -252,7 +252,7 @@ def _command(arguments: list[str], folder: Path) -> None:
 
 
 def _waited(child: int, deadline: float) -> tuple[int, float]:
-    """Exit status of a process, negative for a signal, and gigabytes it had; killed when it is late."""
+    """Return a process's exit status, negative for a signal, and its memory in gigabytes; kill it at the deadline."""
     while True:
         done, status, usage = os.wait4(child, os.WNOHANG)
         if done:
@@ -290,7 +290,7 @@ def _fault(call: str, status: int, said: str, left: set[str], folder: Path) -> s
 
 
 def _map(written: Path, planar: bool) -> tuple[IntArray, FloatArray]:
-    """Triangles and places of a map in a file."""
+    """Return the triangles and positions of a map in a file."""
     if planar:
         moved = read_fem(written)
         return covering_triangles(moved.F)[0], moved.points
@@ -299,16 +299,16 @@ def _map(written: Path, planar: bool) -> tuple[IntArray, FloatArray]:
 
 
 def _positive(F: IntArray, uv: FloatArray) -> bool:
-    """Whether all triangles are positive, in rational numbers."""
+    """Whether all triangles are positive, in rational arithmetic."""
     points = [(Fraction(x), Fraction(y)) for x, y in uv.tolist()]
     corners = ((points[i], points[j], points[k]) for i, j, k in F.tolist())
     return all((b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0]) for a, b, c in corners)
 
 
 def _import_all() -> None:
-    """Import what the command imports, once for all processes that come after."""
+    """Import the command's modules once, before the processes are forked."""
     for module in pkgutil.walk_packages(quasiharmonic.__path__, "quasiharmonic."):
-        # What needs an extra says so when it is imported, and the command imports none of it unasked.
+        # Modules that need an extra raise on import; the command does not import them by default.
         if not module.name.endswith("__main__"):
             with suppress(ImportError):
                 importlib.import_module(module.name)
@@ -317,7 +317,7 @@ def _import_all() -> None:
 
 
 def trials(names: Sequence[str], keep: Path | None = None) -> Iterator[Trial]:
-    """Try one damaged file after another, each in a folder of its own, ``keep`` or one that is removed."""
+    """Try damaged files one by one, each in its own subfolder of ``keep`` or in a temporary folder."""
     files = valid_files()
     _import_all()
     for name in names:
@@ -331,7 +331,7 @@ def trials(names: Sequence[str], keep: Path | None = None) -> Iterator[Trial]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Try files and list what went wrong; 1 when anything has."""
+    """Try files and list the failures; return 1 if there is any."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=1000, help="files (%(default)s)")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="begin with this seed (%(default)s)")

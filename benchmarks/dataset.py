@@ -1,19 +1,18 @@
-"""Write a data set of generated problems, of the make-up of the Locally Injective Mappings Benchmark, into a folder.
+"""Write a data set of generated problems with the composition of the Locally Injective Mappings Benchmark.
 
     python benchmarks/dataset.py FOLDER -n 2000
     qhm batch FOLDER -o OUT && qhm report OUT
 
 Every problem is a folder with ``input.obj`` (the rest mesh, and Tutte's embedding as a first guess) and
-``handles.txt``. As in the benchmark they come in three kinds:
+``handles.txt``. As in the benchmark, there are three kinds:
 
-- ``simple``: small textbook shapes, one in a hundred,
-- ``letters``: thousands of triangles onto a glyph's outline, one in fifty, whose maps differ from the first guess
-  everywhere,
-- ``surfaces``: all others, planar and curved meshes with a boundary that is difficult in places. They are made from a
-  bijective solution, so each has one.
+- ``simple``: small textbook shapes, one problem in a hundred,
+- ``letters``: thousands of triangles onto a glyph's outline, one problem in fifty, whose maps differ from the first
+  guess everywhere,
+- ``surfaces``: all others, planar and curved meshes with a boundary that is difficult in some parts. They are made from
+  a bijective solution, so each of them has one.
 
-The number decides which problems there are: the first ones of a large set are those of a small one. What is there
-already is not made again.
+A set with more problems starts with the problems of a smaller set. Existing problems are not written again.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ SURFACES = "flow", "noise", "carved", "jam"
 
 
 def plan(count: int) -> Iterator[tuple[str, str, int, float, int | None]]:
-    """Kind, family, seed, difficulty and size of the first problems of the set, in order."""
+    """Yield kind, family, seed, difficulty and size of the first problems of the set, in order."""
     for i in range(count):
-        # Multiples of the golden ratio fill the unit interval evenly, however many there are.
+        # Multiples of the golden ratio fill the unit interval evenly for any count.
         share = (0.5 + i * 0.6180339887498949) % 1.0
         if i % 100 == 0:
             yield "simple", SIMPLE[i // 100 % len(SIMPLE)], i, round(0.4 * share, 3), 200
@@ -46,17 +45,17 @@ def plan(count: int) -> Iterator[tuple[str, str, int, float, int | None]]:
 
 
 def drawn(family: str, seed: int, difficulty: float, triangles: int | None) -> Case:
-    """A problem whose target does not overlap itself, as none of the benchmark's letters and surfaces does."""
+    """Return a problem whose target does not overlap itself, like the benchmark's letters and surfaces."""
     while True:
         case = make(family, seed, difficulty, triangles=triangles)
         if case.simple is not False:
             return case
-        # Carved meshes in strong flows next to never keep clear of themselves.
+        # Targets of carved meshes in strong flows almost always overlap.
         seed, difficulty = seed + 1_000_000, round(0.8 * difficulty, 3)
 
 
 def write(folder: Path, case: Case) -> None:
-    """Write one problem, ``handles.txt`` last: where that is, all is."""
+    """Write one problem; ``handles.txt`` comes last, so its presence means that the problem is complete."""
     problem = Problem(case.V, case.F, case.fixed, case.target, reference="equilateral")
     try:
         guess = quasi_harmonic_map(problem)
@@ -69,7 +68,7 @@ def write(folder: Path, case: Case) -> None:
 
 
 def main() -> None:
-    """Write what is missing."""
+    """Write the missing problems."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("-n", "--count", type=int, default=2000)

@@ -1,8 +1,8 @@
-"""Tensors ``e^s 𝒜(μ)``, whose determinant is e^2s: one more number a triangle (§12's wish).
+"""Tensors ``e^s 𝒜(μ)`` with determinant e^2s: one more variable per triangle (future work in §12).
 
-The map is the quasi-harmonic map of the scaled tensors, and what is descended is V₃ of that map at the unscaled ones,
-``Σ 2m |q − μp|²/(1 − |μ|²)``. It is zero exactly at injective maps' own tensors, s whatever leads there. With the
-scaled tensors themselves in V₃, s would fall without end, or stay at 0 where determinants are held at 1 and above.
+The map is the quasi-harmonic map of the scaled tensors. The objective is V₃ of that map at the unscaled tensors,
+``Σ 2m |q − μp|²/(1 − |μ|²)``. It is zero exactly at the tensors of injective maps, for any s that leads there. With the
+scaled tensors in V₃, s would decrease without bound, or stay at 0 if determinants were bounded below by 1.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TensorField
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# |s| is kept below this, so that factors stay within e^±12 of each other.
+# Bound of |s|, so that the factors of two triangles differ by at most e^12.
 FARTHEST = 6.0
 
 
@@ -35,7 +35,7 @@ class Scaled:
         self._boundary[problem.fixed] = problem.frame.inward(problem.target)
 
     def evaluate(self, xi: ComplexArray, s: FloatArray) -> tuple[float, ComplexArray, FloatArray, ComplexArray]:
-        """Its value, its gradients in ξ and in s, and the map."""
+        """Return its value, its gradients in ξ and in s, and the map."""
         objective, mesh = self.objective, self.objective.mesh
         field: TensorField = objective.parameterisation.field(xi)
         stiffness = mesh.edge_stiffness(field.entries())
@@ -43,7 +43,7 @@ class Scaled:
         w = scaled.extend(self._boundary)
         dw = mesh.derivatives(w)
         value, by_mu = beltrami_gradient(mesh, field, dw)
-        # V₃ is ½ wᴴLw less the area, whose derivative by inner vertices is zero.
+        # V₃ is ½ wᴴLw minus the area, whose derivative by inner vertices is zero.
         adjoint = mesh.derivatives(scaled.respond(product(objective.problem.F, stiffness, w)))
         by_c, by_w = twist(mesh, adjoint, dw)
         by_mu = by_mu - np.exp(s) * field.pull_twist(by_c, by_w)
@@ -53,7 +53,7 @@ class Scaled:
 
 
 def product(F: IntArray, stiffness: FloatArray, w: ComplexArray) -> ComplexArray:
-    """``Gᵀ A G w`` from every triangle's off-diagonal entries (3, f), edge by edge."""
+    """Return ``Gᵀ A G w`` from every triangle's off-diagonal entries (3, f), edge by edge."""
     out = np.zeros(w.size, dtype=np.complex128)
     for entry, tail, head in zip(stiffness, F.T, np.roll(F, -1, axis=1).T, strict=True):
         pull = entry * (w[head] - w[tail])
@@ -63,7 +63,7 @@ def product(F: IntArray, stiffness: FloatArray, w: ComplexArray) -> ComplexArray
 
 
 def descend(problem: Problem, *, iterations: int, free: bool, parameterisation: str = "tanh") -> tuple[int, int]:
-    """VectorAdam over ξ, and Adam over s where it is free; inverted triangles in the end and iterations."""
+    """Run VectorAdam over ξ, and Adam over s if ``free``; return final inverted triangles and iterations."""
     functional = Scaled(problem, parameterisation)
     objective, f = functional.objective, len(problem.F)
     xi, s = np.zeros(f, dtype=np.complex128), np.zeros(f)

@@ -1,14 +1,14 @@
-"""Distortion against seconds: first maps, quasi-harmonised, polished.
+"""Distortion against seconds for first maps, quasi-harmonised maps and polished maps.
 
     python benchmarks/distortion.py [FOLDER …] [--unasked]
 
-A folder is a problem (``input.obj`` + ``handles.txt``) or holds problems at any depth; without one, surfaces of the
-package's own go onto letters. The first table has the MIPS energy as §10 defines it, the second the worst stretch
-max(σ₁, 1/σ₂) of any triangle after scaling the map to the surface's area, and beside it what the lengths of the
-boundary's edges alone force it to be. In parentheses: seconds from arrays to that certified map, everything included.
-A dash is where no injective map was found.
+A folder is a problem (``input.obj`` + ``handles.txt``) or contains problems at any depth; by default, generated
+surfaces are mapped to letters. The first table has the MIPS energy as defined in §10. The second has the worst stretch
+max(σ₁, 1/σ₂) of any triangle after scaling the map to the surface's area, and its lower bound from the boundary edges'
+lengths. Parentheses contain seconds from arrays to the certified map, everything included. A dash means that no
+injective map was found.
 
-``--unasked`` asks instead what a few polishing steps are worth, which is what ``qhm map`` takes without being asked:
+``--unasked`` instead measures the effect of a few polishing steps, which ``qhm map`` runs by default. It prints
 geometric means over the problems, relative to the first map.
 """
 
@@ -42,7 +42,7 @@ STEPS = 5, 10, 20, 40
 
 
 def cases(folders: list[Path]) -> Iterator[tuple[str, Problem]]:
-    """Every problem below some folders, or those of our own."""
+    """Yield every problem below the folders, or generated ones."""
     for folder in folders:
         for path in sorted(folder.rglob("input.obj")):
             yield f"{path.parent.parent.name}/{path.parent.name}", Problem(*io.read_problem(path.parent))
@@ -55,14 +55,14 @@ def cases(folders: list[Path]) -> Iterator[tuple[str, Problem]]:
 
 
 def first_map(problem: Problem, strategy: str) -> Found | None:
-    """The first injective map of a strategy, and the seconds from arrays on; None where there is none."""
+    """Return the first injective map of a strategy and the seconds from arrays, or None if no map was found."""
     began = time.perf_counter()
     result = solve(Problem(problem.V, problem.F, problem.fixed, problem.target), strategy=strategy)
     return (result.uv, time.perf_counter() - began) if result.injective else None
 
 
 def forced(problem: Problem) -> float:
-    """What max(σ₁, 1/σ₂) cannot fall below: the ratio of lengths of an edge between two fixed vertices.
+    """Return a lower bound of max(σ₁, 1/σ₂) from the length ratios of edges between two fixed vertices.
 
     A map stretches an edge by a factor between its triangles' σ₂ and σ₁. The target is scaled to the surface's area.
     """
@@ -83,7 +83,7 @@ def forced(problem: Problem) -> float:
 
 
 def measured(problem: Problem, uv: FloatArray) -> tuple[float, float]:
-    """MIPS and the worst stretch."""
+    """Return the MIPS energy and the worst stretch."""
     found = distortion(problem.V, problem.F, uv)
     return found.summary("mips").mean, found.summary("isometric").maximum
 
@@ -114,7 +114,7 @@ def compare(folders: list[Path]) -> None:
 
 
 def unasked(folders: list[Path]) -> None:
-    """Print what some steps of each energy bring, relative to the first map."""
+    """Print the effect of a few steps of each energy, relative to the first map."""
     gains: dict[tuple[str, int], list[tuple[float, float, float]]] = {}
     for name, problem in cases(folders):
         print(name, file=sys.stderr, flush=True)
@@ -138,7 +138,7 @@ def unasked(folders: list[Path]) -> None:
 
 
 def main() -> None:
-    """Read the command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--unasked", action="store_true")

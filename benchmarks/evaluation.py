@@ -3,10 +3,10 @@
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/evaluation.py -n 2100 -o evaluation.csv
     python benchmarks/evaluation.py --summary benchmarks/records/evaluation.csv.gz
 
-100 to 20,000 triangles, spread evenly in their logarithm: the families of `problems` of which a solution is known,
-three that are laid along outlines, and surfaces of ``examples/sculptures.py`` onto letters. On each run the paper's
-strategy, tanh alone on the same triangles where si-log found the map, and ``speed``. A row a problem, written as soon
-as it is done; the same command goes on where it was stopped.
+The problems have 100 to 20,000 triangles, evenly spread in the logarithm. They come from the families of `problems`
+with a known solution, three families mapped to outlines, and surfaces of ``examples/sculptures.py`` mapped to letters.
+Each is solved by the paper's strategy, by ``speed``, and, if si-log found the map, by tanh alone on the same triangles.
+A row is written after each problem; the same command resumes an interrupted run.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ RECORDS = Path(__file__).parent / "records" / "evaluation.csv.gz"
 FEASIBLE = "noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"
 OUTLINES = "glyph", "polygon", "star"
 FAMILIES = *FEASIBLE, *OUTLINES, "sculpture"
-#: Triangles at least and at most.
+#: Minimum and maximum number of triangles.
 LEAST, MOST = 100, 20_000
-#: CPU seconds for one run; what takes longer is ended.
+#: CPU seconds for one run; longer runs are stopped.
 LIMIT = 20.0
-#: Of the generator's difficulties the lower part, as in ``dataset.py``.
+#: The lower part of the generator's difficulties, as in ``dataset.py``.
 HARDEST = 0.7
 SURFACES, LETTERS, HEIGHTS = ("angel", "gargoyle", "rabbit", "bust", "hand"), "GSRAPH", (20, 26, 33, 41, 50, 61)
-#: Edges of the bands of size and of effort in the tables.
+#: Limits of the bands of size and of effort in the tables.
 SIZES, EFFORTS = (100, 300, 1000, 3000, 20_000), (0, 3, 30, 100, 300, 1000)
-#: Edges of the shares of triangles that Tutte's embedding inverts.
+#: Limits of the bands of the share of triangles that Tutte's embedding inverts.
 INVERTED = 0, 0.01, 0.03, 0.1, 1
 RUNS = "paper", "tanh", "speed"
 COLUMNS = (
@@ -61,17 +61,17 @@ Row = dict[str, str]
 
 
 def names(count: int) -> Iterator[str]:
-    """Names of the first problems: families in turn, sizes and difficulties spread evenly."""
+    """Yield names of the first problems: families in turn, sizes and difficulties spread evenly."""
     cells = len(SURFACES) * len(LETTERS) * len(HEIGHTS)
     for i in range(count):
         turn, family = divmod(i, len(FAMILIES))
         if FAMILIES[family] == "sculpture":
-            # A step that has no factor in common with their number visits all of them.
+            # A step coprime to their number visits all of them.
             surface, rest = divmod(turn * 97 % cells, len(LETTERS) * len(HEIGHTS))
             letter, height = divmod(rest, len(HEIGHTS))
             yield f"sculpture:{SURFACES[surface]}:{LETTERS[letter]}:{HEIGHTS[height]}"
             continue
-        # Multiples of these fill the unit square evenly, however many there are (Roberts' sequence).
+        # Multiples of these fill the unit square evenly for any count (Roberts' sequence).
         size, hard = (0.5 + turn * np.array((0.7548776662466927, 0.5698402909980532))) % 1.0
         triangles = round(LEAST * (MOST / LEAST) ** size)
         yield f"{FAMILIES[family]}:{2_000_000 + turn}:{round(HARDEST * hard, 3)} triangles={triangles}"
@@ -79,7 +79,7 @@ def names(count: int) -> Iterator[str]:
 
 @lru_cache(maxsize=4)
 def problem_named(name: str) -> tuple[Problem, bool]:
-    """A problem, and whether a solution is known to exist."""
+    """Return a problem, and whether a solution is known to exist."""
     if name.startswith("sculpture:"):
         _, surface, letter, height = name.split(":")
         V, F = sculpture(surface, int(height))
@@ -90,22 +90,22 @@ def problem_named(name: str) -> tuple[Problem, bool]:
 
 
 def family_of(name: str) -> str:
-    """The first word of a problem's name."""
+    """Return the first word of a problem's name."""
     return name.partition(":")[0]
 
 
 def thin(problem: Problem) -> float:
-    """The share of rest triangles with an angle below 25°, which the paper corrects (§10)."""
+    """Return the share of rest triangles with an angle below 25°, which the paper corrects (§10)."""
     V = np.column_stack([problem.V, np.zeros((problem.n, 3 - problem.V.shape[1]))])
     a, b, c = V[problem.F].transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     sides = np.sort([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    # The least angle is between the two longer sides.
+    # The smallest angle is between the two longer sides.
     return float(np.mean(area < np.sin(np.deg2rad(25)) * sides[1] * sides[2]))
 
 
 def limited(problem: Problem, strategy: Any) -> tuple[MapResult, float]:
-    """A search, ended when its CPU time is over, and the CPU time it took."""
+    """Run a search within the CPU time limit; return the result and its CPU seconds."""
     fresh = Problem(problem.V, problem.F, problem.fixed, problem.target)
     start = time.process_time()
 
@@ -118,14 +118,14 @@ def limited(problem: Problem, strategy: Any) -> tuple[MapResult, float]:
 
 
 def measured(name: str) -> dict[str, Any]:
-    """One row."""
+    """Return the row of a problem."""
     problem, feasible = problem_named(name)
     row: dict[str, Any] = {"problem": name, "triangles": len(problem.F), "feasible": int(feasible)}
     row["thin"] = f"{thin(problem):.3f}"
     for run, strategy in zip(
         RUNS, ("paper", [VectorAdam(reference="corrected", iterations=1000)], "speed"), strict=True
     ):
-        # Where si-log did not get through, the paper's second stage is tanh alone.
+        # If si-log failed, the paper's second stage already was tanh alone.
         if run == "tanh" and row["paper_stage"] != 1:
             continue
         result, seconds = limited(problem, strategy)
@@ -141,7 +141,7 @@ def measured(name: str) -> dict[str, Any]:
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a table, compressed or not; none if it does not exist."""
+    """Return the rows of a table, compressed or not; an empty list if the file does not exist."""
     if not path.exists():
         return []
     with gzip.open(path, "rt", encoding="utf-8") if path.suffix == ".gz" else path.open(encoding="utf-8") as file:
@@ -149,19 +149,19 @@ def read(path: Path) -> list[Row]:
 
 
 def number(rows: Iterable[Row], column: str) -> FloatArray:
-    """A column; NaN where there is nothing."""
+    """Return a column; empty cells become NaN."""
     return np.array([float(row[column] or "nan") for row in rows])
 
 
 def by_si_log(rows: Iterable[Row]) -> list[Row]:
-    """The problems on which si-log and tanh are compared: both found a map, which Tutte's embedding is not."""
+    """Return problems for comparing si-log and tanh: both found a map, and Tutte's embedding is not injective."""
     return [
         row for row in rows if row["paper_stage"] == "1" and row["tanh_mips"] and int(row["start_flipped"] or 0) > 0
     ]
 
 
 def in_bands(rows: Iterable[Row], column: str, edges: Sequence[float]) -> dict[str, list[Row]]:
-    """Rows whose number in a column lies between two edges, by what is said of that."""
+    """Return rows by band of a column's number, with the band's label as key."""
     bands: dict[str, list[Row]] = {f"{low:,} to {high:,}": [] for low, high in pairwise(edges)}
     for row in rows:
         k = int(np.searchsorted(edges, float(row[column]), side="right")) - 1
@@ -170,7 +170,7 @@ def in_bands(rows: Iterable[Row], column: str, edges: Sequence[float]) -> dict[s
 
 
 def by_family(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """Rows of each family."""
+    """Return the rows of each family."""
     families: dict[str, list[Row]] = {family: [] for family in FAMILIES}
     for row in rows:
         families[family_of(row["problem"])].append(row)
@@ -178,7 +178,7 @@ def by_family(rows: Iterable[Row]) -> dict[str, list[Row]]:
 
 
 def strategies(rows: Sequence[Row]) -> str:
-    """What the paper's strategy and ``speed`` solve, how soon, and how distorted it is."""
+    """Return the problems solved, time and distortion of the paper's strategy and of ``speed``."""
     lines = ["| strategy | solved | CPU s: 50, 95, 100 % | MIPS: 25, 50, 75 % |", "|---|---|---|---|"]
     both = [row for row in rows if row["paper_mips"] and row["speed_mips"]]
     for run in ("paper", "speed"):
@@ -195,7 +195,7 @@ def strategies(rows: Sequence[Row]) -> str:
 
 
 def compared(groups: dict[str, list[Row]], what: str) -> str:
-    """si-log's map beside tanh's from the same triangles: a row a group."""
+    """Compare si-log's map with tanh's on the same triangles, one row per group."""
     head = f"| {what} | si-log got through | compared | MIPS, si-log / tanh: 10, 50, 90 % | lower | half the surface |"
     lines = [head, "|---|---|---|---|---|---|"]
     for name, rows in groups.items():
@@ -217,7 +217,7 @@ def compared(groups: dict[str, list[Row]], what: str) -> str:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """All tables."""
+    """Return all tables."""
     return "\n\n".join(
         [
             strategies(rows),
@@ -229,7 +229,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def spread(problem: Problem, parameterisation: str) -> FloatArray:
-    """MIPS of one descent's first map: what 50, 90 and 99 % of the surface stay below, and the mean."""
+    """Return MIPS of one method's first map: the 50, 90 and 99 % quantiles over the surface, and the mean."""
     stage = VectorAdam(parameterisation=parameterisation, reference="corrected", iterations=1000)
     found = distortion(problem.V, problem.F, limited(problem, [stage])[0].uv)
     order = np.argsort(found.mips)
@@ -238,7 +238,7 @@ def spread(problem: Problem, parameterisation: str) -> FloatArray:
 
 
 def explained(rows: Iterable[Row], count: int) -> str:
-    """si-log's distortion beside tanh's by quantiles, on some of the problems that both solve, solved again."""
+    """Compare si-log's and tanh's distortion by quantiles, on some problems that both solve; solves them again."""
     pairs = [row for row in by_si_log(rows) if int(row["triangles"]) <= 3000]
     inverted = number(pairs, "start_flipped") / number(pairs, "triangles")
     words = "half the surface", "90 % of it", "99 % of it", "mean"
@@ -255,7 +255,7 @@ def explained(rows: Iterable[Row], count: int) -> str:
 
 
 def main() -> None:
-    """Run what is missing, or summarise."""
+    """Run the missing problems, or summarise."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=2100, help="problems (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, default=Path("evaluation.csv"), help="table (%(default)s)")
@@ -275,7 +275,7 @@ def main() -> None:
         if not before:
             table.writeheader()
         elif not before.endswith(b"\n"):
-            # A line that a kill has cut short stays alone, and is not read.
+            # A line truncated by a kill stays on its own and is not read.
             file.write("\n")
         for name in names(options.count):
             if name not in done:

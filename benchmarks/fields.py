@@ -1,11 +1,11 @@
-"""Displacement fields of known folds mended, beside smoothing them until nothing folds.
+"""Repair of displacement fields with known folds, compared with Gaussian smoothing.
 
     python benchmarks/fields.py -o DIR
 
-Each field is a gentle wave with bumps on a jittered lattice, each of which folds a few cells and no two the same: 1, 50
-and 5,000 of them. What is compared is the field's distance from the given one, over all pixels: of
-`quasiharmonic.nearest_invertible`, and of the field smoothed by a Gaussian as narrow as leaves no determinant at or
-below the same bound, found by bisection.
+Each field is a smooth wave plus bumps on a jittered lattice; each bump inverts a few cells, and no two are equal.
+Fields have 1, 50 and 5,000 bumps. The measure is the distance from the given field over all pixels. It compares
+`quasiharmonic.nearest_invertible` with the narrowest Gaussian, found by bisection, that brings all determinants above
+the same bound.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from scipy.ndimage import gaussian_filter
 from quasiharmonic.apps.displacement_fields.nearest import fold_free, nearest_invertible
 from quasiharmonic.util.arrays import FloatArray
 
-# Lattice of the bumps, in pixels, and how many each field has.
+# Spacing of the bumps' lattice in pixels, and number of bumps of each field.
 CELL, COUNTS = 12, (1, 50, 5000)
 LEAST = 0.01
 
 
 def synthetic(folds: int, seed: int = 0) -> FloatArray:
-    """A field (h, w, 2) with so many bumps that fold."""
+    """Return a field (h, w, 2) with this number of inverted bumps."""
     dice = np.random.default_rng(seed)
     side = max(6, int(np.ceil(np.sqrt(folds))) + 1)
     size = CELL * side
@@ -44,7 +44,7 @@ def synthetic(folds: int, seed: int = 0) -> FloatArray:
 
 
 def lowest(field: FloatArray) -> float:
-    """The lowest determinant at a corner of a cell."""
+    """Return the lowest determinant at a corner of a cell."""
     h, w = field.shape[:2]
     places = field + np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1)
     along, down = np.diff(places, axis=1), np.diff(places, axis=0)
@@ -53,7 +53,7 @@ def lowest(field: FloatArray) -> float:
 
 
 def smoothed_until_invertible(field: FloatArray) -> tuple[FloatArray, float]:
-    """The field after a Gaussian as narrow as leaves no fold, and its standard deviation in pixels."""
+    """Return the field smoothed by the narrowest sufficient Gaussian, and its standard deviation in pixels."""
 
     def smooth(deviation: float) -> FloatArray:
         return np.stack([gaussian_filter(field[..., k], deviation, mode="nearest") for k in (0, 1)], axis=-1)
@@ -68,7 +68,7 @@ def smoothed_until_invertible(field: FloatArray) -> tuple[FloatArray, float]:
 
 
 def apart(one: FloatArray, other: FloatArray) -> tuple[float, float]:
-    """Root mean square and largest distance of two fields."""
+    """Return the root mean square and the largest distance of two fields."""
     square = ((one - other) ** 2).sum(axis=2)
     return float(np.sqrt(square.mean())), float(np.sqrt(square.max()))
 

@@ -1,9 +1,9 @@
-"""What the paper leaves to the future, tried: hyperbolic steps, asymmetric weights, determinants, starts by others.
+"""Experiments on the paper's future work: hyperbolic steps, asymmetric weights, determinants, other starts.
 
     python benchmarks/future.py [hyperbolic] [weights] [determinants] [starts] [-o TABLE.json]
 
-Small problems, each way alone from its start to the first injective map; `docs/future.md` has what came out. ``starts``
-needs libigl.
+Each method runs alone on small problems, from its start to the first injective map. `docs/future.md` has the results.
+``starts`` requires libigl.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from sculptures import sculpture
 
 FAMILIES = "noise", "jam", "flow", "swirl", "adrift", "spiral", "comb", "maze", "limbs", "pins"
 ITERATIONS = 600
-#: A run's outcome: inverted triangles in the end and iterations.
+#: The result of a run: inverted triangles at the end, and iterations.
 Outcome = tuple[int, int]
 
 
 def trials(seeds: int = 1, surfaces: Sequence[str] = ("angel", "rabbit", "hand")) -> Iterator[tuple[str, Problem]]:
-    """Surfaces onto letters, turned rings, points swapped, and generated problems that have a map."""
+    """Yield surfaces mapped to letters, rotated rings, swapped points, and generated problems that have a map."""
     for surface in surfaces:
         V, F = sculpture(surface, 24)
         for letter in "GSH":
@@ -56,13 +56,13 @@ def trials(seeds: int = 1, surfaces: Sequence[str] = ("angel", "rabbit", "hand")
 
 
 def outcome(problem: Problem, stage: VectorAdam, start: FloatArray | None = None) -> Outcome:
-    """Of one method alone."""
+    """Return the outcome of one method alone."""
     result = solve(problem, strategy=[stage], start=start, max_iterations=stage.iterations)
     return len(result.certificate.inverted) + len(result.certificate.degenerate), result.iterations
 
 
 def hyperbolic(problem: Problem) -> dict[str, Outcome]:
-    """Steps in ξ with tanh and with si-log, and along geodesics of the Poincaré disk."""
+    """Compare steps in ξ with tanh and with si-log, and steps along geodesics of the Poincaré disk."""
     return {
         "ξ, tanh": outcome(problem, VectorAdam(iterations=ITERATIONS)),
         "geodesics": outcome(problem, HyperbolicAdam(iterations=ITERATIONS)),
@@ -72,7 +72,7 @@ def hyperbolic(problem: Problem) -> dict[str, Outcome]:
 
 
 def weights(problem: Problem) -> dict[str, Any]:
-    """Positive weights, one or two an edge, by one smooth inverted area; and what maps have such weights."""
+    """Optimise positive weights, one or two per edge, by a smooth inverted area; test which maps have such weights."""
     found: dict[str, Any] = {
         "tensors": outcome(problem, VectorAdam(iterations=ITERATIONS)),
         "one weight an edge": positive_weights.Means(problem, symmetric=True).descend(),
@@ -86,7 +86,7 @@ def weights(problem: Problem) -> dict[str, Any]:
 
 
 def free_determinants(problem: Problem) -> dict[str, Outcome]:
-    """Tensors of determinant 1, and of any."""
+    """Compare tensors of determinant 1 with tensors of any determinant."""
     return {
         f"{parameterisation}, determinant {what}": determinants.descend(
             problem, iterations=ITERATIONS, free=free, parameterisation=parameterisation
@@ -97,7 +97,7 @@ def free_determinants(problem: Problem) -> dict[str, Outcome]:
 
 
 def starts(problem: Problem) -> dict[str, Any]:
-    """Our search from its own start and from maps of libigl's."""
+    """Run the search from its own start and from libigl's maps."""
     import igl
 
     V, F, fixed, target = problem.V, problem.F, problem.fixed, problem.target
@@ -105,14 +105,14 @@ def starts(problem: Problem) -> dict[str, Any]:
     found: dict[str, Any] = {"ξ = 0": outcome(problem, VectorAdam(iterations=ITERATIONS))}
     flat = V if V.shape[1] == 2 else None
     if flat is None and loop is not None and loop.size == fixed.size:
-        # From the disk, as it asks for a plane mesh.
+        # Start from the disk, since the function requires a planar mesh.
         flat = igl.harmonic(V, F, loop, igl.map_vertices_to_circle(V, loop), 1)
     began = time.process_time()
     maps = {"libigl's harmonic map": igl.harmonic(V, F, fixed, target, 1)}
     found["libigl's composite map"] = "fails"
     if flat is not None:
         for test in (True, False):
-            # Where it fails, what it came to is had by asking it not to look.
+            # The function raises on failure; disabling its check returns the last iterate.
             try:
                 composite = igl.bijective_composite_harmonic_mapping(flat, F, fixed, target, test_for_flips=test)
             except RuntimeError:
@@ -140,7 +140,7 @@ TRIED: dict[str, Callable[[Problem], dict[str, Any]]] = {
 
 
 def main() -> None:
-    """Run what is named, print a row a problem, and sum up."""
+    """Run the named experiments, print a row per problem, and summarise."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="*", choices=[*TRIED, []], default=list(TRIED))
     parser.add_argument("--seeds", type=int, default=1, help="generated problems of each family (1)")

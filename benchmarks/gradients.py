@@ -1,15 +1,16 @@
-"""What gradients through maps cost: forth and back, beside backpropagating through the iterations that make the map.
+"""Cost of gradients through maps, compared with backpropagation through the iterations of the map.
 
     python benchmarks/gradients.py [--size CELLS] [-r REPEATS] [--unrolled ITERATIONS]
 
-For each kind of map, seconds of the processor for the map alone, for what makes its derivative besides (a polished or a
-flattened map has to come to rest to rounding, and is factored once more), for one gradient by everything, and both ways
-over the way forth. Ways take turns in one process; the least of the repeats counts.
+For each kind of map, measure CPU seconds of the map alone, of preparing its derivative, and of one gradient by all
+inputs. The last columns are ratios of both passes to the map alone and to the forward pass. To prepare the derivative,
+a polished or flattened map is converged to rounding and factored once more. Runs are interleaved in one process; the
+minimum of the repeats counts.
 
-``--unrolled`` (it needs PyTorch) writes the map as research code does: tensors in, a symmetric Dirichlet energy, and a
-descent whose every iteration autograd records. For a fair start both begin at the same map, which is near its best.
-Iterations go on until the gradient differs by 1 % from the exact one, or for as many as are allowed. Memory is what the
-process holds at most beyond what it held before.
+``--unrolled`` (requires PyTorch) writes the map as research code does: tensors, a symmetric Dirichlet energy, and a
+descent whose iterations autograd records. Both start from the same map near the optimum. Iterations continue until the
+gradient differs by 1 % from the exact one, or up to the given number. Memory is the peak of the process minus its
+memory before the call.
 """
 
 from __future__ import annotations
@@ -37,28 +38,28 @@ from quasiharmonic.targets import boundary_to, filled, letter
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 T = TypeVar("T")
-# Of the heavy ball that is recorded: the longest step that does not leap out of the map, by a few tries.
+# Parameters of the recorded heavy-ball descent; the step length is the largest that stayed feasible in tests.
 STEP, MOMENTUM = 0.1, 0.97
 BUT_REST = "quasi-harmonic, by μ and target"
 COTANGENTS = np.random.default_rng(0)
 
 
 def clocked(work: Callable[[], T]) -> tuple[T, float]:
-    """What some work makes, and its seconds."""
+    """Return the result of a function, and its seconds."""
     began = time.process_time()
     made = work()
     return made, time.process_time() - began
 
 
 def bean(V: FloatArray, loop: IntArray) -> FloatArray:
-    """The boundary by arc length on a bean."""
+    """Return boundary positions on a bean, by arc length."""
     side = np.linalg.norm(np.roll(V[loop], -1, axis=0) - V[loop], axis=1)
     t = 2 * np.pi * np.cumsum(side) / side.sum()
     return np.stack([np.cos(t) + 0.3 * np.cos(t) ** 2, 0.7 * np.sin(t) + 0.35 * np.cos(t) ** 2], axis=1)
 
 
 def forth_and_back(size: int, repeats: int) -> None:
-    """The table."""
+    """Print the table of forward and backward passes."""
     V, F = cat(size)
     (loop,) = boundary_loops(F, len(V))
     onto_bean, onto_letter = Problem(V, F, loop, bean(V, loop)), Problem(V, F, *boundary_to(V, F, filled(letter("R"))))
@@ -101,7 +102,7 @@ def forth_and_back(size: int, repeats: int) -> None:
 
             rows.append((one, two, clocked(back)[1]))
         one, two, three = np.min(rows, axis=0)
-        # The derivative of a quasi-harmonic map makes the map itself.
+        # The derivative of a quasi-harmonic map computes the map itself.
         way = two if derive is tensors[1] else one + two
         besides = two - one if derive is tensors[1] else two
         print(
@@ -111,12 +112,12 @@ def forth_and_back(size: int, repeats: int) -> None:
 
 
 def peak() -> float:
-    """Megabytes that the process has held at most."""
+    """Return the peak memory of the process in megabytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def unrolled(size: int, most: int) -> None:
-    """The descent of the same energy, every iteration recorded."""
+    """Print the cost of recording every iteration of a descent of the same energy."""
     import torch
 
     V, F = cat(size)
@@ -149,7 +150,7 @@ def unrolled(size: int, most: int) -> None:
         det = scale**2 * (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
         return (share * (a + a / det**2)).sum()
 
-    # Each vertex by the stiffness around it, about the diagonal of the second derivative.
+    # Scale each vertex by the stiffness around it, an approximation of the Hessian's diagonal.
     stiff = share / across**2 + share / length**2
     weight = torch.zeros(len(V), dtype=torch.float64)
     for k in range(3):

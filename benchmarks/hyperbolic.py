@@ -1,9 +1,8 @@
-"""VectorAdam in the Poincaré disk: tensors of determinant 1 are the points of the hyperbolic plane (§8.2's wish).
+"""VectorAdam in the Poincaré disk: tensors of determinant 1 are points of the hyperbolic plane (future work in §8.2).
 
-A step goes from μ along a geodesic, whatever the length of |ξ|, and the mean of gradients is carried along by parallel
-transport. Lengths are in units in which they are those of ξ with tanh at the origin: ``|dμ|/(1 − |μ|²)``, half of the
-usual. In these units the gradient differs from tanh's in its part across ξ alone, by ``2ρ/sinh 2ρ`` with ρ = |ξ|: what
-ξ takes for a long way around the disk is a longer one.
+A step follows a geodesic from μ for any |ξ|. Parallel transport carries the mean of the gradients along. Lengths are
+``|dμ|/(1 − |μ|²)``, half of the usual hyperbolic length; at the origin they equal lengths of ξ with tanh. In these
+units the gradient differs from tanh's only in its component across ξ, by ``2ρ/sinh 2ρ`` with ρ = |ξ|.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 
 def exponential(mu: ComplexArray, step: ComplexArray) -> ComplexArray:
-    """Where a geodesic leads: from μ in the direction and by the length of ``step``; Möbius addition."""
+    """Return the end of a geodesic from μ in the direction and with the length of ``step``, by Möbius addition."""
     length = np.abs(step)
     there = np.tanh(length) * np.divide(step, length, out=np.zeros_like(step), where=length > 0)
     return (mu + there) / (1 + np.conj(mu) * there)
 
 
 def transport(start: ComplexArray, end: ComplexArray) -> ComplexArray:
-    """What parallel transport along the geodesic between two points multiplies vectors by: phases."""
+    """Return the phases by which parallel transport along the geodesic between two points multiplies vectors."""
     turn = 1 - end * np.conj(start)
     return turn / np.conj(turn)
 
 
 def riemannian(gradient: ComplexArray, xi: ComplexArray) -> ComplexArray:
-    """The gradient in an orthonormal frame at μ, its axes those of μ, from the gradient in ξ with tanh."""
+    """Return the gradient in an orthonormal frame at μ, with the axes of μ, from the gradient in ξ with tanh."""
     rho = np.abs(xi)
     axis = np.divide(xi, rho, out=np.ones_like(xi), where=rho > 0)
     local = np.conj(axis) * gradient
@@ -44,12 +43,12 @@ def riemannian(gradient: ComplexArray, xi: ComplexArray) -> ComplexArray:
 
 @dataclass(frozen=True, kw_only=True)
 class HyperbolicAdam(VectorAdam):
-    """VectorAdam with steps along geodesics; tanh alone."""
+    """VectorAdam with steps along geodesics; tanh only."""
 
     word: ClassVar[str] = "hyperbolic-adam"
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """As of `Descent`."""
+        """See `Descent`."""
         first, second = self.momenta
         times, lengths = zip(*self._steps, strict=True)
         mean, square = np.zeros_like(start.xi), np.zeros(start.xi.shape)

@@ -1,13 +1,13 @@
-"""What an installation takes: seconds, megabytes and the largest packages, for the base and for each extra named.
+"""Cost of an installation: seconds, megabytes and the largest packages, for the base and for each named extra.
 
     python benchmarks/install.py                # the base and [mkl]
     python benchmarks/install.py shapes batch   # the base and these
 
-Each goes into a fresh environment, from this checkout, as the README's first command has it, and makes the demo's
-picture there; with `uv` too where that is installed. Packages come from a cache or the network, which decides the
-seconds: it is done twice, both times are reported, and of the second the processor's share. Megabytes, of 10⁶ bytes,
-are what the environment has grown by: its files, the blocks that they take on this disk, and of the files those that
-pip compiles (`.pyc`; uv leaves them to first use).
+Each variant is installed from this checkout into a fresh environment, with the README's first command, and makes the
+demo's image there. If `uv` is installed, it is measured too. Seconds depend on whether packages come from a cache or
+the network. Therefore each installation runs twice; both times are reported, and CPU seconds of the second. Megabytes
+(10⁶ bytes) are the growth of the environment: its files, their blocks on this disk, and the part that pip compiles
+(`.pyc`; uv leaves compilation to the first use).
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def files(folder: Path) -> list[Path]:
-    """All files below a folder."""
+    """Return all files below a folder."""
     return [path for path in folder.rglob("*") if not path.is_dir()]
 
 
 def megabytes(folder: Path, ending: str = "") -> float:
-    """Of all files below a folder, or of those that end so."""
+    """Return the size of all files below a folder, or of those with this ending."""
     return sum(path.lstat().st_size for path in files(folder) if path.name.endswith(ending)) / 1e6
 
 
 def blocks(folder: Path) -> float:
-    """Megabytes that these files take on the disk; not a number where that is not told."""
+    """Return the megabytes that these files occupy on the disk, or NaN if the system does not report them."""
     return sum(getattr(path.lstat(), "st_blocks", float("nan")) * 512 for path in files(folder)) / 1e6
 
 
 def commands() -> dict[str, Callable[[Path], list[str]]]:
-    """What installs into an environment, by its name."""
+    """Return the commands that install into an environment, by name."""
     uv = shutil.which("uv")
     by_pip = {"pip install": lambda environment: [str(python(environment)), "-m", "pip", "install", "--quiet"]}
     by_uv = {"uv pip install": lambda environment: [uv, "pip", "install", "-q", "--python", str(python(environment))]}
@@ -51,7 +51,7 @@ def commands() -> dict[str, Callable[[Path], list[str]]]:
 
 
 def installed(environment: Path, command: Callable[[Path], list[str]], requirement: str) -> tuple[float, float]:
-    """Seconds that it takes to install something into a new environment, by the clock and of the processor."""
+    """Install a requirement into a new environment; return wall seconds and CPU seconds."""
     subprocess.run([sys.executable, "-m", "venv", environment], check=True)
     began, before = time.perf_counter(), os.times()
     subprocess.run([*command(environment), requirement], check=True)
@@ -61,13 +61,13 @@ def installed(environment: Path, command: Callable[[Path], list[str]], requireme
 
 
 def python(environment: Path) -> Path:
-    """The interpreter of an environment."""
+    """Return the interpreter of an environment."""
     windows = environment / "Scripts" / "python.exe"
     return windows if windows.exists() else environment / "bin" / "python"
 
 
 def heaviest(environment: Path, count: int) -> str:
-    """The largest of what lies in an environment, but for pip."""
+    """Describe the largest packages in an environment, except pip."""
     folders = [path for parent in environment.rglob("site-packages") for path in parent.iterdir() if path.is_dir()]
     folders += [path for path in (environment / "lib", environment / "Library") if any(path.glob("*mkl*"))]
     sizes = {}
@@ -94,7 +94,7 @@ def main(arguments: list[str] | None = None) -> None:
             empty, first, again = (Path(work, name) for name in ("empty", "first", "again"))
             subprocess.run([sys.executable, "-m", "venv", empty], check=True)
             (slow, _), (quick, worked) = (installed(each, command, requirement) for each in (first, again))
-            # Sizes before anything has run: what Python compiles on first use is pip's doing already.
+            # Measure sizes before anything runs, so that compiled files are only those that pip wrote.
             sizes = megabytes(again), blocks(again), megabytes(again, ".pyc")
             before = megabytes(empty), blocks(empty), megabytes(empty, ".pyc")
             demo = [python(again), "-m", "quasiharmonic", "demo", "-o", Path(work, "demo")]

@@ -1,13 +1,13 @@
-"""Rate and accuracy of `InverseMap`: surface → plane → surface on a million points.
+"""Rate and accuracy of `InverseMap`, from surface to plane and back, on a million points.
 
     python benchmarks/inverse.py [-n POINTS] [--folder FOLDER …]
 
-For every map: time to build, points per second of `locate`, and how far points that come back are from where they set
-out, as a part of the surface's size, or the map's. Points are drawn from every triangle with the same probability,
-however small it is, or from the plane. Where a map shrinks triangles to 10⁻⁹, doubles tell points within them apart to
-seven digits and no more: the error on the surface is that of the coordinates in the plane.
+For every map, measure the build time, points per second of `locate`, and the distance between points and their round
+trip, relative to the size of the surface or of the map. Points are drawn from every triangle with the same probability,
+or from the plane. If a map shrinks triangles to 10⁻⁹, doubles resolve points within them to seven digits only. The
+error on the surface then is that of the coordinates in the plane.
 
-A folder is a problem (``input.obj`` + ``handles.txt``), solved first.
+A folder is a problem (``input.obj`` + ``handles.txt``), which is solved first.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Map = tuple[str, FloatArray, NDArray[np.int64], FloatArray]
 
 
 def maps(folders: list[Path]) -> Iterator[Map]:
-    """Name, surface, triangles, map."""
+    """Yield name, surface, triangles and map."""
     V, F = cat()
     (loop,) = boundary_loops(F, len(V))
     target = arc_length(V[loop], letter("R")[0])
@@ -47,7 +47,7 @@ def maps(folders: list[Path]) -> Iterator[Map]:
 
 
 def seconds(since: float) -> float:
-    """Processor time: comparable on a machine that does other things too."""
+    """Return the CPU seconds since a time; CPU time is comparable on a busy machine."""
     return time.process_time() - since
 
 
@@ -71,7 +71,7 @@ def main() -> None:
         began = time.process_time()
         at = inverse.locate(places)
         by_triangle = options.points / seconds(began) / 1e6
-        # Rounding may put a point of a triangle at the boundary beyond it.
+        # Rounding may move a point of a boundary triangle outside.
         lost = np.count_nonzero(~at.found)
         error = np.nanmax(np.abs(inverse.surface(at) - surface)) / np.ptp(V, axis=0).max()
         low, high = uv.min(axis=0), uv.max(axis=0)

@@ -1,12 +1,12 @@
-"""Thirty problems by L-BFGS alone, with each functional and parameterisation: the paper's Figure 10, at full size.
+"""Solve thirty problems by L-BFGS alone, with each functional and parameterisation (the paper's Figure 10).
 
     python benchmarks/letters_alone.py TABLE.csv [--scans FOLDER] [--size 64] [-n 600] [--columns "V₃ tanh" …]
     python benchmarks/letters_alone.py --summary
 
-Five surfaces onto the six letters of the figure, arc length along the outer outline. The surfaces are the gallery's, or
-of scans the first problem of each name in a folder of problems (``FOLDER/lucy_G/input.obj``). A row a run is added to
-the table; the same command goes on where it was stopped. `records/letters_alone.csv` is what came out. Each run begins
-at ξ = 0 and has no help from any other method.
+Five surfaces are mapped to the six letters of the figure, by arc length along the outer outline. The surfaces are the
+gallery's; with scans, they are the first problem of each name in a folder (``FOLDER/lucy_G/input.obj``). Each run adds
+a row to the table; the same command resumes an interrupted run. `records/letters_alone.csv` has the results. Each run
+starts at ξ = 0 and uses no other method.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 RECORDS = Path(__file__).parent / "records" / "letters_alone.csv"
 LETTERS = "GSRAPH"
-#: The gallery's surfaces have at most so many triangles at size 24, and more at 64.
+#: Maximum number of triangles of the gallery's surfaces at size 24; at size 64 they have more.
 SMALL = 5000
-#: What is minimised, by name: functional, parameterisation and reference triangles. The paper's are the last three.
+#: Objectives by name: functional, parameterisation and reference triangles. The paper uses the last three.
 COLUMNS = {
     "V₃ tanh": ("dirichlet", "tanh", "equilateral"),
     "V₁ tanh": ("neumann", "tanh", "equilateral"),
@@ -44,7 +44,7 @@ COLUMNS = {
 
 
 class Run(NamedTuple):
-    """One run, as it stands in the table."""
+    """One run, as stored in the table."""
 
     surface: str
     letter: str
@@ -57,7 +57,7 @@ class Run(NamedTuple):
 
 
 def made(size: int) -> Iterator[tuple[str, FloatArray, IntArray]]:
-    """The gallery's five surfaces."""
+    """Yield the gallery's five surfaces."""
     sys.path.append(str(Path(__file__).parent.parent / "examples"))
     from sculptures import sculpture
 
@@ -66,7 +66,7 @@ def made(size: int) -> Iterator[tuple[str, FloatArray, IntArray]]:
 
 
 def scanned(folder: Path) -> Iterator[tuple[str, FloatArray, IntArray]]:
-    """The surfaces of problem folders that are called after their surface and letter."""
+    """Yield the surfaces of problem folders named after surface and letter."""
     done = set()
     for path in sorted(folder.glob("*_?/input.obj")):
         name = path.parent.name[:-2]
@@ -77,7 +77,7 @@ def scanned(folder: Path) -> Iterator[tuple[str, FloatArray, IntArray]]:
 
 
 def measure(surface: str, V: FloatArray, F: IntArray, letter: str, column: str, iterations: int) -> Run:
-    """One run."""
+    """Measure one run."""
     problem = Problem(V, F, *targets.boundary_to(V, F, targets.filled(targets.letter(letter))))
     functional, parameterisation, reference = COLUMNS[column]
     stage = LBFGS(functional=functional, parameterisation=parameterisation, reference=reference, iterations=iterations)
@@ -90,7 +90,7 @@ def measure(surface: str, V: FloatArray, F: IntArray, letter: str, column: str, 
 
 
 def read(path: Path) -> list[Run]:
-    """The table's rows."""
+    """Return the rows of the table."""
     if not path.exists():
         return []
     with path.open(newline="", encoding="utf-8") as file:
@@ -101,7 +101,7 @@ def read(path: Path) -> list[Run]:
 
 
 def summary(runs: Iterable[Run]) -> dict[str, dict[str, int | float]]:
-    """What each column solved, of how many; its most iterations and its CPU seconds."""
+    """Return for each column the problems solved, their total, the maximum iterations and the CPU seconds."""
     found: dict[str, dict[str, int | float]] = {}
     for run in runs:
         column = found.setdefault(run.column, {"of": 0, "solved": 0, "most iterations": 0, "CPU seconds": 0})
@@ -114,7 +114,7 @@ def summary(runs: Iterable[Run]) -> dict[str, dict[str, int | float]]:
 
 
 def by_kind(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, int | float]]]:
-    """The same for the gallery's surfaces, large and small, and for scans."""
+    """Return the summary separately for small and large gallery surfaces and for scans."""
     scans = [run for run in runs if run.surface.startswith("scan of ")]
     large = [run for run in runs if run not in scans and run.triangles > SMALL]
     small = [run for run in runs if run not in scans and run.triangles <= SMALL]
@@ -122,7 +122,7 @@ def by_kind(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, int | float]]]
 
 
 def main() -> None:
-    """Add to a table, or sum one up."""
+    """Add rows to a table, or summarise one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", type=Path, nargs="?", default=RECORDS)
     parser.add_argument("--scans", type=Path, metavar="FOLDER")

@@ -1,13 +1,13 @@
-"""Files made to do harm, each given to the command: one sentence, within ten seconds and a gigabyte.
+"""Run the command on malicious files; each must give a one-line message within ten seconds and a gigabyte.
 
     python benchmarks/malicious.py
     python benchmarks/malicious.py --case vtu-zlib-bomb
 
-Counts that no memory holds, nesting that no stack bears, entities and compressed data that grow without end, numbers
-that are none, references that lead out of the folder or to themselves, pickles, wrong encodings, ends that never come.
-A *failure* is an exit status other than 2, or than 0 and 1 where the file may be taken; a refusal of more than a
-line or that does not say who refuses; a traceback or a warning; and anything left behind.
-`damage.py` has the files that were damaged by chance. Time is the processor's. Needs a system that can fork.
+The files contain huge counts, deep nesting, entities and compressed data that expand without limit, invalid numbers,
+references out of the folder or to themselves, pickles, wrong encodings, and missing ends. A *failure* is any of: an
+exit status other than 2 (or 0 and 1 if the file may be accepted); a message of more than one line or without the
+program's name; a traceback or a warning; files left behind. `damage.py` tests randomly damaged files. Time is CPU time.
+Requires a system with fork.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ import numpy as np
 from damage import valid_files
 
 SECONDS, GIGABYTES, LETTERS = 10.0, 1.0, 600
-# Beyond these a process is ended, and fails.
+# Limits beyond which a process is killed and counts as failed.
 _MOST_SECONDS, _MOST_BYTES = 60, 6 << 30
 _HUGE = 10**15
 
 
 class Evil(NamedTuple):
-    """A file, the command that is to read it (its name stands for {}), and whether it may be taken."""
+    """A file, the command that reads it ({} stands for the file's name), and whether the file may be accepted."""
 
     name: str
     call: str
@@ -51,7 +51,7 @@ class Evil(NamedTuple):
 
 
 def files() -> Iterator[Evil]:
-    """All of them, made one at a time."""
+    """Yield all files, one at a time."""
     good = valid_files()
     yield from _surfaces(good)
     yield from _binary(good)
@@ -128,7 +128,7 @@ def _binary(good: dict[str, bytes]) -> Iterator[Evil]:
         "length": {"buffers": [{"byteLength": _HUGE, "uri": uri}]},
         "scale": {"nodes": [{"mesh": 0, "scale": [1e308, 1e308, 1e308], "translation": [1e308] * 3}]},
     }.items():
-        # Which nodes lead to a mesh is nothing that a reader of the mesh has to ask.
+        # A reader of the mesh need not resolve which nodes lead to it.
         yield Evil(f"gltf-{name}", flat, ".gltf", json.dumps(scene | change).encode(), may="nodes" in change)
     yield Evil("gltf-deep", flat, ".gltf", b'{"asset":' + b"[" * 10**6)
     yield Evil("gltf-digits", flat, ".gltf", b'{"asset":{"version":"2.0"},"scene":' + b"9" * 10**7 + b"}")
@@ -225,14 +225,14 @@ def _pictures() -> Iterator[Evil]:
 
 
 class _Harm:
-    """What is called when somebody unpickles it."""
+    """A class whose unpickling calls a function."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return os.system, ("touch harm",)
 
 
 def _deflated(size: int) -> bytes:
-    """So many zeros, compressed."""
+    """Return compressed zeros, this many before compression."""
     packer, block = zlib.compressobj(9), bytes(1 << 20)
     return b"".join(packer.compress(block) for _ in range(size >> 20)) + packer.flush()
 
@@ -243,14 +243,14 @@ def _lzma(size: int) -> bytes:
 
 
 def _laughs(root: str) -> str:
-    """Entities that stand for ten of the one before, ten times over."""
+    """Return nested entities, each ten times the previous one, ten levels deep."""
     names = "abcdefghij"
     more = "".join(f'<!ENTITY {b} "{10 * f"&{a};"}">' for a, b in pairwise(names))
     return f'<!DOCTYPE {root} [<!ENTITY a "0 0 0 ">{more}]>'
 
 
 def attempt(evil: Evil, good: dict[str, bytes]) -> tuple[str, int, float, float, str]:
-    """What is wrong, exit status, seconds, gigabytes, and what was said."""
+    """Return the fault, exit status, seconds, gigabytes and message."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for other, data in good.items():
@@ -298,7 +298,7 @@ def _fault(evil: Evil, status: int, seconds: float, gigabytes: float, said: str,
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Try all files and list what went wrong; 1 when anything has."""
+    """Try all files and list the failures; return 1 if there is any."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", action="append", metavar="NAME", help="try just this file, e.g. vtu-zlib-bomb")
     options = parser.parse_args(arguments)

@@ -1,13 +1,13 @@
-"""Many small problems: `injective_maps`, `qhm batch`, and `injective_map` or `qhm map` for each.
+"""Many small problems: `injective_maps`, `qhm batch`, and one call of `injective_map` or `qhm map` per problem.
 
     python benchmarks/many.py [-n 10000] [--triangles 500] [-j 1,2] [--each 1000] [--files 200] [-o docs/speed/many.md]
 
-Three sets: one mesh onto many outlines, a mesh of its own for each outline, and generated problems that are hard for
-their size (`problems.py`). Ways to solve arrays take turns, portion by portion. A call for each is made for ``--each``
-problems only, some of every portion, files are written for the first ``--files``; rates are problems a second, of wall
-time and of processor time, and the ratio is that of the latter to a call for each, so that a busy machine is no matter.
-A call for each leaves a second core idle, so what two threads gain in wall time comes on top. Of files, a call for each
-is a loop that reads, maps, writes, reads back and certifies; `qhm batch` besides measures distortion and keeps records.
+Three sets: one mesh with many outlines, a separate mesh for each outline, and generated problems that are hard for
+their size (`problems.py`). Methods for arrays are interleaved, portion by portion. Single calls are made for ``--each``
+problems only, spread over the portions; files are written for the first ``--files``. Rates are problems per second of
+wall time and of CPU time. The ratio compares CPU time with that of single calls, so a busy machine does not affect it.
+Single calls use one core, so the gain of two threads in wall time comes in addition. For files, the baseline is a loop
+that reads, maps, writes, reads back and certifies; `qhm batch` also measures distortion and keeps records.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from speed import machine
 
 Arrays = tuple[FloatArray, IntArray, IntArray, FloatArray]
 
-# Problems between two turns.
+# Problems in one portion.
 _PORTION = 1000
 _CALLS, _FILES = "`injective_map` for each", "files: `injective_map` for each"
 _HARD = "noise", "flow", "swirl", "polygon", "star", "glyph"
 
 
 def blob(V: FloatArray, F: IntArray, seed: int) -> Arrays:
-    """A disk-like mesh onto a smooth outline of its own, in places a quarter as far from the middle as elsewhere."""
+    """Return a problem that maps a disk-like mesh to its own smooth outline, with radii from 0.25."""
     rng = np.random.default_rng(seed)
     (loop,) = boundary_loops(F, len(V))
     angle = np.linspace(0, 2 * np.pi, len(loop), endpoint=False)
@@ -49,19 +49,19 @@ def blob(V: FloatArray, F: IntArray, seed: int) -> Arrays:
 
 
 def one_mesh(triangles: int) -> Iterator[Arrays]:
-    """Endless problems of one mesh."""
+    """Yield problems of one mesh, without end."""
     V, F = disk(round(np.sqrt(triangles / 6)))
     return (blob(V, F, seed) for seed in range(1 << 31))
 
 
 def own_meshes(triangles: int) -> Iterator[Arrays]:
-    """Endless problems, the vertices of each thrown by chance."""
+    """Yield problems with random vertices each, without end."""
     for seed in range(1 << 31):
         yield blob(*random_delaunay(triangles // 2, seed=seed), seed)
 
 
 def generated(triangles: int) -> Iterator[Arrays]:
-    """Endless problems of six families and about this size, at difficulties from 0 to 0.5."""
+    """Yield problems of six families with about this size, at difficulties from 0 to 0.5, without end."""
     for seed in range(1 << 31):
         for family in _HARD:
             case = problems.make(family, seed, (seed % 11) / 20)
@@ -73,13 +73,13 @@ SETS = {"one mesh": one_mesh, "a mesh each": own_meshes, "generated": generated}
 
 
 class Clock:
-    """Problems done in how many seconds, of wall time and of processor time with that of processes that have ended."""
+    """Counts problems, wall seconds and CPU seconds, including those of child processes that have ended."""
 
     def __init__(self) -> None:
         self.done, self.solved, self.wall, self.processor = 0, 0, 0.0, 0.0
 
     def time(self, solve: Callable[[], tuple[int, int]]) -> None:
-        """Time a call that says how many problems it has done and how many of them it has solved."""
+        """Time a call that returns the numbers of problems done and solved."""
         wall, processor = time.perf_counter(), _processor()
         done, solved = solve()
         self.wall += time.perf_counter() - wall
@@ -93,17 +93,17 @@ def _processor() -> float:
 
 
 def together(some: list[Arrays], jobs: int) -> tuple[int, int]:
-    """One call for all."""
+    """Solve all problems in one call."""
     return len(some), sum(result.injective for result in injective_maps(some, jobs=jobs))
 
 
 def one_by_one(some: list[Arrays]) -> tuple[int, int]:
-    """A call for each."""
+    """Solve each problem in its own call."""
     return len(some), sum(injective_map(*arrays).injective for arrays in some)
 
 
 def write_files(root: Path, some: list[Arrays]) -> None:
-    """A data set of problem folders."""
+    """Write a data set of problem folders."""
     for number, (V, F, fixed, target) in enumerate(some):
         folder = root / f"{number:05d}"
         folder.mkdir(parents=True)
@@ -114,13 +114,13 @@ def write_files(root: Path, some: list[Arrays]) -> None:
 
 
 def data_set(root: Path, output: Path, jobs: int) -> tuple[int, int]:
-    """`qhm batch`."""
+    """Run `qhm batch`."""
     progress = batch.run(root, output, jobs=jobs)
     return progress.done, progress.solved
 
 
 def file_by_file(root: Path, output: Path) -> tuple[int, int]:
-    """A loop over the files, which ends with the verdict on what was written."""
+    """Process the files in a loop; certify the written maps."""
     folders, solved = sorted(root.iterdir()), 0
     output.mkdir()
     for folder in folders:
@@ -135,7 +135,7 @@ def file_by_file(root: Path, output: Path) -> tuple[int, int]:
 
 
 def commands(root: Path, output: Path, most: int) -> tuple[int, int]:
-    """`qhm map` for each of the first few."""
+    """Run `qhm map` on each of the first few problems."""
     folders = sorted(root.iterdir())[:most]
     output.mkdir()
     codes = [
@@ -150,13 +150,13 @@ def commands(root: Path, output: Path, most: int) -> tuple[int, int]:
 
 
 def measure(name: str, options: argparse.Namespace, jobs: list[int]) -> list[str]:
-    """Rows of the table for one set."""
+    """Return the table's rows for one set."""
     endless = SETS[name](options.triangles)
     clocks: dict[str, Clock] = {_CALLS: Clock()}
     clocks |= {f"`injective_maps`, {n} {'thread' if n == 1 else 'threads'}": Clock() for n in jobs}
     left, sizes = options.count, []
     first = list(islice(endless, _PORTION))
-    one_by_one(first[:5])  # loads what is loaded once and for all
+    one_by_one(first[:5])  # loads libraries before the measurements
     while left > 0:
         some = (first or list(islice(endless, _PORTION)))[:left]
         first = []
@@ -194,7 +194,7 @@ def measure(name: str, options: argparse.Namespace, jobs: list[int]) -> list[str
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Measure, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=10_000)
     parser.add_argument("--triangles", type=int, default=500)

@@ -1,12 +1,12 @@
-"""How far a boundary can move before a mesh that follows it is inverted, by method.
+"""How far a boundary can move before the mesh that follows it is inverted, by method.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/mesh_motion.py [-o FOLDER] [--only SCENE ...]
 
-Six scenes (`moving_scenes`), and in each every method (`mesh_movers`), step by step until a triangle is inverted,
-exactly, or the scene ends; `morph`, whose steps do not build upon each other, is asked at every eighth. Writes
-mesh_motion.csv, mesh_motion.md and mesh_motion.png: the displacement at the last valid step, the worst and the mean
-quality of triangles on the way, and the processor's time for a step, beside that of one solve of linear elasticity,
-which is taken by turns with them. Kratos is left out where it is not installed.
+In each of six scenes (`moving_scenes`), every method (`mesh_movers`) takes steps until a triangle is inverted or the
+scene ends. Inversion is certified exactly. The steps of `morph` are independent, so it runs at every eighth step only.
+Write mesh_motion.csv, mesh_motion.md and mesh_motion.png: the displacement at the last valid step, the worst and the
+mean triangle quality, and CPU time per step. The baseline is one solve of linear elasticity, interleaved with the
+steps. Kratos is skipped if it is not installed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.util.arrays import FloatArray
 
 OURS, MORPH = "ours", "morph"
-#: By name and by what each step begins with. Kratos' solvers have one way only.
+#: Methods by name and start of each step. Kratos' solvers have only one kind of start.
 METHODS: dict[tuple[str, str], Callable[[Scene], Mover]] = {
     (name, base): partial(Extended, extension=extension, from_rest=base == "first")
     for name, extension in (
@@ -51,28 +51,28 @@ if importlib.util.find_spec("KratosMultiphysics") is not None:
     }
 METHODS[OURS, "last"] = Ours
 METHODS[MORPH, "first"] = MorphResult
-#: Methods of which only every so many-th step is taken, and the last: a step of theirs costs as much as many of others.
+#: Methods with expensive steps take only every k-th step and the last one; the value is k.
 SELDOM = {(MORPH, "first"): 8}
-#: Scenes of which something is known that forbids to go on.
+#: Scenes with a known upper bound of the motion.
 TURNING = ("turning disk", "sliding walls")
-# Of how many steps one is followed by a solve of elasticity, to compare with.
+# In every this many steps, one elasticity solve is timed as the baseline.
 _YARDSTICK = 8
 
 
 @dataclass
 class Run:
-    """What has become of one method in one scene.
+    """The result of one method in one scene.
 
     Attributes
     ----------
     at : list of int
         The valid steps that were taken.
     quality : list of (4,)
-        At each: worst and mean of the triangles' shape, and of their likeness to the first mesh, as mean ratios.
+        At each: worst and mean of the triangles' shape, and of their similarity to the first mesh, as mean ratios.
     moves : list of float
-        How far a vertex went since the last of these steps, at most, in units of how far the body's went.
+        Maximum vertex displacement since the previous one of these steps, relative to that of the body.
     seconds : list of float
-        Of the processor, of each step.
+        CPU seconds of each step.
     """
 
     at: list[int] = field(default_factory=list)
@@ -82,19 +82,19 @@ class Run:
 
     @property
     def steps(self) -> int:
-        """The last valid step; 0 where there is none."""
+        """The last valid step, or 0 if there is none."""
         return self.at[-1] if self.at else 0
 
 
 def likeness(scene: Scene, V: FloatArray) -> FloatArray:
-    """The mean ratio 2 det J / |J|² of each triangle's Jacobian from the first mesh; 1 for a similarity."""
+    """Return the mean ratio 2 det J / |J|² of each triangle's Jacobian from the first mesh; 1 for a similarity."""
     now, first = (np.diff(P[scene.F], axis=1).transpose(0, 2, 1) for P in (V, scene.V))
     J = now @ np.linalg.inv(first)
     return 2 * np.linalg.det(J) / np.sum(J**2, axis=(1, 2))
 
 
 def race(scene: Scene, steps: int | None = None) -> tuple[dict[tuple[str, str], Run], list[float]]:
-    """Every method's run, taken step by step by turns, and the seconds of single solves of elasticity in between."""
+    """Run all methods, interleaved step by step; return their runs and the seconds of single elasticity solves."""
     runs = {key: Run() for key in METHODS}
     movers = {key: make(scene) for key, make in METHODS.items()}
     last = dict.fromkeys(METHODS, scene.V)
@@ -128,11 +128,11 @@ def race(scene: Scene, steps: int | None = None) -> tuple[dict[tuple[str, str], 
 
 
 def forbidden_beyond(scene: Scene) -> float:
-    """Degrees by which a body around the origin cannot turn, whatever the mesh does.
+    """Return an upper bound, in degrees, of the rotation of a body around the origin, for any mesh motion.
 
-    Seen from the origin an edge spans less than 2 arccos(r / R), where r is the radius of a disk inside the body and R
-    that of one around the walls. A chain of edges from the body to a vertex of the walls that stays has to wind by the
-    turn and what it winds at first, and so bounds it.
+    Seen from the origin, an edge spans less than 2 arccos(r / R), where r is the radius of a disk inside the body and
+    R that of one around the walls. A chain of edges from the body to a fixed vertex of the walls winds by the rotation
+    plus its initial winding. The sum of its edges' spans therefore bounds the rotation.
     """
     F, z = scene.F, scene.V @ (1, 1j)
     span = 2 * np.arccos(np.abs(z[scene.body]).min() / np.abs(z).max())
@@ -148,7 +148,7 @@ def forbidden_beyond(scene: Scene) -> float:
 
 
 def rows(name: str, scene: Scene, runs: dict[tuple[str, str], Run], yardstick: list[float]) -> list[dict[str, object]]:
-    """The table's rows for a scene."""
+    """Return the table's rows for a scene."""
     unit = float(np.median(yardstick))
     found = []
     for (method, base), run in runs.items():
@@ -178,7 +178,7 @@ def rows(name: str, scene: Scene, runs: dict[tuple[str, str], Run], yardstick: l
 
 
 def table(found: list[dict[str, object]], scenes: dict[str, Scene]) -> str:
-    """The rows in Markdown, scene by scene."""
+    """Return the rows in Markdown, scene by scene."""
     lines = []
     for name, scene in scenes.items():
         about = (SCENES[name].__doc__ or "").split("\n")[0]
@@ -219,7 +219,7 @@ def _versions() -> str:
 
 
 def draw(races: dict[str, dict[tuple[str, str], Run]], scenes: dict[str, Scene], path: Path) -> None:
-    """The worst quality over the displacement, one panel a scene."""
+    """Plot the worst quality over the displacement, one panel per scene."""
     from matplotlib.figure import Figure
 
     names = list(dict.fromkeys(method for method, _ in METHODS))

@@ -1,7 +1,7 @@
-"""Ways to move a mesh with its boundary: those of finite-element codes, and this library's.
+"""Methods that move a mesh with its boundary: those of finite-element codes, and this library's.
 
-Each is made of a `Scene` and has ``step(target)``, which hands back all vertices with the scene's ``fixed`` at
-``target``. Linear ones come in two kinds: every step from the first mesh, or each from the last.
+Each method is constructed from a `Scene` and has ``step(target)``, which returns all vertices with the scene's
+``fixed`` vertices at ``target``. Linear methods start every step either from the first mesh or from the last one.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from scipy.spatial.distance import cdist
 from moving_scenes import Scene
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-#: From vertices (n, 2), triangles, the vertices whose x and whose y is given, and how far all go where they are given
-#: (n, 2): how far all go.
+#: A function of vertices (n, 2), triangles, the vertices with prescribed x and with prescribed y, and the prescribed
+#: displacements (n, 2); it returns all displacements.
 Extension = Callable[[FloatArray, IntArray, tuple[IntArray, IntArray], FloatArray], FloatArray]
 
 
 class Mover(Protocol):
-    """A way to move a mesh."""
+    """A method that moves a mesh."""
 
     def step(self, target: FloatArray) -> FloatArray: ...
 
 
 class Extended:
-    """A displacement of the boundary, extended inside.
+    """Moves a mesh by extending the boundary's displacement to the interior.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Extended:
         way = np.zeros_like(base)
         way[scene.fixed] = target - base[scene.fixed]
         given = scene.given()
-        # What glides along a wall is not displaced across it.
+        # Vertices that slide along a wall have no displacement across it.
         moved = base + self._extension(base, scene.F, given, way)
         for axis in (0, 1):
             at = np.isin(scene.fixed, given[axis])
@@ -58,7 +58,7 @@ class Extended:
 
 
 def harmonic(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way: FloatArray) -> FloatArray:
-    """Either component harmonic."""
+    """Extend each component harmonically."""
     from skfem import Basis, ElementTriP1, MeshTri, condense, solve
     from skfem.models.poisson import laplace
 
@@ -67,7 +67,7 @@ def harmonic(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way: 
 
 
 def elasticity(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way: FloatArray) -> FloatArray:
-    """Linear elasticity, ν = 0.3, each triangle as stiff as it is small (Stein, Tezduyar and Benney 2003, χ = 1)."""
+    """Extend by linear elasticity, ν = 0.3; smaller triangles are stiffer (Stein, Tezduyar and Benney 2003, χ = 1)."""
     from skfem import Basis, BilinearForm, ElementTriP1, ElementVector, MeshTri, condense, solve
     from skfem.helpers import ddot, eye, sym_grad, trace
     from skfem.models.elasticity import lame_parameters
@@ -92,7 +92,7 @@ def elasticity(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way
 
 
 def thin_plate(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way: FloatArray) -> FloatArray:
-    """Thin-plate splines through the boundary (SciPy's `RBFInterpolator`)."""
+    """Extend by thin-plate splines through the boundary (SciPy's `RBFInterpolator`)."""
     if given[0] is given[1]:
         return RBFInterpolator(V[given[0]], way[given[0]], kernel="thin_plate_spline")(V)
     parts = [RBFInterpolator(V[at], way[at, k], kernel="thin_plate_spline")(V) for k, at in enumerate(given)]
@@ -100,7 +100,7 @@ def thin_plate(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way
 
 
 def compact(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way: FloatArray) -> FloatArray:
-    """Wendland's C² function (de Boer, van der Schoot and Bijl 2007) of a radius of 2, about the channels' height."""
+    """Extend by Wendland's C² function (de Boer, van der Schoot, Bijl 2007); radius 2, about the channels' height."""
     radius = 2.0
 
     def kernel(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -114,7 +114,7 @@ def compact(V: FloatArray, F: IntArray, given: tuple[IntArray, IntArray], way: F
 
 
 class Kratos:
-    """Kratos' mesh-moving solvers, their settings as they come.
+    """Kratos' mesh-moving solvers with default settings.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ class Kratos:
 
 
 class Ours:
-    """`quasiharmonic.MovingMesh`, as it comes."""
+    """`quasiharmonic.MovingMesh` with default settings."""
 
     def __init__(self, scene: Scene) -> None:
         from quasiharmonic import MovingMesh
@@ -187,7 +187,7 @@ class Ours:
 
 
 class MorphResult:
-    """`quasiharmonic.morph`, as it comes: each displacement as one step from the first mesh."""
+    """`quasiharmonic.morph` with default settings; each displacement is one step from the first mesh."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene

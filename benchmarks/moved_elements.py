@@ -1,11 +1,11 @@
-"""Triangles, quadrilaterals and second-order triangles around a body that moves far: which meshes stay valid.
+"""Validity of triangles, quadrilaterals and second-order triangles around a body with a large motion.
 
     pip install gmsh
     python benchmarks/moved_elements.py
 
-Gmsh meshes a square around an ellipse, coarsely and finely, as triangles of three and of six nodes and, recombined, as
-quadrilaterals. The ellipse is turned, bent, shifted and swollen, with the nodes on the walls held and sliding. A line
-tells whether the mesh is valid, exactly, the quality of its worst element, and CPU seconds.
+Gmsh meshes a square around an ellipse, coarsely and finely, as triangles with three and with six nodes and, recombined,
+as quadrilaterals. The ellipse is rotated, bent, shifted and scaled; nodes on the walls are fixed or slide. Each line
+reports whether the mesh is valid (certified exactly), the quality of its worst element, and CPU seconds.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from quasiharmonic import morph
 from quasiharmonic.geometry.mesh.elements import joined, rim
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-#: Gmsh's order, whether it recombines, and its number of the algorithm.
+#: Gmsh's order, whether it recombines, and its algorithm number.
 KINDS = {"triangles": (1, False, 6), "quadrilaterals": (1, True, 8), "six-node triangles": (2, False, 6)}
 SIZES = 0.12, 0.05
 NODES = {2: 3, 3: 4, 9: 6}
 
 
 def turned(degrees: float) -> Callable[[FloatArray], FloatArray]:
-    """A motion about the origin."""
+    """Return a rotation about the origin."""
     angle = np.radians(degrees)
     return lambda points: points @ np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
 
@@ -42,7 +42,7 @@ MOTIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def meshes() -> Iterator[tuple[str, FloatArray, IntArray]]:
-    """Names, nodes and elements."""
+    """Yield names, nodes and elements."""
     import gmsh
 
     gmsh.initialize(interruptible=False)

@@ -1,16 +1,16 @@
-"""Heat around a cylinder that travels through a channel: finite elements on a mesh that moves for 200 steps.
+"""Heat around a cylinder that travels through a channel: finite elements on a moving mesh, 200 steps.
 
     python benchmarks/moving_heat.py [-o FOLDER]
 
-The cylinder goes around in the channel without turning, and a fluid of no viscosity gives way: a = ∇φ with φ harmonic
-and its normal derivative that of the walls. A hot spot is carried along and spreads::
+The cylinder circles in the channel without rotating. The inviscid fluid's velocity is a = ∇φ, with φ harmonic and its
+normal derivative that of the walls. A hot spot is advected and diffuses::
 
     d/dt ∫ u v + ∫ (κ ∇u − u (a − w)) · ∇v = 0      for each v that moves with the mesh, whose velocity is w
 
-in linear elements of scikit-fem, with the middle of the step for all but the masses. No heat crosses a wall, so the
-sum stays; and since a triangle's area is quadratic in time, the middle gives its change exactly, so a uniform
-temperature stays uniform (the geometric conservation law). Both are measured at every step, and the run ends where a
-triangle of the mesh, or of that in the middle of the step, is inverted.
+The discretisation uses linear elements of scikit-fem, with all terms except the masses at the middle of the step. No
+heat crosses a wall, so the total heat is constant. A triangle's area is quadratic in time, so the midpoint gives its
+change exactly and a uniform temperature stays uniform (the geometric conservation law). Both properties are measured at
+every step. The run ends if a triangle is inverted in the mesh or in the mesh at the middle of the step.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ MOVERS = {
 
 @dataclass
 class History:
-    """What was measured, step by step.
+    """The measurements, step by step.
 
     Attributes
     ----------
     heat : list of float
-        ∫ u over what it was at first, less 1.
+        ∫ u relative to its initial value, minus 1.
     uniform : list of float
-        By how much the temperature that was 1 everywhere differs from 1 at most.
+        Maximum deviation from 1 of the temperature that was 1 everywhere.
     quality : list of float
         The worst mean ratio of the mesh.
     meshes, temperatures : list
@@ -67,13 +67,13 @@ class History:
 
 @BilinearForm
 def carried(u, v, w):
-    """What moves over the mesh: −∫ u (a − w) · ∇v."""
+    """The transport term −∫ u (a − w) · ∇v."""
     return -u * dot(w["flow"].grad - w["mesh"], grad(v))
 
 
 @LinearForm
 def displaced(v, w):
-    """What a wall displaces: ∮ w · n v."""
+    """The flux of a moving wall, ∮ w · n v."""
     return dot(w["mesh"], w.n) * v
 
 
@@ -82,7 +82,7 @@ def _mesh(V: FloatArray, F: IntArray) -> MeshTri:
 
 
 def step(V: FloatArray, there: FloatArray, F: IntArray, u: FloatArray, dt: float) -> FloatArray:
-    """Temperatures (n, k) a step later, as the mesh goes from one place to another."""
+    """Return the temperatures (n, k) after a step in which the mesh moves from ``V`` to ``there``."""
     middle = _mesh((V + there) / 2, F)
     basis, vectors = Basis(middle, ElementTriP1(), intorder=3), Basis(middle, ElementVector(ElementTriP1()), intorder=3)
     velocity = np.zeros(vectors.N)
@@ -90,7 +90,7 @@ def step(V: FloatArray, there: FloatArray, F: IntArray, u: FloatArray, dt: float
     rim = FacetBasis(middle, ElementTriP1(), intorder=3)
     pushed = displaced.assemble(rim, mesh=rim.with_element(ElementVector(ElementTriP1())).interpolate(velocity))
     K = laplace.assemble(basis).tocsc()
-    # The potential is known up to a constant: one of its values is 0.
+    # The potential is determined up to a constant, so one of its values is set to 0.
     flow = np.append(0.0, splu(K[1:, 1:]).solve(pushed[1:]))
     C = carried.assemble(basis, flow=basis.interpolate(flow), mesh=vectors.interpolate(velocity))
     before, after = (mass.assemble(Basis(_mesh(P, F), ElementTriP1(), intorder=2)) for P in (V, there))
@@ -99,7 +99,7 @@ def step(V: FloatArray, there: FloatArray, F: IntArray, u: FloatArray, dt: float
 
 
 def run(scene: Scene, mover: Mover, steps: int) -> History:
-    """Move the mesh and the heat on it for so many steps, or until a triangle is inverted."""
+    """Move the mesh and its heat for the given number of steps, or until a triangle is inverted."""
     V, F, dt = scene.V, scene.F, LAPS * PERIOD / steps
     spot = np.exp(-((V[:, 0] - 0.7) ** 2 + V[:, 1] ** 2) / 0.05)
     u = np.stack([spot, np.ones(len(V))], axis=1)
@@ -120,14 +120,14 @@ def run(scene: Scene, mover: Mover, steps: int) -> History:
 
 
 def _heat(V: FloatArray, F: IntArray, u: FloatArray) -> float:
-    """∫ u."""
+    """Return ∫ u."""
     a, b, c = V[F].transpose(1, 0, 2)
     area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
     return float(area @ u[F].mean(axis=1))
 
 
 def draw(scene: Scene, histories: dict[str, History], steps: int, path: Path) -> None:
-    """Four moments of ours with the mesh, and what was measured over the steps."""
+    """Plot the mesh at four times, as moved by this library, and the measurements over the steps."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 6.4), layout="constrained")

@@ -1,8 +1,8 @@
-"""Scenes of moving boundaries: meshes of some thousand triangles, made here, and where their boundaries go.
+"""Scenes with moving boundaries: generated meshes of a few thousand triangles, and the motion of their boundaries.
 
-A scene moves one loop of its mesh, the body's, as a rigid or a bending body; the walls are held, or let their vertices
-glide along them. ``places(t)`` for t from 0 to 1 says where the body's vertices are, ``extent(t)`` how far that is in
-the scene's own unit.
+A scene moves one loop of its mesh, the body's, as a rigid or a bending body. Vertices of the walls are fixed, or slide
+along them. For t from 0 to 1, ``places(t)`` returns the positions of the body's vertices, and ``extent(t)`` the
+displacement in the scene's unit.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from scipy.spatial import Delaunay, cKDTree
 from quasiharmonic import boundary_loops
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-#: Where vertices go (k, 2) at a time from 0 to 1.
+#: A function of a time from 0 to 1 that returns positions (k, 2).
 Places = Callable[[float], FloatArray]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A mesh in a box, and a body in it that moves.
+    """A mesh in a box with a moving body.
 
     Attributes
     ----------
@@ -32,18 +32,18 @@ class Scene:
     body, walls : (k,) int64
         The loops of the boundary.
     places : callable
-        Of a time from 0 to 1: where the body's vertices are.
+        Positions of the body's vertices at a time from 0 to 1.
     extent : callable
-        Of a time from 0 to 1: the displacement, in ``unit``.
+        The displacement at a time from 0 to 1, in ``unit``.
     unit : str
     steps : int
-        In how many steps the scene is run.
+        Number of steps of the scene.
     end : str
-        Why it ends where it does.
+        Reason for the end of the scene.
     slide : bool
-        Whether vertices of the walls glide along them, corners excepted.
+        Whether vertices of the walls slide along them, except at corners.
     axis, place_on_axis, log : str, callable, bool
-        What a plot has over: its name, its value at a time, and whether its axis is logarithmic and falls.
+        Abscissa of a plot: its name, its value at a time, and whether it is logarithmic and descending.
     """
 
     V: FloatArray
@@ -65,11 +65,11 @@ class Scene:
         object.__setattr__(self, "fixed", np.concatenate([self.body, self.walls]))
 
     def target(self, t: float) -> FloatArray:
-        """Where all of ``fixed`` are, before anything slides; (k, 2)."""
+        """Return the target positions of all ``fixed`` vertices, before sliding; (k, 2)."""
         return np.concatenate([self.places(t), self.V[self.walls]])
 
     def given(self) -> tuple[IntArray, IntArray]:
-        """The vertices whose x is given, and those whose y is."""
+        """Return the vertices with prescribed x, and those with prescribed y."""
         if not self.slide:
             return self.fixed, self.fixed
         low, high = self.V[self.walls].min(axis=0), self.V[self.walls].max(axis=0)
@@ -79,7 +79,7 @@ class Scene:
 
 
 def box(width: float, height: float, step: float) -> ComplexArray:
-    """The boundary of a box around the origin, its vertices about ``step`` apart."""
+    """Return the boundary of a box around the origin, with vertices about ``step`` apart."""
     across, up = (max(2, round(length / step)) for length in (width, height))
     x, y = np.linspace(-width / 2, width / 2, across + 1), np.linspace(-height / 2, height / 2, up + 1)
     sides = [x[:-1] + 1j * y[0], x[-1] + 1j * y[:-1], x[:0:-1] + 1j * y[-1], x[0] + 1j * y[:0:-1]]
@@ -94,10 +94,10 @@ def circle(radius: float, step: float, centre: complex = 0) -> ComplexArray:
 def meshed(
     outer: ComplexArray, inner: ComplexArray, size: Callable[[ComplexArray], FloatArray], seed: int = 0
 ) -> tuple[FloatArray, IntArray, IntArray, IntArray]:
-    """A mesh between two loops, with edges about as long as ``size`` says: vertices, triangles, and the two loops.
+    """Return a mesh between two loops, with edge lengths given by ``size``: vertices, triangles, and the two loops.
 
-    Points that push each other apart along the edges of their Delaunay triangulation (Persson and Strang 2004), those
-    of the boundary at rest.
+    Points repel each other along the edges of their Delaunay triangulation (Persson and Strang 2004); boundary points
+    are fixed.
     """
     boundary = np.concatenate([outer, inner])
     near = cKDTree(_pairs(boundary))
@@ -146,7 +146,7 @@ def _pairs(z: ComplexArray) -> FloatArray:
 
 
 def _between(points: ComplexArray, outlines: list[Outline]) -> IntArray:
-    """Delaunay's triangles whose middles are between two outlines, counterclockwise."""
+    """Return Delaunay triangles with centroids between two outlines, counterclockwise."""
     F = Delaunay(_pairs(points)).simplices.astype(np.int64)
     a, b, c = points[F].T
     area = ((b - a).conj() * (c - a)).imag
@@ -181,7 +181,7 @@ def _even(step: float) -> Callable[[ComplexArray], FloatArray]:
 
 
 def turning_disk(step: float = 0.07) -> Scene:
-    """A disk that turns in a channel."""
+    """A disk that rotates in a channel."""
     return _scene(
         box(4, 2, step),
         circle(0.5, step),
@@ -195,14 +195,14 @@ def turning_disk(step: float = 0.07) -> Scene:
 
 
 def bending_beam(step: float = 0.07) -> Scene:
-    """A beam, held in its middle, that bends into a ring."""
+    """A beam, fixed in its middle, that bends into a ring."""
     length, thick = 2.4, 0.14
     beam = box(length, thick, step)
 
     def bent(z: ComplexArray, t: float) -> ComplexArray:
         turn = np.radians(358) * t
         angle = turn * z.real / length
-        # The middle line is an arc; sinc keeps its beginning, a straight line, as it is.
+        # The middle line is an arc; sinc handles its initial state, a straight line.
         along = z.real * np.sinc(angle / np.pi) + 1j * z.real * angle / 2 * np.sinc(angle / (2 * np.pi)) ** 2
         return along + 1j * z.imag * np.exp(1j * angle)
 
@@ -210,7 +210,7 @@ def bending_beam(step: float = 0.07) -> Scene:
 
 
 def closing_gap(step: float = 0.06) -> Scene:
-    """A disk that comes down to the floor aslant, to 1e-4 of the gap, and rolls as it does."""
+    """A disk that descends obliquely to the floor, to 1e-4 of the initial gap, and rolls."""
     gap, radius, aside = 0.5, 0.4, 0.6
 
     def down(z: ComplexArray, t: float) -> ComplexArray:
@@ -234,7 +234,7 @@ def closing_gap(step: float = 0.06) -> Scene:
 
 
 def travelling_hole(step: float = 0.07, laps: float = 5) -> Scene:
-    """A round hole that goes around in a channel, without turning."""
+    """A round hole that circles in a channel without rotating."""
     radius = 0.3
 
     def around(t: float) -> complex:
@@ -253,7 +253,7 @@ def travelling_hole(step: float = 0.07, laps: float = 5) -> Scene:
 
 
 def flapping_aerofoil(step: float = 0.16) -> Scene:
-    """A NACA 0012 that pitches about its quarter chord and heaves a quarter of a stroke behind, ever more."""
+    """A NACA 0012 that pitches about its quarter chord and heaves a quarter period later, with growing amplitude."""
     s = 0.5 * (1 - np.cos(np.linspace(0, np.pi, 36)))
     half = 0.6 * (0.2969 * np.sqrt(s) - 0.126 * s - 0.3516 * s**2 + 0.2843 * s**3 - 0.1036 * s**4)
     wing = np.concatenate([s[::-1] + 1j * half[::-1], s[1:-1] - 1j * half[1:-1]]) - 0.25
@@ -292,7 +292,7 @@ def flapping_aerofoil(step: float = 0.16) -> Scene:
 
 
 def sliding_walls(step: float = 0.07) -> Scene:
-    """An oval that turns between walls whose vertices glide along them."""
+    """An oval that rotates between walls whose vertices slide along them."""
     oval = circle(1, 1 / 40)
     oval = 0.75 * oval.real + 0.4j * oval.imag
     return _scene(
@@ -309,7 +309,7 @@ def sliding_walls(step: float = 0.07) -> Scene:
 
 
 def _evenly(loop: ComplexArray, step: float) -> ComplexArray:
-    """Points about ``step`` apart along a closed curve that fine steps are given of."""
+    """Return points about ``step`` apart along a closed curve given by fine steps."""
     closed = np.append(loop, loop[0])
     s = np.append(0, np.cumsum(np.abs(np.diff(closed))))
     at = np.linspace(0, s[-1], round(s[-1] / step), endpoint=False)

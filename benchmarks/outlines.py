@@ -1,4 +1,4 @@
-"""Outlines that a boundary is laid along, for `problems`: an outer contour, then holes."""
+"""Outlines for the boundaries of `problems`: an outer contour, then holes."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 Generator = np.random.Generator
 
-# Glyphs of one piece; marks and dots would be components of their own.
+# Connected glyphs only; marks and dots would be separate components.
 _GLYPHS = "ABCDEFGHKLMNOPQRSTUVWXYZabcdefghkmnopqrstuvwxyz023456789&@§$ß"
 
 
 def laid(z: ComplexArray, F: IntArray, contours: list[FloatArray]) -> ComplexArray:
-    """Where the boundary vertices go: the longest loop along the first contour, the others in turn along theirs."""
+    """Return target positions: the longest loop along the first contour, the others along theirs in order."""
     image = np.zeros_like(z)
     loops = sorted(boundary_loops(F, len(z)), key=lambda loop: -span(z[loop]))
     for loop, contour in zip(loops, contours, strict=False):
         try:
             placed = arc_length(points(z[loop]), contour)
         except ValueError:
-            # Too few vertices to keep all corners.
+            # There are too few vertices to keep all corners.
             placed = arc_length(points(z[loop]), contour, corner_angle=181)
         image[loop] = placed[:, 0] + 1j * placed[:, 1]
     return image
 
 
 def moved_holes(rng: Generator, z: ComplexArray, F: IntArray, difficulty: float) -> ComplexArray:
-    """Inner loops turned and moved at random, as rigid bodies that keep clear of each other and the outer loop."""
+    """Rotate and move inner loops at random, as rigid bodies without contact to other loops."""
     image = z.copy()
     outer, *inner = sorted(boundary_loops(F, len(z)), key=lambda loop: -span(z[loop]))
     others = [z[outer]]
@@ -54,7 +54,7 @@ def _inside(point: complex, loop: ComplexArray) -> bool:
 
 
 def polygon(rng: Generator, difficulty: float) -> list[FloatArray]:
-    """A simple polygon: the tour of random points, uncrossed."""
+    """A simple polygon: a tour of random points with crossings removed."""
     z = rng.normal(size=5 + int(25 * difficulty)) + 1j * rng.normal(size=5 + int(25 * difficulty))
     n, crossed = len(z), True
     while crossed:
@@ -71,12 +71,12 @@ def polygon(rng: Generator, difficulty: float) -> list[FloatArray]:
 
 
 def burst(rng: Generator, difficulty: float) -> list[FloatArray]:
-    """A star, ever sharper."""
+    """A star; corners get sharper with difficulty."""
     return [star(int(rng.integers(3, 5 + int(12 * difficulty))), 0.7 * (1 - difficulty) + 0.03)]
 
 
 def whirl(rng: Generator, difficulty: float) -> list[FloatArray]:
-    """A band wound up."""
+    """A band wound into a spiral."""
     angle = np.linspace(0, 2 * np.pi * (0.3 + 3.7 * difficulty), 30 + int(120 * difficulty))
     half = np.pi * rng.uniform(0.3, 0.9)
     radius = angle + rng.uniform(1.1, 2) * np.pi
@@ -107,13 +107,13 @@ def filling(rng: Generator, difficulty: float) -> list[FloatArray]:
     z = hilbert(1 + int(3.99 * difficulty))
     step = np.diff(z)
     into, out = np.append(step[0], step), np.append(step, step[-1])
-    # At a turn the corner of the band is off the curve by both normals, else by one.
+    # At a turn, the band's corner is offset from the curve by both normals, elsewhere by one.
     side = rng.uniform(0.2, 0.45) * 1j * (into + out) / (1 + (into.conj() * out).real)
     return [points(np.concatenate([z - side, (z + side)[::-1]]))]
 
 
 def koch(level: int) -> ComplexArray:
-    """Corners of Koch's snowflake, counter-clockwise, around 0; its shortest sides are 1 long."""
+    """Return the corners of Koch's snowflake around 0, counterclockwise; its shortest sides have length 1."""
     sixth = np.exp(1j * np.pi / 3)
     z = 3.0**level / np.sqrt(3) * np.exp(2j * np.pi * np.arange(3) / 3 - 1j * np.pi / 6)
     for _ in range(level):
@@ -123,7 +123,7 @@ def koch(level: int) -> ComplexArray:
 
 
 def hilbert(order: int) -> ComplexArray:
-    """Corners of Hilbert's curve, (4 ** order,), a step of 1 from each to the next."""
+    """Return the corners of Hilbert's curve (4 ** order,), with unit steps."""
     z = np.zeros(1, dtype=complex)
     for k in range(order):
         side, turned = 2**k, 1j * z.conj()

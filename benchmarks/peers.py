@@ -1,4 +1,4 @@
-"""What `speed` compares with: every function takes a mesh and its fixed vertices, arrays in, and returns a map."""
+"""Methods that `speed` compares with; each takes the arrays of a mesh and its fixed vertices, and returns a map."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def igl_harmonic(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:
-    """The yardstick, libigl's harmonic map: it assembles, analyses, factors and solves once, and inverts triangles."""
+    """Return libigl's harmonic map, the baseline: one assembly, factorisation and solve; triangles may be inverted."""
     import igl
 
     return igl.harmonic(V, F, fixed, target, 1)
 
 
 def scipy_splu(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:
-    """The same map by SciPy's SuperLU, its symmetric mode, from libigl's cotangent Laplacian."""
+    """Return the same map by SciPy's SuperLU in symmetric mode, from libigl's cotangent Laplacian."""
     import igl
     from scipy.sparse.linalg import splu
 
@@ -32,12 +32,12 @@ def scipy_splu(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) 
 
 
 def mouette_untangle(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:
-    """Mouette's foldover-free map with fixed boundary: from libigl's harmonic map until no triangle is inverted."""
+    """Return Mouette's foldover-free map with fixed boundary, from libigl's harmonic map until it has no inversions."""
     from mouette.processing.parametrization.winslow import untangle
 
     start = igl_harmonic(V, F, fixed, target)
     a, b, c = start[F].transpose(1, 0, 2)
-    # As its own front end has it: triangles of unit area on average, all of the same ideal shape.
+    # Use Mouette's own defaults: triangles of unit area on average, all of the same ideal shape.
     scale = np.sqrt(len(F) / (0.5 * np.abs(np.linalg.det(np.stack([b - a, c - a], axis=1))).sum()))
     locked = np.zeros(len(V), dtype=bool)
     locked[fixed] = True
@@ -46,7 +46,7 @@ def mouette_untangle(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatA
 
 
 def igl_composite(V: FloatArray, F: IntArray, fixed: IntArray, target: FloatArray) -> FloatArray:
-    """A composite of harmonic maps by libigl, from one into a disk; for one boundary loop without pins."""
+    """Return libigl's composite of harmonic maps, the first into a disk; for one boundary loop without pins."""
     import igl
 
     loops = boundary_loops(F, len(V))

@@ -1,4 +1,4 @@
-"""Where the time of a call goes: functions of the library clocked from outside, each charged to a phase."""
+"""Time of a call by phase: functions of the library are timed from outside and each is assigned to a phase."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.refine import mapping
 from quasiharmonic.solver.search import coarse, solving, stages
 
-# What is read: seconds of wall time, or of the processor.
+# The available clocks: wall time or CPU time.
 clock = time.perf_counter
 
 NAMES = (
@@ -33,7 +33,7 @@ NAMES = (
     "certificate",
 )
 
-# What is not named here is charged to the named function that calls it.
+# Functions not listed here count toward the listed function that calls them.
 _CLOCKED: tuple[tuple[Any, str, str], ...] = (
     (mapping, "injective_map", "set-up"),
     (mapping, "solve", "set-up"),
@@ -57,9 +57,9 @@ _CLOCKED: tuple[tuple[Any, str, str], ...] = (
 
 
 class Phases:
-    """Seconds by phase, and calls by phase, while it is `clocking`.
+    """Seconds and calls by phase, measured within `clocking`.
 
-    A function's time is its own: what it calls and is clocked too is charged there and not twice.
+    The time of a function excludes that of the timed functions that it calls.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Phases:
 
     @contextmanager
     def clocking(self) -> Iterator[Phases]:
-        """Clock every call of the library's functions within the block."""
+        """Time every call of the listed functions within the block."""
         saved = []
         try:
             for owner, name, phase in self._functions:
@@ -105,7 +105,7 @@ class Phases:
         return clocked
 
     def _turn(self, phase: str | None) -> None:
-        """Charge the time since the last turn to who was running; start a phase, or end the one that runs."""
+        """Add the time since the last change to the running phase; start a phase, or end the running one if None."""
         now = clock()
         if self._running:
             self.seconds[self._running[-1]] += now - self._since

@@ -1,10 +1,11 @@
-"""Pins for surfaces whose boundary is free, feasible by construction: seeded, of several families.
+"""Seeded problems with pins on surfaces with a free boundary, of several families, feasible by construction.
 
     V, F, fixed, target = make("swirl:7", scans)[:4]
 
-A surface is flattened, the flat map is deformed by a known map of the plane as far as it stays bijective, which is
-decided exactly, and 1 to 200 vertices are pinned where they are then. The map is kept as ``hidden``. A family and a
-number name a problem; with scans, a folder of OBJ files, half of the surfaces are patches of these.
+A surface is flattened. A known map of the plane then deforms the flat map as far as it stays bijective, which is
+certified exactly. Between 1 and 200 vertices are pinned at their positions in the result, which is stored as
+``hidden``. A family and a number name a problem. With scans, a folder of OBJ files, half of the surfaces are patches of
+these.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 Generator = np.random.Generator
 
 SMALLEST, LARGEST = 500, 4000
-# Surfaces drawn until one bears a deformation of some strength.
+# Maximum number of surfaces drawn to find one that allows a strong enough deformation.
 _ATTEMPTS = 200
 
 
@@ -39,14 +40,14 @@ class Pinned(NamedTuple):
     Attributes
     ----------
     V, F, fixed, target : arrays
-        A surface with a boundary, and where some of its vertices go.
+        A surface with a boundary, and the target positions of some of its vertices.
     name : str
     surface : str
-        What kind of surface it is.
+        The kind of surface.
     strength : float
-        Of the deformation; what it means depends on the family.
+        Strength of the deformation; its meaning depends on the family.
     hidden : (n, 2) float64
-        A bijective map that has the vertices there.
+        A bijective map with these target positions.
     """
 
     V: FloatArray
@@ -60,12 +61,12 @@ class Pinned(NamedTuple):
 
 
 def make(name: str, scans: Sequence[Path] = ()) -> Pinned:
-    """Make a problem of a name such as ``swirl:7``.
+    """Make a problem from a name such as ``swirl:7``.
 
     Raises
     ------
     ValueError
-        When there is no such family.
+        If the family does not exist.
     """
     family, _, number = name.partition(":")
     if family not in FAMILIES or not number.isdecimal():
@@ -73,16 +74,16 @@ def make(name: str, scans: Sequence[Path] = ()) -> Pinned:
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([zlib.crc32(family.encode()), int(number), attempt])
         kind, V, F = _surface(rng, scans)
-        # Of little distortion, or a disk, and what is in between.
+        # The flat map has low distortion, is a disk, or is a blend of both.
         flat = flatten(V, F, max_iterations=int(rng.choice([0, 3, 100])), tolerance=1e-2).uv @ (1, 1j)
         size = planar.span(flat)
         image, strength = FAMILIES[family](rng, (flat - flat.mean()) / size, F)
-        # What hardly moves is no problem; meshes with slivers bear no more.
+        # Weak deformations make no useful problem; meshes with slivers allow only those.
         if strength > WEAKEST[family]:
             break
     else:
         raise AssertionError(f"no surface bears {name}")
-    # Elsewhere in the plane, turned, and not quite of the surface's size.
+    # Move, rotate and scale the target.
     image = size * (image * np.exp(2j * np.pi * rng.random() + rng.uniform(-0.7, 0.7)) + rng.normal(0, 2, 2) @ (1, 1j))
     hidden = planar.points(image)
     if not certify(F, hidden).bijective:
@@ -92,7 +93,7 @@ def make(name: str, scans: Sequence[Path] = ()) -> Pinned:
 
 
 def _surface(rng: Generator, scans: Sequence[Path]) -> tuple[str, FloatArray, IntArray]:
-    """A surface of the plane's topology: its kind, vertices and triangles."""
+    """Return the kind, vertices and triangles of a surface with the topology of a plane region."""
     size = int(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
     if scans and rng.random() < 0.5:
         path = scans[rng.integers(len(scans))]
@@ -115,7 +116,7 @@ def _scan(path: Path) -> tuple[FloatArray, IntArray]:
 
 
 def patch_of_scan(rng: Generator, path: Path, size: int) -> tuple[FloatArray, IntArray] | None:
-    """About ``size`` triangles around a random vertex, or all if there are no more; None where they fit no plane."""
+    """Return a patch of about ``size`` triangles around a random vertex, or None if it cannot be planar."""
     V, F = _scan(path)
     if len(F) > 1.5 * size:
         distance = _rings(F, len(V), int(rng.integers(len(V))))
@@ -131,7 +132,7 @@ def patch_of_scan(rng: Generator, path: Path, size: int) -> tuple[FloatArray, In
         loops = boundary_loops(F, len(V))
     except ValueError:
         return None
-    # Of genus 0, so that it fits into the plane.
+    # Require genus 0, so that the patch can be mapped into the plane.
     if len(V) - len(found.interior) - len(found.boundary) + len(F) != 2 - len(loops):
         return None
     a, b = V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]
@@ -139,7 +140,7 @@ def patch_of_scan(rng: Generator, path: Path, size: int) -> tuple[FloatArray, In
 
 
 def _rings(F: IntArray, n: int, start: int) -> IntArray:
-    """How many edges each vertex is away from one; those that are in another part are farthest."""
+    """Return the distance of each vertex from one vertex, in edges; other components are farthest."""
     distance = np.full(n, n)
     distance[start] = 0
     for ring in range(1, n):
@@ -152,7 +153,7 @@ def _rings(F: IntArray, n: int, start: int) -> IntArray:
 
 
 def _chosen(rng: Generator, F: IntArray, n: int) -> IntArray:
-    """Vertices to be pinned: anywhere, near each other, or on the boundary."""
+    """Return vertices to pin: anywhere, close together, or on the boundary."""
     count = min(int(np.exp(rng.uniform(0, np.log(200.99)))), n // 3)
     way = rng.choice(["anywhere", "together", "boundary"], p=(0.6, 0.2, 0.2))
     if way == "together":
@@ -163,7 +164,7 @@ def _chosen(rng: Generator, F: IntArray, n: int) -> IntArray:
 
 
 def _bijective(z: Callable[[float], ComplexArray], F: IntArray, strength: float) -> tuple[ComplexArray, float]:
-    """Points moved as strongly as asked for, or as it leaves them bijective."""
+    """Return the points moved with the given strength, or with the greatest strength that stays bijective."""
     for _ in range(40):
         image = z(strength)
         if planar.positive(image, F) and certify(F, planar.points(image)).bijective:
@@ -173,14 +174,14 @@ def _bijective(z: Callable[[float], ComplexArray], F: IntArray, strength: float)
 
 
 def _swirl(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
-    """A disk of the plane turned, the middle most."""
+    """Rotate a disk of the plane, most in its middle."""
     centre, radius = z[rng.integers(len(z))], rng.uniform(0.4, 1.0)
     bump = np.clip(1 - (abs(z - centre) / radius) ** 2, 0, None) ** 2
     return _turned(rng, z, F, centre, bump, rng.uniform(0.5, 6.0))
 
 
 def _overwound(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
-    """Everything turned, more the nearer to the middle, about as far as the triangles bear."""
+    """Rotate all points, more toward the middle, about as far as the triangles allow."""
     centre = z[np.argsort(abs(z))[rng.integers(1 + len(z) // 10)]]
     return _turned(rng, z, F, centre, 1 - abs(z - centre) / abs(z - centre).max(), 40.0)
 
@@ -193,7 +194,7 @@ def _turned(
 
 
 def _bend(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
-    """Straight lines become arcs."""
+    """Bend straight lines into arcs."""
     turn = np.exp(2j * np.pi * rng.random())
     w = z * turn
     return _bijective(
@@ -202,7 +203,7 @@ def _bend(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, f
 
 
 def _pinch(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
-    """Up to three places drawn together or blown up."""
+    """Contract or expand up to three regions."""
     centres = z[rng.integers(len(z), size=rng.integers(1, 4))]
     radii, signs = rng.uniform(0.2, 0.7, len(centres)), rng.choice([-1, 1], len(centres))
 
@@ -217,7 +218,7 @@ def _pinch(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, 
 
 
 def _wave(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
-    """Shears along waves, one way and the other."""
+    """Shear along waves in two directions."""
     ways = np.exp(2j * np.pi * rng.random(rng.integers(2, 5)))
     numbers, phases = rng.uniform(4, 14, len(ways)), rng.uniform(0, 2 * np.pi, len(ways))
 
@@ -231,7 +232,7 @@ def _wave(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, f
 
 
 def _flow(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
-    """Local twists, drags and pinches, one after the other, each by a share of what the triangles bear."""
+    """Apply local twists, drags and pinches in sequence, each by a share of what the triangles allow."""
     strength = rng.uniform(0.2, 0.9)
     for _ in range(rng.integers(2, 7)):
         moved = planar.flow(rng, z, F, 1, strength)
@@ -241,7 +242,7 @@ def _flow(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, f
 
 
 def _mixed(rng: Generator, z: ComplexArray, F: IntArray) -> tuple[ComplexArray, float]:
-    """Two to four of these, one after the other, each about as strong as it leaves the map bijective."""
+    """Apply two to four of these in sequence, each about as strong as bijectivity allows."""
     for name in rng.choice(["swirl", "multiply_wound", "bend", "pinch", "wave", "flow"], rng.integers(2, 5)).tolist():
         z, strength = FAMILIES[name](rng, (z - z.mean()) / planar.span(z), F)
     return z, strength
@@ -256,5 +257,5 @@ FAMILIES: dict[str, Callable[[Generator, ComplexArray, IntArray], tuple[ComplexA
     "flow": _flow,
     "mixed": _mixed,
 }
-# Strengths below which a problem is not worth its name.
+# Minimum strengths of the families' problems.
 WEAKEST = {"swirl": 0.5, "multiply_wound": 4.0, "bend": 0.5, "pinch": 0.4, "wave": 0.3, "flow": 0.1, "mixed": 0.0}

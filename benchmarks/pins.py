@@ -1,14 +1,14 @@
-"""Vertices held and the boundary free: thousands of problems that are feasible by construction, and what is solved.
+"""Solve thousands of problems with pins and a free boundary, feasible by construction; report success and time.
 
     python benchmarks/pins.py -n 2000 -o pins.jsonl [--scans FOLDER] [--families swirl,bend]
     python benchmarks/pins.py --summary pins.jsonl
     python benchmarks/pins.py --case swirl:7 [--scans FOLDER]
 
-`pin_problems` makes them. One line of JSON a problem is written as soon as that is done, and what the file already has
-is skipped: it may be interrupted or killed at any moment and started again. A problem is *solved* when the map is
-bijective by the exact verdict and every pin in its place to the last bit; whatever raises or warns is not. Seconds are
-CPU seconds of one process, from arrays to a map of converged distortion; ``placing`` are those of the clock until the
-map was bijective.
+`pin_problems` makes the problems. Each problem adds one line of JSON when it is done; problems in the file are skipped.
+The program may be interrupted or killed at any time and started again. A problem is *solved* if the map is certified
+bijective and every pin is exactly at its target position. An exception or a warning counts as a failure. Seconds are
+CPU seconds of one process, from arrays to a map of converged distortion; ``placing`` is wall time until the map was
+bijective.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ Record = dict[str, Any]
 
 
 def names(count: int, families: Sequence[str]) -> list[str]:
-    """Names of the first problems: families in turn."""
+    """Return names of the first problems, families in turn."""
     return [f"{families[i % len(families)]}:{i // len(families)}" for i in range(count)]
 
 
 def run(name: str, scans: Sequence[Path]) -> Record:
-    """Make and solve one problem; never raises but for what ends the process."""
+    """Make and solve one problem; catch every exception except those that end the process."""
     record: Record = {"name": name, "family": name.partition(":")[0]}
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
@@ -72,7 +72,7 @@ def run(name: str, scans: Sequence[Path]) -> Record:
 
 
 def summary(records: Sequence[Record]) -> str:
-    """Success and time by family, by number of pins and by kind of surface; the failures with how to repeat them."""
+    """Return success and time by family, number of pins and kind of surface, and the failures with their commands."""
     lines = [f"{'':24}{'solved':>14}{'seconds: mean':>16}{'50 %':>8}{'95 %':>8}{'most':>8}{'placing: mean':>16}"]
     lines += [_row("all", records), ""]
     for title, key in (("family", _family), ("pins", _pins), ("surface", _surface)):
@@ -119,7 +119,7 @@ def _row(title: str, records: Sequence[Record]) -> str:
 
 
 def _story(record: Record) -> str:
-    """What became of a failure, in a few words."""
+    """Describe a failure in a few words."""
     if record["outcome"] != "not solved":
         return f"{record['outcome']}: {record.get('message', '')}"
     where = f"{record['surface']}, {record['triangles']} triangles, {record['pins']} pins"
@@ -127,7 +127,7 @@ def _story(record: Record) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, summarise or repeat; 1 when there is a failure among the problems looked at."""
+    """Run, summarise or repeat; return 1 if any of the problems failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=2000, help="problems (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, default=Path("pins.jsonl"), help="records (%(default)s)")
@@ -157,9 +157,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _campaign(todo: Sequence[str], output: Path, scans: Sequence[Path]) -> list[Record]:
-    """Solve what a file does not have yet, and append it there; all of its records."""
+    """Solve the problems missing from a file, append them there, and return all of its records."""
     done = {record["name"] for record in read(output)}
-    # A line that a kill has cut short stays alone, and is not read.
+    # A line truncated by a kill stays on its own and is not read.
     torn = output.exists() and output.stat().st_size > 0 and output.read_bytes()[-1:] != b"\n"
     try:
         with output.open("a", encoding="utf-8") as file:

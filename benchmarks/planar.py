@@ -20,21 +20,21 @@ Plane = tuple[ComplexArray, IntArray]
 
 
 class Draft(NamedTuple):
-    """A planar mesh and a map of it, as a family makes them.
+    """A planar mesh and a map of it, as made by a family.
 
     Attributes
     ----------
     z : (n,) complex128
-        The mesh at rest.
+        The rest mesh.
     F : (f, 3) int64
     image : (n,) complex128
-        Where its vertices go; only the fixed ones count, if no solution is known.
+        The map; only fixed vertices count if no solution is known.
     pins : (k,) int64
-        Interior vertices to hold.
+        Interior vertices to fix.
     feasible : bool
         Whether the image is a solution.
     unit : float
-        What the rest positions, brought to size 1, are multiplied by.
+        A factor for the rest positions after scaling them to size 1.
     """
 
     z: ComplexArray
@@ -46,29 +46,29 @@ class Draft(NamedTuple):
 
 
 def points(z: ComplexArray) -> FloatArray:
-    """Complex numbers as (n, 2)."""
+    """Return complex numbers as (n, 2)."""
     return np.stack([z.real, z.imag], axis=1)
 
 
 def span(z: ComplexArray) -> float:
-    """The longer side of the box around points."""
+    """Return the longer side of the bounding box of points."""
     return float(max(np.ptp(z.real), np.ptp(z.imag)))
 
 
 def areas(z: ComplexArray, F: IntArray) -> FloatArray:
-    """Signed area of every triangle."""
+    """Return the signed area of every triangle."""
     a, b, c = z[F.T]
     return 0.5 * ((b - a).conj() * (c - a)).imag
 
 
 def positive(z: ComplexArray, F: IntArray, share: float = 1e-9) -> bool:
-    """Whether every triangle has at least a share of the mean area, safely above rounding."""
+    """Whether every triangle has at least this share of the mean area, safely above rounding."""
     signed = areas(z, F)
     return bool(signed.min() > share * abs(signed.mean()))
 
 
 def blank(rng: Generator, size: int, holes: int) -> Plane:
-    """A planar mesh of one of several makes, about ``size`` triangles, ``holes`` + 1 boundary loops."""
+    """Return a random planar mesh with about ``size`` triangles and ``holes`` + 1 boundary loops."""
     make = rng.choice(["grid", "rings", "even", "graded"])
     n = max(12, size // 2)
     if make == "grid":
@@ -87,12 +87,12 @@ def blank(rng: Generator, size: int, holes: int) -> Plane:
 
 
 def _graded(rng: Generator, n: int) -> tuple[FloatArray, IntArray]:
-    """Delaunay triangles of points that crowd around the middle of a disk."""
+    """Return a Delaunay triangulation of points that concentrate around the middle of a disk."""
     k = max(6, int(np.sqrt(n)))
     rim = np.exp(2j * np.pi * np.arange(k) / k)
     inner = (1 - 2 / k) * rng.random(n - k) ** rng.uniform(0.5, 2.5) * np.exp(2j * np.pi * rng.random(n - k))
     V = points(np.concatenate([rim, inner]))
-    # Of points that are next to each other Delaunay's triangles may leave one out.
+    # Delaunay triangulation may omit a point that is very close to another.
     used, corners = np.unique(Delaunay(V).simplices, return_inverse=True)
     V, F = V[used], corners.reshape(-1, 3).astype(np.int64)
     turned = areas(V[:, 0] + 1j * V[:, 1], F) < 0
@@ -101,7 +101,7 @@ def _graded(rng: Generator, n: int) -> tuple[FloatArray, IntArray]:
 
 
 def _pierced(rng: Generator, z: ComplexArray, F: IntArray, holes: int) -> Plane:
-    """Cut holes out of a mesh; where one cannot be cut without touching another loop, there are fewer."""
+    """Cut holes into a mesh; skip holes that would touch another loop."""
     for _ in range(4 * holes):
         loops = len(boundary_loops(F, len(z)))
         if loops > holes:
@@ -112,7 +112,7 @@ def _pierced(rng: Generator, z: ComplexArray, F: IntArray, holes: int) -> Plane:
             continue
         used, renumbered = np.unique(left, return_inverse=True)
         renumbered = renumbered.reshape(-1, 3)
-        # A vertex whose boundary is passed through twice is no surface's.
+        # A vertex that the boundary passes twice is not manifold.
         outgoing = np.bincount(boundary_edges(renumbered, used.size)[:, 0])
         if outgoing.max() > 1 or components(renumbered, used.size).max() > 0:
             continue
@@ -122,7 +122,7 @@ def _pierced(rng: Generator, z: ComplexArray, F: IntArray, holes: int) -> Plane:
 
 
 def without_chords(z: ComplexArray, F: IntArray) -> Plane:
-    """Split interior edges that join two boundary vertices: they alone may rule a map out."""
+    """Split interior edges that join two boundary vertices: such an edge alone can make a map impossible."""
     found = edges(F, len(z))
     rim = np.zeros(len(z), dtype=bool)
     rim[found.boundary] = True
@@ -131,7 +131,7 @@ def without_chords(z: ComplexArray, F: IntArray) -> Plane:
 
 
 def cells(mask: NDArray[np.bool_]) -> Plane:
-    """Unit squares at the true entries of a mask, [row, column] at (column, row): points and (m, 4) corners."""
+    """Return unit squares at the true entries of a mask, [row, column] at (column, row): points and (m, 4) corners."""
     j, i = np.nonzero(mask)
     wide = mask.shape[1] + 1
     low = i + j * wide
@@ -140,13 +140,13 @@ def cells(mask: NDArray[np.bool_]) -> Plane:
 
 
 def split(rng: Generator, quads: IntArray) -> IntArray:
-    """Quadrilaterals as triangles, along a diagonal drawn for each."""
+    """Split quadrilaterals into triangles along random diagonals."""
     turned = np.where((rng.random(len(quads)) < 0.5)[:, None], quads, np.roll(quads, 1, axis=1))
     return turned[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def maze(rng: Generator, rooms: int, width: int, ways: int, winding: float) -> NDArray[np.bool_]:
-    """Corridors through ``rooms`` × ``rooms`` rooms, with so many walls left out; long ones as ``winding`` nears 1."""
+    """Return a maze of ``rooms`` × ``rooms`` rooms with ``ways`` extra openings; ``winding`` makes corridors longer."""
     pitch = width + 1
     mask = np.zeros((rooms * pitch - 1,) * 2, dtype=bool)
     seen = np.zeros((rooms, rooms), dtype=bool)
@@ -166,7 +166,7 @@ def maze(rng: Generator, rooms: int, width: int, ways: int, winding: float) -> N
     open_rooms = [(0, 0)]
     room(0, 0)
     while open_rooms:
-        # Going on from the last room makes long corridors, from any room a bush.
+        # Continuing from the last room makes long corridors; continuing from a random room makes a bush.
         at = len(open_rooms) - 1 if rng.random() < winding else int(rng.integers(len(open_rooms)))
         fresh = [near for near in around(*open_rooms[at]) if not seen[near]]
         if not fresh:
@@ -184,11 +184,11 @@ def maze(rng: Generator, rooms: int, width: int, ways: int, winding: float) -> N
 
 
 def limbed(body: int, limbs: int, rows: int, width: int) -> tuple[ComplexArray, IntArray, list[IntArray]]:
-    """A square of cells with straight limbs ``width`` cells wide: points, quadrilaterals, rows of every limb."""
+    """Return a square of cells with straight limbs ``width`` wide: points, quadrilaterals, rows of every limb."""
     z, quads = cells(np.ones((body, body), dtype=bool))
     index = np.arange(z.size).reshape(body + 1, body + 1)
     left = (body - width) // 2
-    # Seen from outside, limbs stand on their sides from left to right.
+    # Order the sides so that limbs run from left to right when viewed from outside.
     sides = [index[-1], index[::-1, -1], index[0, ::-1], index[:, 0]]
     grown, parts, count = [], [z], z.size
     for side in sides[:limbs]:
@@ -205,7 +205,7 @@ def limbed(body: int, limbs: int, rows: int, width: int) -> tuple[ComplexArray, 
 
 
 def carved(rng: Generator, F: IntArray, n: int, share: float) -> IntArray:
-    """Remove triangles from the rim until a share of the interior vertices has come to lie on it."""
+    """Remove triangles from the boundary until a share of the interior vertices lies on the boundary."""
     across = {(int(t[k]), int(t[k - 2])): (f, int(t[k - 1])) for f, t in enumerate(F.tolist()) for k in range(3)}
     rim = [tuple(e) for e in boundary_edges(F, n).tolist()]
     on_rim = np.zeros(n, dtype=bool)
@@ -225,7 +225,7 @@ def carved(rng: Generator, F: IntArray, n: int, share: float) -> IntArray:
 
 
 class Mover:
-    """Moves vertices, class by class of vertices that share no triangle, and keeps every triangle positive."""
+    """Moves vertices in classes that share no triangle, and keeps every triangle positive."""
 
     def __init__(self, F: IntArray, n: int) -> None:
         near: list[set[int]] = [set() for _ in range(n)]
@@ -243,11 +243,11 @@ class Mover:
             self._groups.append((t, F[t, k], F[t, (k + 1) % 3], F[t, (k + 2) % 3]))
 
     def move(self, z: ComplexArray, step: ComplexArray, floor: FloatArray) -> ComplexArray:
-        """Every vertex goes its step, or half of it and so on, while no triangle shrinks below its own ``floor``."""
+        """Move every vertex by its step, halved while a triangle's area would fall below its own ``floor``."""
         z = z.copy()
         for t, a, b, c in self._groups:
             side = (z[c] - z[b]).conj()
-            # What is below its floor already may stay, but for rounding.
+            # Triangles already below their floor must not shrink further, except for rounding.
             least = np.minimum(floor[t], (1 - 1e-9) * 0.5 * (side * (z[a] - z[b])).imag)
             going, moved = step.copy(), np.unique(a)
             for attempt in range(12):
@@ -262,7 +262,7 @@ class Mover:
 def roughen(
     rng: Generator, z: ComplexArray, F: IntArray, sweeps: int, share: float = 1e-3, held: IntArray | None = None
 ) -> ComplexArray:
-    """Push all vertices but the ``held`` about at random; triangles keep a share of their area."""
+    """Move all vertices except ``held`` at random; triangles keep a share of their area."""
     if sweeps == 0:
         return z
     mover, n = Mover(F, len(z)), len(z)
@@ -282,7 +282,7 @@ def roughen(
 def flow(
     rng: Generator, z: ComplexArray, F: IntArray, times: int, strength: float, held: IntArray | None = None
 ) -> ComplexArray:
-    """Twist, drag or pinch the plane in disks drawn at random, by a share of what the triangles bear."""
+    """Twist, drag or pinch the plane in random disks, by a share of what the triangles allow."""
     for _ in range(times):
         centre, radius = z[rng.integers(len(z))], span(z) * rng.uniform(0.15, 0.6)
         bump = np.clip(1 - (abs(z - centre) / radius) ** 2, 0, None) ** 2
@@ -295,14 +295,14 @@ def flow(
 
 
 def _warped(z: ComplexArray, kind: int, bump: FloatArray, centre: complex, drag: complex, t: float) -> ComplexArray:
-    """Points twisted around a centre one way or the other, dragged along, or drawn to the centre."""
+    """Return points twisted around a centre in either direction, dragged along, or contracted to the centre."""
     if kind == 0:
         return centre + (z - centre) * np.exp(1j * np.sign(drag.real) * t * bump)
     return z + t * drag * bump if kind == 1 else centre + (z - centre) * np.exp(-t * bump)
 
 
 def strongest(moved: Callable[[float], ComplexArray], F: IntArray, most: float, share: float) -> ComplexArray:
-    """Points moved by a share of the greatest strength, ``most`` or less, that keeps triangles positive."""
+    """Return points moved by a share of the greatest strength, up to ``most``, that keeps triangles positive."""
     low, high = 0.0, most
     for _ in range(24):
         middle = 0.5 * (low + high)
@@ -310,7 +310,7 @@ def strongest(moved: Callable[[float], ComplexArray], F: IntArray, most: float, 
             low = middle
         else:
             high = middle
-    # Some movements undo on the way what they do to a triangle at first: less of them may be too much.
+    # Some motions are not monotone: a smaller strength may invert triangles that a larger one keeps positive.
     strength = share * low
     while not positive(moved(strength), F) and strength > 1e-3 * low:
         strength *= 0.8

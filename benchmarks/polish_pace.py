@@ -1,12 +1,12 @@
-"""How soon a polish is within 2 % of where it comes to rest, and what its steps are spent on.
+"""Time until a polish is within 2 % of its converged energy, and the phases of its steps.
 
     OMP_NUM_THREADS=1 python benchmarks/polish_pace.py [FOLDER …] --solvers pardiso rslab
 
-A folder is a problem (``input.obj`` and ``handles.txt``) or holds problems at any depth; without one, the head of a cat
-goes onto the letter R. Each first map is polished by the symmetric Dirichlet energy. At rest is where a tolerance of
-1e-10 ends. The first table has, by solver, the seconds and steps to within 2 % of the energy there, and to where the
-polish ends of itself, of which the phases' shares are; the second where it ends by other tolerances. Seconds are of the
-processor, the least of the turns.
+A folder is a problem (``input.obj`` and ``handles.txt``) or contains problems at any depth; by default, a cat's head is
+mapped to the letter R. Each first map is polished by the symmetric Dirichlet energy. The converged energy is that at a
+tolerance of 1e-10. By solver, the first table has the seconds and steps to within 2 % of it, and to the default end of
+the polish, with the shares of the phases. The second table has the results at other tolerances. Seconds are CPU
+seconds, the minimum over the interleaved repetitions.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from speed import cat, machine
 
 SIZES = 4_000, 16_000, 64_000
 TOLERANCES = 1e-2, 1e-3, 1e-4
-# So near to the energy at rest.
+# Energy relative to the converged energy that counts as near.
 NEAR = 1.02
-# At rest, and steps at most until then.
+# Tolerance that defines convergence, and maximum number of steps until then.
 _REST, _MOST = 1e-10, 2000
 
 _CLOCKED = (
@@ -49,7 +49,7 @@ PHASES = tuple(dict.fromkeys(phase for *_, phase in _CLOCKED))
 
 
 class AdamState(NamedTuple):
-    """One polish: seconds of the processor and energy after each step, seconds of all, and seconds by phase."""
+    """One polish: CPU seconds and energy after each step, total seconds, and seconds by phase."""
 
     seconds: list[float]
     energies: list[float]
@@ -57,7 +57,7 @@ class AdamState(NamedTuple):
     by_phase: dict[str, float]
 
     def near(self, rest: float) -> tuple[float, int] | None:
-        """Seconds and steps to within 2 % of the energy at rest; None where it has not come there."""
+        """Return seconds and steps to within 2 % of the converged energy, or None if the polish did not reach it."""
         for step, (seconds, energy) in enumerate(zip(self.seconds, self.energies, strict=True)):
             if energy <= NEAR * rest:
                 return seconds, step
@@ -65,12 +65,12 @@ class AdamState(NamedTuple):
 
 
 def pace(problem: Problem, uv: FloatArray, solver: str, *, tolerance: float = 1e-4, most: int = 200) -> AdamState:
-    """Polish a first map and write down how it goes."""
+    """Polish a first map and record its steps."""
     seconds: list[float] = []
     energies: list[float] = []
 
     def told(step: Step) -> None:
-        # In between the last step is told again.
+        # The callback may report the last step again.
         if step.iteration == len(seconds):
             seconds.append(phases.clock() - began)
             energies.append(step.energy)
@@ -86,7 +86,7 @@ def pace(problem: Problem, uv: FloatArray, solver: str, *, tolerance: float = 1e
 
 
 def cases(folders: list[Path], sizes: list[int]) -> Iterator[tuple[str, Problem]]:
-    """Every problem below some folders, or those of our own."""
+    """Yield every problem below the folders, or generated ones."""
     for folder in folders:
         for path in sorted(folder.rglob("input.obj")):
             yield path.parent.name, Problem(*io.read_problem(path.parent))
@@ -96,7 +96,7 @@ def cases(folders: list[Path], sizes: list[int]) -> Iterator[tuple[str, Problem]
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print both tables, the first as it grows, and write them."""
+    """Print both tables, the first row by row, and write them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--triangles", nargs="*", type=int, default=list(SIZES), help="sizes of the project's surfaces")

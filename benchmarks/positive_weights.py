@@ -1,9 +1,9 @@
-"""Tutte's embedding with positive weights, one for each edge or two: asymmetric ones (§6.1's wish).
+"""Tutte's embedding with positive weights, one or two per edge; two are asymmetric (future work in §6.1).
 
-Every inner vertex is a mean of its neighbours with positive weights, ``w_i = Σ λ_ij w_j``. Symmetric weights are one
-number an edge; asymmetric ones are two, and every injective map has such: in it a vertex lies inside the polygon of its
-neighbours. What is descended is a smooth inverted area, ``Σ (√(a² + ε²) − a)/2`` over signed areas a, for there is no
-V₃ without an energy; ε falls from the mean area to a thousandth of it.
+Every interior vertex is a mean of its neighbours with positive weights, ``w_i = Σ λ_ij w_j``. Symmetric weights have
+one value per edge, asymmetric ones two. Every injective map has asymmetric weights, since each vertex lies inside the
+polygon of its neighbours. V₃ requires an energy, which asymmetric weights lack. The objective is therefore a smooth
+inverted area, ``Σ (√(a² + ε²) − a)/2`` over signed areas a; ε decreases from the mean area to a thousandth of it.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ SHARPENING = (1.0, 0.1, 0.01, 0.001)
 
 
 class Found(NamedTuple):
-    """Inverted triangles in the end, and linear systems factored."""
+    """Inverted triangles at the end, and the number of factorisations."""
 
     flips: int
     iterations: int
 
 
 class Means:
-    """The maps of a problem in which inner vertices are means of their neighbours.
+    """The maps of a problem in which interior vertices are means of their neighbours.
 
     Parameters
     ----------
     problem : Problem
     symmetric : bool
-        Whether both directions of an edge have one weight.
+        Whether both directions of an edge have the same weight.
     """
 
     def __init__(self, problem: Problem, symmetric: bool) -> None:
@@ -60,14 +60,14 @@ class Means:
         self._boundary[problem.fixed] = problem.frame.inward(problem.target)
 
     def matrix(self, theta: FloatArray) -> tuple[csr_array, FloatArray]:
-        """``λ`` on inner vertices, (i, i), and all weights, from their logarithms up to a factor."""
+        """Return ``λ`` on interior vertices, (i, i), and all weights, from their logarithms up to a factor."""
         weight = np.exp(np.clip(theta, -30, 30))[self.number]
         weight /= np.bincount(self.row, weight)[self.row]
         at, n = self._within, self.inner.size
         return csr_array((weight[at], (self.row[at], self.column[at])), shape=(n, n)), weight
 
     def evaluate(self, theta: FloatArray, sharp: float) -> tuple[ComplexArray, FloatArray]:
-        """The map, and the slope of the smooth inverted area with an ε of so many mean areas."""
+        """Return the map, and the gradient of the smooth inverted area; ε is ``sharp`` times the mean area."""
         matrix, weight = self.matrix(theta)
         solver = splu(csc_array(eye_array(self.inner.size) - matrix))
         w, outer = self._boundary.copy(), ~self._within
@@ -80,7 +80,7 @@ class Means:
         return w, np.bincount(self.number, weight * by_weight, minlength=self.count)
 
     def descend(self, iterations: int = 150, length: float = 0.1) -> Found:
-        """Adam over the logarithms, from equal weights; so many steps for every ε."""
+        """Run Adam over the logarithms from equal weights, ``iterations`` steps for every ε."""
         theta, mean, square = (np.zeros(self.count) for _ in range(3))
         done, fewest = 0, len(self.problem.F)
         for sharp in np.repeat(SHARPENING, iterations):
@@ -96,19 +96,19 @@ class Means:
 
 
 def area_gradient(F: IntArray, w: ComplexArray, sharp: float) -> ComplexArray:
-    """Derivative by positions of ``Σ (√(a² + ε²) − a)/2``, ε being so many mean areas; (n,) complex128."""
+    """Return the derivative of ``Σ (√(a² + ε²) − a)/2`` by positions, ε in mean areas; (n,) complex128."""
     area = signed_areas(F, w)
     width = sharp * float(np.abs(area).mean())
     by_area = 0.5 * (area / np.sqrt(area**2 + width**2) - 1)
     out = np.zeros(w.size, dtype=np.complex128)
     for k in range(3):
-        # The area grows where a corner moves away from the side opposite to it.
+        # The area grows if a corner moves away from the opposite side.
         np.add.at(out, F[:, k], 0.5j * by_area * (w[F[:, (k + 2) % 3]] - w[F[:, (k + 1) % 3]]))
     return out
 
 
 def mean_values(problem: Problem, uv: FloatArray) -> float:
-    """How far the means by an injective map's own mean-value weights miss it, in its frame; for small meshes."""
+    """Return the error with which a map's mean-value weights reproduce it, in its frame; for small meshes only."""
     means = Means(problem, symmetric=False)
     w = problem.frame.inward(uv)
     weight = np.zeros((problem.n, problem.n))
@@ -125,13 +125,13 @@ def mean_values(problem: Problem, uv: FloatArray) -> float:
 
 
 def has_symmetric(problem: Problem, uv: FloatArray) -> bool:
-    """Whether a map has positive symmetric weights: a stress of all edges in equilibrium, by linear program."""
+    """Whether a map has positive symmetric weights: an equilibrium stress of all edges, by linear programming."""
     means = Means(problem, symmetric=True)
     w = problem.frame.inward(uv)
     side = w[means.head] - w[means.tail]
     n = means.inner.size
     rows = np.concatenate([means.row, n + means.row])
-    # Of each vertex's sides the mean length is taken for one, and the least weight is made as large as can be.
+    # Scale by the mean length of each vertex's edges, and maximise the smallest weight.
     scale = (np.bincount(means.row, np.abs(side)) / np.bincount(means.row))[means.row]
     values = np.concatenate([side.real / scale, side.imag / scale])
     equal = csr_array((values, (rows, np.concatenate([means.number] * 2))), shape=(2 * n, means.count + 1))

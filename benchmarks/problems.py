@@ -1,13 +1,13 @@
-"""Problems made to measure: seeded, of many families, as hard as one asks for.
+"""Generated problems: seeded, of many families, with adjustable difficulty.
 
     V, F, fixed, target = make("maze", seed=7, difficulty=0.8)[:4]
 
-A family, a seed and a difficulty from 0 to 1 name a problem; nothing else goes into it. In the *feasible* families a
-solution is made first: an injective map of the mesh, whose boundary (and pins) are then the problem. The solution is
-kept as ``hidden``. The other families lay the boundary along outlines, and nobody knows which of them have a solution.
+A family, a seed and a difficulty from 0 to 1 determine a problem. *Feasible* families are made from a solution: an
+injective map of the mesh, whose boundary (and pins) then define the problem. The solution is stored as ``hidden``. The
+other families map the boundary to outlines; it is unknown which of their problems have a solution.
 
-Whether a map exists depends on how the triangles are joined and on the target, not on the rest mesh's shape. That is
-drawn on its own: plain, stretched until angles are 1e-6, graded over areas of 1:1e12, with single slivers, curved.
+Whether a map exists depends on the connectivity and the target, not on the rest mesh's shape. The shape is drawn
+separately: plain, stretched to angles of 1e-6, graded over areas of 1:1e12, with single slivers, or curved.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Generator = np.random.Generator
 
 
 class Case(NamedTuple):
-    """A problem, and what is known about it.
+    """A problem and its known properties.
 
     Attributes
     ----------
@@ -61,17 +61,17 @@ class Case(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What `parse` understands."""
+        """The name of the problem, as `parse` reads it."""
         return f"{self.family}:{self.seed}:{self.difficulty!r}"
 
 
 def parse(name: str) -> tuple[str, int, float]:
-    """Family, seed and difficulty of a `Case.name`.
+    """Return the family, seed and difficulty of a `Case.name`.
 
     Raises
     ------
     ValueError
-        When it names no problem.
+        If the text is not the name of a problem.
     """
     try:
         family, seed, difficulty = name.split(":")
@@ -94,14 +94,14 @@ def make(family: str, seed: int, difficulty: float, *, triangles: int | None = N
     difficulty : float
         From 0 to 1.
     triangles : int, optional
-        About how many; otherwise mostly 50 to 1000, now and then 5000 and rarely 50 000.
+        Approximate number; by default mostly 50 to 1000, sometimes 5000 and rarely 50 000.
     """
     rng = np.random.default_rng([zlib.crc32(family.encode()), seed, round(difficulty * 1e6)])
     size = _size(rng)
     draft = (FAMILIES | ADVERSARIAL)[family](rng, difficulty, triangles or size)
     fixed = np.concatenate([*boundary_loops(draft.F, len(draft.z)), draft.pins])
     image = planar.points(draft.image)
-    # At the ends of what doubles hold there is no room for slivers besides.
+    # Near the limits of double precision, slivers cannot be represented as well.
     V = draft.unit * dressed(rng, draft.z, draft.F, difficulty if draft.unit == 1 else 0.0)
     simple, hidden = None, None
     if draft.feasible:
@@ -118,7 +118,7 @@ def _size(rng: Generator) -> int:
 
 
 def dressed(rng: Generator, z: ComplexArray, F: IntArray, difficulty: float) -> FloatArray:
-    """Rest positions for a planar mesh: (n, 2) or (n, 3), every triangle with an area."""
+    """Return rest positions for a planar mesh, (n, 2) or (n, 3), with a positive area for every triangle."""
     z = (z - z.mean()) / np.ptp(planar.points(z), axis=0).max()
     style = rng.choice(["plain", "stretched", "graded", "slivers"])
     strength = difficulty
@@ -127,7 +127,7 @@ def dressed(rng: Generator, z: ComplexArray, F: IntArray, difficulty: float) -> 
         if style == "stretched":
             rest = z.real + 1j * z.imag * 10 ** (-6 * strength)
         elif style == "graded":
-            # Conformal, so that angles stay; exp is injective while the imaginary part spans less than 2π.
+            # Conformal, so angles are preserved; exp is injective while the imaginary part spans less than 2π.
             a = 13.8 * strength
             rest = np.exp(a * z.real + 1j * min(a, 5.0) * z.imag)
         else:
@@ -145,7 +145,7 @@ def dressed(rng: Generator, z: ComplexArray, F: IntArray, difficulty: float) -> 
 
 
 def _slivers(rng: Generator, z: ComplexArray, F: IntArray, thin: float) -> ComplexArray:
-    """Push a few vertices onto an opposite edge but for a share ``thin``."""
+    """Move a few vertices close to an opposite edge, up to a share ``thin``."""
     step = np.zeros_like(z)
     chosen = F[rng.random(len(F)) < 0.1]
     a, b, c = chosen.T
@@ -154,13 +154,13 @@ def _slivers(rng: Generator, z: ComplexArray, F: IntArray, thin: float) -> Compl
 
 
 def _noise(rng: Generator, d: float, size: int) -> Draft:
-    """Every vertex pushed about at random, as far as triangles allow."""
+    """Every vertex moved at random, as far as the triangles allow."""
     z, F = blank(rng, size, int(rng.integers(4)))
     return Draft(z, F, roughen(rng, z, F, 1 + int(15 * d), 10 ** (-3 - 6 * d)))
 
 
 def _jam(rng: Generator, d: float, size: int) -> Draft:
-    """All vertices drift along a field that converges and shears, until they jam."""
+    """All vertices moved along a field that converges and shears, as far as the triangles allow."""
     z, F = blank(rng, size, int(rng.integers(3)))
     mover, w = Mover(F, len(z)), z
     wave = rng.normal(0, 2.5, (4, 2))
@@ -173,13 +173,13 @@ def _jam(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _flow(rng: Generator, d: float, size: int) -> Draft:
-    """Smooth local twists, drags and pinches, each nearly as strong as the mesh can bear."""
+    """Smooth local twists, drags and pinches, each nearly as strong as the mesh allows."""
     z, F = blank(rng, size, int(rng.integers(4)))
     return Draft(z, F, flow(rng, z, F, 2 + int(14 * d), 0.5 + 0.49 * d))
 
 
 def _swirl(rng: Generator, d: float, size: int) -> Draft:
-    """An inner loop, or the pinned middle of a disk, turned as far as a rotation by radius can turn it."""
+    """An inner loop, or the pinned middle of a disk, rotated as far as a rotation by radius allows."""
     z, F = blank(rng, size, int(rng.integers(2)))
     loops = boundary_loops(F, len(z))
     inner = min(loops, key=lambda loop: planar.span(z[loop])) if len(loops) > 1 else None
@@ -199,7 +199,7 @@ def _swirl(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _adrift(rng: Generator, d: float, size: int) -> Draft:
-    """Up to three inner loops, turned and carried about as rigid bodies, as far as the mesh around them bears."""
+    """Up to three inner loops, rotated and moved as rigid bodies as far as the mesh around them allows."""
     z, F = blank(rng, max(size, 150), 3)
     loops = boundary_loops(F, len(z))
     outer = max(loops, key=lambda loop: planar.span(z[loop]))
@@ -218,12 +218,12 @@ def _adrift(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _carried(z: ComplexArray, near: FloatArray, centre: complex, turn: float, shift: complex, t: float) -> ComplexArray:
-    """Points turned around a centre and shifted, as far as they are ``near`` it."""
+    """Return points rotated around a centre and shifted, weighted by ``near``."""
     return centre + (z - centre) * np.exp(1j * turn * t * near) + 0.1 * t * near * shift
 
 
 def _pins(rng: Generator, d: float, size: int) -> Draft:
-    """Interior vertices held, from one of them to a third of all; with or without the boundary moved."""
+    """Pinned interior vertices, from one to a third of all; with or without a moved boundary."""
     z, F = blank(rng, size, int(rng.integers(3)))
     boundary = np.concatenate(boundary_loops(F, len(z)))
     inside = np.setdiff1d(np.arange(len(z)), boundary)
@@ -235,11 +235,11 @@ def _pins(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _spiral(rng: Generator, d: float, size: int) -> Draft:
-    """A straight strip wound up."""
+    """A straight strip wound into a spiral."""
     across = int(rng.integers(2, 6))
     along = max(8, size // (2 * across))
     z, quads = planar.cells(np.ones((across, along), dtype=bool))
-    # Fewer than six steps a turn would cut through the next coil.
+    # With fewer than six steps per turn, chords would cross the next coil.
     turns, tight = min(0.4 + 5.6 * d, along / 6), rng.uniform(0.3, 0.8)
     angle = 2 * np.pi * turns * z.real / along
     radius = rng.uniform(1.1, 2) * np.pi + angle + tight * np.pi * (2 * z.imag / across - 1)
@@ -248,7 +248,7 @@ def _spiral(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _comb(rng: Generator, d: float, size: int) -> Draft:
-    """A comb with ever longer teeth."""
+    """A comb with teeth of increasing length."""
     width = int(rng.integers(2, 4))
     teeth = int(rng.integers(2, 7))
     depth = max(2, round((0.2 + 0.8 * d) * size / (2 * width * teeth)))
@@ -258,7 +258,7 @@ def _comb(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _maze(rng: Generator, d: float, size: int) -> Draft:
-    """The corridors of a maze, with up to three ways around."""
+    """The corridors of a maze with up to three loops."""
     width = int(rng.integers(2, 4))
     rooms = max(2, round(np.sqrt(size / (4 * width * width))))
     mask = planar.maze(rng, rooms, width, int(rng.integers(4)), winding=d)
@@ -272,13 +272,13 @@ def _polyomino(rng: Generator, d: float, mask: NDArray[np.bool_]) -> Draft:
 
 
 def _limbs(rng: Generator, d: float, size: int) -> Draft:
-    """A square with limbs whose segments shrink geometrically, some of them curling up."""
+    """A square with limbs whose segments shrink geometrically; some limbs curl."""
     body, width, limbs = (int(k) for k in rng.integers((4, 2, 1), (8, 5, 5)))
     rows = max(3, (size - 2 * body * body) // (2 * width * limbs))
     z, quads, grown = planar.limbed(body, limbs, rows, width)
     image = z.copy()
     for limb in grown:
-        # Many rows take small steps down to the smallest segment, few rows large ones.
+        # With more rows, each step down to the smallest segment is smaller.
         shrink = max(10 ** (-(2 + 8 * d) * rng.uniform(0.5, 1) / rows), 0.3)
         curl = shrink * np.exp(1j * rng.uniform(-1, 1) * min(1 - shrink, 0.3))
         middle, across = z[limb[0]].mean(), z[limb[0]] - z[limb[0]].mean()
@@ -291,7 +291,7 @@ def _limbs(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _carved(rng: Generator, d: float, size: int) -> Draft:
-    """A mesh nibbled at until most of its vertices lie on the boundary."""
+    """A mesh from which triangles are removed until most of its vertices lie on the boundary."""
     z, F = blank(rng, int(size * (1 + d)), int(rng.integers(3)))
     F = planar.carved(rng, F, len(z), 0.3 + 0.65 * d)
     image = flow(rng, z, F, int(4 * d), 0.8 * d)
@@ -299,7 +299,7 @@ def _carved(rng: Generator, d: float, size: int) -> Draft:
 
 
 def _outlined(draw: Callable[[Generator, float], list[FloatArray]]) -> Callable[[Generator, float, int], Draft]:
-    """The family of meshes whose boundary goes along an outline; nobody knows which have a solution."""
+    """Return the family of meshes whose boundary is mapped to an outline; feasibility is unknown."""
 
     def family(rng: Generator, d: float, size: int) -> Draft:
         contours = draw(rng, d)
@@ -310,7 +310,7 @@ def _outlined(draw: Callable[[Generator, float], list[FloatArray]]) -> Callable[
 
 
 def _moved(rng: Generator, d: float, size: int) -> Draft:
-    """Holes turned and moved by any amount that keeps them apart."""
+    """Holes rotated and moved by any amount that keeps them apart."""
     z, F = planar.without_chords(*blank(rng, size, int(rng.integers(1, 4))))
     return Draft(z, F, outlines.moved_holes(rng, z, F, d), feasible=False)
 

@@ -1,12 +1,12 @@
-"""Beside TLC and Foldover-free, from records of theirs: what each solves, how soon, and how distorted.
+"""Compare with records of TLC and Foldover-free: problems solved, time and distortion.
 
     python benchmarks/rivals.py                       # from the records
     python benchmarks/rivals.py --anew speed untangling [-n 20] [-o ANEW.csv]
 
-With ``--anew`` our side is run again on the same problems, in their order, and judged as they were: by strategies, or
-by `Untangling` alone, which descends Foldover-free's regularised energy our own way. Seconds then are of this machine
-and version; they are compared with each other, and with the records' in kind only. ``records/README.md`` says where
-those come from.
+``--anew`` runs this package again on the same problems, in their order, and certifies the maps in the same way. It runs
+strategies, or `Untangling` alone, which descends Foldover-free's regularised energy with this package's own method.
+These seconds belong to the current machine and version. Compare them with each other; compare them with the records
+only qualitatively. ``records/README.md`` has the origin of the records.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from quasiharmonic.solver.search.strategy import STRATEGIES
 from quasiharmonic.util.arrays import FloatArray
 
 RECORDS = Path(__file__).parent / "records"
-#: The programs in the order of the tables; those that ran every problem of the first 68.
+#: The programs in the order of the tables: those that ran every problem of the first 68.
 PROGRAMS = "ours speed", "ours quality", "TLC-PN", "TLC-QN", "SBP", "SBP until first injective"
-#: What can be run anew, and the runs of these that are kept.
+#: The methods that can be run again, and the names of their stored runs.
 WAYS = *STRATEGIES, "untangling"
 ANEW = tuple(f"anew {way}" for way in WAYS)
-#: Less than a tick of the clock they were measured with; in ratios it counts as that.
+#: Less than a tick of the recording clock; ratios use this value for it.
 TICK = 0.004
 
 
@@ -45,13 +45,13 @@ class Run(NamedTuple):
     problem, program : str
     triangles : int
     seconds : float
-        Of CPU, the solver alone.
+        CPU seconds of the solver alone.
     injective, feasible : bool
         By `certify`; whether a solution is known to exist.
     start_flipped : int
         Inverted triangles of Tutte's embedding.
     mips, polished, stretch : float
-        Mean MIPS, the same after polishing, largest max(σ₁, 1/σ₂); NaN where the map is not injective.
+        Mean MIPS, the same after polishing, largest max(σ₁, 1/σ₂); NaN if the map is not injective.
     """
 
     problem: str
@@ -67,7 +67,7 @@ class Run(NamedTuple):
 
 
 def recorded() -> list[Run]:
-    """All runs on generated problems."""
+    """Return all recorded runs on generated problems."""
     with (RECORDS / "rivals.csv").open(encoding="utf-8", newline="") as file:
         return [
             Run(
@@ -86,7 +86,7 @@ def recorded() -> list[Run]:
 
 
 def kept(path: Path = RECORDS / "anew.csv") -> list[Run]:
-    """Runs of ours that were made anew and written with ``-o``."""
+    """Return this package's repeated runs, as written with ``-o``."""
     with path.open(encoding="utf-8", newline="") as file:
         return [
             Run(
@@ -104,24 +104,24 @@ def kept(path: Path = RECORDS / "anew.csv") -> list[Run]:
 
 
 def letters() -> list[dict[str, str]]:
-    """What TLC-PN and Foldover-free took on seven scans onto letters, and came to."""
+    """Return the time and results of TLC-PN and Foldover-free on seven scans mapped to letters."""
     with (RECORDS / "letters.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
 def on_common_problems(runs: Iterable[Run]) -> dict[str, dict[str, Run]]:
-    """Of each problem that all programs ran, the run of each."""
+    """Return, for each problem that all programs ran, the run of each program."""
     by_problem: dict[str, dict[str, Run]] = {}
     for run in runs:
         if run.program in PROGRAMS + ANEW:
             by_problem.setdefault(run.problem, {})[run.program] = run
-    # A run of SBP that never came to an injective map has no moment at which it did.
+    # If SBP never found an injective map, it has no run "until first injective".
     needed = set(PROGRAMS[:-1])
     return {name: row for name, row in by_problem.items() if needed <= row.keys()}
 
 
 def anew(rows: dict[str, dict[str, Run]], way: str) -> Iterator[Run]:
-    """Our side on the problems of some records, now: by a strategy, or untangling alone."""
+    """Run this package again on the problems of some records, by a strategy or by untangling alone."""
     strategy = [Untangling(iterations=2000)] if way == "untangling" else way
     for name in rows:
         made, _, triangles = name.partition(" triangles=")
@@ -140,11 +140,11 @@ def anew(rows: dict[str, dict[str, Run]], way: str) -> Iterator[Run]:
 
 
 def summary(rows: dict[str, dict[str, Run]], programs: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """What each program solved, its ratio of seconds to the first program's, and its distortion where all solved.
+    """Return for each program: problems solved, its time relative to the first program, distortion where all solved.
 
     ``least`` counts the polished maps that are within 1 % of the least distorted one.
 
-    What was run anew is compared with the first of those in place of the records' first: they share a machine.
+    Repeated runs are compared with the first repeated program, since they share a machine.
     """
     first = programs[0]
     first_now = next((name for name in programs if name.startswith("anew ")), first)
@@ -174,13 +174,13 @@ def summary(rows: dict[str, dict[str, Run]], programs: Sequence[str]) -> dict[st
 
 
 def median(values: Sequence[float]) -> float:
-    """To four digits; NaN of nothing."""
+    """Return the median to four digits; NaN if there are no values."""
     known: FloatArray = np.array(values)[np.isfinite(values)]
     return float(f"{np.median(known):.4g}") if known.size else float("nan")
 
 
 def print_table(table: dict[str, dict[str, Any]]) -> None:
-    """In Markdown."""
+    """Print the table in Markdown."""
     first = next(iter(table))
     print(f"| program | feasible | unknown | seconds / {first}: 10, 50, 90 % | quicker | MIPS | polished | least |")
     print("|---|---|---|---|---|---|---|---|")

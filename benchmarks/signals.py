@@ -1,13 +1,13 @@
-"""Signals at random times to the command: nothing is written in part, nothing is lost, and it ends in a sentence.
+"""Send signals at random times to the command; check that outputs are complete, inputs intact, and messages clean.
 
     python benchmarks/signals.py -n 100
     python benchmarks/signals.py --case polish:41 --keep FOLDER
 
-Each command is run once undisturbed, which tells how long it takes; then again and again, in a session of its own, and
-SIGINT or SIGTERM is sent to it at a time drawn from seed and name. A *failure* is a traceback; an exit status of no
-meaning (SIGTERM may end a process as it does by default); a process left behind; inputs that have changed; output that
-cannot be read to its end, or that is gone; a temporary file left behind by SIGINT; and a batch that does not go on to
-its end when the same command is given again. Needs a system with process groups.
+Each command runs once undisturbed, to measure its duration. It then runs repeatedly, each time in its own session, and
+receives SIGINT or SIGTERM at a time drawn from seed and name. A *failure* is any of: a traceback; an undocumented exit
+status (SIGTERM may end a process with its default status); a remaining process; changed inputs; output that is missing
+or truncated; a temporary file remaining after SIGINT; a batch that does not complete when the same command runs again.
+Requires a system with process groups.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from quasiharmonic import boundary_loops, injective_map
 from quasiharmonic.io import MeshData, map_of, read_mesh, write_map
 from quasiharmonic.surfaces import cat, disk
 
-# What is interrupted: arguments, and what they write.
+# Commands to interrupt: arguments, and the files that they write.
 CALLS: dict[str, tuple[str, str]] = {
     "map": ("map mesh.obj --to star:5 --polish symmetric-dirichlet -o out.obj", "out.obj"),
     "refine": ("map coarse.obj --refine -o out.ply", "out.ply"),
@@ -43,13 +43,13 @@ CALLS: dict[str, tuple[str, str]] = {
     "batch": ("batch set -o out --to disk -j 2 --polish symmetric-dirichlet", "out"),
 }
 _SIGNALS = signal.SIGINT, signal.SIGTERM
-# Seconds that a process has to end in once it was told to, and its children after it, which may still be loading.
+# Seconds for a process to end after a signal, and for its children after it, which may still be loading.
 _PATIENCE, _CHILDREN = 60.0, 30.0
 _OLD = b"what was here before"
 
 
 class Trial(NamedTuple):
-    """What became of an interrupted command: ``fault`` says what is wrong, and is empty where nothing is."""
+    """The result of an interrupted command; ``fault`` describes the failure and is empty if there is none."""
 
     name: str
     sent: str
@@ -61,7 +61,7 @@ class Trial(NamedTuple):
 
 
 def prepare(folder: Path) -> None:
-    """Write what the commands read."""
+    """Write the files that the commands read."""
     V, F = disk(14)
     (loop,) = boundary_loops(F, len(V))
     bent = MeshData(np.column_stack([V, 0.4 * (V**2).sum(axis=1)]), F)
@@ -71,7 +71,7 @@ def prepare(folder: Path) -> None:
     write_map(folder / "flat.obj", bent, injective_map(V, F, loop, waves[-1][loop]).uv)
     np.save(folder / "frames.npy", np.stack(waves))
     write_map(folder / "cat.obj", MeshData(*cat(40)), np.zeros((len(cat(40)[0]), 2)))
-    # A star whose corners lie where the mesh is a fan of few triangles: edges have to be split.
+    # A star with corners where the mesh is a fan of few triangles, so that edges must be split.
     coarse, G = disk(3)
     (rim,) = boundary_loops(G, len(coarse))
     star = coarse.copy()
@@ -83,7 +83,7 @@ def prepare(folder: Path) -> None:
 
 
 def undisturbed(kind: str, given: Path) -> float:
-    """Seconds that a command takes."""
+    """Return the seconds that a command takes."""
     with tempfile.TemporaryDirectory() as folder:
         shutil.copytree(given, folder, dirs_exist_ok=True)
         began = time.monotonic()
@@ -95,7 +95,7 @@ def undisturbed(kind: str, given: Path) -> float:
 
 
 def attempt(name: str, given: Path, seconds: float, folder: Path) -> Trial:
-    """Interrupt a command, ``kind:seed``, in a folder of its own."""
+    """Interrupt a command, named ``kind:seed``, in its own folder."""
     kind, seed = name.split(":")
     call, written = CALLS[kind]
     rng = np.random.default_rng([zlib.crc32(kind.encode()), int(seed)])
@@ -123,7 +123,7 @@ def attempt(name: str, given: Path, seconds: float, folder: Path) -> Trial:
 
 
 def _start(call: str, folder: Path) -> subprocess.Popen[str]:
-    """The command, the leader of a group of its own."""
+    """Start the command as the leader of its own process group."""
     return subprocess.Popen(
         [sys.executable, "-m", "quasiharmonic", *call.split()],
         cwd=folder,
@@ -131,7 +131,7 @@ def _start(call: str, folder: Path) -> subprocess.Popen[str]:
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
-        # Which shells have ignored by what they start in the background.
+        # Shells ignore these signals in background processes.
         preexec_fn=_heeding,
     )
 
@@ -141,7 +141,7 @@ def _heeding() -> None:
 
 
 def _fault(number: signal.Signals, process: subprocess.Popen[str], ended: float, said: str) -> str:
-    """What is wrong with how it ended."""
+    """Return the fault in how the process ended, or an empty string."""
     if ended >= _PATIENCE:
         return f"not ended after {_PATIENCE:g} s"
     if "Traceback" in said or "Error" in said:
@@ -169,13 +169,13 @@ def _alive(group: int) -> bool:
 
 
 def _left(given: Path, folder: Path, number: signal.Signals, written: str, status: int) -> str:
-    """What is wrong with what is in the folder."""
+    """Return the fault in the folder's contents, or an empty string."""
     for path in (path for path in given.rglob("*") if path.is_file()):
         here = folder / path.relative_to(given)
         if not here.is_file() or here.read_bytes() != path.read_bytes():
             return f"{here.name} has changed"
     parts = list(folder.rglob("*.tmp"))
-    # A batch ends its workers outright, and clears up when it is given again.
+    # A batch kills its workers, and removes temporary files when it runs again.
     if parts and number is signal.SIGINT and not (folder / "out").is_dir():
         return f"left behind: {parts[0].name}"
     output = folder / written
@@ -189,7 +189,7 @@ def _left(given: Path, folder: Path, number: signal.Signals, written: str, statu
 
 
 def _unreadable(paths: Iterable[Path]) -> str:
-    """The first of some maps that cannot be read, and why."""
+    """Return the first map that cannot be read, and the reason."""
     for path in paths:
         try:
             if map_of(read_mesh(path)) is None:
@@ -200,7 +200,7 @@ def _unreadable(paths: Iterable[Path]) -> str:
 
 
 def _not_resumed(call: str, folder: Path) -> str:
-    """What is wrong when a batch is given again."""
+    """Return the fault when a batch runs again, or an empty string."""
     again = _start(call, folder)
     said, _ = again.communicate()
     if again.returncode:
@@ -213,7 +213,7 @@ def _not_resumed(call: str, folder: Path) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Interrupt commands and list what went wrong; 1 when anything has."""
+    """Interrupt commands and list the failures; return 1 if there is any."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=60, help="signals (%(default)s)")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="begin with this seed (%(default)s)")

@@ -1,11 +1,12 @@
-"""Time and memory by linear solver: maps, polishing and flattening, by MKL, by the base installation, by each backend.
+"""Time and memory of maps, polishing and flattening by linear solver.
 
     OMP_NUM_THREADS=1 python benchmarks/solvers.py FOLDER … --memory -o docs/choose/solvers.md
 
-The project's own surfaces by size, and whatever problems (``input.obj`` and ``handles.txt``) and surfaces (other
-``.obj``) the folders hold. Solvers take turns in one process, each at the whole call, from arrays to verdict. Seconds
-are of the processor, the least of the turns; those of the others are in units of MKL's. "base" is what ``auto`` takes
-where neither MKL nor CHOLMOD is installed. Peak memory is that of a process of its own which maps a million triangles.
+Run on generated surfaces of several sizes, and on the problems (``input.obj`` and ``handles.txt``) and surfaces (other
+``.obj`` files) of the folders. Solvers are interleaved in one process and measured on the whole call, from arrays to
+certificate. Times are CPU seconds, the minimum of the repetitions; those of other solvers are relative to MKL's. "base"
+is the choice of ``auto`` if neither MKL nor CHOLMOD is installed. Peak memory is that of a separate process that maps a
+million triangles.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Task = tuple[str, int, Callable[[str], object]]
 
 @contextmanager
 def base_only() -> Iterator[None]:
-    """Without what the base installation does not bring."""
+    """Hide the solvers that the base installation does not include."""
     every = dict(BACKENDS)
     for name in (MKL, "cholmod"):
         BACKENDS.pop(name, None)
@@ -42,7 +43,7 @@ def base_only() -> Iterator[None]:
 
 
 def seconds(work: Callable[[str], object], solver: str) -> float:
-    """Of the processor, for one call by one solver."""
+    """Return the CPU seconds of one call with one solver."""
     gc.collect()
     began = time.process_time()
     if solver == BASE:
@@ -54,7 +55,7 @@ def seconds(work: Callable[[str], object], solver: str) -> float:
 
 
 def mapped(name: str, arrays: Arrays) -> Iterator[Task]:
-    """A map, and its polishing until it has converged."""
+    """Yield a map, and its polishing until convergence."""
     V, F, fixed, _ = arrays
     yield f"map, {name}", len(F), lambda solver: injective_map(*arrays, linear_solver=solver)
     uv = injective_map(*arrays).uv
@@ -62,7 +63,7 @@ def mapped(name: str, arrays: Arrays) -> Iterator[Task]:
 
 
 def tasks(sizes: list[int], folders: list[Path]) -> Iterator[Task]:
-    """What is to be done, one at a time."""
+    """Yield the tasks, one at a time."""
     for size in sizes:
         arrays = cat(size, "R")
         yield from mapped("cat on R", arrays)
@@ -80,7 +81,7 @@ def tasks(sizes: list[int], folders: list[Path]) -> Iterator[Task]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print a table as it grows, and write it."""
+    """Print the table row by row, and write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", type=Path, help="problem folders, and folders of surfaces")
     parser.add_argument("--triangles", nargs="*", type=int, default=list(SIZES), help="sizes of the project's surfaces")
@@ -99,7 +100,7 @@ def main(arguments: list[str] | None = None) -> None:
     ]
     print("\n".join(lines), flush=True)
     for solver in solvers:
-        seconds(lambda name: injective_map(*cat(500, "R"), linear_solver=name), solver)  # what is loaded once
+        seconds(lambda name: injective_map(*cat(500, "R"), linear_solver=name), solver)  # load libraries once
     for name, triangles, work in tasks(options.triangles, options.folders):
         least: dict[str, float] = {}
         for _ in range(options.runs):

@@ -1,20 +1,20 @@
-"""Time and memory from arrays to the certified map, beside other tools in the same process.
+"""Time and memory from arrays to the certified map, compared with other tools in the same process.
 
     pip install '.[bench]'
-    python benchmarks/speed.py                                  # made problems, 1 000 to 130 000 triangles
+    python benchmarks/speed.py                                  # generated problems, 1 000 to 130 000 triangles
     python benchmarks/speed.py --triangles 500000 1000000 3500000 --peers igl.harmonic --memory
     python benchmarks/speed.py FOLDER … --triangles             # problem folders only
     python benchmarks/speed.py FOLDER … --triangles --halved 2  # with every edge halved, twice
-    python benchmarks/speed.py --animation                      # 100 frames of a moving boundary besides
-    python benchmarks/speed.py --triangles --join a.csv b.csv   # one table and picture of earlier runs
-    python benchmarks/speed.py --fine                           # every iteration on the mesh itself, never a coarse one
-    python benchmarks/speed.py --linear-solver qdldl            # by this backend, not by the best present
-    OMP_NUM_THREADS=1 python benchmarks/speed.py --processor    # seconds of the processor, where others use it too
+    python benchmarks/speed.py --animation                      # also 100 frames of a moving boundary
+    python benchmarks/speed.py --triangles --join a.csv b.csv   # one table and plot of earlier runs
+    python benchmarks/speed.py --fine                           # every iteration on the full mesh
+    python benchmarks/speed.py --linear-solver qdldl            # this backend instead of the best available
+    OMP_NUM_THREADS=1 python benchmarks/speed.py --processor    # CPU seconds, for busy machines
 
-A made problem maps the head of a cat onto the letters C, R and S. A folder is a problem (``input.obj`` +
-``handles.txt``) or holds problems at any depth. Tools take turns, and medians over the turns are taken; a tool that
-exceeds ``--limit`` seconds gets no larger problem. Peak memory is that of a process of its own, over what it holds
-before the call. Written to ``--output``: ``speed.csv``, ``speed.md`` with machine and versions, ``speed.png``.
+A generated problem maps a cat's head to the letters C, R and S. A folder is a problem (``input.obj`` +
+``handles.txt``) or contains problems at any depth. Tools are interleaved, and the table has medians. If a tool exceeds
+``--limit`` seconds, it gets no larger problem. Peak memory is that of a separate process, minus its memory before the
+call. Write to ``--output``: ``speed.csv``, ``speed.md`` with machine and versions, ``speed.png``.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ LETTERS = "CRS"
 SIZES = (1_000, 4_000, 16_000, 64_000, 130_000)
 FRAMES = 100
 _MOVING = f"{FRAMES} frames"
-# What an iteration does besides factoring and solving.
+# Phases of an iteration other than factoring and solving.
 _REST = "assembly", "gradient", "optimiser"
 
 
 @dataclass
 class Record:
-    """What one tool did with one problem."""
+    """The result of one tool on one problem."""
 
     problem: str
     triangles: int
@@ -73,16 +73,16 @@ class Record:
 
     @property
     def median(self) -> float:
-        """Seconds; NaN where the tool failed."""
+        """Median seconds, or NaN if the tool failed."""
         return float(np.median(self.seconds)) if self.seconds else np.nan
 
     def phase(self, name: str) -> float:
-        """Median seconds in a phase."""
+        """Return the median seconds in a phase."""
         return float(np.median([seconds[name] for seconds in self.phases])) if self.phases else np.nan
 
 
 def cat(triangles: int, character: str) -> Arrays:
-    """The head of a cat, of about so many triangles, and a letter to lay its boundary along."""
+    """Return a cat's head with about this many triangles, and a letter as the target of its boundary."""
     halvings = max(0, int(np.ceil(np.log(triangles / 40_000) / np.log(4))))
     V, F = surfaces.cat(max(4, round(np.sqrt(triangles / 6) / 2**halvings)))
     for _ in range(halvings):
@@ -92,7 +92,7 @@ def cat(triangles: int, character: str) -> Arrays:
 
 
 def halved(arrays: Arrays) -> Arrays:
-    """The problem with every edge halved, those of the boundary where they go too."""
+    """Return the problem with every edge halved; new boundary vertices get their edge's target midpoint."""
     V, F, fixed, target = arrays
     places = np.full((len(V), 2), np.nan)
     places[fixed] = target
@@ -106,7 +106,7 @@ def halved(arrays: Arrays) -> Arrays:
 
 
 def problems(sizes: list[int], letters: str, folders: list[Path], times: int = 0) -> Iterator[tuple[str, Arrays]]:
-    """Names and arrays, one at a time, the small ones first; edges of folders' problems halved so many times."""
+    """Yield names and arrays, smallest first; edges of folders' problems are halved this many times."""
     for size in sizes:
         for character in letters:
             yield f"cat on {character}", cat(size, character)
@@ -122,7 +122,7 @@ def problems(sizes: list[int], letters: str, folders: list[Path], times: int = 0
 def measure(
     name: str, arrays: Arrays, tools: list[str], runs: int, strategy: Strategy, linear_solver: str = "auto"
 ) -> list[Record]:
-    """Let the tools take turns at a problem."""
+    """Run the tools on a problem, interleaved."""
     records = [Record(name, len(arrays[1]), tool) for tool in tools]
     for turn in range(runs):
         for record in records:
@@ -147,7 +147,7 @@ def measure(
 
 
 def warm_up(tools: list[str]) -> list[str]:
-    """Load every tool and let it compile what it compiles on first use; the tools that are there."""
+    """Load and compile every tool; return the tools that are available."""
     present = []
     for tool in tools:
         try:
@@ -159,7 +159,7 @@ def warm_up(tools: list[str]) -> list[str]:
 
 
 def peak_megabytes(arrays: Arrays, tool: str, linear_solver: str = "auto") -> float | None:
-    """What a tool's call adds to the peak of a fresh process that holds no more than the arrays."""
+    """Return the increase of peak memory by a tool's call, in a fresh process with only the arrays."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "problem.npz")
         np.savez(path, *arrays)
@@ -169,12 +169,12 @@ def peak_megabytes(arrays: Arrays, tool: str, linear_solver: str = "auto") -> fl
 
 
 def print_peak(tool: str, path: Path, linear_solver: str) -> None:
-    """The child's part of `peak_megabytes`."""
+    """Print the result of `peak_megabytes` in the child process."""
     with np.load(path) as stored:
         arrays = tuple(stored[name] for name in stored.files)
     ours = partial(mapping.injective_map, linear_solver=linear_solver)
     run: Callable[..., object] = ours if tool == OURS else PEERS[tool]
-    # A small problem first, for what is loaded once and for all.
+    # Solve a small problem first, to load libraries.
     run(*cat(100, "C"))
     before = _peak()
     run(*arrays)
@@ -182,10 +182,10 @@ def print_peak(tool: str, path: Path, linear_solver: str) -> None:
 
 
 def _peak() -> float:
-    """Most memory this process has held, in megabytes."""
+    """Return the peak memory of this process in megabytes."""
     status = Path("/proc/self/status")
     if status.exists():
-        # Linux's resource usage counts what the parent held before this process became another program.
+        # On Linux, resource usage includes the memory of the parent before this process replaced its program.
         lines = status.read_text(encoding="utf-8").splitlines()
         return next(float(line.split()[1]) for line in lines if "VmHWM" in line) / 1024
     import resource
@@ -194,7 +194,7 @@ def _peak() -> float:
 
 
 def animation(triangles: int) -> list[Record]:
-    """A strip bent into a ring, frame by frame: every frame afresh, and each from the last one's map."""
+    """Bend a strip into a ring, frame by frame: each frame from scratch, and each from the previous map."""
     V, F = surfaces.disk(round(np.sqrt(triangles / 6)))
     (loop,) = boundary_loops(F, len(V))
     strip = arc_length(V[loop], rectangle(8.0, 1.0))
@@ -225,7 +225,7 @@ def animation(triangles: int) -> list[Record]:
 
 
 def machine() -> str:
-    """Processor, cores, threads asked for, versions."""
+    """Return CPU, cores, requested threads and versions."""
     model = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").exists():
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -241,7 +241,7 @@ def machine() -> str:
 
 
 def table(records: list[Record]) -> str:
-    """Markdown: the tools side by side, with memory where it was measured."""
+    """Return a Markdown table of the tools side by side, with memory if it was measured."""
     tools = list(dict.fromkeys(record.tool for record in records))
     measured = any(record.megabytes is not None for record in records)
     heads = ["problem", "triangles", *(f"{tool} s" for tool in tools), f"ratio to {YARDSTICK}"]
@@ -258,13 +258,13 @@ def table(records: list[Record]) -> str:
 
 
 def phase_table(records: list[Record]) -> str:
-    """Markdown: what share of our time each phase has, in percent, and what an iteration does besides solving."""
+    """Return a Markdown table of phases in percent of this package's time, and the rest of an iteration."""
     heads = ["problem", "triangles", "iterations", *phases.NAMES, "an iteration's rest / factor + solve"]
     rows = []
     for name, triangles in _rows(records):
         ours = next((r for r in records if (r.problem, r.triangles, r.tool) == (name, triangles, OURS)), None)
         if ours is None:
-            continue  # it took too long with a smaller problem
+            continue  # skipped after a smaller problem exceeded the limit
         shares = [f"{100 * ours.phase(phase) / ours.median:.0f}" for phase in phases.NAMES]
         rest, solving = (sum(map(ours.phase, names)) for names in (_REST, ("factor", "solve")))
         rows.append([name, f"{triangles:,}", str(ours.iterations), *shares, f"{rest / solving:.2f}"])
@@ -284,12 +284,12 @@ def _time(record: Record | None) -> str:
         return ""
     if not record.seconds:
         return "fails"
-    # Of the others only some claim to be free of inversions.
+    # Mark maps that are not injective; only some other tools claim to avoid inversions.
     return f"{record.median:.4g}{'' if record.injective else ' ×'}"
 
 
 def write_csv(records: list[Record], path: Path) -> None:
-    """One line for each tool and problem."""
+    """Write one line for each tool and problem."""
     with path.open("w", encoding="utf-8", newline="") as file:
         out = csv.writer(file)
         out.writerow(["problem", "triangles", "tool", "seconds", "injective", "iterations", "megabytes", *phases.NAMES])
@@ -300,7 +300,7 @@ def write_csv(records: list[Record], path: Path) -> None:
 
 
 def read_csv(path: Path) -> list[Record]:
-    """What `write_csv` wrote, medians for seconds."""
+    """Read the output of `write_csv`; seconds are medians."""
     records = []
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -316,7 +316,7 @@ def read_csv(path: Path) -> list[Record]:
 
 
 def draw(records: list[Record], path: Path) -> None:
-    """Seconds over triangles, both logarithmic: every problem a dot, every tool a line through its medians."""
+    """Plot seconds over triangles, both logarithmic: a dot per problem, and a line of medians per tool."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -325,7 +325,7 @@ def draw(records: list[Record], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
     for tool in dict.fromkeys(record.tool for record in records):
         done = [record for record in records if record.tool == tool and record.seconds]
-        # Meshes that differ by a triangle or two are one size.
+        # Meshes that differ by a triangle or two count as the same size.
         sizes = sorted({float(f"{record.triangles:.2g}") for record in done})
         medians = [np.median([r.median for r in done if float(f"{r.triangles:.2g}") == size]) for size in sizes]
         (line,) = axes.loglog(sizes, medians, label=tool, linewidth=2 if tool == OURS else 1.2)
@@ -338,7 +338,7 @@ def draw(records: list[Record], path: Path) -> None:
 
 
 def _count(text: str) -> int:
-    """A whole number of at least one, of an argument."""
+    """Parse an argument as a whole number of at least one."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"{number} is less than 1")
@@ -346,7 +346,7 @@ def _count(text: str) -> int:
 
 
 def _records(path: str) -> list[Record]:
-    """The records of an earlier run, of an argument."""
+    """Parse an argument as the records of an earlier run."""
     try:
         return read_csv(Path(path))
     except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
@@ -354,7 +354,7 @@ def _records(path: str) -> list[Record]:
 
 
 def _folder(path: str) -> Path:
-    """A folder with a problem in it, of an argument."""
+    """Parse an argument as a problem folder."""
     folder = Path(path)
     if next(folder.rglob("input.obj"), None) is None:
         raise argparse.ArgumentTypeError(f"there is no input.obj in {path}, nor in a folder of it")
@@ -362,7 +362,7 @@ def _folder(path: str) -> Path:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure, print a table as it grows, write the files."""
+    """Measure, print the table row by row, and write the files."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", type=_folder, help="problem folders")
     parser.add_argument("--triangles", nargs="*", type=_count, default=list(SIZES), help="sizes of the made problems")

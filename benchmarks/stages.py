@@ -1,9 +1,9 @@
-"""What each stage of a strategy brings, on generated problems that have a solution.
+"""Contribution of each stage of a strategy, on generated problems that have a solution.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/stages.py -n 440 -o docs/choose/stages.md
 
-The first problems of a campaign that are made from a solution, mostly of 50 to 1,000 triangles. For each strategy: on
-how many of them a stage ran, how many it solved, and its share of the time.
+The problems are the first ones of a campaign that are made from a solution, mostly of 50 to 1,000 triangles. For each
+strategy, report how many problems each stage ran on, how many it solved, and its share of the time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from quasiharmonic.solver.search.strategy import STRATEGIES
 
 
 class Outcome(NamedTuple):
-    """What came of a problem: the result, CPU seconds, and MIPS, which is NaN where no map was found."""
+    """The result for a problem: the map, CPU seconds, and MIPS, which is NaN if no map was found."""
 
     result: MapResult
     seconds: float
@@ -33,7 +33,7 @@ class Outcome(NamedTuple):
 
 
 def outcomes(names: Iterable[str], strategy: str) -> list[Outcome]:
-    """Problems solved one after another."""
+    """Solve the problems one by one."""
     found = []
     for name in names:
         case = problems.make(*problems.parse(name))
@@ -46,7 +46,7 @@ def outcomes(names: Iterable[str], strategy: str) -> list[Outcome]:
 
 
 def strategies(runs: dict[str, list[Outcome]]) -> str:
-    """A row for each strategy."""
+    """Return a table with a row for each strategy."""
     shared = np.all([[run.result.injective for run in found] for found in runs.values()], axis=0)
     lines = ["| strategy | solved | CPU s: 50, 95, 100 % | MIPS where all solved |", "|---|---|---|---|"]
     for name, found in runs.items():
@@ -57,17 +57,17 @@ def strategies(runs: dict[str, list[Outcome]]) -> str:
 
 
 def solved(found: Sequence[Outcome]) -> int:
-    """How many."""
+    """Return how many problems were solved."""
     return sum(run.result.injective for run in found)
 
 
 def kind(stage: Stage) -> str:
-    """A stage's method and parameterisation; V₃ and the size of a coarse mesh are left out."""
+    """Return a stage's method and parameterisation, without V₃ and the size of a coarse mesh."""
     return ", ".join(part for part in stage.name.split(", ") if part != "dirichlet" and not part.endswith("triangles"))
 
 
 def stages(strategy: str, found: Sequence[Outcome]) -> str:
-    """A row for each kind of stage, in the order of their first turns."""
+    """Return a table with a row for each kind of stage, in the order of first use."""
     deepest_first = sorted(found, key=lambda run: -len(run.result.stages))
     in_all = sum(stage.seconds for run in found for stage in run.result.stages)
     lines = [f"| stage of `{strategy}` | ran on | solved | share of the time |", "|---|---|---|---|"]
@@ -80,7 +80,7 @@ def stages(strategy: str, found: Sequence[Outcome]) -> str:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", "--count", type=int, default=440, help="problems (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, help="a file for the tables (else to the screen)")

@@ -1,12 +1,11 @@
-"""How quickly the page follows a hand: maps a second, and milliseconds from the mouse to the picture, in a browser.
+"""Response of the studio page in a browser: maps per second, and milliseconds from mouse event to image.
 
     pip install '.[studio]' playwright
     python benchmarks/studio.py --triangles 5000 20000 100000
 
-The mouse goes around in a circle with a corner of the square in its hand. A picture counts when all of it is drawn, by
-the processor where there is no graphics card, which takes its share of the cores. The last two columns are CPU time,
-which says something on a busy machine too: of a map that follows with its exact verdict, and with all that a page is
-told of it.
+The mouse drags a corner of the square in a circle. An image counts when it is drawn completely. Without a graphics card
+the CPU draws it, which uses part of the cores. The last two columns are CPU times, which are meaningful on a busy
+machine too: of one updated map with its exact certificate, and of the same with all messages to the page.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def main():
 
 
 def in_browser(rings, options):
-    """Maps and pictures a second, and the median and the 95th percentile of the latency in milliseconds."""
+    """Return maps and images per second, and the median and the 95th percentile of the latency in milliseconds."""
     from playwright.sync_api import sync_playwright
 
     width, height = map(int, options.window.split("x"))
@@ -68,7 +67,7 @@ def in_browser(rings, options):
 
 
 def dragged(page, seconds):
-    """Drag a corner around for so long, after a little while that does not count; what the page has counted."""
+    """Drag a corner in circles for ``seconds`` after a warm-up; return the page's counts."""
     vertex = page.evaluate("studio.view.scene.corners[2]")
     x, y = page.evaluate("v => studio.view.hands.plane.pointOf(...studio.view.scene.placeOf(v))", vertex)
     box = page.locator("#view").bounding_box()
@@ -88,7 +87,7 @@ def dragged(page, seconds):
 
 
 def write(path, rings):
-    """A cat's head as an OBJ without a map."""
+    """Write a cat's head as an OBJ file without a map."""
     from quasiharmonic.surfaces import cat
 
     V, F = cat(rings)
@@ -97,7 +96,7 @@ def write(path, rings):
 
 
 def session_of(rings):
-    """A session with a cat's head, whose messages go nowhere."""
+    """Return a session with a cat's head that discards its messages."""
     from quasiharmonic.io import MeshData
     from quasiharmonic.surfaces import cat
     from quasiharmonic.ui.studio.protocol import encode
@@ -110,7 +109,7 @@ def session_of(rings):
 
 
 def following(rings):
-    """CPU seconds of one map that follows, verdict included."""
+    """Return the CPU seconds of one updated map, certificate included."""
     from quasiharmonic.ui.studio.falloff import grip
     from quasiharmonic.ui.studio.following import Follower
 
@@ -122,7 +121,7 @@ def following(rings):
 
 
 def told(rings):
-    """CPU seconds of one movement, with the numbers about the map and the frame that tells it."""
+    """Return the CPU seconds of one movement, with the map's figures and the frame sent to the page."""
     from quasiharmonic.ui.studio.protocol import Frame
 
     session = session_of(rings)
@@ -133,7 +132,7 @@ def told(rings):
 
 
 def timed(move, count=60):
-    """Mean CPU seconds of one movement of many around a circle."""
+    """Return the mean CPU seconds of one of ``count`` movements around a circle."""
     began = time.process_time()
     for k in range(count):
         move(0.05 * np.array([np.cos(k / 15) - 1, np.sin(k / 15)]))

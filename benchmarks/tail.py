@@ -1,4 +1,4 @@
-"""The tail of the time: hundreds of scanned surfaces onto outlines, and how long the slowest take.
+"""Slowest cases: hundreds of scanned surfaces mapped to outlines, and the time of the slowest ones.
 
     python benchmarks/tail.py --scans FOLDER [-n 700] [-o tail.jsonl]
     python benchmarks/tail.py --summary tail.jsonl [OTHER.jsonl …]
@@ -6,13 +6,13 @@
     python benchmarks/tail.py --family spirals [-n 20] [-o spirals.jsonl] [--case 17]
     python benchmarks/tail.py --family pins [-n 20] [-o pins.jsonl] [--case 17]
 
-A number and the folder's files name a pair: a disk of 1,000 to 20,000 triangles around a random place of a scan, its
-boundary laid along a letter, a polygon, a star, a comb or a whirl. Edges across its rim are split, as they may forbid a
-map by themselves. Two families of larger problems need no scans: *spirals*, round meshes of 30,000 triangles onto thin
-bands that are wound up, and *pins*, grids of 17,000 triangles whose boundary stays and 84 of whose inner vertices go
-where a warp takes them. Pairs that the diagnosis proves to have none do not count. Seconds are CPU seconds of one
-process, from arrays to a certified map; for those that can be compared let BLAS have one thread (``OMP_NUM_THREADS=1
-MKL_NUM_THREADS=1``). A campaign may be interrupted and goes on.
+A number and the folder's files determine a pair: a disk of 1,000 to 20,000 triangles around a random point of a scan,
+and its boundary on a letter, a polygon, a star, a comb or a whirl. Interior edges between boundary vertices are split,
+since they alone can make a map impossible. Two families of larger problems need no scans. *spirals* maps round meshes
+of 30,000 triangles to thin wound bands. *pins* has grids of 17,000 triangles with fixed boundary and 84 pinned interior
+vertices, which a warp moves. Pairs that the diagnosis proves infeasible do not count. Seconds are CPU seconds of one
+process, from arrays to a certified map. For comparable times use one BLAS thread (``OMP_NUM_THREADS=1
+MKL_NUM_THREADS=1``). A campaign may be interrupted and resumed.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ PERCENTILES = 50, 90, 95, 99, 100
 
 
 class Pair(NamedTuple):
-    """A surface and where its boundary goes.
+    """A surface and the target positions of its boundary.
 
     Attributes
     ----------
     V, F, fixed, target : arrays
         As `injective_map` takes them.
     surface, outline : str
-        Whose they are.
+        Their names.
     """
 
     V: FloatArray
@@ -73,7 +73,7 @@ class Pair(NamedTuple):
 
 
 def make(number: int, scans: Sequence[Path]) -> Pair:
-    """Make a pair; anew where a scan has no disk around the place drawn, or vertices too few for the outline."""
+    """Make a pair; draw again if the scan has no disk at the drawn point, or too few vertices for the outline."""
     rng = np.random.default_rng([7, number])
     while True:
         path = scans[rng.integers(len(scans))]
@@ -90,12 +90,12 @@ def make(number: int, scans: Sequence[Path]) -> Pair:
         except ValueError:
             continue
         if judge_loops([np.arange(len(loop))], target)[1]:
-            continue  # too few vertices to stay clear of itself
+            continue  # too few vertices: the target would cross itself
         return Pair(V, F, loop, target, path.parent.name if path.stem == "input" else path.stem, word)
 
 
 def spirals(number: int) -> Pair:
-    """A round mesh, and a thin band wound up one to four times."""
+    """A round mesh mapped to a thin band that is wound one to four times."""
     rng = np.random.default_rng([11, number])
     V, F = disk(71)
     (loop,) = boundary_loops(F, len(V))
@@ -107,7 +107,7 @@ def spirals(number: int) -> Pair:
 
 
 def pins(number: int) -> Pair:
-    """A grid, its boundary where it was, and pins where a warp takes them that leaves every triangle positive."""
+    """A grid with fixed boundary, and pins moved by a warp that keeps every triangle positive."""
     rng = np.random.default_rng([13, number])
     V, F = grid(93, 93)
     z = np.ascontiguousarray(V[:, :2]).view(np.complex128).ravel()
@@ -147,7 +147,7 @@ def run(number: int, pose: Callable[[int], Pair]) -> Record:
 
 
 def summary(records: Sequence[Record]) -> str:
-    """What was solved, percentiles of seconds, and the slowest."""
+    """Return the problems solved, percentiles of seconds, and the slowest problems."""
     counted = [r for r in records if not r["impossible"]]
     solved = [r for r in counted if r["injective"]]
     if not solved:

@@ -1,13 +1,13 @@
-"""Linear solvers and threads: how often a process crashes, by trial and by solver.
+"""Linear solvers and threads: number of crashed processes, by trial and by solver.
 
     python benchmarks/threads.py
     python benchmarks/threads.py -n 5 --trials end overlap --solvers rslab
     python benchmarks/threads.py --trials blender --blender .ci/venv-blender/bin/python
 
-A library that keeps memory for every thread may crash when the thread that loaded it has ended, or when a later one has
-taken its place. So every trial is run many times, each in a process of its own. A process *fails* if its status is not
-zero, or if it does not end. Where a solver cannot be loaded, SuperLU stands in for it. The trial in Blender takes the
-solver that the extension takes.
+A library with thread-local memory may crash after the thread that loaded it has ended, or when a later thread has
+replaced it. Therefore every trial runs many times, each in its own process. A process *fails* if its status is not zero
+or if it does not end. If a solver cannot be loaded, SuperLU replaces it. The trial in Blender uses the extension's
+solver.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from quasiharmonic.linsolve import available
 from quasiharmonic.surfaces import cat
 from quasiharmonic.ui.studio.protocol import decode, encode
 
-# Seconds until a process that has not ended counts as one that never will.
+# Seconds after which a process counts as never ending.
 _PATIENCE = 120
 _BUILD = Path(__file__).resolve().parents[1] / "blender" / "build.py"
-# The first lines of every process: no other solver than this one, and SuperLU.
+# The first lines of every process: allow this solver and SuperLU only.
 _SOLVER = """
 from quasiharmonic.linsolve import BACKENDS
 for name in BACKENDS.keys() - {"%s", "superlu"}:
@@ -59,11 +59,11 @@ def in_pools():
             list(pool.map(work, [1, 1]))
 """
 TRIALS = {
-    # Threads one after another, each ended before the next.
+    # Threads in sequence, each ended before the next.
     "end": "for _ in range(4): in_threads(1)",
-    # Threads at the same time, and others after them.
+    # Simultaneous threads, and more threads after them.
     "overlap": "for count in (3, 2, 1, 2): in_threads(count)",
-    # The first thread is at work while others come and go.
+    # The first thread works while others start and end.
     "outlive": """
 first = threading.Thread(target=work, args=(4,))
 first.start()
@@ -73,7 +73,7 @@ first.join()
 in_threads(1)
 work()
 """,
-    # Pools of threads, in a process that a thread starts.
+    # Thread pools in a process that a thread starts.
     "pool": """
 code = sys.argv[1] + "in_pools()"
 in_threads(1, lambda: subprocess.run([sys.executable, "-c", code], check=True))
@@ -90,7 +90,7 @@ if hasattr(os, "fork"):
     assert os.waitpid(child, 0)[1] == 0
 in_threads(1)
 """,
-    # The solver's package was imported before, by a thread that has ended.
+    # A thread that has ended has already imported the solver's package.
     "imported": """
 if find_spec(sys.argv[2]):
     in_threads(1, lambda: import_module(sys.argv[2]))
@@ -112,7 +112,7 @@ for _ in range(2):
 
 
 def main() -> int:
-    """Run all, one line each; 1 if any process failed."""
+    """Run all trials, one line each; return 1 if any process failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-n", type=int, default=20, metavar="N", help="processes for each trial (default: 20)")
     parser.add_argument("--trials", nargs="+", choices=[*TRIALS, "worker", "blender"], help="(default: all)")
@@ -130,7 +130,7 @@ def main() -> int:
 
 
 def in_python(folder: Path) -> dict[str, Callable[[str], int]]:
-    """The trials that need no Blender: functions of a solver that run one process and return its status."""
+    """Return the trials without Blender: functions of a solver that run one process and return its status."""
     surface = folder / "cat.obj"
     V, F = cat(40)
     write_obj(surface, MeshData(V, F))
@@ -139,13 +139,13 @@ def in_python(folder: Path) -> dict[str, Callable[[str], int]]:
 
 
 def in_process(code: str, solver: str) -> int:
-    """Run a trial in a process."""
+    """Run a trial in a process; return its status."""
     first = _SOLVER % solver + _WORK
     return status_of([sys.executable, "-W", "ignore", "-c", first + code, first, solver])
 
 
 def in_worker(surface: Path, solver: str) -> int:
-    """Have the process behind a page flatten and polish a surface."""
+    """Flatten and polish a surface in the process behind a page."""
     command = [sys.executable, "-c", _SOLVER % solver + _SERVE, str(surface)]
     asked = [{"do": "flatten"}, {"do": "polish", "energy": "symmetric-dirichlet"}, {"do": "flatten"}]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -156,7 +156,7 @@ def in_worker(surface: Path, solver: str) -> int:
                 message = encode(request)
                 process.stdin.write(len(message).to_bytes(8, "little") + message)
                 process.stdin.flush()
-            # The last thing that is said of a map.
+            # The last message about a map.
             kind = ""
             while kind != "obstructions" and len(head := process.stdout.read(8)) == 8:
                 kind = decode(process.stdout.read(int.from_bytes(head, "little"))).header["kind"]
@@ -167,7 +167,7 @@ def in_worker(surface: Path, solver: str) -> int:
 
 
 def in_blender(python: str, folder: Path) -> Callable[[], int]:
-    """Build the extension; a function that flattens Suzanne twice in Blender, subdivided twice."""
+    """Build the extension; return a function that flattens Suzanne, subdivided twice, two times in Blender."""
     subprocess.run([python, str(_BUILD), "-o", str(folder)], check=True)
     (archive,) = folder.glob("*.zip")
 
@@ -179,7 +179,7 @@ def in_blender(python: str, folder: Path) -> Callable[[], int]:
 
 
 def status_of(command: list[str]) -> int:
-    """What a process ends with; 124 if it does not end."""
+    """Return the exit status of a command, or 124 if it does not end."""
     try:
         return subprocess.run(command, stdout=subprocess.DEVNULL, timeout=_PATIENCE).returncode
     except subprocess.TimeoutExpired:
@@ -187,7 +187,7 @@ def status_of(command: list[str]) -> int:
 
 
 def report(trial: str, solver: str, n: int, run: Callable[[], int]) -> bool:
-    """Run a trial n times and print what became of it; whether any process failed."""
+    """Run a trial n times and print the results; return whether any process failed."""
     found = Counter(run() for _ in range(n))
     failed = n - found.pop(0, 0)
     kinds = ", ".join(f"{count} with status {status}" for status, count in sorted(found.items()))

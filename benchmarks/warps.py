@@ -1,11 +1,10 @@
-"""Landmark warps, by resolution of the mesh: worst stretch with landmarks as cusps and with a second-order term.
+"""Worst stretch of landmark warps by mesh resolution, with landmarks as cusps and with a second-order term.
 
     python benchmarks/warps.py [-o FOLDER] [--resolutions 16 32 64 128 256]
 
-Three scenes on a picture of 257 × 257 pixels: one landmark that goes 48 pixels, six that go about a circle, a curve
-that bends. *Stretch* is the larger of σ₁ and 1/σ₂, the worst of all triangles. `cusps` is ``smoothness=0``, a
-deformation energy of first derivatives alone, as all landmark warps here were made once; `smooth` is the default.
-Writes a table and a plot.
+Three scenes on an image of 257 × 257 pixels: one landmark that moves by 48 pixels, six that move along a circle, a
+curve that bends. *Stretch* is the larger of σ₁ and 1/σ₂, the maximum over all triangles. `cusps` is ``smoothness=0``, a
+deformation energy of first derivatives alone; `smooth` is the default. Write a table and a plot.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ KINDS = {"cusps": 0.0, "smooth": None}
 
 
 def scenes() -> dict[str, dict[str, Any]]:
-    """What `warp_by_landmarks` is given, by name."""
+    """Return the arguments of `warp_by_landmarks`, by name."""
     middle = (SIDE - 1) / 2
     around = 0.2 * SIDE * np.exp(2j * np.pi * np.arange(6) / 6)
     turned = around * np.exp(0.5j)
@@ -43,13 +42,13 @@ def scenes() -> dict[str, dict[str, Any]]:
 
 
 def worst(points: FloatArray, F: Any, moved: FloatArray) -> float:
-    """The worst stretch of a map."""
+    """Return the worst stretch of a map."""
     measured = distortion(points, F, moved)
     return float(np.maximum(measured.sigma1, 1 / measured.sigma2).max())
 
 
 def measured(resolutions: list[int]) -> list[dict[str, Any]]:
-    """A row for each scene, kind and resolution."""
+    """Return a row for each scene, kind and resolution."""
     rows = []
     picture = np.zeros((SIDE, SIDE), dtype=np.uint8)
     for scene, given in scenes().items():
@@ -72,7 +71,7 @@ def measured(resolutions: list[int]) -> list[dict[str, Any]]:
 
 
 def plotted(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw stretch over resolution, a panel for each scene."""
+    """Plot stretch over resolution, a panel for each scene."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -98,7 +97,7 @@ def plotted(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The rows in Markdown."""
+    """Return the rows in Markdown."""
     resolutions = sorted({row["resolution"] for row in rows})
     lines = [f"| scene | landmarks | {' | '.join(map(str, resolutions))} |", "|" + "---|" * (2 + len(resolutions))]
     for scene, kind in dict.fromkeys((row["scene"], row["kind"]) for row in rows):

@@ -1,7 +1,7 @@
-"""Build the zip that Blender installs: ``python blender/build.py [--platform NAME] [-o FOLDER]``.
+"""Build the zip file that Blender installs: ``python blender/build.py [--platform NAME] [-o FOLDER]``.
 
-It holds the extension, a wheel of this package, SciPy, and the two solvers of the base install. NumPy is Blender's own.
-The package's loops are compiled where the zip is for the platform that it is built on, and in NumPy for others.
+The zip contains the extension and wheels of this package, of SciPy, and of the two solvers of the base installation.
+NumPy comes with Blender. The loops are compiled if the zip is for the platform of the build; otherwise they use NumPy.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from platform import machine
 
 HERE = Path(__file__).resolve().parent
 EXTENSION = HERE / "extension"
-# Blender's names of platforms, and the tags of wheels that run there.
+# Blender's platform names, and the wheel tags that run there.
 PLATFORMS = {
     "linux-x64": ["manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64"],
     "windows-x64": ["win_amd64"],
     "macos-arm64": ["macosx_14_0_arm64", "macosx_12_0_arm64", "macosx_11_0_arm64"],
 }
-# Blender 4.5 and 5.0 have Python 3.11 and NumPy 1.26 to 2.
+# Blender 4.5 and 5.0 come with Python 3.11 and NumPy 1.26 to 2.
 PYTHON = "3.11"
 NEEDED = ["scipy>=1.14,<1.17", "qdldl>=0.1.7", "rslab>=1.7"]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Download, write, say where."""
+    """Download the wheels, write the zip and print its path."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--platform", choices=PLATFORMS, default=_here(), required=_here() is None, help="(default: this one)"
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def version() -> str:
-    """That of the package."""
+    """Return the version of the package."""
     text = (HERE.parent / "src" / "quasiharmonic" / "__init__.py").read_text(encoding="utf-8")
     found = re.search(r'__version__ = "([0-9.]+)', text)
     assert found is not None
@@ -55,7 +55,7 @@ def version() -> str:
 
 
 def collect(folder: Path, platform: str) -> list[Path]:
-    """All wheels for a platform, in a folder."""
+    """Download all wheels for a platform into a folder and return their paths."""
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
     tags = [option for tag in PLATFORMS[platform] for option in ("--platform", tag)]
     chosen = ["--only-binary=:all:", "--no-deps", "--python-version", PYTHON, *tags]
@@ -69,7 +69,7 @@ def collect(folder: Path, platform: str) -> list[Path]:
 
 
 def write(target: Path, wheels: list[Path], platform: str) -> None:
-    """The zip: manifest, modules, licence, wheels."""
+    """Write the zip: manifest, modules, licence, wheels."""
     listed = "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels)
     manifest = (EXTENSION / "blender_manifest.toml").read_text(encoding="utf-8")
     manifest += f'version = "{version()}"\nplatforms = ["{platform}"]\nwheels = [\n{listed}]\n'
@@ -83,7 +83,7 @@ def write(target: Path, wheels: list[Path], platform: str) -> None:
 
 
 def _here() -> str | None:
-    """The platform that this runs on, if it is one of Blender's."""
+    """Return Blender's name of the current platform, or None if Blender does not support it."""
     system = {"win32": "windows", "darwin": "macos"}.get(sys.platform, sys.platform)
     processor = {"amd64": "x64", "x86_64": "x64"}.get(machine().lower(), machine().lower())
     name = f"{system}-{processor}"

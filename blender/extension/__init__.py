@@ -1,4 +1,4 @@
-"""UVs without flips, in Blender: checked exactly, repaired, flattened, smoothed, fitted to an outline."""
+"""Blender extension for UV maps without inverted faces: check, repair, flatten, reduce stretch, fit to an outline."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ _CLASSES = (*operators.CLASSES, *panel.CLASSES)
 
 
 def register() -> None:
-    """Called by Blender when the extension is enabled."""
+    """Register the classes; Blender calls this when the extension is enabled."""
     for one in _CLASSES:
         bpy.utils.register_class(one)
 
 
 def unregister() -> None:
-    """Called by Blender when the extension is disabled."""
+    """Unregister the classes; Blender calls this when the extension is disabled."""
     for one in reversed(_CLASSES):
         bpy.utils.unregister_class(one)

@@ -1,4 +1,4 @@
-"""Work that leaves Blender alive: in a thread, its progress shown, ended by Esc with nothing changed."""
+"""Operators that work in a thread: Blender stays responsive, shows progress, and Esc cancels without changes."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from quasiharmonic import Step
 
 from .surface import Refused
 
-# Seconds between two looks at a thread.
+# Seconds between two checks of a thread.
 _LOOK = 0.05
 
 Work = Callable[[Callable[[Step], None]], Any]
 
 
 class Job:
-    """A function in a thread of its own.
+    """A function that runs in its own thread.
 
     Parameters
     ----------
     work : callable
-        Called with a callback that is to be called with every step.
+        Receives a callback, which it must call at every step.
     """
 
     def __init__(self, work: Work) -> None:
@@ -37,25 +37,25 @@ class Job:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask it to end at its next step."""
+        """Request the work to stop at its next step."""
         self._stopped.set()
 
     @property
     def stopped(self) -> bool:
-        """Whether it was asked to end."""
+        """Whether a stop was requested."""
         return self._stopped.is_set()
 
     @property
     def running(self) -> bool:
-        """Whether it is still at work."""
+        """Whether the thread is still running."""
         return self._thread.is_alive()
 
     def wait(self) -> None:
-        """Until it ends."""
+        """Wait until the thread ends."""
         self._thread.join()
 
     def _run(self) -> None:
@@ -72,36 +72,36 @@ class Job:
 
 
 class Working(bpy.types.Operator):
-    """An operator whose work is a `Job`; `prepare` says what it is, `finish` takes over what came out."""
+    """An operator whose work is a `Job`: `prepare` returns the work, `finish` receives its result."""
 
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 (as Blender has it)
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 (Blender's convention)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Whether there is a mesh to work on."""
+        """Whether the active object is a mesh."""
         thing = context.active_object
         return thing is not None and thing.type == "MESH"
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        """What to do in the thread, where Blender's data is not touched."""
+        """Return the work for the thread. The work must not access Blender's data."""
         raise NotImplementedError
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
-        """Take over what came out."""
+        """Write the result of the work."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Do it at once, as scripts ask for it."""
+        """Run the work immediately, as scripts expect."""
         return self._guarded(context, self._at_once)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Do it in a thread, as buttons ask for it."""
+        """Run the work in a thread, as buttons expect."""
         if bpy.app.background:
             return self.execute(context)
         return self._guarded(context, self._begin)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Look after the thread."""
+        """Check the thread at every timer event."""
         if event.type == "ESC" and event.value == "PRESS":
             self._job.stop()
         if event.type != "TIMER":
@@ -143,7 +143,7 @@ class Working(bpy.types.Operator):
         return {"FINISHED"}
 
     def _guarded(self, context: bpy.types.Context, act: Callable[[bpy.types.Context], set[str]]) -> set[str]:
-        """Act in object mode, where a mesh's data is up to date; what is wrong becomes a report."""
+        """Call ``act`` in object mode, where mesh data is up to date, and report errors to the user."""
         self.mode = mode = context.active_object.mode
         if mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")

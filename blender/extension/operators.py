@@ -1,4 +1,4 @@
-"""What can be done to UVs: one operator for each."""
+"""Blender operators on UVs."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ class UvWorking(Working):
     """An operator on the UVs of the active object."""
 
     def read(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
-        """The active object's mesh; in edit mode without islands that are not selected, unless the whole is meant."""
+        """Return the active object's mesh; in edit mode, only islands with selected faces unless ``whole`` is true."""
         chosen_only = not whole and self.mode == "EDIT"
         self.surface = surface.read(context.active_object.data, chosen_only=chosen_only)
         return self.surface.mesh
 
     def read_map(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
-        """As `read`, of a mesh that has a UV layer."""
+        """Return the mesh as `read` does; require a UV layer."""
         mesh = self.read(context, whole=whole)
         surface.require_map(self.surface)
         return mesh
 
     def take(self, context: bpy.types.Context, mapped: SeamedMesh, remark: str = "") -> None:
-        """Write a map, and say what it is as Blender has it."""
+        """Write a map to Blender and report the verdict of the map as stored there."""
         verdict = atlas.certify(surface.write(context.active_object.data, self.surface, mapped))
         lost = np.setdiff1d(verdict.inverted, atlas.certify(mapped).inverted)
         if lost.size:
@@ -59,7 +59,7 @@ class UvWorking(Working):
 
 
 class ChosenWorking(UvWorking):
-    """One that in edit mode minds what is selected."""
+    """An operator that in edit mode works on the selected islands only."""
 
     whole: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="All islands", description="In edit mode also islands without a selected face", default=False
@@ -67,13 +67,13 @@ class ChosenWorking(UvWorking):
 
 
 class QHM_OT_check(UvWorking):
-    """Select the faces whose UVs are inverted or degenerate, or lie on others; decided exactly."""
+    """Select faces whose UVs are inverted, degenerate or overlapping. The check is exact."""
 
     bl_idname = "uv.qhm_check"
     bl_label = "Check UVs"
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        """Judge."""
+        """Return the work that certifies the map."""
         mesh = self.read_map(context)
 
         def work(reports_progress: Callable[[Step], None]) -> tuple[AtlasVerdict, IntArray, IntArray]:
@@ -83,7 +83,7 @@ class QHM_OT_check(UvWorking):
         return work
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
-        """Select and tell."""
+        """Select the faces found and report the verdict."""
         verdict, lying, bent = result
         face = self.surface.polygons.of_triangle
         inverted = np.unique(face[verdict.inverted])
@@ -99,7 +99,7 @@ class QHM_OT_check(UvWorking):
 
 
 class QHM_OT_repair(ChosenWorking):
-    """Right inverted faces; borders stay, and so does every UV that need not move."""
+    """Untangle inverted faces. Borders stay unchanged, and so does every UV that need not move."""
 
     bl_idname = "uv.qhm_repair"
     bl_label = "Repair UVs"
@@ -108,7 +108,7 @@ class QHM_OT_repair(ChosenWorking):
     )
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        """Repair."""
+        """Return the work that repairs the map."""
         mesh = self.read_map(context, whole=self.whole)
         unmirror = self.unmirror
         return lambda reports_progress: repair(
@@ -116,14 +116,14 @@ class QHM_OT_repair(ChosenWorking):
         )
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
-        """Write and tell."""
+        """Write the map and report the result."""
         mesh = self.surface.mesh
         reasons = " ".join(island.reason for island in result.islands if island.reason)
         self.take(context, SeamedMesh(mesh.V, mesh.F, result.FT, result.uv), f"{reasons} " if reasons else "")
 
 
 class QHM_OT_flatten(UvWorking):
-    """Lay the mesh flat, borders free, without flips or overlap; cut at marked seams, or where the UVs are."""
+    """Flatten the mesh with free borders, without inversion or overlap; cut at marked seams or along UV borders."""
 
     bl_idname = "uv.qhm_flatten"
     bl_label = "Flatten"
@@ -136,7 +136,7 @@ class QHM_OT_flatten(UvWorking):
     energy: bpy.props.EnumProperty(name="Keep", items=_ENERGIES)  # type: ignore[valid-type]
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        """Cut and flatten."""
+        """Return the work that cuts and flattens the mesh."""
         mesh, polygons = self.read(context), self.surface.polygons
         seams = surface.marked_seams(context.active_object.data)
         cut, pack, energy = self.cut, self.pack, self.energy
@@ -146,7 +146,7 @@ class QHM_OT_flatten(UvWorking):
             if len(seams):
                 here = seaming.cut_along(mesh, seams, polygons=polygons)
             elif 1 < len(polygons) == len(mesh.islands):
-                # As a new UV layer of Blender's is: every face fills the square.
+                # A new UV layer of Blender looks the same: every face fills the square.
                 here = SeamedMesh(mesh.V, mesh.F)
             if cut:
                 here = seaming.cut_apart(here, polygons=polygons)
@@ -159,12 +159,12 @@ class QHM_OT_flatten(UvWorking):
         return work
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
-        """Write and tell."""
+        """Write the map and report the result."""
         self.take(context, result)
 
 
 class QHM_OT_reduce(ChosenWorking):
-    """Reduce stretch with borders kept or free; no face flips on the way."""
+    """Reduce stretch with fixed or free borders, without inverting a face."""
 
     bl_idname = "uv.qhm_reduce_stretch"
     bl_label = "Reduce Stretch"
@@ -174,7 +174,7 @@ class QHM_OT_reduce(ChosenWorking):
     energy: bpy.props.EnumProperty(name="Keep", items=_ENERGIES)  # type: ignore[valid-type]
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        """Polish."""
+        """Return the work that reduces the distortion."""
         mesh = self.read_map(context, whole=self.whole)
         free, energy = self.free, self.energy
 
@@ -187,7 +187,7 @@ class QHM_OT_reduce(ChosenWorking):
         return work
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
-        """Write and tell."""
+        """Write the map and report the result."""
         self.take(context, result)
 
 
@@ -210,7 +210,7 @@ class QHM_OT_fit(ChosenWorking):
     curve: bpy.props.StringProperty(name="Curve", description="Name of the object")  # type: ignore[valid-type]
 
     def prepare(self, context: bpy.types.Context) -> Work:
-        """Lay the boundary along the outline, its corners at what looks like some, and map."""
+        """Return the work that fits the boundary to the outline, with corners detected, and computes the map."""
         mesh = self.read(context, whole=self.whole)
         if len(mesh.islands) != 1:
             raise Refused(f"there are {len(mesh.islands)} islands: in edit mode, select a face of the one to fit")
@@ -233,11 +233,11 @@ class QHM_OT_fit(ChosenWorking):
         )
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
-        """Write and tell."""
+        """Write the map and report the result."""
         self.take(context, result)
 
     def _contours(self, context: bpy.types.Context) -> list[Any]:
-        """The outline, in the unit square but for rectangles that are higher."""
+        """Return the outline as contours in the unit square; a rectangle may be higher."""
         if self.to == "RECTANGLE":
             return outline.rectangle(self.height)
         if self.to == "DISK":
@@ -248,18 +248,18 @@ class QHM_OT_fit(ChosenWorking):
 
 
 def _require_borders(mesh: SeamedMesh) -> None:
-    """Raise `Refused` where there is nothing along which to lay a surface flat."""
+    """Raise `Refused` if the mesh has no border along which it can be flattened."""
     if any(not len(boundary_edges(island.F, len(island.vertices))) for island in mesh.islands):
         raise Refused("the mesh, or a part of it, is closed: mark seams, or use Cut and Flatten")
 
 
 def _told(verdict: AtlasVerdict) -> str:
-    """The first lines of a verdict, on one."""
+    """Return the first lines of a verdict, joined into one line."""
     return " ".join(verdict.summary().splitlines()[:3])
 
 
 def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:
-    """Triangles that share area with others, among islands without inverted ones; ascending."""
+    """Return the overlapping triangles among islands without inverted triangles, in ascending order."""
     concerned = set(verdict.overlapping.ravel().tolist())
     concerned |= {k for k, one in enumerate(verdict.islands) if one.injective and not one.bijective}
     if not concerned:
@@ -271,7 +271,7 @@ def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:
 
 
 def _bent(mesh: SeamedMesh, polygons: Any, verdict: AtlasVerdict) -> IntArray:
-    """Faces that are not convex in the plane though none of their triangles is inverted; ascending."""
+    """Return faces that are not convex in the plane although no triangle of theirs is inverted, in ascending order."""
     mirrored = polygons.of_triangle[_mirrored(verdict)]
     front, back = (not_convex(polygons, mesh.FT, mesh.uv * [side, 1.0]) for side in (1.0, -1.0))
     bent = np.union1d(np.setdiff1d(front, mirrored), np.intersect1d(back, mirrored))
@@ -279,7 +279,7 @@ def _bent(mesh: SeamedMesh, polygons: Any, verdict: AtlasVerdict) -> IntArray:
 
 
 def _mirrored(verdict: AtlasVerdict) -> IntArray:
-    """Triangles of mirrored islands."""
+    """Return the triangles of mirrored islands."""
     return np.concatenate(
         [np.empty(0, dtype=np.int64), *(verdict.islands[k].triangles for k in verdict.mirrored.tolist())]
     )

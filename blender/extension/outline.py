@@ -1,4 +1,4 @@
-"""Outlines to fit an island to: rectangle, disk, and whatever of the scene has an outline seen from above."""
+"""Outlines to fit an island to: a rectangle, a disk, a letter, or an object of the scene seen from above."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 from .surface import Refused, numbers
 
-# Points of an outline nearer than this, as a share of its size, are one.
+# Points of an outline closer than this fraction of its size are merged.
 _SAME = 1e-6
 
 
 def rectangle(height: float) -> list[FloatArray]:
-    """One of width 1."""
+    """Return the outline of a rectangle of width 1."""
     return [targets.rectangle(1.0, height)]
 
 
 def disk() -> list[FloatArray]:
-    """A disk in the unit square."""
+    """Return the outline of a disk in the unit square."""
     return _in_unit_square([targets.disk()])
 
 
 def of_letter(letter: str) -> list[FloatArray]:
-    """A letter in Blender's own font.
+    """Return the outline of a letter in Blender's own font.
 
     Raises
     ------
     Refused
-        When it is blank.
+        If the letter is blank.
     """
     if not letter.strip():
         raise Refused("name a letter")
@@ -45,12 +45,12 @@ def of_letter(letter: str) -> list[FloatArray]:
 
 
 def of_named(context: bpy.types.Context, name: str) -> list[FloatArray]:
-    """The object of some name.
+    """Return the outline of an object, by its name.
 
     Raises
     ------
     Refused
-        When there is none, or it has no outline.
+        If the object does not exist or has no outline.
     """
     thing = context.scene.objects.get(name)
     if thing is None:
@@ -59,12 +59,12 @@ def of_named(context: bpy.types.Context, name: str) -> list[FloatArray]:
 
 
 def of_object(thing: bpy.types.Object) -> list[FloatArray]:
-    """Closed contours (k, 2), in the unit square, of a curve, text or mesh object that is seen from above.
+    """Return closed contours (k, 2), in the unit square, of a curve, text or mesh object seen from above.
 
     Raises
     ------
     Refused
-        When it has none.
+        If the object has no outline.
     """
     try:
         data = thing.to_mesh()
@@ -74,13 +74,13 @@ def of_object(thing: bpy.types.Object) -> list[FloatArray]:
     points = numbers(data.vertices, "co", 3, np.float32).astype(np.float64) @ turn.T
     ends = numbers(data.edges, "vertices", 2, np.int32).astype(np.int64)
     if len(data.polygons):
-        # Of what is filled, the edges of one face only.
+        # In filled areas, only edges of exactly one face belong to the outline.
         sides = numbers(data.loops, "edge_index", 1, np.int32).ravel()
         ends = ends[np.bincount(sides, minlength=len(ends)) == 1]
     thing.to_mesh_clear()
     if not len(ends):
         raise Refused(f"{thing.name} has no outline: choose a closed curve, without bevel")
-    # A filled curve has points twice where its faces meet its outline.
+    # A filled curve has duplicate points where its faces meet its outline.
     unit = np.ptp(points, axis=0).max() * _SAME or 1.0
     _, first, same = np.unique((points / unit).round(), axis=0, return_index=True, return_inverse=True)
     found = [points[first][ring] for ring in _rings(same.ravel()[ends])]
@@ -96,7 +96,7 @@ def _in_unit_square(contours: list[FloatArray]) -> list[FloatArray]:
 
 
 def _rings(ends: IntArray) -> list[list[int]]:
-    """Vertices of the closed chains among some edges."""
+    """Return the vertices of each closed chain of edges."""
     near: dict[int, list[int]] = {}
     for a, b in np.unique(np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1), axis=0).tolist():
         near.setdefault(a, []).append(b)

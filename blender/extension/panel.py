@@ -1,4 +1,4 @@
-"""The buttons: in the sidebars of the UV editor and of the 3D view."""
+"""Panels with the operators' buttons, in the sidebars of the UV editor and of the 3D view."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class _Buttons:
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Whether there is a mesh."""
+        """Whether the active object is a mesh."""
         return operators.QHM_OT_check.poll(context)
 
     def draw(self, context: bpy.types.Context) -> None:
-        """One button a line, those with choices twice."""
+        """Draw one button per line, and two for operators with options."""
         column = self.layout.column(align=True)  # type: ignore[attr-defined]
         column.operator("uv.qhm_check")
         column.operator("uv.qhm_repair")
@@ -38,14 +38,14 @@ class _Buttons:
 
 
 class QHM_PT_uv(_Buttons, bpy.types.Panel):
-    """In the UV editor."""
+    """The panel of the UV editor."""
 
     bl_idname = "QHM_PT_uv"
     bl_space_type = "IMAGE_EDITOR"
 
 
 class QHM_PT_view(_Buttons, bpy.types.Panel):
-    """In the 3D view."""
+    """The panel of the 3D view."""
 
     bl_idname = "QHM_PT_view"
     bl_space_type = "VIEW_3D"

@@ -1,7 +1,7 @@
-"""Places in single precision, which is what Blender has: rounded such that no triangle flips, wherever that can be.
+"""Rounding of positions to Blender's single precision without inverting triangles, where that is possible.
 
-A triangle narrower than the spacing of single precision may flip when its corners go to the nearest such numbers. Its
-corners then try the numbers nearby, and take those at which fewest of the triangles around them are wrong.
+If a triangle is narrower than the spacing of single precision, rounding its vertices to the nearest numbers may invert
+it. Each of its vertices then tries the numbers nearby and takes those with the fewest wrong triangles around it.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.seams import SeamedMesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# How many numbers away in each coordinate, and how often all corners of wrong triangles try.
+# Numbers tried on each side in each coordinate, and passes over the vertices of wrong triangles.
 _REACH, _ROUNDS = 3, 20
-# An island with more wrong triangles is too fine for single precision, and is left as it is.
+# If an island has more wrong triangles, it is too fine for single precision and is left unchanged.
 _MOST = 500
 
 _STEPS = sorted(itertools.product(range(-_REACH, _REACH + 1), repeat=2), key=lambda step: step[0] ** 2 + step[1] ** 2)
 
 
 def in_single_precision(mesh: SeamedMesh) -> SeamedMesh:
-    """Round a map's places to numbers of single precision, keeping triangles from flipping where nearby ones allow it.
+    """Round a map's positions to single precision, and avoid inverting triangles where nearby numbers allow it.
 
     Parameters
     ----------
     mesh : SeamedMesh
-        Its places finite.
+        A map with finite positions.
 
     Returns
     -------
     SeamedMesh
-        What rounding has inverted after all is for `quasiharmonic.atlas.certify` to say.
+        The rounded map. Use `quasiharmonic.atlas.certify` to find triangles that rounding has inverted.
     """
     return mesh.with_places([_rounded(island.F, island.uv) for island in mesh.islands])
 
 
 def _rounded(F: IntArray, uv: FloatArray) -> FloatArray:
-    """The places of an island (m, 2), as float64 that are numbers of single precision."""
+    """Return the positions of an island (m, 2) as float64 values that are representable in single precision."""
     mirrored = is_mirrored(F, uv)
     F = F[:, ::-1] if mirrored else F
     before = inverted_triangles(F, uv)
@@ -57,7 +57,7 @@ def _rounded(F: IntArray, uv: FloatArray) -> FloatArray:
 
 
 def _settled(F: IntArray, near: FloatArray, vertex: int) -> bool:
-    """Move a vertex to the nearest numbers at which fewer triangles around it are wrong; whether there were any."""
+    """Move a vertex to the nearest numbers with fewer wrong triangles around it; return whether it moved."""
     star = F[(vertex == F).any(axis=1)]
     steps = np.array(_STEPS, dtype=np.float64)
     tried = near[vertex] + steps * np.spacing(np.abs(near[vertex]).astype(np.float32)).astype(np.float64)

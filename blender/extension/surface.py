@@ -1,4 +1,4 @@
-"""A Blender mesh as a surface with seams, and places back into its UV layer; nothing else of the mesh is touched."""
+"""Conversion of a Blender mesh to a surface with seams, and of positions back into the mesh's UV layer."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 from .rounding import in_single_precision
 
-# Places of a vertex that are apart by no more than so many spacings of single precision are one: Blender's own unwraps
-# and primitives write it with different roundings into the loops around it.
+# Positions of a vertex that differ by at most this many spacings of single precision are merged. Blender's unwraps
+# and primitives store them with different roundings in the loops of the vertex.
 _ROUNDING = 4
 
 
-class Refused(Exception):  # noqa: N818 (said to users, in the past tense)
-    """What the user can do something about, in a sentence."""
+class Refused(Exception):  # noqa: N818 (the name matches the messages)
+    """An error that the user can resolve; the message is one sentence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +30,12 @@ class Surface:
     Attributes
     ----------
     mesh : SeamedMesh
-        Its triangles, as Blender itself draws them, each corner at the row of the first loop that is at the same
-        place; triangles that are not chosen have rows of -1. Places are those of all loops.
+        Its triangles, in Blender's own triangulation. Each corner refers to the row of the first loop at the same
+        position; triangles that are not chosen have rows of -1. Positions are those of all loops.
     polygons : Polygons
-        The mesh's faces as rings of the triangles' corners.
+        The mesh's faces, as rings of the triangles' corners.
     loops : (f, 3) int64
-        The loop that each corner of a triangle is.
+        The loop of each corner of each triangle.
     """
 
     mesh: SeamedMesh
@@ -44,19 +44,19 @@ class Surface:
 
 
 def read(data: bpy.types.Mesh, *, chosen_only: bool) -> Surface:
-    """Read a mesh, its active UV layer, and which faces are chosen.
+    """Read a mesh, its active UV layer and the selected faces.
 
     Parameters
     ----------
     data : bpy.types.Mesh
         In object mode.
     chosen_only : bool
-        Leave out islands none of whose faces is selected, if a face is.
+        If any face is selected, leave out islands without selected faces.
 
     Raises
     ------
     Refused
-        When there are no faces.
+        If the mesh has no faces.
     """
     if not len(data.polygons):
         raise Refused("the mesh has no faces")
@@ -65,7 +65,7 @@ def read(data: bpy.types.Mesh, *, chosen_only: bool) -> Surface:
     starts = np.append(numbers(data.polygons, "loop_start", 1, np.int32).ravel(), len(vertex)).astype(np.int64)
     data.calc_loop_triangles()
     T = numbers(data.loop_triangles, "loops", 3, np.int32).astype(np.int64)
-    # Every corner of a face is one of its triangles'.
+    # Every corner of a face is a corner of one of its triangles.
     polygons = Polygons(np.unique(T, return_index=True)[1], starts)
     layer = data.uv_layers.active
     if layer is None:
@@ -79,29 +79,29 @@ def read(data: bpy.types.Mesh, *, chosen_only: bool) -> Surface:
 
 
 def require_map(surface: Surface) -> None:
-    """Raise `Refused` where there is no UV layer."""
+    """Raise `Refused` if the mesh has no UV layer."""
     if surface.mesh.uv is None:
         raise Refused("the mesh has no UV map: flatten it first")
 
 
 def marked_seams(data: bpy.types.Mesh) -> IntArray:
-    """The edges (k, 2) that are marked as seams, by vertices."""
+    """Return the edges (k, 2) marked as seams, by their vertices."""
     marked = numbers(data.edges, "use_seam", 1, np.bool_).ravel()
     return numbers(data.edges, "vertices", 2, np.int32).astype(np.int64)[marked]
 
 
 def write(data: bpy.types.Mesh, surface: Surface, mapped: SeamedMesh) -> SeamedMesh:
-    """Write places into the active UV layer; one is made if there is none.
+    """Write positions into the active UV layer; create a layer if there is none.
 
     Returns
     -------
     SeamedMesh
-        The map as Blender has it, in single precision.
+        The map as stored by Blender, in single precision.
 
     Raises
     ------
     Refused
-        When the mesh has as many UV layers as it can have, none of them active.
+        If the mesh has the maximum number of UV layers and none is active.
     """
     layer = data.uv_layers.active or data.uv_layers.new(name="UVMap")
     if layer is None:
@@ -109,33 +109,33 @@ def write(data: bpy.types.Mesh, surface: Surface, mapped: SeamedMesh) -> SeamedM
     rounded = in_single_precision(mapped)
     places = numbers(layer.uv, "vector", 2, np.float32)
     places[surface.loops[rounded.mapped]] = rounded.uv[rounded.FT[rounded.mapped]]
-    # Not into layer.uv, whose array undo shares: nothing could be undone.
+    # Undo shares the array of layer.uv, so writing there could not be undone.
     data.attributes[layer.name].data.foreach_set("vector", places.ravel())
     data.update()
     return SeamedMesh(mapped.V, mapped.F, np.where(mapped.FT >= 0, surface.loops, -1), places.astype(np.float64))
 
 
 def select_faces(context: bpy.types.Context, surface: Surface, faces: IntArray) -> None:
-    """Select some faces of the active object, in object mode, and no others; what of it is selected is by faces now."""
+    """Select these faces of the active object and deselect all others, in object mode; switch to face selection."""
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.mesh.select_all(action="DESELECT")
     bpy.ops.object.mode_set(mode="OBJECT")
     chosen = np.zeros(len(surface.polygons), dtype=np.bool_)
     chosen[faces] = True
-    # Edit mode selects the edges and vertices of these by itself, if faces are what it selects.
+    # In face selection mode, edit mode selects the edges and vertices of these faces by itself.
     context.active_object.data.polygons.foreach_set("select", chosen)
     context.tool_settings.mesh_select_mode = (False, False, True)
 
 
 def numbers(items: Any, name: str, width: int, kind: type) -> Any:
-    """One attribute of all items of a Blender collection; (n, width) of the kind that Blender has it in."""
+    """Return an attribute of all items of a Blender collection as an array (n, width) of Blender's own type."""
     values = np.empty(len(items) * width, dtype=kind)
     items.foreach_get(name, values)
     return values.reshape(-1, width)
 
 
 def _welded(vertex: IntArray, places: FloatArray) -> IntArray:
-    """For every loop the first one of its vertex that is at the same place, or off by rounding; (l,) int64."""
+    """Return for every loop the first loop of its vertex at the same position, up to rounding; (l,) int64."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -154,7 +154,7 @@ def _welded(vertex: IntArray, places: FloatArray) -> IntArray:
 
 
 def _chosen(mesh: SeamedMesh, selected: BoolArray) -> SeamedMesh:
-    """The islands in which a triangle is selected; all if none is."""
+    """Return the islands that contain a selected triangle, or all islands if no triangle is selected."""
     if not selected.any() or selected.all():
         return mesh
     FT = np.full_like(mesh.FT, -1)
