@@ -433,7 +433,7 @@ class TestRun:
             ({"flatten": True, "polish": "mips"}, "polish is of maps onto a given boundary"),
             ({"flatten": True, "slide": True}, "slide is of maps onto a given boundary"),
             ({"slide": True}, "slides while distortion is lowered: give an energy as well, by polish"),
-            ({"energy": "mips"}, "energy is for flatten, and flatten was not asked for"),
+            ({"energy": "mips"}, "energy applies only to flatten"),
             ({"flatten": True, "energy": "arap"}, "energy must be one of .*arap-barrier, distances, not 'arap'"),
         ],
     )

@@ -386,7 +386,7 @@ def test_what_are_no_indices_is_named(name):
     [
         ([[0, 1]], r"loops\[0\] has 2 vertices, but a boundary loop has three or more"),
         ([RIM, [3]], r"loops\[1\] has 1 vertex, but"),
-        ([], "loops has no boundary loop: leave it out"),
+        ([], "loops has no boundary loop: omit it"),
         ([[]], r"loops\[0\] has 0 vertices"),
         (RIM, r"loops\[0\] must have shape \(l,\), the vertices of one loop, not \(\); pass a list of loops"),
         ([RIM[None]], r"loops\[0\] must have shape \(l,\), the vertices of one loop, not \(1, 12\)$"),
@@ -488,4 +488,4 @@ def test_how_it_counts_is_said_where_something_is_counted(options, said, counted
 
 def test_an_energy_without_a_flattening(tmp_path, capsys):
     assert main(["batch", str(tmp_path), "-o", str(tmp_path / "out"), "--energy", "mips", "--polish", "mips"]) == 2
-    assert "energy is for flatten, and flatten was not asked for" in capsys.readouterr().err
+    assert "energy applies only to flatten" in capsys.readouterr().err

@@ -378,7 +378,7 @@ def test_derivatives_are_finite_or_refused(scale):
             derivative = derivative_of()
             assert np.isfinite(derivative.jvp(rest=1e-3 * V)).all()
         else:
-            with pytest.raises(ValueError, match="triangle 0 at rest leave the range of doubles"):
+            with pytest.raises(ValueError, match="triangle 0 at rest are outside the range of doubles"):
                 derivative_of()
 
 

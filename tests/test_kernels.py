@@ -211,7 +211,7 @@ def test_an_extension_of_before_is_told(monkeypatch):
 
     monkeypatch.setattr(kernels, "extension", SimpleNamespace(__file__="there"))
     monkeypatch.setattr(kernels, "TWINS", {})
-    with pytest.raises(ImportError, match=r"there is too old to have newer.*pip install"):
+    with pytest.raises(ImportError, match=r"there is too old: it has no newer.*pip install"):
         kernels.compiled(newer)
 
 

@@ -183,20 +183,18 @@ def test_nothing_to_pack():
 def test_triangles_too_thin_for_the_square():
     V, F = np.array([(0, 0), (1, 0), (1 / 3, 1e-22), (0.4, 1.0)]), np.array([(0, 1, 2), (0, 2, 3), (2, 1, 3)])
     assert is_injective(F, V)
-    with pytest.raises(
-        ValueError, match="island 1: rounding to places in the unit square would invert triangle 0 of it"
-    ):
+    with pytest.raises(ValueError, match="island 1: its triangle 0 would be inverted by rounding in the unit square"):
         packed([V + [(0, 1)] * 4, V], [F, F], [1, 1])
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"areas": [1]}, "there are 2 islands' places, 2 islands' triangles and areas of shape"),
-        ({"areas": [1, -1]}, "areas must be finite and not negative, as they are not of island 1"),
-        ({"areas": [1, np.nan]}, "not of island 1"),
-        ({"margin": -0.1}, "margin must be a share of the square's side, from 0 to below 1, not -0.1"),
-        ({"margin": 0.7}, "2 islands, each with a margin of 0.7 of the square's side around it, have no room"),
+        ({"areas": [1]}, "uv has 2 islands, F has 2, and areas has shape"),
+        ({"areas": [1, -1]}, "areas must be finite and not negative: check island 1"),
+        ({"areas": [1, np.nan]}, "check island 1"),
+        ({"margin": -0.1}, "margin must be a fraction of the square's side, at least 0 and less than 1, not -0.1"),
+        ({"margin": 0.7}, "2 islands do not fit with a margin of 0.7 of the square's side around each"),
         ({"uv": [np.full((9, 2), np.inf)] * 2}, r"uv\[0\] is not finite at vertices 0, 1"),
         ({"uv": [np.zeros((8, 2))] * 2}, "F refers to vertex 8"),
     ],

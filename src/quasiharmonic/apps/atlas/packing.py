@@ -93,7 +93,7 @@ def packed(
         own = lost[owner[lost] == i] - int(np.searchsorted(owner, i))
         raise ValueError(
             f"island {i}: its {named('triangle', 'triangles', own)} would be inverted by rounding in the unit square, "
-            "because they are too thin: polish the map first, or do not pack it"
+            "too thin for that: polish the map first, or do not pack it"
         )
     return found
 
@@ -113,7 +113,7 @@ def _checked(
         )
     wrong = np.flatnonzero(~((surface >= 0) & np.isfinite(surface)))
     if wrong.size:
-        raise ValueError(f"areas must be finite and not negative, unlike that of {named('island', 'islands', wrong)}")
+        raise ValueError(f"areas must be finite and not negative: check {named('island', 'islands', wrong)}")
     if not 0 <= margin < 1:
         raise ValueError(f"margin must be a fraction of the square's side, at least 0 and less than 1, not {margin}")
     islands = [map_array(f"uv[{i}]", points) for i, points in enumerate(uv)]

@@ -73,7 +73,7 @@ def in_range(uv: FloatArray) -> FloatArray:
         If positions exceed the range of doubles.
     """
     if not np.isfinite(uv).all():
-        raise ValueError("the map exceeds double precision (1e308): scale the surface or the pins down")
+        raise ValueError("the map is outside the range of doubles (1e308): scale the surface or the pins down")
     return uv
 
 

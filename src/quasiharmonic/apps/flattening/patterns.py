@@ -91,7 +91,7 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     with np.errstate(over="ignore"):
         seam = [places[loop] * UNITS[unit] for loop in judged.loops]
     if not all(np.isfinite(line).all() for line in seam):
-        raise ValueError(f"the map's coordinates in mm exceed double precision: check the unit {unit}")
+        raise ValueError(f"the map's coordinates in mm are outside the range of doubles: check the unit {unit}")
     if not allowance:
         return Pattern(seam, seam)
     label = components(triangles, len(places))

@@ -69,7 +69,8 @@ class RestStrain(Strain):
         lost = np.flatnonzero(~(np.isfinite(self.m) & np.isfinite(self.half).all(axis=0)))
         if lost.size:
             raise ValueError(
-                f"the areas of {named('triangle', 'triangles', lost)} at rest exceed double precision: scale the "
+                f"the areas of {named('triangle', 'triangles', lost)} at rest are outside the "
+                f"range of doubles: scale the "
                 "surface to about unit size"
             )
         # Unit vectors in the triangle's plane, (d, f): along the first side, and perpendicular to it.
