@@ -52,7 +52,7 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
             "MIPS": round(mips(problem, result.uv), 2),
         }
     curves[0].set(ylabel="inverted triangles", yscale="symlog", ylim=(0, None))
-    # For an untangled map V₃ is evaluated at the map's own tensors, where it is zero up to rounding.
+    # `Untangling` uses the map's own tensors. At an injective map V₃ is zero there, up to rounding.
     curves[1].set(ylabel="V₃ / area", yscale="log", ylim=(1e-6, 2))
     for ax in curves:
         ax.set_xlabel("iteration")

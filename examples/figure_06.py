@@ -51,7 +51,7 @@ def main(output: Path, size: int = 24) -> dict[str, Any]:
     for row, (functional, name) in zip(axes, NAMES.items(), strict=True):
         stage = VectorAdam(parameterisation="si-log", functional=functional)
         result = solve(problem, strategy=[stage], max_iterations=1000, record_every=1)
-        # V₄'s descent untangles nothing, so its frames need no particular iterations.
+        # V₄ untangles nothing, so its frames are spaced evenly by iteration.
         still = functional == "poisson"
         path = [-shot.iteration if still else inverted_area(problem, shot.uv) for shot in result.path]
         for ax, at in zip(row, frames(path, SHOTS), strict=True):
