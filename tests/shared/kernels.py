@@ -18,7 +18,7 @@ ARGUMENTS: dict[str, list[Callable[[np.random.Generator], Arguments]]] = {}
 
 
 def arguments_of(name: str) -> Callable[[Callable[[np.random.Generator], Arguments]], object]:
-    """Register a function that makes arguments of a kernel; a kernel may have several. Output arrays have any content."""
+    """Register a function that makes arguments of a kernel, of which there may be several; outputs hold any values."""
     return lambda make: ARGUMENTS.setdefault(name, []).append(make)
 
 
@@ -77,7 +77,7 @@ def _(rng):
 
 @arguments_of("link_nodes")
 def _(rng):
-    """Columns of triangles, as components has them."""
+    """Columns of triangles, as for connected components."""
     F = soup(rng, 200, 40)
     return F[:, :2], F[:, 1:], np.empty(200, dtype=np.int64)
 
@@ -89,13 +89,13 @@ def _(rng):
 
 @arguments_of("link_nodes")
 def _(rng):
-    """A node that is not there, in the first link."""
+    """A node index out of range, in the first link."""
     return np.array([9, 0]), np.array([0, 1]), np.arange(9)
 
 
 @arguments_of("follow_loops")
 def _(rng):
-    """A short loop, and a long one."""
+    """A short loop and a long one."""
     around = rng.permutation(60)
     loops = np.concatenate([np.stack([some, np.roll(some, 1)], axis=1) for some in (around[:4], around[4:])])
     return rng.permutation(loops), np.zeros(60, dtype=np.int64), np.zeros(60, dtype=np.int64)
@@ -103,14 +103,14 @@ def _(rng):
 
 @arguments_of("follow_loops")
 def _(rng):
-    """A vertex passed twice."""
+    """A vertex that the loop visits twice."""
     loops = np.array([[0, 1], [1, 2], [2, 0], [2, 3], [3, 4], [4, 2]])
     return rng.permutation(loops), np.zeros(6, dtype=np.int64), np.zeros(6, dtype=np.int64)
 
 
 @arguments_of("sure_signs")
 def _(rng):
-    """Triangles of whole numbers, many of them without area, and of what has no orientation."""
+    """Integer triangles, many of zero area, and some with NaN or infinite coordinates."""
     uv = rng.integers(0, 4, (30, 2)) * rng.choice([1.0, 1e200, 1e-320, 0.1], (30, 1))
     uv[rng.integers(0, 30, 3), rng.integers(0, 2, 3)] = np.nan, np.inf, -np.inf
     return soup(rng, 30, 400), uv, np.zeros(400, dtype=np.int8)
@@ -118,14 +118,14 @@ def _(rng):
 
 @arguments_of("sure_signs")
 def _(rng):
-    """Slivers within rounding of none."""
+    """Slivers whose area is zero up to rounding."""
     uv = np.ldexp(np.linspace(0, 1, 40)[:, None] * [1, 3] + rng.integers(-2, 3, (40, 2)) * 2.0**-52, 3)
     return soup(rng, 40, 500), uv, np.zeros(500, dtype=np.int8)
 
 
 @arguments_of("sure_signs")
 def _(rng):
-    """A vertex that is not there, in the first triangle."""
+    """A vertex index out of range, in the first triangle."""
     F = soup(rng, 7, 5)
     F[0] = -1, 6, 7
     return F, rng.normal(size=(7, 2)), np.zeros(5, dtype=np.int8)
@@ -133,7 +133,7 @@ def _(rng):
 
 @arguments_of("count_turns")
 def _(rng):
-    """On whole numbers many corners are level; one is nowhere."""
+    """Integer coordinates, so many corners have equal heights; one vertex has a NaN coordinate."""
     uv = np.append(rng.integers(0, 5, (29, 2)), [[0, np.nan]], axis=0)
     return soup(rng, 30, 400), uv, rng.integers(0, 3, 30)
 
@@ -458,7 +458,7 @@ def _(rng):
 
 @arguments_of("place_inverted")
 def _(rng):
-    """A triangle with all vertices fixed, a vertex with NaN position, and a vertex of high degree."""
+    """An inverted triangle with all vertices fixed, a vertex with NaN position, and a vertex of high degree."""
     F, moves, mesh, w, *_ = stirred_disks(rng, [1, 2])
     w[np.flatnonzero(moves)[-4]] = np.nan
     n, spokes = w.size, 20
@@ -603,7 +603,7 @@ arguments_of("find_places")(lambda rng: (numbers(rng, 0, 4), numbers(rng, 0)))
 
 @arguments_of("smooth")
 def _(rng):
-    """A map with few inverted triangles before smoothing."""
+    """A nearly injective map that gets inverted triangles."""
     V, F = disk(9)
     held = rng.random(len(V)) < 0.1
     return V[:, 0] * (1 + 9 * V[:, 0] ** 2) + 0.3 * rng.random(len(V)) / 9 + 1j * V[:, 1], F, held
