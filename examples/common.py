@@ -1,4 +1,4 @@
-"""What the figures share: a turned ring, measures of distortion, panels, and the command line."""
+"""Shared helpers of the examples: a turned ring, measures of distortion, panels, and the command line."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from quasiharmonic.util.arrays import FloatArray
 BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 RED, INK = (0.89, 0.07, 0.17), (0.06, 0.12, 0.29)
 COLORS = {"tanh": (0.85, 0.45, 0.10), "si-log": (0.16, 0.38, 0.75)}
-#: Of `Untangling`, the regularised energy of SBP descended our own way.
+#: The colour of `Untangling`, which minimises SBP's regularised energy.
 GREEN = (0.35, 0.55, 0.25)
 
 
 def ring(cells: int, hole: tuple[float, float, float, float], turn: float) -> Problem:
-    """The square [-1, 1]² around a hole whose boundary is turned about its own middle by so many radians."""
+    """The square [-1, 1]² with a hole whose boundary is turned about its own centre by ``turn`` radians."""
     V, F = surfaces.annulus(cells, hole=hole)
     target = V[:, 0] + 1j * V[:, 1]
     inner = np.abs(V).max(axis=1) < 1
@@ -42,20 +42,20 @@ def ring(cells: int, hole: tuple[float, float, float, float], turn: float) -> Pr
 
 
 def onto(V: FloatArray, F: NDArray[np.int64], outline: FloatArray, start: int | None = None) -> Problem:
-    """A disk-like mesh onto an outline by arc length; ``start`` is the boundary vertex that goes to its first point."""
+    """A disk-like mesh mapped onto an outline by arc length; boundary vertex ``start`` goes to its first point."""
     (loop,) = boundary_loops(F, len(V))
     at = None if start is None else int(np.flatnonzero(loop == start)[0])
     return Problem(V, F, loop, targets.arc_length(V[loop], outline, start=at))
 
 
 def first_map(problem: Problem, parameterisation: str, iterations: int = 1000, **options: Any) -> MapResult:
-    """The first injective map that one stage of VectorAdam on V₃ comes by, from the rest triangles."""
+    """The first injective map found by one stage of VectorAdam on V₃, in the rest triangles."""
     stage = VectorAdam(parameterisation=parameterisation, reference="corrected", iterations=iterations)
     return solve(problem, strategy=[stage], max_iterations=iterations, **options)
 
 
 def ratios(problem: Problem, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """σ₁/σ₂ of every triangle from its rest shape, and its share of the rest area."""
+    """σ₁/σ₂ of every triangle relative to its rest shape, and its share of the rest area."""
     mesh = problem.domain.mesh("rest")
     p, q, _ = mesh.derivatives(uv @ (1, 1j))
     p, q = np.abs(p), np.abs(q)
@@ -69,12 +69,12 @@ def mips(problem: Problem, uv: FloatArray) -> float:
 
 
 def flips(problem: Problem, uv: FloatArray) -> int:
-    """Triangles that are not strictly positive, exactly."""
+    """The exact number of triangles that are not strictly positive."""
     return int(inverted_triangles(problem.F, uv).size)
 
 
 def colorbar(figure: Figure, drawn: PolyCollection, label: str = "σ₁/σ₂", extend: str = "max") -> None:
-    """A bar for what triangles are coloured by at the right, in room added to the figure."""
+    """Add a colour bar at the right and widen the figure for it."""
     width, height = figure.get_size_inches()
     kept = width / (width + 0.9)
     for ax in figure.axes:
@@ -88,13 +88,13 @@ def colorbar(figure: Figure, drawn: PolyCollection, label: str = "σ₁/σ₂", 
 
 
 def inverted_area(problem: Problem, uv: FloatArray) -> float:
-    """Area of the inverted triangles' images."""
+    """The total area of the inverted triangles' images."""
     area = problem.domain.mesh("rest").derivatives(uv @ (1, 1j)).area
     return float(-area[area < 0].sum())
 
 
 def panels(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, list[list[Axes]]]:
-    """A figure of axes of equal ``size`` in inches, with room for a title above each."""
+    """A figure of axes of equal ``size`` in inches, with space for a title above each."""
     width, height = size
     figure = Figure(figsize=(columns * width, rows * height), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
@@ -117,7 +117,7 @@ def show(ax: Axes, problem: Problem, uv: FloatArray, title: str, *, size: float 
 
 
 def show_ratios(ax: Axes, problem: Problem, uv: FloatArray, title: str, highest: float) -> PolyCollection:
-    """Draw a map coloured by σ₁/σ₂ from 1 to ``highest``; hand back what a colour bar needs."""
+    """Draw a map coloured by σ₁/σ₂ from 1 to ``highest``, and return the collection for a colour bar."""
     drawn = PolyCollection(
         uv[problem.F],
         array=ratios(problem, uv)[0],
@@ -136,7 +136,7 @@ def show_ratios(ax: Axes, problem: Problem, uv: FloatArray, title: str, highest:
 
 
 def frames(falling: Sequence[float], count: int) -> list[int]:
-    """``count`` places in a sequence, the first, the last and those where its least value so far has fallen evenly."""
+    """``count`` indices into a sequence: the first, the last, and those where its running minimum has fallen evenly."""
     left = np.minimum.accumulate(falling)
     last = len(left) - 1
     found = [int(np.argmax(left <= wanted)) for wanted in np.linspace(left[0], left[-1], count)[:-1]]
@@ -146,13 +146,13 @@ def frames(falling: Sequence[float], count: int) -> list[int]:
 
 
 def save(figure: Figure, output: Path, name: str) -> None:
-    """Write a picture into a folder, made if need be."""
+    """Write a figure as PNG into a folder, and create the folder if it is missing."""
     output.mkdir(parents=True, exist_ok=True)
     figure.savefig(output / f"{name}.png")
 
 
 def run(main: Callable[..., dict[str, Any]]) -> None:
-    """Call ``main(output, …)`` from the command line, its further integer and boolean parameters as options.
+    """Call ``main(output, …)`` from the command line, with its other integer and boolean parameters as options.
 
     In a notebook, call it as it is and show the pictures it made.
     """

@@ -1,16 +1,15 @@
 """A human cortex laid flat: distances along it kept better than by the brain mappers' own programs, and bijective
 ==================================================================================================================
 
-The left half of FreeSurfer's average brain, fsaverage5, as nilearn brings it, without the wall in its middle and with
-the five cuts of the flat map that is published with it: 18,654 triangles of the white matter's surface. Top: sulcal
-depth, on the inflated surface from outside and on the flat maps. Bottom: the cuts, and how far distances are off around
-each vertex.
+The left half of FreeSurfer's average brain, fsaverage5, as nilearn provides it: 18,654 triangles of the white matter's
+surface. The medial wall is removed, and the five cuts of the flat map published with it are applied. Top: sulcal depth,
+on the inflated surface from outside and on the flat maps. Bottom: the cuts, and the distance errors around each vertex.
 
-What is measured are distances between vertices at most 20 edges apart, from every vertex to 150 others drawn at random:
-along the surface, as chains of straight segments that cross at most five edges each and no cut, and in the plane. The
-error of a pair is |scale · plane / surface − 1|, with the scale, one for each map, for which the mean is least; "rms"
-is the root of its mean square. All maps are measured alike, whatever made them. Seconds are of one thread's
-processor time; the picture's are the clock's.
+The table measures distances between vertices at most 20 edges apart, from every vertex to 150 others drawn at random.
+Distances along the surface are lengths of straight segments in a chain, each of which crosses at most five edges and no
+cut. The error of a pair is |scale · plane / surface − 1|, with one scale per map, which minimises the mean error. "rms"
+is the root-mean-square error. All maps are measured in the same way. Seconds are CPU seconds of one thread; the times
+in the figure are wall-clock times.
 
 =============================== ======= =================== ==================== ====== ==============
 map                             seconds symmetric Dirichlet distance error, mean rms    bijective
@@ -21,8 +20,8 @@ autoflatten 1.0.7                   144                   ∞               14.9
 that, and ``keep_distances``        5.2               0.639               13.6 % 19.0 % yes
 =============================== ======= =================== ==================== ====== ==============
 
-``--autoflatten`` runs that program too (``pip install autoflatten``; some minutes) and shows its map. ``--subdivided``
-flattens the surface with each triangle in sixteen, too, and measures distances from 1,500 vertices to 200 each.
+``--autoflatten`` also runs that program (``pip install autoflatten``; some minutes) and shows its map. ``--subdivided``
+also flattens the surface with each triangle split into sixteen, and measures distances from 1,500 vertices to 200 each.
 """
 
 from __future__ import annotations
@@ -50,13 +49,13 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.ui.plot.shading import lit
 from quasiharmonic.util.arrays import IntArray
 
-# From the crowns of the gyri to the depths of the sulci.
+# Colours from the crowns of the gyri to the bottoms of the sulci.
 DEPTH = LinearSegmentedColormap.from_list("depth", [(0.98, 0.86, 0.55), (0.93, 0.93, 0.90), (0.16, 0.30, 0.55)])
 WALL = (0.80, 0.80, 0.82)
 
 
 class Cortex(NamedTuple):
-    """What is known of the hemisphere's patch, and of the whole for showing it.
+    """The patch of the hemisphere that is flattened, and the whole hemisphere for display.
 
     Attributes
     ----------
@@ -64,11 +63,11 @@ class Cortex(NamedTuple):
         The patch.
     published : (n, 2) float64
     depth : (n,) float64
-        Sulcal.
+        Sulcal depth.
     number : (n,) int64
-        Of its vertices, in the whole.
+        Indices of the patch's vertices in the whole hemisphere.
     inflated, whole
-        The whole hemisphere's vertices, blown up, and its triangles.
+        The vertices of the whole inflated hemisphere, and its triangles.
     """
 
     V: FloatArray
@@ -81,7 +80,7 @@ class Cortex(NamedTuple):
 
 
 def cortex() -> Cortex:
-    """The left hemisphere, out of nilearn's wheel."""
+    """Read the left hemisphere from the files of the installed package nilearn."""
     import nibabel
     from nilearn.datasets import fetch_surf_fsaverage
 
@@ -104,19 +103,19 @@ def cortex() -> Cortex:
 
 
 def by_autoflatten(brain: Cortex) -> FloatArray:
-    """The map of the program of that name, by way of FreeSurfer's files."""
+    """The map computed by autoflatten, exchanged through FreeSurfer's files."""
     from nibabel.freesurfer import write_geometry
 
     kind = np.dtype([("vertex", ">i4"), ("place", ">f4", 3)])
     rows = np.zeros(len(brain.V), dtype=kind)
-    # Vertices count from one, those of the boundary negative.
+    # Vertex numbers start at one; those of boundary vertices are negative.
     rows["vertex"], rows["place"] = brain.number + 1, brain.V
     rows["vertex"][np.unique(boundary_edges(brain.F, len(brain.V)))] *= -1
     with TemporaryDirectory() as folder:
         surface, patch, flat = (str(Path(folder, name)) for name in ("lh.fiducial", "lh.patch.3d", "lh.flat.patch.3d"))
         everywhere = np.zeros((len(brain.inflated), 3))
         everywhere[brain.number] = brain.V
-        # The cuts are where triangles are missing: the surface is given without them.
+        # autoflatten finds the cuts from missing triangles, so the surface contains only the patch's.
         write_geometry(surface, everywhere, brain.number[brain.F])
         Path(patch).write_bytes(np.array([-1, len(rows)], dtype=">i4").tobytes() + rows.tobytes())
         program = str(Path(sys.executable).with_name("autoflatten"))
@@ -130,7 +129,7 @@ def by_autoflatten(brain: Cortex) -> FloatArray:
 
 
 def show_surface(ax: Axes, brain: Cortex, side: int, color: FloatArray, *, cuts: bool) -> None:
-    """Draw the inflated hemisphere from outside (-1) or from the middle (1), the patch in its colours."""
+    """Draw the inflated hemisphere from outside (-1) or from the medial side (1), with the patch in its colours."""
     seen = brain.inflated[:, 1] * side
     points, towards = np.stack([seen, brain.inflated[:, 2]], axis=1), side * brain.inflated[:, 0]
     corners = brain.inflated[brain.whole]
@@ -155,7 +154,7 @@ def show_surface(ax: Axes, brain: Cortex, side: int, color: FloatArray, *, cuts:
 
 
 def show_map(ax: Axes, brain: Cortex, uv: FloatArray, color: FloatArray) -> None:
-    """Draw a flat map, turned as the published one is, in the colours of its triangles."""
+    """Draw a flat map, rotated like the published one, in the colours of its triangles."""
     w, like = uv @ (1, 1j), brain.published @ (1, 1j)
     w, like = w - w.mean(), like - like.mean()
     turn = np.vdot(w, like)
@@ -170,13 +169,13 @@ def show_map(ax: Axes, brain: Cortex, uv: FloatArray, color: FloatArray) -> None
 
 
 def around_vertices(sample: SurfaceDistances, uv: FloatArray) -> FloatArray:
-    """The mean error of the pairs of each vertex; (n,) float64."""
+    """The mean error of the pairs of each vertex, (n,) float64."""
     off = np.abs(sample.error(uv).relative)
     return np.bincount(sample.target, off, len(uv)) / np.maximum(np.bincount(sample.target, minlength=len(uv)), 1)
 
 
 def halved(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
-    """Each triangle in four, by the middles of its sides: the same surface, with twice as many rings."""
+    """Split each triangle into four at the midpoints of its sides: the same surface with twice as many rings."""
     sides = np.sort(np.stack([F, np.roll(F, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     ends, middle = np.unique(sides, axis=0, return_inverse=True)
     ab, bc, ca = (len(V) + middle.reshape(-1, 3)).T

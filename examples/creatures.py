@@ -1,12 +1,12 @@
 """An octopus and an armadillo, cut open and laid flat with their boundaries free
 ==================================================================================
 
-Two closed surfaces made of formulas. Middle: ``flatten`` after one cut, ``cut_open(V, F)``, between two points far from
-each other. A limb that no cut reaches lies there as a disk, its rim stretched and its end pressed together. Right:
-``flatten`` after all cuts that are worth their length, ``cut_open(V, F, min_gain=0.1)``. They go to the ends of arms,
-legs, ears and fingers, are drawn at the left, and worth a factor of 80 in the one energy and of 25 in the other.
-Colours are how far lengths change at most, max(σ₁, 1/σ₂); the creatures have those of the map at the right. All four
-maps are bijective, and took 1 to 7 s on one core.
+Two closed surfaces defined by formulas. Middle: ``flatten`` after one cut, ``cut_open(V, F)``, between two distant
+points. A limb without a cut becomes a disk with a stretched rim and a compressed tip. Right: ``flatten`` after all cuts
+that reduce distortion enough for their length, ``cut_open(V, F, min_gain=0.1)``. These cuts, drawn at the left, reach
+the ends of arms, legs, ears and fingers. They reduce the energy by a factor of 80 for one creature and of 25 for the
+other. Colours show the largest change of length, max(σ₁, 1/σ₂); the surfaces at the left have the colours of the map at
+the right. All four maps are bijective and took 1 to 7 s on one core.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from quasiharmonic.ui.plot.shading import lit
 from quasiharmonic.util.arrays import IntArray
 from sculptures import creature
 
-# By how many degrees a creature is turned and seen from above.
+# Angles of view in degrees: rotation about the vertical axis, and elevation.
 CREATURES = {"octopus": (-25, 30), "armadillo": (-30, 12)}
-# What a cut must be worth for its length.
+# Minimum gain of a cut for its length.
 GAIN = 0.1
-# What the colours' bar says.
+# Ticks of the colour bar.
 BAR = [1, 1.5, 2, 3, 5]
 
 
 def show_creature(
     ax: Axes, V: FloatArray, F: IntArray, turned: tuple[int, int], color: FloatArray, cut: IntArray
 ) -> None:
-    """Draw it in the colours of its triangles, cuts where they are seen."""
+    """Draw a surface in the colours of its triangles, with the cuts on its visible side."""
     yaw, pitch = np.radians(turned)
     from_side = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
     from_above = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
@@ -48,7 +48,7 @@ def show_creature(
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     shades = lit(color, normal @ (np.array([-0.45, 0.6, 0.66]) / np.linalg.norm((0.45, 0.6, 0.66))))
     marked = np.isin(edge_keys(F, np.roll(F, -1, axis=1), len(V)), edge_keys(cut[:, 0], cut[:, 1], len(V)))
-    # Painted from behind, lines a little before their triangles, so that what is in front hides them.
+    # Paint from back to front, lines slightly before their triangles, so that nearer parts hide farther ones.
     front = np.flatnonzero(normal[:, 2] > 0)
     depth = seen[F[front], 2].mean(axis=1)
     patches = [*seen[F[front], :2]]
@@ -65,14 +65,14 @@ def show_creature(
 
 
 def show_map(ax: Axes, F: IntArray, uv: FloatArray, color: FloatArray) -> None:
-    """Draw a flat map in the colours of its triangles, its boundary as a line."""
+    """Draw a flat map in the colours of its triangles, and its boundary as a line."""
     ax.add_collection(PolyCollection(uv[F], facecolors=color, edgecolors="face", lw=0.3))
     ax.add_collection(LineCollection(uv[boundary_edges(F, len(uv))], colors=[INK], lw=0.7))
     frame(ax)
 
 
 def frame(ax: Axes) -> None:
-    """Show all that is drawn, and nothing else."""
+    """Fit the axes to their contents and hide the frame."""
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_axis_off()

@@ -1,11 +1,12 @@
 """Closed surfaces, cut open and laid flat by ``qhm map surface.obj --to … --cut --refine`` alone
 =================================================================================================
 
-A sphere onto a disk, a torus onto a square, a surface with two handles onto the letter O without its hole. Neither
-closed surfaces nor handles fit into the plane: the surfaces are cut along edges first, the red lines, of which those on
-the far side are not drawn. In the file that is written they are seams: vertices and faces of the surface stay as they
-are, and a vertex on a cut has several places in the plane. Beside a cut there may be triangles with all three vertices
-on it, for which a straight side of the target has no room: their edges are split. All three maps are bijective.
+The examples map a sphere onto a disk, a torus onto a square, and a surface with two handles onto the letter O without
+its hole. Closed surfaces and handles cannot be flattened, so the surfaces are first cut along edges. The cuts are drawn
+as red lines, except on the far side. In the written file the cuts are seams: the vertices and faces of the surface stay
+unchanged, and a vertex on a cut has several positions in the plane. Next to a cut, a triangle can have all three
+vertices on it and would be degenerate on a straight side of the target. The edges of these triangles are split. All
+three maps are bijective.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ Mesh = tuple[FloatArray, NDArray[np.int64]]
 
 
 def blocks(solid: NDArray[np.bool_], rounds: int = 12) -> Mesh:
-    """The surface of a solid made of unit blocks, smoothed."""
+    """The smoothed surface of a solid made of unit blocks."""
     padded = np.pad(solid, 1)
     quads = []
     for axis in range(3):
         for sense in (1, -1):
             at = np.argwhere(padded & ~np.roll(padded, -sense, axis=axis))
-            # The side between a block and the empty one next to it, counterclockwise from there.
+            # The face between a block and the empty block next to it, counterclockwise from the empty side.
             first, second = np.eye(3, dtype=np.int64)[[(axis + 1) % 3, (axis + 2) % 3]][::sense]
             low = at + (np.eye(3, dtype=np.int64)[axis] if sense > 0 else 0)
             quads.append(np.stack([low, low + first, low + first + second, low + second], axis=1))
@@ -57,7 +58,7 @@ def blocks(solid: NDArray[np.bool_], rounds: int = 12) -> Mesh:
 
 
 def solids(size: int) -> dict[str, tuple[str, Mesh]]:
-    """Where each goes."""
+    """The target and the surface of each example, by name."""
     ball = np.linalg.norm(np.indices((size, size, size)) - (size - 1) / 2, axis=0) < size / 2
     plate = np.ones((size, size, max(2, size // 4)), dtype=bool)
     third = size // 3
@@ -73,7 +74,7 @@ def solids(size: int) -> dict[str, tuple[str, Mesh]]:
 
 
 def cut_lines(ax: Axes, V: FloatArray, F: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
-    """Draw where the surface is cut."""
+    """Draw the cut edges that are on the visible side."""
     seen = view(V, F)
     near = np.zeros(len(V), dtype=bool)
     near[F[~seen.inside]] = True

@@ -1,23 +1,21 @@
 """What V₄ adds to V₃: in linear elements zeros that are no maps, in Crouzeix and Raviart's nothing
 =====================================================================================================
 
-The paper's Poisson functional V₄ is the dual of V₃: it puts the target's normal forces on the boundary, lets the
-boundary go, and compares energies. Propositions 7.1 and E.1 say that it is least, and zero, at injective maps. In the
-continuous setting it is.
+The paper's Poisson functional V₄ is the dual of V₃. It applies the target's normal forces at the boundary, frees the
+boundary, and compares energies. Propositions 7.1 and E.1 say that its minimum is zero and is reached at injective maps.
+This holds in the continuous setting.
 
-*In linear elements* it is not. Left: a disk onto a star, the tensors at random and of such a size that V₄ is zero; the
-inverted triangles are red. A little rougher, and V₄ is negative (middle): it has no least value, only a bound, minus
-the target's area.
+*In linear elements* it does not hold. Left: a disk mapped onto a star with random tensors, scaled such that V₄ is zero;
+the inverted triangles are red. With slightly rougher tensors V₄ is negative (middle). It has no minimum, only a lower
+bound, which is minus the target's area.
 
-*In elements that are continuous at the middles of edges* V₄ is never negative (`edge-poisson`). But there it is V₃:
-what is free of divergence in the one kind of element is the rotated gradient of the other, and tensors of determinant
-1 give both the same energy. The curves of the middle panel lie on each other, to the last digits, and a descent of
-either takes the same steps.
+*In elements that are continuous at edge midpoints* V₄ is never negative (`edge-poisson`), but there it equals V₃.
+Divergence-free fields of one kind of element are rotated gradients of the other, and tensors of determinant 1 give both
+the same energy. The curves of the middle panel agree to the last digits, and descents of both take the same steps.
 
-What is left is what V₄ does not see. Pins are not in it at all, and each inner loop may lie anywhere (right): the ring
-whose hole goes beyond its outer boundary is, to V₄, the ring whose hole stays, so that it is zero where V₃ is not. As
-the hole is free to go where it likes, the ring of Figure 6 takes fewer iterations: 192 for V₃'s 232. That is what V₄
-adds.
+V₄ ignores pins and the positions of inner loops (right). A ring whose hole is moved across its outer boundary has the
+same V₄ as the ring whose hole stays fixed, so V₄ is zero where V₃ is not. Because the hole is free to move, the ring of
+Figure 6 takes fewer iterations: 192 instead of 232 for V₃. This is the only advantage of V₄.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ CURVES = {"V₃": ("dirichlet", "-"), "V₄": ("poisson", "-"), "V₄ by edges":
 
 
 def star(size: int) -> Problem:
-    """A disk onto a star of five arms."""
+    """A disk onto a star with five arms."""
     V, F = surfaces.disk(size)
     (loop,) = boundary_loops(F, len(V))
     turn = np.angle(V[loop] @ (1, 1j))
@@ -45,7 +43,7 @@ def star(size: int) -> Problem:
 
 
 def displaced_ring(size: int) -> Problem:
-    """A square ring onto itself, but for its hole, which is asked to lie across the outer boundary."""
+    """A square ring onto itself, except that the target of its hole crosses the outer boundary."""
     problem = ring(size, (-0.25, -0.25, 0.25, 0.25), 0.0)
     target = problem.target.copy()
     target[np.abs(target).max(axis=1) < 0.5] += [0.9, 0.0]
@@ -53,7 +51,7 @@ def displaced_ring(size: int) -> Problem:
 
 
 def iterations(problem: Problem, functional: str, parameterisation: str) -> int | str:
-    """Iterations of VectorAdam to an injective map."""
+    """Iterations of VectorAdam to an injective map, or the number of triangles left inverted."""
     stage = VectorAdam(functional=functional, parameterisation=parameterisation, iterations=600)
     result = solve(problem, strategy=[stage])
     return result.iterations if result.injective else f"{len(result.certificate.inverted)} inverted"

@@ -1,15 +1,15 @@
 """Figure 1: an angel onto a G
 ==============================
 
-The paper's first picture maps Lucy onto the letter G: tanh and Adam find an injective map in tens of gradient steps
-and 3.1 s of MATLAB; SBP (Garanzha et al. 2021), in C++ on all cores, takes 300 times as long.
+The paper's first picture maps Lucy onto the letter G. tanh with Adam finds an injective map in tens of gradient steps
+and 3.1 s of MATLAB. SBP (Garanzha et al. 2021), in C++ on all cores, takes 300 times as long.
 
-Here it is an angel of our own, 25,074 triangles of which Tutte's embedding inverts 2,278. tanh takes 16 iterations,
-and with everything included three to six times as long as Tutte's embedding alone, less than a second on one core.
+This example uses a synthetic angel of 25,074 triangles, of which Tutte's embedding inverts 2,278. tanh takes 16
+iterations. In total it takes three to six times as long as Tutte's embedding alone, less than a second on one core.
 
-SBP is another program and not run here. In its stand stands its regularised energy, descended our own way, by Newton's
-method on the positions (`Untangling`): 51 iterations and nine times the time of tanh on the mesh itself, and a map with
-a tenth of the distortion, MIPS 2.4 against 25. ``qhm report --against`` draws a comparison from anybody's records.
+SBP is another program and is not run. Instead, `Untangling` minimises its regularised energy by Newton's method on the
+positions. It takes 51 iterations and nine times the time of tanh on the same mesh. Its map has a tenth of the
+distortion: MIPS 2.4 against 25. ``qhm report --against`` draws a comparison with the records of any program.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sculptures import seven
 def main(output: Path, size: int = 96) -> dict[str, Any]:
     problem = seven(size)["angel onto G"]
     given = problem.V, problem.F, problem.fixed, problem.target
-    quasi_harmonic_map(problem)  # whatever has to be imported is
+    quasi_harmonic_map(problem)  # import lazily loaded modules before timing
     seconds, maps = {}, {}
     for name, found_by in {
         "Tutte": lambda: quasi_harmonic_map(Problem(*given)),

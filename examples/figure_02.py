@@ -1,16 +1,16 @@
 """Figure 2: how the first map of si-log distributes σ₁/σ₂, on the angel that goes onto a G
 ========================================================================================
 
-The paper compares si-log's first map with what TLC comes to after 28,000 iterations: an order of magnitude less MIPS,
-and a distribution of σ₁/σ₂ without TLC's long tail. TLC is another program; tanh's first map, which looks for no
-conformality either, stands in for it. Next to both is the map of least MIPS that quasi-harmonisation finds from
-tanh's (§11): less of it still on average, and a tail of triangles that pay for it. The dotted lines are the means
-over the surface, the full ones the worst triangles; the colours go as far as the worst triangle of all three.
+The paper compares si-log's first map with TLC's map after 28,000 iterations. si-log has an order of magnitude less
+MIPS, and its distribution of σ₁/σ₂ lacks TLC's long tail. TLC is another program and is not run. tanh's first map is
+shown instead, because tanh does not favour conformal maps either. Beside them is the map of least MIPS that
+quasi-harmonisation finds from tanh's map (§11). Its mean MIPS is even lower, but a tail of triangles has large ratios.
+Dotted lines are means over the surface, solid lines the worst triangles. The colours reach the worst of all three maps.
 
-Mean MIPS is 22 for tanh, 6.8 for si-log and 1.7 for the last; 99 % of the triangles are below 58, 11 and 22. si-log's
-distribution is narrow as in the paper (Figure 12 has why), but for a few triangles at the inner corner that were
-righted last, the worst of them at 2,900; the others have their worst at 197 and 46. In the paper si-log's largest
-ratio is below TLC's too.
+Mean MIPS is 22 for tanh, 6.8 for si-log and 1.7 for the last map. 99 % of the triangles are below 58, 11 and 22.
+si-log's distribution is narrow, as in the paper (see Figure 12), except for a few triangles at the inner corner that
+were untangled last. The worst of them has 2,900; the worst of the other maps have 197 and 46. In the paper si-log's
+largest ratio is also below TLC's.
 """
 
 from __future__ import annotations

@@ -2,12 +2,13 @@
 =====================================================================================================
 
 The paper shows shapes of Du et al. and Weber and Zorin: cotangent weights invert triangles at concave corners,
-si-log does not. Here are outlines of the same kind, an arrow, a cross, and a sheet two of whose corners are bent
-across each other (four crossings, one turn in all), from a square of 24 × 24 cells.
+si-log does not. This example maps a square of 24 × 24 cells onto outlines of the same kind: an arrow, a cross and a
+sheet. Two corners of the sheet are bent across each other, with four crossings and a turning number of one.
 
-Harmonic maps invert 344, 170 and 91 of 1,152 triangles, si-log none after 194, 40 and 63 iterations: as in the
-paper. The sheet's map is injective triangle by triangle and, its target overlapping itself, not bijective. si-log
-is not the less distorted on every shape: on the arrow tanh finds a map of MIPS 9.9 in 4 iterations, si-log 13.8.
+Harmonic maps invert 344, 170 and 91 of 1,152 triangles. As in the paper, si-log inverts no triangle, after 194, 40
+and 63 iterations. No triangle of the sheet's map is inverted, but the map is not bijective, because its target overlaps
+itself. si-log is not the less distorted on every shape. On the arrow tanh finds a map of MIPS 9.9 in 4 iterations;
+si-log's map has 13.8.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ ARROW = np.array([(0, 0), (1, 0), (0.15, 0.15), (0, 1)], dtype=float)
 CROSS = np.array(
     [(1, 0), (2, 0), (2, 1), (3, 1), (3, 2), (2, 2), (2, 3), (1, 3), (1, 2), (0, 2), (0, 1), (1, 1)], dtype=float
 )
-# A sheet two of whose corners are bent across each other: four crossings, and one turn all around.
+# A sheet with two corners bent across each other: four crossings and turning number one.
 OVERLAP = np.array([(8, 0), (8, 9.5), (0, 9.5), (0, 0.6), (4, 5), (5, 4), (-1.3, 3)], dtype=float)
 
 

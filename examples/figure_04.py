@@ -1,23 +1,25 @@
 """Figure 4: the inner rectangle turned by π, until something breaks
 ====================================================================
 
-The paper shows one ring, which its method passes, with triangles that become very thin. Here are fourteen, ever
-narrower, finer, off-centre and stretched, each from several functionals: their own descent first, then Newton's method
-on V₃ for the triangles that are left.
+The paper shows one ring, which its method maps with triangles that become very thin. This example has fourteen rings:
+narrower, finer, off-centre and stretched ones. Each is solved from several functionals. The functional's own descent
+runs first; Newton's method on V₃ then untangles the remaining triangles.
 
-What breaks first is existence, and that is proven: on the three rings with but two layers of triangles somewhere
-the diagnosis names vertices that cannot see all their fixed neighbours from any point of the target, so no map
-exists. With a layer or two more there is one. Where nothing forbids a map,
+The first obstacle is existence. On the three rings with only two layers of triangles somewhere, the diagnosis proves
+that no map exists: it names vertices that cannot see all their fixed neighbours from any point of the target. With one
+or two more layers a map exists. On the rings that the diagnosis does not exclude:
 
-- V₃ never fails with si-log (232 to 499 iterations), down to a strip of 1/40 of the width; with tanh (64 to 188) it
-  does on that one alone, where 10 of 7,800 triangles stay inverted, which `solve` rights with its later stages;
-- V₂ and V₁ fail with si-log on that one alone (2 and 8 triangles), with tanh on five and four of eleven rings;
-- V₄ fails on six with tanh and on seven with si-log, for the reason that Figure 6 has; Newton's method saves the rest.
+- V₃ with si-log always succeeds (232 to 499 iterations), down to a strip of 1/40 of the width. With tanh (64 to 188
+  iterations) it fails only on that strip: 10 of 7,800 triangles stay inverted, which later stages of `solve` untangle.
+- V₂ and V₁ with si-log fail only on that strip (2 and 8 triangles). With tanh they fail on five and four of eleven
+  rings.
+- V₄ fails on six rings with tanh and on seven with si-log, for the reason given in Figure 6. Newton's method then
+  solves these rings.
 
-Refinement is no difficulty: 6 and 12 layers take 108 and 113 iterations.
+A finer mesh is not harder: 6 and 12 layers take 108 and 113 iterations.
 
-By default every combination runs on the first ring and those with a chance on the others; ``--full`` runs
-all on all, ``--size 14`` adds the two narrowest rings.
+By default every combination runs on the first ring, and the promising ones on the others. ``--full`` runs all
+combinations on all rings. ``--size 14`` adds the two narrowest rings.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ Hole = tuple[float, float, float, float]
 
 
 def rectangle(half_width: float, half_height: float, x: float = 0.0, y: float = 0.0) -> Hole:
-    """A hole around (x, y)."""
+    """A rectangular hole centred at (x, y)."""
     return x - half_width, y - half_height, x + half_width, y + half_height
 
 
@@ -58,13 +60,13 @@ CASES: dict[str, tuple[int, Hole]] = {
 }
 NAMES = {"V₃": "dirichlet", "V₂": "sobolev", "V₁": "neumann", "V₄": "poisson"}
 COLUMNS = [f"{name} {parameterisation}" for name in NAMES for parameterisation in ("tanh", "si-log")]
-# All eight on the first ring; then those that have a chance.
+# All eight combinations run on the first ring, and these on the other rings.
 USUAL = ["V₃ tanh", "V₃ si-log", "V₂ si-log", "V₁ si-log"]
 DRAWN = ["strip 0.5, 12 layers", "strip 0.2, 5 layers", "off-centre, 4 layers", "hole 1.5 × 0.5, 3 layers"]
 
 
 def search(problem: Problem, column: str) -> MapResult:
-    """A functional's own descent, 100 iterations for tanh and 300 for si-log; then Newton's on V₃, with tanh."""
+    """Descend a functional for 100 iterations (tanh) or 300 (si-log), then run Newton's method on V₃ with tanh."""
     name, parameterisation = column.split()
     steps = 100 if parameterisation == "tanh" else 300
     first = VectorAdam(functional=NAMES[name], parameterisation=parameterisation, iterations=steps)
@@ -72,7 +74,7 @@ def search(problem: Problem, column: str) -> MapResult:
 
 
 def outcome(result: MapResult) -> str:
-    """For a cell of the table."""
+    """The text of a table cell: iterations, or what is left to untangle."""
     if result.injective:
         return f"{result.iterations}"
     return "none exists" if result.status is Status.IMPOSSIBLE else f"{len(result.certificate.inverted)} inverted"
@@ -107,7 +109,7 @@ def main(output: Path, size: int = 12, full: bool = False) -> dict[str, Any]:
 
 
 def table(figure: Figure, numbers: dict[str, Any]) -> None:
-    """Iterations to the first injective map, or what was left."""
+    """Draw the table of iterations to the first injective map, or of remaining inverted triangles."""
     ax = figure.add_axes((0.27, 0.01, 0.72, 0.3))
     ax.set_axis_off()
     cells = [[row.get(column, "") for column in COLUMNS] for row in numbers.values()]

@@ -1,16 +1,16 @@
 """Figure 5: the paths of tanh and si-log on a curved surface that goes onto a G
 ================================================================================
 
-The paper maps Lucy and counts gradients: tanh is injective in fewer than 60, si-log in 190 and with a MIPS energy an
-order of magnitude below others'. TLC has none after 10,000 steps of quasi-Newton, and one after 113 of projected
-Newton, which 28,000 more do not bring near si-log's; SBP takes orders of magnitude more. Both are other programs and
-not run here. SBP's regularised energy is, descended our own way by Newton's method on the positions (`Untangling`).
+The paper maps Lucy and counts gradients. tanh is injective in fewer than 60; si-log takes 190 and its MIPS energy is an
+order of magnitude below that of other methods. TLC has no injective map after 10,000 quasi-Newton steps and one after
+113 projected Newton steps; 28,000 further steps do not reach si-log's energy. SBP takes orders of magnitude more. This
+example runs neither program. `Untangling` minimises SBP's regularised energy by Newton's method on the positions.
 
-Here it is an angel, 8,510 triangles of which Tutte's embedding inverts 747. tanh takes 16 iterations and
-ends at MIPS 22.0, si-log 106 and 6.8: the same trade. Both undo most inversions in the first ten iterations, and the
-last few triangles take most of the time. `Untangling` takes 40 Newton steps, each as long as several of tanh's: after
-the first nearly all triangles are inverted, at the 31st nearly all at once come right, and MIPS is 2.8. V₃ need not
-fall at every step: VectorAdam's is not a line search.
+The surface is an angel with 8,510 triangles, of which Tutte's embedding inverts 747. tanh takes 16 iterations and
+reaches MIPS 22.0; si-log takes 106 and reaches 6.8. Both remove most inversions in the first ten iterations, and the
+last few triangles take most of the time. `Untangling` takes 40 Newton steps, each as long as several iterations of
+tanh. After its first step nearly all triangles are inverted; at the 31st nearly all become positive at once. Its MIPS
+is 2.8. V₃ need not decrease at every step, because VectorAdam has no line search.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
             "MIPS": round(mips(problem, result.uv), 2),
         }
     curves[0].set(ylabel="inverted triangles", yscale="symlog", ylim=(0, None))
-    # At an injective map's own tensors, which untangling has, it is zero but for rounding.
+    # `Untangling` uses the map's own tensors. At an injective map V₃ is zero there, up to rounding.
     curves[1].set(ylabel="V₃ / area", yscale="log", ylim=(1e-6, 2))
     for ax in curves:
         ax.set_xlabel("iteration")

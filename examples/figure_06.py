@@ -1,18 +1,18 @@
 """Figure 6: the ring whose hole is turned by π, descended from the four functionals with si-log
 ================================================================================================
 
-The paper shows V₃, V₄ and V₁, all of them injective at last: V₃ opens a hole in the middle, V₁ moves the singularity
-to a corner first, V₄ turns the whole domain and takes the fewest iterations.
+The paper shows V₃, V₄ and V₁, and all reach an injective map. V₃ opens a hole in the middle, V₁ first moves the
+singularity to a corner, and V₄ turns the whole domain and takes the fewest iterations.
 
-Here V₃ takes 232 iterations, V₂ 242, V₁ 497, and all three go the same way: nothing much for about 90 iterations,
-then a hole opens in the middle and within ten iterations fills the inner square. V₁'s detour by a corner does not
-occur: the mesh is its own image under half a turn and the start is undisturbed, so the middle stays the middle.
+In this example V₃ takes 232 iterations, V₂ 242 and V₁ 497, along the same path. For about 90 iterations little
+changes. Then a hole opens in the middle and fills the inner square within ten iterations. V₁'s detour by a corner does
+not occur: the mesh is symmetric under half a turn and the start is not perturbed, so the middle stays fixed.
 
-V₄ does not get there: 74 triangles stay inverted. It fails too with tanh, with L-BFGS, with other steps and on rings
-of up to 17,000 triangles. In linear elements V₄ is not bounded below by zero, and injective maps, which are among its
-zeros, are saddle points: close around the tensor of V₃'s map it is negative in every one of twenty random directions.
-A slow descent, as this one is, leaves the smooth fields before it arrives. A fast one may not: turned by π/2, with
-tanh and a fine mesh, V₄ finds a map in 3 iterations.
+V₄ fails: 74 triangles stay inverted. It also fails with tanh, with L-BFGS, with other step lengths and on rings of up
+to 17,000 triangles. In linear elements V₄ is not bounded below by zero. Injective maps are among its zeros but are
+saddle points: near the tensor of V₃'s map V₄ is negative in all of twenty random directions. A slow descent like this
+one leaves the smooth fields before it reaches the map. A fast descent can succeed: for a turn by π/2, with tanh and a
+fine mesh, V₄ finds a map in 3 iterations.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SHOTS = 6
 
 
 def around_own_tensor(problem: Problem, uv: np.ndarray) -> dict[str, float]:
-    """V₄ over the target's area at an injective map's own tensor, and the largest of twenty values close around it."""
+    """V₄ over the target's area at an injective map's own tensor, and the largest of twenty values near that tensor."""
     objective = Objective(problem, "poisson", "tanh")
     xi = objective.near_map(problem.frame.inward(uv)).xi
     random = np.random.default_rng(0)
@@ -51,7 +51,7 @@ def main(output: Path, size: int = 24) -> dict[str, Any]:
     for row, (functional, name) in zip(axes, NAMES.items(), strict=True):
         stage = VectorAdam(parameterisation="si-log", functional=functional)
         result = solve(problem, strategy=[stage], max_iterations=1000, record_every=1)
-        # Nothing unfolds while V₄ falls: there any moment is as good as another.
+        # V₄ untangles nothing, so its frames are spaced evenly by iteration.
         still = functional == "poisson"
         path = [-shot.iteration if still else inverted_area(problem, shot.uv) for shot in result.path]
         for ax, at in zip(row, frames(path, SHOTS), strict=True):

@@ -1,9 +1,9 @@
 """Figure 7: the curves |ξ| ↦ |μ| of the two parameterisations, and what they are for
 =====================================================================================
 
-The paper draws ``r = tanh`` and ``r = si-log``. So do we, and beside them how far ξ must go for a given angle
-distortion σ₁/σ₂ = (1 + |μ|)/(1 − |μ|): a distance that grows with the logarithm of the distortion for tanh and
-exponentially with it for si-log. For σ₁/σ₂ = 19, that is |μ| = 0.9, tanh needs |ξ| = 1.5 and si-log 8,100.
+The paper draws ``r = tanh`` and ``r = si-log``. This example also draws the distance |ξ| needed for a given angle
+distortion σ₁/σ₂ = (1 + |μ|)/(1 − |μ|). For tanh the distance grows with the logarithm of the distortion; for si-log
+it grows exponentially. For σ₁/σ₂ = 19, which is |μ| = 0.9, tanh needs |ξ| = 1.5 and si-log 8,100.
 """
 
 from __future__ import annotations

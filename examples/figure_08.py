@@ -1,13 +1,13 @@
 """Figure 8: the first injective maps of tanh and si-log, coloured by their angle distortion
 ============================================================================================
 
-The paper shows one pair and says that si-log's distortion is the smaller. Here are two pairs. Onto the letter S,
-si-log's first map has a MIPS energy of 5.5 against tanh's 10.3, and 99 % of its triangles lie below σ₁/σ₂ = 16
-against 61; on the ring turned by a quarter it is 1.46 against 1.69 and 3.8 against 4.7. The price is iterations: 66
+The paper shows one pair and says that si-log has the smaller distortion. This example shows two pairs. Onto the letter
+S, si-log's first map has a MIPS energy of 5.5 and tanh's 10.3; 99 % of the triangles lie below σ₁/σ₂ = 16 and 61. On
+the ring turned by a quarter, MIPS is 1.46 and 1.69, and 99 % lie below 3.8 and 4.7. si-log needs more iterations: 66
 against 5, and 22 against 3.
 
-Said plainly: the largest single ratio is si-log's, 620 against 230 and 115 against 5. The search stops at the first
-map without inverted triangles, and the triangle that was righted last is nearly flat.
+However, si-log has the largest single ratio: 620 against 230, and 115 against 5. The search stops at the first map
+without inverted triangles, and the triangle untangled last is nearly degenerate.
 """
 
 from __future__ import annotations

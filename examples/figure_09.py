@@ -1,13 +1,13 @@
 """Figures 9 and 22: the surfaces at rest, their boundaries in red
 ===============================================================
 
-The paper's are scans: Lucy, a gargoyle, a bunny, David, a hand, and in Figure 22 more of that kind. A gallery that
-needs nobody's data makes its own: an angel, a gargoyle, a rabbit, a bust and a hand, each a formula that is negative
-inside, meshed and cut open below (``examples/sculptures.py``). They have what makes the scans hard to map, limbs far
-from the boundary: all that the boundary sees is the last row of triangles above it.
+The paper's surfaces are scans: Lucy, a gargoyle, a bunny, David, a hand, and similar ones in Figure 22. To need no
+external data, this example builds its own: an angel, a gargoyle, a rabbit, a bust and a hand. Each is a formula that is
+negative inside, meshed and cut open below (``examples/sculptures.py``). Like the scans they have limbs far from the
+boundary, which are hard to map: only the last row of triangles above the boundary touches it.
 
-All are disks, with angles above 17° at this size and no interior edge between two boundary vertices, so that nothing in
-the mesh forbids a map.
+All are disks with angles above 17° at this size. No interior edge joins two boundary vertices, so the mesh does not
+exclude a map.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def main(output: Path, size: int = 72) -> dict[str, Any]:
         V, F = sculpture(name, size)
         plot_surface(V, F, ax)
         rim, seen = boundary_edges(F, len(V)), view(V, F)
-        # Of the rim, what is in front.
+        # The visible part of the rim.
         of = {
             edge: triangle
             for triangle, corners in enumerate(F.tolist())

@@ -1,10 +1,10 @@
 """Figure 10: five surfaces onto six letters, by L-BFGS alone
 ===========================================================
 
-In the paper L-BFGS with si-log finds injective maps of thirty shapes onto letters from V₃, V₄ and V₁ alike. That comes
-out here for V₃, but for a few of the thirty, and not for the others. Solved of 30, at most 600 evaluations, no help
-from any other method, and the most iterations that a solved one took; *small* are 1,258 to 2,820 triangles, *large*
-9,198 to 21,212, the *scans* 19,996 to 40,006, which are not shipped:
+In the paper L-BFGS with si-log finds injective maps of thirty shapes onto letters from V₃, V₄ and V₁. This example
+reproduces that for V₃, except for a few of the thirty, and not for V₄ and V₁. The table counts problems solved of 30,
+with at most 600 evaluations and L-BFGS alone. In parentheses is the largest number of iterations of a solved problem.
+*small* are 1,258 to 2,820 triangles, *large* 9,198 to 21,212, the *scans* 19,996 to 40,006 (not shipped):
 
 ====================== ========= ========= =========
 functional             small     large     scans
@@ -19,17 +19,18 @@ V₄, si-log             1 (4)
 V₄ by edges, tanh      29 (101)
 ====================== ========= ========= =========
 
-All are in equilateral triangles but the third row's, which are those of the surface, as the paper's are: there
-limbs shrink to nothing, and what stays inverted, the same number on every letter, is too small to be seen by V₃: on A
-in the median 5e-14 of the area for the angel, 1e-15 for the rabbit and 5e-18 for the hand. V₁ with si-log leaves 1 to 9
-triangles. V₄ in linear elements goes below zero; in Crouzeix and Raviart's it does as V₃ does (`edge_elements`).
+All rows use equilateral reference triangles except the third, which uses the surface's own triangles, as the paper
+does. There limbs shrink to tiny areas, and the triangles that stay inverted are too small to affect V₃. On A their
+median area is 5e-14 of the total for the angel, 1e-15 for the rabbit and 5e-18 for the hand. Their number is the same
+on every letter. V₁ with si-log leaves 1 to 9 triangles. V₄ in linear elements becomes negative. In Crouzeix-Raviart
+elements it behaves like V₃ (`edge_elements`).
 
-The maps drawn are those of V₃ with tanh. It leaves three triangles of the rabbit onto H, at the concave corners of the
-bar, each with a ten-millionth of the area, and after 4,000 evaluations one; `speed` takes 17 iterations, on a coarse
-mesh. Three scans are left with 4 to 8 triangles. With more evaluations two of these are solved, David onto H by 1,623
-and the gargoyle onto H by 1,472; the bunny onto G is not by 3,000.
+The drawn maps are those of V₃ with tanh. On the rabbit onto H it leaves three inverted triangles at the concave corners
+of the bar, each with a ten-millionth of the area, and one after 4,000 evaluations. `speed` takes 17 iterations, on a
+coarse mesh. Three scans keep 4 to 8 inverted triangles. More evaluations solve two of them: David onto H takes 1,623
+and the gargoyle onto H 1,472. The bunny onto G is not solved by 3,000.
 
-``benchmarks/letters_alone.py`` has all runs, one by one.
+``benchmarks/letters_alone.py`` lists all runs.
 """
 
 from __future__ import annotations

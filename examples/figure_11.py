@@ -1,14 +1,14 @@
 """Figure 11: the middle of a rectangle moved to its left, the boundary held; coloured by σ₁/σ₂
 ===============================================================================================
 
-The paper compares si-log, which keeps the largest σ₁/σ₂ small, with a map of least MIPS energy (tanh + MIPS), which
-concentrates it in a spike at the point, and with Bounded Distortion Mapping (Lipman 2012), another program and not run
-here. So it is here: si-log takes 3 iterations and its largest ratio is 2.9; the map
-of least MIPS has less than half its energy (0.25 against 0.57) and a largest ratio of 35.
+The paper compares si-log with a map of least MIPS energy (tanh + MIPS) and with Bounded Distortion Mapping (Lipman
+2012). si-log keeps the largest σ₁/σ₂ small; the least-MIPS map concentrates it in a spike at the point. This example
+shows the same without Bounded Distortion Mapping, which is another program. si-log takes 3 iterations and its largest
+ratio is 2.9. The map of least MIPS has less than half its energy (0.25 against 0.57) and a largest ratio of 35.
 
-The paper descends MIPS along with V₃ from tanh; here the si-log map is polished, for tanh alone does not get there:
-at this size one or two triangles stay inverted, after 366 or 485 iterations, as the linear solver rounds. On grids of
-24 and 30 cells it takes 30 and 170 iterations, on coarser ones a single one.
+The paper minimises MIPS together with V₃ from tanh. This example polishes the si-log map instead, because tanh alone
+fails: at this size one or two triangles stay inverted after 366 or 485 iterations, depending on the rounding of the
+linear solver. On grids of 24 and 30 cells tanh takes 30 and 170 iterations, on coarser ones a single one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOVE = 0.5
 
 
 def moved_point(size: int) -> Problem:
-    """A 2 × 1 rectangle, ``size`` cells high, whose middle goes a quarter of the width to the left."""
+    """A 2 × 1 rectangle, ``size`` cells high, whose middle moves a quarter of the width to the left."""
     V, F = surfaces.grid(2 * size, size)
     V = V * (2, 1)
     (loop,) = boundary_loops(F, len(V))

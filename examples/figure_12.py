@@ -1,14 +1,14 @@
 """Figure 12: a rectangle whose boundary is displaced upwards by twice |x|; the distribution of σ₁/σ₂
 =====================================================================================================
 
-The paper's si-log distributes distortion evenly and TLC concentrates it at the concave corner. TLC is another
-program; tanh's first map is of that kind and stands in for it. The dotted line is the ratio of the plain shear
-``(x, y + 2|x|)``, 5.83 everywhere.
+In the paper si-log distributes distortion evenly and TLC concentrates it at the concave corner. This example does not
+run TLC, which is another program, and shows tanh's first map instead, which behaves similarly. The dotted line is the
+ratio of the plain shear ``(x, y + 2|x|)``, which is 5.83 everywhere.
 
-si-log: half of all triangles between 5.31 and 5.45, 99 % below 6.7. tanh: half between 5.16 and 5.46, but a tail at the
-corner, 99 % below 44. A map of least MIPS (3.37; si-log 3.64, tanh 4.74) leaves a disk in the middle nearly
-conformal and is the less even one: 99 % below 7.2. As in Figure 8 si-log's one outlier, at 480, is the
-triangle that was righted last.
+With si-log, half of all triangles lie between 5.31 and 5.45, and 99 % below 6.7. With tanh, half lie between 5.16 and
+5.46, but the tail at the corner puts the 99 % quantile at 44. A map of least MIPS (3.37; si-log 3.64, tanh 4.74) leaves
+a disk in the middle nearly conformal. It is less even than si-log: 99 % lie below 7.2. As in Figure 8, si-log's one
+outlier, at 480, is the triangle untangled last.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SLOPE = 2.0
 
 
 def wedge(size: int) -> Problem:
-    """The rectangle [-1, 1] × [0, 1], ``size`` cells high, its boundary displaced by SLOPE · |x|."""
+    """The rectangle [-1, 1] × [0, 1], ``size`` cells high, with its boundary displaced by SLOPE · |x|."""
     V, F = surfaces.grid(2 * size, size)
     V = (V - (0.5, 0)) * (2, 1)
     (loop,) = boundary_loops(F, len(V))

@@ -1,24 +1,24 @@
 """Figures 13 to 16: beside TLC and SBP, from records of theirs
 =============================================================
 
-The paper shows maps of TLC alone (Figure 13) and of SBP alone (Figure 15), MIPS over a benchmark (Figure 14) lower
-than TLC's, and times (Figure 16) of 0.01 to 5 s for most meshes where SBP takes 1 to 100 s.
+The paper shows maps of TLC alone (Figure 13) and of SBP alone (Figure 15). Figure 14 shows MIPS over a benchmark, lower
+than TLC's. Figure 16 shows times of 0.01 to 5 s for most meshes where SBP takes 1 to 100 s.
 
-TLC and SBP are no packages that one can install. What they did on 68 problems of this project's own generator, 300 to
-6,000 triangles, was measured once, by us, and is kept in ``benchmarks/records`` with versions, settings and machine;
-their maps were not, so Figures 13 and 15 are drawn as what is said of them there: TLC's first maps have MIPS energies
-far above ours, 90 and 46 in the median against 14, and SBP's do not: it lowers its energy until that has converged and
-ends at 6.4, below our first maps (Figure 14's claim is about TLC, and holds here; of SBP the paper says no such
-thing). Polished for least MIPS all come to about the same, 6.3 to 6.6.
+TLC and SBP are not installable packages. Their results on 68 problems of this project's generator, with 300 to 6,000
+triangles, were measured once. ``benchmarks/records`` keeps the results with versions, settings and machine, but not the
+maps. Figures 13 and 15 are therefore drawn as statistics. TLC's first maps have median MIPS energies of 90 and 46,
+this project's 14. SBP minimises its energy until it has converged and reaches 6.4, below this project's first maps.
+The claim of Figure 14 about TLC is thus reproduced; the paper makes no such claim about SBP. After polishing for least
+MIPS all methods reach 6.3 to 6.6.
 
-Of 44 problems known to have a map ours solves 44, SBP 42, TLC-QN 36 and TLC-PN 34, with their default tolerances. In
-CPU time ours is ahead of SBP on 49 of 50 and of TLC-PN on 41 of 43 that both solve. TLC-QN is close: 1.5 times ours in
-the median, and the quicker one on 17 of 42. The problems are the generator's on which
-this project's defaults were developed, the others' were developed elsewhere.
+Of 44 problems known to have a map this project solves 44, SBP 42, TLC-QN 36 and TLC-PN 34, with default tolerances. In
+CPU time it is faster than SBP on 49 of 50 problems that both solve, and than TLC-PN on 41 of 43. TLC-QN is close: its
+median time is 1.5 times as long, and it is faster on 17 of 42. This project's defaults were developed on problems of
+this generator, and those of the other programs elsewhere.
 
-Ours is what was run beside them, version 0.1.0. `Untangling` is SBP's regularised energy, descended our own way by
-Newton's method; it was run anew on the same problems, and beside `speed` on the same day it solves 43 of the 44 in 2.2
-times the time, to MIPS energies of 9.6. ``benchmarks/rivals.py --anew`` runs ours again.
+The comparison used version 0.1.0 of this project. `Untangling`, which minimises SBP's regularised energy by Newton's
+method, was run later on the same problems. Compared with `speed` on the same day it solves 43 of the 44 in 2.2
+times the time, with MIPS energies of 9.6. ``benchmarks/rivals.py --anew`` runs this project's solver again.
 """
 
 from __future__ import annotations

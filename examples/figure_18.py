@@ -1,14 +1,15 @@
 """Figure 18: boundaries that allow no map: the search is stable, ends at the minimal surface, and says so
 ==========================================================================================================
 
-The paper shows one such boundary and says that the method stays stable and yields a minimal surface. Here are three,
-each descended until nothing moves any more, and measured: the A-Dirichlet energy comes down to the unsigned area of the
-map (the sandwich of eq. 42 closes), and for the two curves that area is the least that any map with this
-boundary can have, ``∫ |winding number|``, both to three digits: 1.455 and 0.949. The third is a ring with too few
-triangles, where no map is that small.
+The paper shows one boundary of this kind and says that the method stays stable and yields a minimal surface. This
+example descends three until they have converged, and measures them. The A-Dirichlet energy decreases to the unsigned
+area of the map, so the bounds of eq. 42 coincide. For the two curves this area is the least that any map with this
+boundary can have, ``∫ |winding number|``, to three digits: 1.455 and 0.949. The third problem is a ring with too few
+triangles, and its maps all have a larger area.
 
-The status says that no map exists, and the diagnosis why: loops wound the wrong way, turning numbers, and for
-the ring vertices whose fixed neighbours no point of the target sees together.
+The status says that no map exists, and the diagnosis gives the reason. For the curves these are loops wound the wrong
+way and turning numbers. For the ring they are vertices whose fixed neighbours are not all visible from any point of the
+target.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from quasiharmonic import Problem, boundary_loops, surfaces
 
 
 def problems(size: int) -> dict[str, Problem]:
-    """A disk onto curves that bound nothing, and a ring too coarse for the turn that is asked of it."""
+    """A disk onto two curves that bound no immersed disk, and a ring too coarse for its prescribed turn."""
     V, F = surfaces.disk(size)
     (loop,) = boundary_loops(F, len(V))
     t = 2 * np.pi * np.arange(len(loop)) / len(loop)
     eight = np.stack([np.cos(t), 0.5 * np.sin(2 * t) + 0.25 * np.sin(t)], axis=1)
-    # Four loops outwards, wound the wrong way, at the corners of a disk.
+    # Four loops that point outwards at the corners of a disk and are wound the wrong way.
     looped = np.stack([1.2 * np.cos(t) - 0.5 * np.cos(3 * t), 0.6 * np.sin(t) + 0.45 * np.sin(3 * t)], axis=1)
     return {
         "lopsided eight": Problem(V, F, loop, eight),
@@ -38,7 +39,7 @@ def problems(size: int) -> dict[str, Problem]:
 
 
 def winding_area(problem: Problem) -> float:
-    """``∫ |winding number|`` of the target's boundary over the plane, by sampling: no map covers less area."""
+    """``∫ |winding number|`` of the target's boundary, by sampling: a lower bound on the area of every map."""
     place = dict(zip(problem.fixed.tolist(), problem.target @ (1, 1j), strict=True))
     low, high = problem.target.min(axis=0), problem.target.max(axis=0)
     x, y = (low[k] + (np.arange(400) + 0.5) / 400 * (high - low)[k] for k in range(2))

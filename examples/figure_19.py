@@ -1,11 +1,11 @@
 """Figure 19: one surface onto one outline, by five energies and a regulariser, each with V₃ to keep it injective
 ==============================================================================================================
 
-The paper shows that V₃ can be blended with any of them. Here every energy begins at the same first map of tanh, and
-the table says what each map comes to in each energy, relative to the least of all. No map has an inverted triangle,
-and each is the best of the seven in its own energy. Springs and ARAP come to nearly the same, as the paper finds, and
-so do MIPS and R₁, which is MIPS once V₃ has vanished; the area-preserving map has little in common with the others.
-ARAP and springs let the ears shrink to next to nothing: they charge it at most for what is lost.
+The paper shows that V₃ can be blended with any of these energies. In this example every energy starts at the same first
+map of tanh. The table gives the value of each energy for each map, relative to the least of all. No map has an inverted
+triangle, and each is the best of the seven in its own energy. Springs and ARAP give nearly the same map, as in the
+paper. So do MIPS and R₁, which equals MIPS where V₃ is zero. The area-preserving map differs from all others. ARAP and
+springs let the ears shrink to almost nothing, because their cost of shrinking is bounded.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
         numbers[name] |= {title: float(f"{energy.value(uv @ (1, 1j)):.4g}") for title, energy in measures.items()}
     last = axes[1][3]
     last.set_axis_off()
-    # What each energy comes to, relative to the least of all maps.
+    # The value of each energy relative to the least of all maps.
     values = np.array([[numbers[name][title] for title in measures] for name in maps])
     relative = values / values.min(axis=0)
     rows = ("first", "ARAP", "springs", "area", "MIPS", "sym. D.", "R₁")

@@ -1,15 +1,15 @@
 """Figure 20: collision avoidance by way of bijectivity, figures squeezed into an hourglass, a flask and a bend
 ============================================================================================================
 
-The paper puts a figure with holes into an hourglass in one go: figure and air are one mesh, the quasi-harmonised ARAP
-energy counts on the figure (blue) alone, and the air (yellow) has no weight, yet no triangle of it may be inverted, so
-that nothing overlaps. That is ``harmonise(…, energy="arap-unsigned", weights=0 on the air, scaled=False)``; the last
-word keeps the figure at its own size, where the paper's Figure 23 scales the whole mesh. *Longer* means up to 200
-solves in each of the four rounds, where 40 are the default.
+The paper puts a figure with holes into an hourglass in one step. Figure and air are one mesh. The quasi-harmonised ARAP
+energy applies to the figure (blue) alone, and the air (yellow) has no weight. Since no triangle of the air may be
+inverted, nothing overlaps. That is ``harmonise(…, energy="arap-unsigned", weights=0 on the air, scaled=False)``. With
+``scaled=False`` the figure keeps its own size, where the paper's Figure 23 scales the whole mesh. *Longer* means up to
+200 solves in each of the four rounds instead of the default 40.
 
-Beside it the same energy with a barrier, a tenth of det J + 1/det J, by Newton's method, the air at a thousandth of the
-weight: on the same mesh, and as `AirMesh` does it, the air triangulated anew. ARAP of the figure, solves, and CPU
-seconds on one core:
+The second method adds a barrier to the same energy, a tenth of det J + 1/det J, and minimises it by Newton's method.
+The air has a thousandth of the weight. It runs on the same mesh, and with `AirMesh`, which triangulates the air again.
+The table gives ARAP of the figure, solves, and CPU seconds on one core:
 
 ======================  ================  ==================  ==================
 way                     man, hourglass    starfish, flask     wrench, bend
@@ -22,9 +22,10 @@ barrier, the same air   0.008, 39, 0.2    0.013, 60, 0.3      0.007, 21, 0.1
 barrier, fresh air      0.006, 0.3 s      0.026, 0.3 s        0.006, 0.1 s
 ======================  ================  ==================  ==================
 
-All maps are bijective. So the paper's way works, from the first map on, and Newton's method with a barrier is better on
-the same mesh in less time. What the paper's way alone does is to begin at a map that is not injective. Fresh air lets
-figures slide; without it they keep their neighbours. The starfish has several ways to lie: each method ends in one.
+All maps are bijective. The paper's method works from the first map on, but Newton's method with a barrier gives better
+maps of the same mesh in less time. Only the paper's method can start at a map that is not injective. Triangulating the
+air again lets figures slide; otherwise they keep their neighbours. The starfish has several local minima, and the
+methods find different ones.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-#: Half the width and height of the box that each figure rests in, and points along its lower, right, upper, left side.
+#: Half the width and height of the initial box of each figure, and points along its lower, right, upper, left side.
 BOX, COUNTS = (1.5, 2.0), (24, 32, 24, 32)
 
 
@@ -60,10 +61,10 @@ class Scene:
     Attributes
     ----------
     V : (n, 2) float64
-        At rest; the rim's vertices come last.
+        Rest positions; the rim's vertices come last.
     F : (f, 3) int64
     body : (f,) bool
-        Which triangles are not air.
+        True for triangles of the figure, False for air.
     rim : (k,) int64
     """
 
@@ -82,7 +83,7 @@ def holes(*circles: tuple[float, float, float]) -> Polygon:
 
 
 def man() -> Polygon:
-    """A man of cheese."""
+    """A man with holes, like cheese."""
     parts = [
         Point(0, 1.0).buffer(0.36),
         limb(0.33, (0, 0.42), (0, -0.3)),
@@ -97,21 +98,21 @@ def man() -> Polygon:
 
 
 def starfish() -> Polygon:
-    """Seven arms around a hole."""
+    """A starfish of seven arms around a hole."""
     tips = [(1.15 * float(np.cos(t)), 1.15 * float(np.sin(t))) for t in 2 * np.pi * (np.arange(7) / 7 + 0.03)]
     body = union_all([Point(0, 0).buffer(0.42), *(limb(0.13, (0, 0), tip) for tip in tips)])
     return body.buffer(0.05).buffer(-0.05).difference(holes((0, 0, 0.2)))
 
 
 def wrench() -> Polygon:
-    """A bar with an open jaw at either end, and a hole."""
+    """A bar with an open jaw at each end, and a hole."""
     bar = union_all([limb(0.16, (0, -1.1), (0, 1.1)), Point(0, 1.25).buffer(0.42), Point(0, -1.25).buffer(0.42)])
     jaws = union_all([limb(0.14, (0, 1.3), (0, 2.0)), limb(0.14, (0, -1.3), (0, -2.0))])
     return bar.buffer(0.06).buffer(-0.06).difference(jaws).difference(holes((0, 0.5, 0.07)))
 
 
 def around(corners: Sequence[complex], bulge: float = 0.0) -> FloatArray:
-    """The points along a polygon's four sides, these bent outwards if a convex hull is wanted."""
+    """Points along a polygon's four sides, which ``bulge`` bends outwards."""
     points = []
     for a, b, count in zip(corners, [*corners[1:], corners[0]], COUNTS, strict=True):
         t = np.arange(count) / count
@@ -126,20 +127,20 @@ def box() -> FloatArray:
 
 
 def hourglass(neck: float = 0.22) -> FloatArray:
-    """The box, smaller, and drawn in at the middle."""
+    """The box, smaller and narrowed in the middle."""
     x, y = 0.72 * box().T
     return np.stack([x * (neck + (1 - neck) * np.clip(np.abs(y), 0, 1) ** 1.5), 1.2 * y], axis=1)
 
 
 def flask(neck: float = 0.3) -> FloatArray:
-    """The box, smaller, with a long neck above."""
+    """The box, smaller and with a long neck above."""
     x, y = 0.62 * box().T
     t = np.clip((y + 0.2) / 0.6, 0, 1)
     return np.stack([x * (1 + (neck - 1) * t * t * (3 - 2 * t)), 1.1 * y], axis=1)
 
 
 def bend(width: float = 0.3) -> FloatArray:
-    """The box, made narrow and bent into most of a circle."""
+    """The box, narrowed and bent into most of a circle."""
     x, y = box().T
     angle, radius = np.pi * (0.5 + 0.7 * y / BOX[1]), 0.8 - width * x
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1) * (-1, 1)
@@ -153,7 +154,7 @@ SCENES = {
 
 
 def scene(shape: Polygon, spacing: float) -> Scene:
-    """Mesh a shape and the air up to the box, with points about so far apart."""
+    """Mesh a shape and the air up to the box, with point distances of about ``spacing``."""
     rim, loops = box(), []
     for ring in (shape.exterior, *shape.interiors):
         at = np.arange(max(8, round(ring.length / spacing)))
@@ -177,7 +178,7 @@ def scene(shape: Polygon, spacing: float) -> Scene:
 
 
 def newton(here: Scene, uv: FloatArray, air_weight: float = 1e-3, steps: int = 300) -> tuple[FloatArray, int]:
-    """ARAP with a barrier, lowered on the same mesh; the map, and how many steps it took."""
+    """Minimise ARAP with a barrier on the same mesh; return the map and the number of steps."""
     weights = np.where(here.body, 1.0, air_weight)
     energy = DeformationEnergy(here.V, here.F, Combination((1.0, ARAP()), (0.1, AreaBarrier())), weights=weights)
     descent, taken = NewtonDescent(energy, uv, here.rim, 0, "auto"), 0

@@ -1,10 +1,10 @@
 """Figure 21: surfaces onto the disk, area-preserving, by si-log, and as rigid as possible
 =======================================================================================
 
-As in the paper, si-log's maps are nearly conformal (mean MIPS 0.01 to 0.10) and put all that is tall into a point;
-ARAP gives it the room that lengths ask for, where the boundary leaves it; and the area-preserving maps look like
-neither: what is tall fills most of the disk. There a triangle's area is off by 2 to 11 % on average, where si-log's
-are off by 37 to 169 %. No triangle is inverted, in any map.
+As in the paper, si-log's maps are nearly conformal (mean MIPS 0.01 to 0.10) and compress all tall parts into a point.
+ARAP gives these parts the space that their lengths need, as far as the boundary allows. In the area-preserving maps the
+tall parts fill most of the disk, unlike in the others. There a triangle's area is off by 2 to 11 % on average, against
+37 to 169 % for si-log. No map has an inverted triangle.
 """
 
 from __future__ import annotations

@@ -2,14 +2,14 @@
 ===================================================================================
 
 Upper rows: the map of least energy, found by L-BFGS on its vertices from the first injective map. From 3 to over 1,600
-triangles end up inverted: those behind the boundary's concave corners, and folds wherever a fold costs less than
-squeezing, for springs wherever the surface stands up. Lower rows: the same energies with V₃, as `harmonise` descends
-them. None inverted. ARAP is 42 to 61 % higher for it on A, P and H and springs 22 to 45 %; on R, where the energies
-alone leave through the gap between the legs, 2.7 and 3.1 times as high. For areas it is lower on A, P and H: the folds
-of the energy alone are local minima.
+triangles are inverted. They lie behind the boundary's concave corners and wherever a fold costs less than compression,
+for springs wherever the surface is steep. Lower rows: the same energies with V₃, minimised by `harmonise`. No triangle
+is inverted. ARAP is then 42 to 61 % higher on A, P and H, and springs 22 to 45 %. On R, where the unconstrained maps
+leave through the gap between the legs, they are 2.7 and 3.1 times as high. The area energy is lower on A, P and H,
+because the folds of the unconstrained maps are local minima.
 
-ARAP is the paper's, with σ₂ ≥ 0 (``"arap-unsigned"``), for which a mirrored triangle is as good as another. With the
-signed σ₂ of ``"arap"``, which charges it, the difference was 2 to 17 % on A, P and H, and R's 1.8 times.
+ARAP is the paper's, with σ₂ ≥ 0 (``"arap-unsigned"``), which costs the same for a mirrored triangle. With the signed σ₂
+of ``"arap"``, which penalises mirrored triangles, the difference was 2 to 17 % on A, P and H, and a factor of 1.8 on R.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NAMES = {"arap-unsigned": "ARAP", "springs": "springs", "area": "areas"}
 
 
 def alone(problem: Problem, energy: DeformationEnergy, uv: FloatArray, iterations: int = 1000) -> FloatArray:
-    """The map of least energy near ``uv``, whatever becomes of its triangles: L-BFGS on the free vertices."""
+    """The map of least energy near ``uv``, by L-BFGS on the free vertices, where triangles may become inverted."""
     free = np.setdiff1d(np.arange(problem.n), problem.fixed)
     w = uv @ (1, 1j)
 

@@ -1,22 +1,23 @@
 """Figure 24: areas alone, or angles alone: SBP's two terms and quasi-harmonisation
 =================================================================================
 
-SBP descends ``(1 − θ) MIPS + θ E_a`` with E_a = det J + 1/det J − 2. The paper reports that its program fails for θ =
-1 on all letters but David to A, and that θ = 0 ends in maps of extreme scale at the boundary, and compares the former
+SBP minimises ``(1 − θ) MIPS + θ E_a`` with E_a = det J + 1/det J − 2. The paper reports that its program fails for θ =
+1 on all letters but David to A, and that θ = 0 gives maps of extreme scale at the boundary. It compares the former
 with its own area-preserving maps.
 
-SBP has to find an injective map on its way. From one at hand both of its terms can be descended to convergence by
-`polish`, and that is what the first and the third column have: θ = 1 does not fail, and leaves areas off by 0.2 to 8
-% on average. Quasi-harmonised, the area energy gets less far in its 160 linear solves, 5 to 35 %, with a quarter of
-the shear where room is short (mean MIPS of 11 against 45 on R, and 25 against 101 on H). Where an energy has a
-barrier and second derivatives Newton's method is the better one; quasi-harmonisation needs neither.
+SBP must find an injective map first. From a given injective map, `polish` can minimise both of its terms until it has
+converged. The first and the third column show this: θ = 1 does not fail, and areas are off by 0.2 to 8 % on average.
+With quasi-harmonisation the area energy is less reduced within its 160 linear solves, to 5 to 35 %. Its maps have a
+quarter of the shear where the target is narrow (mean MIPS of 11 against 45 on R, and 25 against 101 on H). For energies
+with a barrier and second derivatives Newton's method is better; quasi-harmonisation needs neither.
 
-The last column stands for SBP itself: its regularised energy of both terms, with 10⁻⁴ of areas and not 1/128, until the
-first injective map, by Newton's method on the positions (`Untangling`). Angles are kept about as well as by si-log or
-better, and areas as little as with θ = 0.
+The last column represents SBP itself. `Untangling` minimises its regularised energy of both terms by Newton's method on
+the positions, until the first injective map. The weight of areas is 10⁻⁴ instead of 1/128. Angles are preserved as well
+as by si-log or better, and areas as poorly as with θ = 0.
 
-θ = 0 does what the paper says: areas span 7 to 11 orders of magnitude, and triangles at the boundary grow to between 28
-and 67 times their area. si-log's first map, which minimises no energy of angles, spans nearly as many but stops at 27.
+θ = 0 behaves as the paper says: areas span 7 to 11 orders of magnitude, and triangles at the boundary grow to between
+28 and 67 times their area. si-log's first map, which minimises no angle energy, spans nearly as many but grows at most
+27 times.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ COLUMNS = "bust onto A", "rabbit onto R", "gargoyle onto H"
 
 
 def maps_of(problem: Problem) -> dict[str, FloatArray]:
-    """What is compared."""
+    """The maps to compare, by name."""
     first = solve(problem, strategy=[VectorAdam(iterations=600)]).uv
     return {
         "θ = 1: areas": polish_map(problem.domain, first, energy=conformal_area_blend(1.0)).uv,
@@ -54,7 +55,7 @@ def maps_of(problem: Problem) -> dict[str, FloatArray]:
 
 
 def show_areas(ax: Axes, problem: Problem, uv: FloatArray, title: str) -> PolyCollection:
-    """Draw a map coloured by its area ratio, mean 1; hand back what a colour bar needs."""
+    """Draw a map coloured by its area ratio, with mean 1, and return the collection for a colour bar."""
     ratio = distortion(problem.V, problem.F, uv).area_ratio
     drawn = PolyCollection(
         uv[problem.F], array=ratio, cmap="RdBu_r", norm=LogNorm(0.1, 10), edgecolors="face", lw=0.3, snap=False

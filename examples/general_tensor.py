@@ -1,9 +1,10 @@
 """Beyond det A = 1: tensors of two Beltrami coefficients, and the boundary's condition (§8.1, §D)
 ===============================================================================================
 
-Theory, for study; the solver uses nothing of it. Drawn is Proposition D.2's ``s`` along the boundary of a disk, of
-Tutte's embedding onto a star and of an injective map: negative exactly where the triangle at the boundary edge is
-inverted. The injective map is also the conjugate quasi-harmonic map of tensors with determinants drawn at random.
+This example is theory for study; the solver uses none of it. The figure shows Proposition D.2's ``s`` along the
+boundary of a disk, for Tutte's embedding onto a star and for an injective map. It is negative exactly where the
+triangle at the boundary edge is inverted. The injective map is also the conjugate quasi-harmonic map of tensors with
+random determinants.
 
 For any elliptic A, the equations ``∇·(A∇u) = 0`` and ``∇v = * A ∇u`` are one complex Beltrami equation for
 ``f = u + i v``::
@@ -16,23 +17,22 @@ and with ``d = |1 + ν|² − |μ|²``::
     A = ─  ⎢                                     ⎥ ,   [μ, ν] = ──────────────── · ⎢                           ⎥
         d  ⎣ −2 Im(ν + μ)        |1 + μ|² − |ν|² ⎦               1 + tr A + det A  ⎣ 1 − det A + i (a12 − a21) ⎦
 
-as Astala, Iwaniec and Martin (2008, §16.1) have it. The paper's eq. 32 has ``−2 Im μ`` in both off-diagonal
-places and calls ν complex. That is right for real ν, which is what a symmetric tensor has (three numbers
-a triangle: μ and ν). Of a complex ν it keeps the symmetric part only, and the Beltrami equation fails.
-Determinant and eigenvalues are::
+as in Astala, Iwaniec and Martin (2008, §16.1). The paper's eq. 32 has ``−2 Im μ`` in both off-diagonal entries and
+calls ν complex. This is right for real ν, which belongs to symmetric tensors (three numbers a triangle: μ and ν). For
+complex ν it keeps only the symmetric part, and the Beltrami equation fails. Determinant and eigenvalues are::
 
     det A = (|1 − ν|² − |μ|²) / (|1 + ν|² − |μ|²)
     eigenvalues (1 + |μ| − ν) / (1 − |μ| + ν) and (1 − |μ| − ν) / (1 + |μ| + ν)       for real ν
 
 So for symmetric A the condition det A = 1 is ν = 0, and A is eq. 33.
 
-What the solver uses is ν = 0 alone: one complex number a triangle, the same tensor for u and for v, and maps
-that lose nothing by it (Theorem 6.4). With ν ≠ 0 the same holds of conjugate maps: any map without inverted
-triangles is the conjugate quasi-harmonic map of *every* pair that its triangles' Beltrami equations admit, so
-ν adds freedom that no map needs.
+The solver uses ν = 0 alone: one complex number per triangle and the same tensor for u and for v. No map is lost by this
+(Theorem 6.4). With ν ≠ 0 the same holds for conjugate maps. Any map without inverted triangles is the conjugate
+quasi-harmonic map of *every* pair that satisfies the Beltrami equation on its triangles. So ν adds freedom that no map
+needs.
 
-Tensors here are in the frames of the reference triangles (`ReferenceMesh`), without the area factor. In a
-frame turned by φ, μ becomes ``μ e^{−2iφ}`` and ν stays.
+The tensors are given in the frames of the reference triangles (`ReferenceMesh`), without the area factor. In a frame
+turned by φ, μ becomes ``μ e^{−2iφ}`` and ν is unchanged.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, named
 
 
 def beltrami_tensor(mu: ArrayLike, nu: ArrayLike) -> FloatArray:
-    """The tensor A of a Beltrami pair (eq. 32, corrected for complex ν).
+    """Return the tensor A of a Beltrami pair (eq. 32, corrected for complex ν).
 
     Parameters
     ----------
     mu, nu : (...) complex
-        With ``|μ| + |ν| < 1``; they are broadcast against each other.
+        The pair, with ``|μ| + |ν| < 1``, broadcast against each other.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def beltrami_tensor(mu: ArrayLike, nu: ArrayLike) -> FloatArray:
     Raises
     ------
     ValueError
-        Where ``|μ| + |ν| ≥ 1``: the equation is not elliptic.
+        If ``|μ| + |ν| ≥ 1`` anywhere, because the equation is then not elliptic.
     """
     mu, nu = np.broadcast_arrays(np.asarray(mu, dtype=np.complex128), np.asarray(nu, dtype=np.complex128))
     bad = np.flatnonzero(~(np.abs(mu) + np.abs(nu) < 1))
@@ -85,12 +85,12 @@ def beltrami_tensor(mu: ArrayLike, nu: ArrayLike) -> FloatArray:
 
 
 def beltrami_pair(A: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
-    """The Beltrami pair of a tensor, the inverse of `beltrami_tensor`.
+    """Return the Beltrami pair of a tensor; the inverse of `beltrami_tensor`.
 
     Parameters
     ----------
     A : (..., 2, 2) float
-        Any matrices with positive definite symmetric part.
+        Matrices with positive definite symmetric part.
 
     Returns
     -------
@@ -104,10 +104,9 @@ def beltrami_pair(A: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
 
 
 def conjugate_tensor(A: ArrayLike) -> FloatArray:
-    """``Ā = *ᵀ A⁻¹ * = Aᵀ / det A`` (Definition 8.1): the tensor of v where A is that of u.
+    """Return the conjugate tensor ``Ā = *ᵀ A⁻¹ * = Aᵀ / det A`` (Definition 8.1), the tensor of v if A is that of u.
 
-    Its Beltrami pair is ``(μ, −ν)``, so it is A itself exactly where ν = 0, that is where A is symmetric and
-    has unit determinant.
+    Its Beltrami pair is ``(μ, −ν)``. It equals A exactly if ν = 0, that is, if A is symmetric and has unit determinant.
 
     Parameters
     ----------
@@ -122,28 +121,28 @@ def conjugate_tensor(A: ArrayLike) -> FloatArray:
 
 
 def conjugate_quasi_harmonic_map(problem: Problem, A: ArrayLike, reference: Reference = "rest") -> FloatArray:
-    """The map with ``∇·(A∇u) = 0`` and ``∇·(Ā∇v) = 0`` and the problem's positions (eq. 31), in linear elements.
+    """Solve ``∇·(A∇u) = 0`` and ``∇·(Ā∇v) = 0`` with the problem's positions (eq. 31), in linear elements.
 
-    Reproduces every map whose triangles satisfy the Beltrami equation of A's pair. For ν = 0 it is the
+    This reproduces every map whose triangles satisfy the Beltrami equation of A's pair. For ν = 0 it is the
     quasi-harmonic map that the solver computes.
 
     Parameters
     ----------
     problem : Problem
     A : (f, 2, 2) float
-        By triangle, in its reference frame.
+        One tensor per triangle, in its reference frame.
     reference : {"rest", "equilateral", "corrected"}
-        The triangles in which A is meant, unless the problem itself names them.
+        The reference triangles of A, used if the problem itself names none.
 
     Returns
     -------
     (n, 2) float64
-        The fixed vertices at their target.
+        Vertex positions; fixed vertices are at their target positions.
 
     Raises
     ------
     ValueError
-        When A has another shape or is not elliptic.
+        If A has another shape or is not elliptic.
     """
     from scipy.sparse.linalg import splu
 
@@ -160,21 +159,21 @@ def conjugate_quasi_harmonic_map(problem: Problem, A: ArrayLike, reference: Refe
 
 @dataclass(frozen=True)
 class Conormal:
-    """The co-normal derivative of a map at the boundary, beside the target's normal (Proposition D.2).
+    """The co-normal derivative of a map at the boundary, and the target's normal (Proposition D.2).
 
     The condition of eq. 8 is ``nᵀ [A∇u  A∇v] = s n̂ᵀ`` with some ``s > 0``: ``s`` positive and ``misalignment``
-    zero. Eq. 9 asks for more: ``flux`` equal to ``normal``.
+    zero. Eq. 9 is stronger: ``flux`` equal to ``normal``.
 
     Attributes
     ----------
     at : (k, 2) or (k,) int64
-        Boundary edges, the surface to their left, or boundary vertices.
+        Boundary edges, with the surface to their left, or boundary vertices.
     flux : (k,) complex128
         ``n · A∇(u + i v)`` integrated over the edge, or its weak form at the vertex: ``Gᵀ A G (u + i v)``.
     normal : (k,) complex128
-        The target's outward normal times the length of the edge's image; at a vertex the mean of its edges'.
+        The target's outward normal times the length of the edge's image; at a vertex, the mean over its two edges.
     length : (k,) float64
-        Rest length of the edge, or the mean of the vertex's two.
+        Rest length of the edge; at a vertex, the mean over its two edges.
     """
 
     at: NDArray[np.int64]
@@ -184,26 +183,26 @@ class Conormal:
 
     @property
     def s(self) -> FloatArray:
-        """Share of the co-normal derivative along the unit normal n̂, zero where the image has no length."""
+        """The component of the co-normal derivative along the unit normal n̂, zero where the image has no length."""
         size = np.abs(self.normal) * self.length
         along = (self.flux * self.normal.conj()).real
         return np.divide(along, size, out=np.zeros_like(along), where=size > 0)
 
     @property
     def misalignment(self) -> FloatArray:
-        """Angle from n̂ to the co-normal derivative, in radians from −π to π."""
+        """The angle from n̂ to the co-normal derivative, in radians from −π to π."""
         return np.asarray(np.angle(self.flux * self.normal.conj()))
 
 
 def conormal_derivative(A: ArrayLike, J: ArrayLike, n: ArrayLike) -> FloatArray:
-    """``nᵀ [A∇u  A∇v]`` as a vector, ``J Aᵀ n``: the left side of Proposition D.2's condition at points.
+    """Return ``nᵀ [A∇u  A∇v]`` as a vector, ``J Aᵀ n``: the left side of Proposition D.2's condition at points.
 
     With the tangent t counterclockwise of n and n̂ the unit normal of the image curve, clockwise of ``Jt``,
 
         det J = s |J t| / (nᵀ A n),      s = n̂ · J Aᵀ n.
 
-    This is the proposition with a number in it. The proof's last line reads ``s n̂ᵀ n`` where it means
-    ``s n̂ᵀ n̂``. It uses the part along n̂ alone, so that ``s > 0`` suffices and alignment is not needed.
+    This is the quantitative form of the proposition. The proof's last line reads ``s n̂ᵀ n`` where it means
+    ``s n̂ᵀ n̂``. It uses only the component along n̂, so ``s > 0`` suffices and alignment is not needed.
 
     Parameters
     ----------
@@ -222,38 +221,38 @@ def conormal_derivative(A: ArrayLike, J: ArrayLike, n: ArrayLike) -> FloatArray:
 
 
 def edge_conormal(problem: Problem, A: ArrayLike, uv: ArrayLike, reference: Reference = "rest") -> Conormal:
-    """Proposition D.2's condition on boundary edges, from the one triangle at each.
+    """Evaluate Proposition D.2's condition on boundary edges, from the triangle at each edge.
 
-    ``s > 0`` on an edge exactly where its triangle is positive, whatever the elliptic A and the rest of the
-    map. With linear elements this reaches no further inwards: the second row of triangles may be inverted
-    behind a positive first one (the third failed attempt of §7.1), which Theorem D.1 excludes for smooth maps.
+    For every elliptic A and every map, ``s > 0`` on an edge exactly if its triangle is positive. With linear elements
+    the condition constrains only this first row: the second row of triangles may be inverted behind a positive first
+    row (the third failed attempt of §7.1). Theorem D.1 excludes this for smooth maps.
 
     Parameters
     ----------
     problem : Problem
     A : (f, 2, 2) float
-        By triangle, in its reference frame.
+        One tensor per triangle, in its reference frame.
     uv : (n, 2) float
         Any map.
     reference : {"rest", "equilateral", "corrected"}
-        The triangles in which A is meant, unless the problem itself names them.
+        The reference triangles of A, used if the problem itself names none.
 
     Returns
     -------
     Conormal
-        One row for each boundary edge.
+        One row per boundary edge.
 
     Raises
     ------
     ValueError
-        When A has another shape or is not elliptic.
+        If A has another shape or is not elliptic.
     """
     A = _elliptic(A, len(problem.F))
     mesh, w = ReferenceMesh(problem.V, problem.F, problem.reference or reference), _complex(uv)
     tail, head = problem.F.T.ravel(), problem.F.T[(1, 2, 0), :].ravel()
     outer = np.flatnonzero(~np.isin(tail * problem.n + head, head * problem.n + tail))
     corner, triangle = np.divmod(outer, len(problem.F))
-    # The gradient of the hat at the opposite corner points inwards and is the height's reciprocal.
+    # The gradient of the hat function at the opposite corner points inwards; its length is 1 / height.
     inward = mesh.gamma[(corner + 2) % 3, triangle]
     length = 2 * np.abs(mesh.m[triangle] * inward)
     n = np.stack([-inward.real, -inward.imag], axis=1) / np.abs(inward)[:, None]
@@ -265,25 +264,25 @@ def edge_conormal(problem: Problem, A: ArrayLike, uv: ArrayLike, reference: Refe
 
 
 def vertex_conormal(problem: Problem, A: ArrayLike, uv: ArrayLike, reference: Reference = "rest") -> Conormal:
-    """Proposition D.2's condition at boundary vertices in the weak form of §6.2, ``Rᵀ Gᵀ A G [u v]`` beside ``C b``.
+    """Evaluate Proposition D.2's condition at boundary vertices in the weak form of §6.2: ``Rᵀ Gᵀ A G [u v]``, ``C b``.
 
-    Where the map is quasi-harmonic and ``det A = 1``, ``flux = normal`` everywhere makes it injective (Theorem
-    6.4). ``s > 0`` alone does not: at a vertex positive triangles make up for inverted ones.
+    If the map is quasi-harmonic, ``det A = 1`` and ``flux = normal`` everywhere, the map is injective (Theorem 6.4).
+    ``s > 0`` alone is not sufficient, because at a vertex positive triangles compensate for inverted ones.
 
     Parameters
     ----------
     problem, A, uv, reference
-        As of `edge_conormal`.
+        As for `edge_conormal`.
 
     Returns
     -------
     Conormal
-        One row for each boundary vertex.
+        One row per boundary vertex.
 
     Raises
     ------
     ValueError
-        When A has another shape or is not elliptic.
+        If A has another shape or is not elliptic.
     """
     w = _complex(uv)
     flux = _stiffness(problem, _elliptic(A, len(problem.F)), reference) @ w
@@ -298,7 +297,7 @@ def vertex_conormal(problem: Problem, A: ArrayLike, uv: ArrayLike, reference: Re
 
 
 def _stiffness(problem: Problem, A: FloatArray, reference: Reference) -> csc_array:
-    """``Gᵀ A G`` of tensors that need not be symmetric."""
+    """Return ``Gᵀ A G`` for tensors that may be asymmetric."""
     op = operators(problem.V, problem.F, problem.reference or reference)
     f = len(problem.F)
     Gx, Gy = op.G[:f], op.G[f:]
@@ -322,14 +321,14 @@ def _complex(points: ArrayLike) -> ComplexArray:
 
 
 def admitted_pair(problem: Problem, uv: FloatArray, seed: int = 0) -> tuple[ComplexArray, ComplexArray]:
-    """On every triangle of a positive map a random real ν, and the μ with which the map satisfies the equation."""
+    """Return a random real ν per triangle of a positive map, and the μ with which the map satisfies the equation."""
     p, q, _ = ReferenceMesh(problem.V, problem.F, "rest").derivatives(_complex(uv))
     nu = 0.98 * (1 - np.abs(q / p)) * (np.random.default_rng(seed).random(p.size) - 0.5)
     return (q - nu * p.conj()) / p, nu.astype(np.complex128)
 
 
 def star(rings: int) -> Problem:
-    """A disk onto a star of five points."""
+    """A disk onto a star with five points."""
     V, F = disk(rings)
     (loop,) = boundary_loops(F, len(V))
     turn = 2 * np.pi * np.arange(len(loop)) / len(loop)

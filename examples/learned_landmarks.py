@@ -1,16 +1,15 @@
 """A network that learns to flatten a family of surfaces such that their landmarks meet
 ====================================================================================
 
-Faces of a kind: a disk with two bumps and a ridge between them, each of these elsewhere in every face. Four landmarks
-on each, the bumps' tops and the ridge's ends. A small network looks at every triangle (where it is, how it
-slopes, and how far away the landmarks are) and says one number for it, the Beltrami coefficient of a tensor.
-The map of these tensors, onto the unit disk, is ``quasiharmonic.torch.quasi_harmonic_map``, a layer like any other: the
-loss is how far landmarks come to lie from where those of the mean face do, and its gradient goes through the map into
-the network.
+The faces are disks with two bumps and a ridge between them, at varying positions. Each face has four landmarks: the
+tops of the bumps and the ends of the ridge. A small network reads features of every triangle (its position, its slope
+and its distances to the landmarks) and returns the Beltrami coefficient of a tensor.
+``quasiharmonic.torch.quasi_harmonic_map`` is a layer that maps the face onto the unit disk with these tensors. The loss
+is the distance of the landmarks from those of the mean face. Its gradient passes through the map into the network.
 
-At the default size there are 60 faces to learn from and 12 others to be judged by. The landmarks of the others come to
-lie 0.24 from where they should (root of the mean square) with all tensors the identity, and 0.11 after 150 steps. Of
-the other faces' maps none has an inverted triangle. Above: faces in space; middle: flattened before; below: after.
+At the default size there are 60 training faces and 12 test faces. The root-mean-square distance of the test faces'
+landmarks from their targets is 0.24 with identity tensors, and 0.11 after 150 steps. No map of a test face has an
+inverted triangle. Top: faces in space; middle: flattened before training; bottom: flattened after training.
 
 ``pip install torch``; the library itself does not need it.
 """
@@ -28,12 +27,12 @@ from quasiharmonic import Problem, surfaces
 from quasiharmonic.plot import plot_surface
 
 Array = NDArray[np.float64]
-# The price of tensors that are not the identity.
+# Weight of the penalty on tensors other than the identity.
 PRICE = 0.002
 
 
 def faces(V: Array, count: int, seed: int) -> tuple[Array, NDArray[np.int64]]:
-    """Surfaces (count, n, 3) over a disk, and their landmarks (count, 4)."""
+    """Random surfaces (count, n, 3) over a disk, and their landmarks (count, 4)."""
     rng = np.random.default_rng(seed)
     z = V @ (1, 1j)
     shapes, marks = np.empty((count, len(V), 3)), np.empty((count, 4), dtype=np.int64)
@@ -52,7 +51,7 @@ def faces(V: Array, count: int, seed: int) -> tuple[Array, NDArray[np.int64]]:
 
 
 def features(shapes: Array, F: NDArray[np.int64], marks: NDArray[np.int64]) -> Array:
-    """What the network sees of every triangle: (count, f, 14)."""
+    """Network input of every triangle: (count, f, 14)."""
     corners = shapes[:, F]
     middle = corners.mean(axis=2)
     normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
@@ -72,7 +71,7 @@ def main(output: Path, size: int = 8, steps: int = 150, count: int = 60) -> dict
     rim = np.flatnonzero(np.abs(V @ (1, 1j)) > 1 - 1e-9)
     rim = rim[np.argsort(np.angle(V[rim] @ (1, 1j)))]
     problem = Problem(V, F, rim, V[rim])
-    # A triangle's tensor is in its own frame; the network speaks of the disk's.
+    # Turn a coefficient from the disk's frame, which the network uses, into the triangle's own frame.
     side = (V[F[:, 1]] - V[F[:, 0]]) @ (1, 1j)
     turn = torch.tensor((side.conj() / np.abs(side)) ** 2)
     network = torch.nn.Sequential(
@@ -96,7 +95,7 @@ def main(output: Path, size: int = 8, steps: int = 150, count: int = 60) -> dict
     with torch.no_grad():
         plain = quasi_harmonic_map(problem, reference="rest")
         before = plain.expand(len(others), -1, -1)
-        # Where landmarks of the faces to learn from come to lie at first, in the mean: there they are to meet.
+        # The targets are the mean positions of the training faces' landmarks under identity tensors.
         places = landmarks(plain.expand(len(shapes), -1, -1), marks).mean(dim=0)
 
     def apart(uv: torch.Tensor, marks: NDArray[np.int64]) -> torch.Tensor:

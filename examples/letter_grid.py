@@ -1,13 +1,14 @@
 """The outline of a letter fitted so that points inside come to lie on a grid
 ==========================================================================
 
-A cat's head is mapped onto a letter, and some of its vertices are marked. Where they come to lie is what the letter's
-outline makes of them; here the outline is what gives way. How far the marks are from the nodes of a grid is a function
-of the polished map, its gradient by all of the outline's vertices is one solve (``polish_derivative(…).vjp``), and a
-quasi-Newton method lowers it, along with how much the outline is bent. The map stays injective at every step.
+A cat's head is mapped onto a letter, and some of its vertices are marked. The outline of the letter determines where
+the marks lie. This example fits the outline such that the marks lie on the nodes of a grid. The distance of the marks
+from the nodes is a function of the polished map. Its gradient with respect to all vertices of the outline takes one
+solve (``polish_derivative(…).vjp``). A quasi-Newton method minimises it with a penalty on the outline's displacement.
+The map stays injective at every step.
 
-At the default size 27 marks begin 0.020 from their nodes (root of the mean square; the letter is 0.73 high) and end
-0.005 from them, after 89 maps. The outline has moved by 0.05 at most. Left: the letter; middle: fitted; right: both.
+At the default size the root-mean-square distance of 27 marks from their nodes is 0.020 at the start (the letter is 0.73
+high) and 0.005 after 89 maps. The outline moves by at most 0.05. Left: the letter; middle: fitted; right: both.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from quasiharmonic import Problem, polish_derivative, solve, surfaces
 from quasiharmonic.targets import boundary_to, filled, letter
 
 Array = NDArray[np.float64]
-# The displacement of the outline costs its square, so many times that of the marks.
+# Weight of the outline's squared displacement, relative to the squared distance of the marks.
 PRICE = 1e-4
-# Vertices of the outline over which it moves as one, about.
+# Width of the smoothing kernel along the outline, in vertices.
 WIDTH = 2.0
 
 
 def smoothed(field: Array, width: float) -> Array:
-    """A field (k, 2) around the outline, convolved with a bell so many vertices wide; its own transpose."""
+    """Convolve a field (k, 2) along the outline with a bell ``width`` vertices wide; the operation is self-adjoint."""
     frequency = np.fft.rfftfreq(len(field))
     bell = np.exp(-0.5 * (2 * np.pi * frequency * width) ** 2)
     return np.fft.irfft(bell[:, None] * np.fft.rfft(field, axis=0), n=len(field), axis=0)
@@ -42,12 +43,12 @@ def main(output: Path, size: int = 26, steps: int = 40) -> dict[str, Any]:
     fixed, drawn = boundary_to(V, F, filled(letter("H")))
     problem = Problem(V, F, fixed, drawn)
     first = solve(problem, polish="symmetric-dirichlet")
-    # The marks: vertices that are near the nodes of a grid in the first map, but bent away from them.
+    # The marks are vertices near the nodes of a grid in the first map, after a bend.
     stems, bar = np.linspace(0.08, 0.65, 6), [(0.33, 0.382), (0.42, 0.382), (0.51, 0.382)]
     nodes = np.array([(x, y) for x in (0.14, 0.23, 0.605, 0.695) for y in stems] + bar)
     bent = nodes + 0.02 * np.sin([9, 14] * nodes[:, ::-1] + [0.5, 0.3])
     marks = np.array([np.argmin(np.linalg.norm(first.uv - place, axis=1)) for place in bent])
-    # A map that a step too long has led to may lie in another valley: each search starts at the best one so far.
+    # After too long a step the map may be in another local minimum, so each search starts at the best map so far.
     start, lowest = first.uv, np.inf
 
     def value(bends: Array) -> tuple[float, Array]:

@@ -1,12 +1,13 @@
 """Seven letters, each from its surface by ``qhm map surface.obj --to letter:X`` alone
 =====================================================================================
 
-The letters are those of the paper's Tables 2 to 4, the surfaces are made here. Those of A and P have a hole, which goes
-to the letter's; R is mapped onto from a surface without one, so the letter's is filled. Nothing else is said: which
-boundary vertex goes where, how the letter stands and how its hole is turned are found from the shapes.
+The letters are those of the paper's Tables 2 to 4; the surfaces are synthetic. The surfaces of A and P have a hole,
+which is mapped to the letter's hole. The surface of R has no hole, so the letter's hole is filled. There is no other
+input: the correspondence of the boundary, the rotation of the letter and the rotation of its hole are found from the
+shapes.
 
-The command writes a mesh file and judges it as a reader gets it. At the default size, 2,400 triangles each, every map
-is bijective after 19 to 37 iterations, polish included, where Tutte's embedding inverts 18 to 705 triangles.
+The command writes a mesh file and certifies the map in it. At the default size, 2,400 triangles each, every map is
+bijective after 19 to 37 iterations, polish included. Tutte's embedding inverts 18 to 705 triangles.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ Mesh = tuple[FloatArray, NDArray[np.int64]]
 
 
 def disk(height: Any, size: int) -> Mesh:
-    """The unit disk lifted to a height that is a function of x and y."""
+    """The unit disk lifted to a height, a function of x and y."""
     V, F = surfaces.disk(size)
     return np.column_stack([V, height(*V.T)]), F
 
 
 def ring(height: Any, size: int) -> Mesh:
-    """A square with a round hole, lifted."""
+    """A square with a round hole, lifted to a height, a function of x and y."""
     V, F = surfaces.annulus(2 * size)
     far = np.abs(V).max(axis=1)
     V *= (far / np.hypot(*V.T))[:, None] ** (2 - 2 * far)[:, None]
@@ -44,7 +45,7 @@ def ring(height: Any, size: int) -> Mesh:
 
 
 def seven(size: int) -> dict[str, tuple[str, Mesh]]:
-    """A surface for each letter."""
+    """The letter and the surface of each example."""
     return {
         "cat": ("R", surfaces.cat(size)),
         "vault with a hole": ("A", ring(lambda x, y: 0.6 * np.cos(x) * np.cos(y), size)),

@@ -1,11 +1,10 @@
 """Ways to look at a map: distortion, a checkerboard, the way there, a window
 ==========================================================================
 
-One map, of a cat's head onto the letter R, seen as ``qhm plot`` and ``qhm view`` show it: ``--kind distortion`` colours
-the triangles by how much they are stretched, with a histogram; ``--kind texture`` puts a checkerboard on the surface,
-which shows at once where the map does not keep angles or sizes; and the window has both, to turn around (polyscope, the
-extra ``view``). The animation is that of the search itself: ``record_every=1`` keeps every iteration's map, and
-inverted triangles are red until there is none.
+The map of a cat's head onto the letter R, drawn as by ``qhm plot`` and ``qhm view``. ``--kind distortion`` colours the
+triangles by their stretch and adds a histogram. ``--kind texture`` draws a checkerboard on the surface, which shows
+where the map changes angles or sizes. The window shows both in 3D (polyscope, the extra ``view``). The animation shows
+the search: ``record_every=1`` records every iteration's map, and inverted triangles are red.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """The boundary of a finite-element mesh has moved: a flap turned in its channel
 =============================================================================
 
-A mesh around a flap, which is then turned by up to 75°, while the walls stay. What is commonly done is to spread the
-displacement of the boundary over the interior by Laplace's equation; that inverts triangles in the end. ``morph``
-never does. It starts from the same extension, searches where triangles are inverted and then lowers a distortion
-energy, so that the triangles keep the shapes and sizes they had.
+A mesh around a flap, which is turned by up to 75° while the walls stay fixed. The usual method extends the displacement
+of the boundary into the interior by Laplace's equation, which inverts triangles for large turns. ``morph`` inverts no
+triangle. It starts from the same extension, untangles it if necessary, and then minimises a distortion energy, so that
+the triangles keep their shapes and sizes.
 
-Of the 4,588 triangles at the default size Laplace's equation inverts 8 at 25°, 62 at 50° and 156 at 75°, ``morph``
-none. The worst mean ratio (1 for an equilateral triangle, 0 for one without area) falls from 0.84 to 0.21, 0.15 and
-0.08, at the flap's tips. For files of Gmsh and VTK there is ``qhm morph mesh.msh --field NAME -o moved.msh``.
+Of the 4,588 triangles at the default size Laplace's equation inverts 8 at 25°, 62 at 50° and 156 at 75°; ``morph``
+inverts none. The worst mean ratio (1 for an equilateral triangle, 0 for a degenerate one) falls from 0.84 to 0.21, 0.15
+and 0.08, at the flap's tips. For Gmsh and VTK files use ``qhm morph mesh.msh --field NAME -o moved.msh``.
 """
 
 from __future__ import annotations

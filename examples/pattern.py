@@ -1,13 +1,12 @@
 """A sewing pattern: a plush fish of four panels, flattened and written true to scale with a seam allowance
 ============================================================================================================
 
-The body of a fish, 30 cm long, is cut along its back, its belly and its sides, and the upper panels have a hole for
-an eye. Each panel is flattened by itself, true to scale and bijectively, and all four go into one drawing,
-``pattern.svg``, whose dashed lines are the seams and whose outer lines, 7 mm farther out, are where the cloth is cut.
-Printed at full size it is ready to use; with a name that ends in ``.dxf``, ``write_pattern`` makes a DXF drawing of it.
-Cloth stretches by a few percent, and so much is asked of it: the colours say how much lengths change. Two sides that
-are sewn together must be equally long: along the sides of the fish they differ by 0.5 mm in 327, and along the back and
-the belly by less than 0.01 mm.
+The body of a fish, 30 cm long, is cut along its back, its belly and its sides. The upper panels have a hole for an eye.
+Each panel is flattened separately, true to scale and bijectively. All four go into one drawing, ``pattern.svg``. Its
+dashed lines are the seams; the outer lines, 7 mm outside, are the cutting lines. The drawing is printed at full size.
+For a name that ends in ``.dxf``, ``write_pattern`` writes a DXF drawing. Cloth stretches by a few percent, and the
+colours show that the changes of length are about as small. Two sides that are sewn together must be equally long. Along
+the sides of the fish they differ by 0.5 mm in 327, and along the back and the belly by less than 0.01 mm.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from quasiharmonic.util.arrays import IntArray
 
 LENGTH, ALLOWANCE, GAP = 300.0, 7.0, 20.0
 BACK, BELLY = (0.95, 0.55, 0.25), (1.00, 0.85, 0.60)
-# The eye: how far along the body, how high up its side (from 0 to 1), and its radius in millimetres.
+# The eye: position along the body, height on its side (both from 0 to 1), and radius in millimetres.
 EYE = 0.15, 0.38, 11.0
 
 
@@ -41,9 +40,9 @@ class Panel(NamedTuple):
     Attributes
     ----------
     V, F
-        In millimetres, triangles counterclockwise from outside.
+        Vertices in millimetres, and triangles, counterclockwise from outside.
     side : (n, 2) float64
-        Where along the body and how high up the side each vertex is, both from 0 to 1; 1 is the back or the belly.
+        Each vertex's position along the body and height on the side, both from 0 to 1; 1 is the back or the belly.
     """
 
     V: FloatArray
@@ -52,8 +51,8 @@ class Panel(NamedTuple):
 
 
 def body(along: FloatArray, up: FloatArray, top: bool) -> FloatArray:
-    """The right side of the fish; (n, 3) in millimetres."""
-    # From the nose a drop, which ends in a tail that is high and flat.
+    """The right side of the fish, (n, 3) in millimetres."""
+    # A drop that starts at the nose and ends in a high, flat tail.
     drop = 2.35 * np.sqrt(along) * (1 - along) ** 0.9
     tail = np.clip((along - 0.72) / 0.28, 0, 1) ** 1.6
     high = (64 if top else 52) * drop + 58 * tail + 3 * along
@@ -63,7 +62,7 @@ def body(along: FloatArray, up: FloatArray, top: bool) -> FloatArray:
 
 
 def panel(size: int, top: bool, left: bool) -> Panel:
-    """One of the four, from a grid whose first column is drawn together at the nose."""
+    """One of the four panels, from a grid whose first column is collapsed at the nose."""
     side, F = surfaces.grid(3 * size, size)
     nose = side[:, 0] < 1e-9
     number = np.where(nose, np.count_nonzero(~nose), np.cumsum(~nose) - 1)
@@ -78,7 +77,7 @@ def panel(size: int, top: bool, left: bool) -> Panel:
 
 
 def with_eye(side: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
-    """Leave out the triangles where the eye is, and draw what is around them to its rim."""
+    """Remove the triangles of the eye, and move the vertices around them to its rim."""
     along, up, radius = EYE
     step = 1e-4
     middle, ahead, above = (
@@ -96,7 +95,7 @@ def with_eye(side: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
 
 
 def laid_out(maps: list[FloatArray]) -> list[FloatArray]:
-    """Maps below each other, with room for their allowances."""
+    """Arrange maps below each other, with space for their allowances."""
     placed, low = [], 0.0
     for uv in maps:
         uv = uv - uv.min(axis=0)
@@ -106,14 +105,14 @@ def laid_out(maps: list[FloatArray]) -> list[FloatArray]:
 
 
 def seam_length(places: FloatArray, F: IntArray, on: NDArray[np.bool_]) -> float:
-    """Length of the boundary between marked vertices."""
+    """Length of the boundary edges between marked vertices."""
     ends = boundary_edges(F, len(places))
     ends = ends[on[ends].all(axis=1)]
     return float(np.linalg.norm(places[ends[:, 0]] - places[ends[:, 1]], axis=1).sum())
 
 
 def show_body(ax: Axes, parts: list[Panel]) -> None:
-    """Draw the fish from its right, its seams as lines."""
+    """Draw the fish from its right, with its seams as lines."""
     turn = np.radians(-28)
     frame = np.array([[np.cos(turn), np.sin(turn), 0], [-0.25 * np.sin(turn), 0.25 * np.cos(turn), 0.97]])
     towards = np.cross(frame[0], frame[1])
@@ -151,7 +150,7 @@ def main(output: Path, size: int = 24) -> dict[str, Any]:
     figure, axes = panels(1, 2, (6.2, 5.6))
     show_body(axes[0][0], parts)
     axes[0][0].set_title("a fish of four panels", size=11)
-    # How much the mean of both directions changes, in percent.
+    # The change of the mean length over both directions, in percent.
     measured = [distortion(part.V, part.F, place) for part, place in zip(parts, placed, strict=True)]
     change = np.concatenate([50 * (found.sigma1 + found.sigma2) - 100 for found in measured])
     drawn = PolyCollection(uv[F], array=change, cmap="RdBu_r", norm=TwoSlopeNorm(0, -6, 6), edgecolors="face", lw=0.3)

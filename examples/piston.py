@@ -1,12 +1,12 @@
 """A cheese with holes pushed through an hourglass: collision avoidance while time goes on
 ========================================================================================
 
-A piston comes down and pushes a cheese with five holes into the neck of an hourglass. At every step piston, cheese
-(blue) and air (yellow) are one mesh that is certified bijective, so nothing overlaps, ever, not even inside the holes,
-whose walls come to lie against each other. The air is triangulated anew at every step, and carries a thousandth of the
-weight. Nothing detects a contact or answers it; in `figure_20` a figure is pressed into its place in one go.
+A piston moves down and pushes a cheese with five holes into the neck of an hourglass. At every step piston, cheese
+(blue) and air (yellow) are one mesh that is certified bijective, so nothing overlaps. This includes the holes, whose
+walls come close to each other. The air is triangulated again at every step and has a thousandth of the weight. No
+collision detection or response is needed. In `figure_20` a figure is pressed into its target in one step.
 
-Beside the picture of six moments, an animation is written: ``piston.gif``.
+The example also writes an animation, ``piston.gif``, beside the figure of six steps.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def hourglass(neck: float = 0.35) -> FloatArray:
 
 
 def piston(bottom: float, neck: float = 0.35) -> FloatArray:
-    """A plate as wide as the hourglass lets through at its lower side, and rounded below."""
+    """A plate as wide as the hourglass at the height of its lower side, and rounded below."""
     room = neck + (1.3 - neck) * np.clip((bottom - 0.1) / 1.3, 0, 1) ** 1.5
     x = np.linspace(-1, 1, 33) * (0.93 * room)
     below = np.stack([x, bottom - 0.1 * (1 - (x / x[-1]) ** 2)], axis=1)

@@ -1,10 +1,10 @@
 """A UV map with flips, repaired in place: two islands, seams kept, only what must move moves
 =============================================================================================
 
-A cat's head is cut along its middle into two islands, as a modelling program would lay them out. In one a few
-vertices have been dragged about, the other has been scribbled over with a brush: 91 triangles are inverted. Both come
-out with none. Of the 117 vertices that were touched 60 move (the dots), and no other; the boundaries are where they
-were, to the last bit.
+A cat's head is cut along its middle into two islands, as in a modelling program. In one island a few vertices were
+dragged, and the other was scrambled with a brush: 91 triangles are inverted. After the repair no triangle is inverted.
+Of the 117 displaced vertices, 60 move (the dots), and no other vertex moves. The boundaries are unchanged to the last
+bit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from quasiharmonic.util.arrays import IntArray
 
 
 def halves(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
-    """Cut along the middle and lay the halves side by side: places (m, 2), and their rows for every corner."""
+    """Cut along the middle and lay the halves side by side: UV positions (m, 2), and their indices for every corner."""
     right = V[F, 0].mean(axis=1) > 0
     places, FT = [], np.empty_like(F)
     for side, middle in ((~right, -0.8), (right, 0.8)):
@@ -51,7 +51,7 @@ def main(output: Path, size: int = 24) -> dict[str, Any]:
     figure, axes = panels(1, 3, (4.4, 3.6))
     plot_surface(V, F, axes[0][0])
     axes[0][0].set_title("the surface", size=10)
-    # The surface cut along the seams: a vertex for every place.
+    # The surface cut along the seams has one vertex per UV position.
     cut = np.empty((len(uv), 3))
     cut[FT] = V[F]
     for ax, places, title in zip(axes[0][1:], (damaged, result.uv), ("damaged", "repaired"), strict=True):

@@ -1,9 +1,9 @@
-"""Surfaces that stand for the paper's scans: an angel, a gargoyle, a rabbit, a bust and a hand, from a few formulas.
+"""Synthetic surfaces in place of the paper's scans: an angel, a gargoyle, a rabbit, a bust and a hand, from formulas.
 
-Each is a *field*, negative inside: rounded cones and ellipsoids that flow into each other. It is meshed by surface
-nets (a vertex in every cell of a grid that the surface passes, a square across every edge it passes), the vertices are
-relaxed along the surface, and what lies below a plane is cut off: the rim is the boundary. They stand upright along y,
-face +z and are between one and three units high. Two creatures, an octopus and an armadillo, are closed all around.
+Each is a *field*, negative inside: rounded cones and ellipsoids, joined smoothly. Surface nets mesh it: a vertex in
+every grid cell that the surface intersects, and a square across every edge that it crosses. The vertices are relaxed
+along the surface. The part below a plane is removed, and the rim of the cut is the boundary. The surfaces stand upright
+along y, face +z and are between one and three units high. Two creatures, an octopus and an armadillo, are closed.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ Field = Callable[[FloatArray], FloatArray]
 
 
 def cone(x: FloatArray, a: ArrayLike, b: ArrayLike, ra: float, rb: float) -> FloatArray:
-    """A ball of radius ``ra`` at ``a``, one of ``rb`` at ``b``, and what is between them."""
+    """The field of the convex hull of two balls: radius ``ra`` at ``a`` and ``rb`` at ``b``."""
     a, axis = np.asarray(a), np.subtract(b, a)
     t = np.clip((x - a) @ axis / (axis @ axis), 0, 1)
     return np.linalg.norm(x - a - t[..., None] * axis, axis=-1) - (ra + t * (rb - ra))
 
 
 def ball(x: FloatArray, middle: ArrayLike, radii: ArrayLike, turn: float = 0.0, axis: int = 2) -> FloatArray:
-    """An ellipsoid, turned about an axis by so many radians; the distance is a good guess near it."""
+    """The field of an ellipsoid turned about ``axis`` by ``turn`` radians; near it an approximate signed distance."""
     p = x - np.asarray(middle)
     if turn:
         i, j = (k for k in range(3) if k != axis)
         w = (p[..., i] + 1j * p[..., j]) * np.exp(-1j * turn)
         p = p.copy()
         p[..., i], p[..., j] = w.real, w.imag
-    p = p / radii + 1e-9  # never 0 / 0
+    p = p / radii + 1e-9  # avoid 0 / 0
     near = np.linalg.norm(p, axis=-1)
     return near * (near - 1) / np.linalg.norm(p / radii, axis=-1)
 
 
 def join(smooth: float, *fields: FloatArray) -> FloatArray:
-    """The union, seams rounded over a width of ``smooth``."""
+    """The union of fields, with seams rounded over a width of ``smooth``."""
     first, *others = fields
     for other in others:
         h = np.maximum(smooth - np.abs(first - other), 0) / smooth
@@ -53,17 +53,17 @@ def join(smooth: float, *fields: FloatArray) -> FloatArray:
 
 
 def carve(smooth: float, field: FloatArray, *others: FloatArray) -> FloatArray:
-    """What is left without the others."""
+    """The difference of a field and others, with seams rounded over a width of ``smooth``."""
     return -join(smooth, -field, *others)
 
 
 def mirrored(x: FloatArray) -> FloatArray:
-    """Points reflected to x ≥ 0, so that what is made on one side is on the other as well."""
+    """Reflect points to x ≥ 0, so that a field evaluated there is symmetric."""
     return np.concatenate([np.abs(x[..., :1]), x[..., 1:]], axis=-1)
 
 
 def bust(x: FloatArray) -> FloatArray:
-    """Head and shoulders of somebody."""
+    """A head with shoulders."""
     s = mirrored(x)
     skull = join(0.15, ball(x, (0, 1.32, -0.06), (0.40, 0.47, 0.48)), ball(x, (0, 1.08, 0.16), (0.29, 0.36, 0.27)))
     face = carve(0.10, skull, ball(s, (0.16, 1.24, 0.50), (0.12, 0.075, 0.12)))
@@ -74,7 +74,7 @@ def bust(x: FloatArray) -> FloatArray:
     face = join(
         0.08, face, ball(x, (0, 0.80, 0.36), (0.10, 0.07, 0.08)), ball(s, (0.41, 1.2, -0.03), (0.05, 0.14, 0.09))
     )
-    # Curls: a shell over crown and neck, waved.
+    # Curls: a wavy shell over crown and neck.
     wave = 0.022 * np.sin(17 * x[..., 0]) * np.sin(15 * x[..., 1] + 8 * x[..., 2]) * np.sin(13 * x[..., 2])
     shell = ball(x, (0, 1.38, -0.13), (0.46, 0.47, 0.50)) + 1.6 * wave
     hair = np.maximum(shell, 0.75 * (x[..., 2] - 0.18) - 0.66 * (x[..., 1] - 1.50))
@@ -85,7 +85,7 @@ def bust(x: FloatArray) -> FloatArray:
 
 
 def hand(x: FloatArray) -> FloatArray:
-    """A hand held up, fingers a little apart and bent."""
+    """A raised hand, with fingers slightly spread and bent."""
     palm = join(0.2, ball(x, (0.02, 0.62, 0), (0.44, 0.50, 0.17)), cone(x, (0, -0.5, -0.02), (0, 0.3, 0), 0.23, 0.25))
     palm = carve(0.2, palm, ball(x, (0.02, 0.66, 0.30), (0.24, 0.30, 0.18)))
     parts = [palm]
@@ -116,7 +116,7 @@ def hand(x: FloatArray) -> FloatArray:
 
 
 def rabbit(x: FloatArray) -> FloatArray:
-    """A rabbit, sitting."""
+    """A sitting rabbit."""
     s = mirrored(x)
     body = join(0.35, ball(x, (0, 0.42, -0.30), (0.50, 0.52, 0.62)), ball(x, (0, 0.55, 0.15), (0.36, 0.44, 0.38)))
     body = join(0.10, body, ball(s, (0.40, 0.26, -0.38), (0.20, 0.36, 0.40)))
@@ -138,7 +138,7 @@ def rabbit(x: FloatArray) -> FloatArray:
 
 
 def gargoyle(x: FloatArray) -> FloatArray:
-    """A gargoyle crouching on its plinth, wings half spread."""
+    """A gargoyle crouching on its plinth, with wings half spread."""
     s = mirrored(x)
     body = join(0.25, ball(x, (0, 0.50, -0.05), (0.38, 0.60, 0.34)), ball(x, (0, 0.95, 0.08), (0.40, 0.30, 0.30)))
     legs = join(
@@ -237,7 +237,7 @@ def angel(x: FloatArray) -> FloatArray:
 
 
 def arm(x: FloatArray, points: FloatArray, thick: float, thin: float) -> FloatArray:
-    """A limb along a chain of points, ever thinner."""
+    """A limb along a chain of points, tapering from ``thick`` to ``thin``."""
     radii = np.linspace(thick, thin, len(points))
     found = np.full(x.shape[:-1], np.inf)
     for k in range(len(points) - 1):
@@ -246,13 +246,13 @@ def arm(x: FloatArray, points: FloatArray, thick: float, thin: float) -> FloatAr
 
 
 def octopus(x: FloatArray) -> FloatArray:
-    """An octopus that walks, each of its eight arms curled in its own way."""
+    """A walking octopus, each of whose eight arms is curled differently."""
     s = mirrored(x)
     head = join(0.25, ball(x, (0, 1.02, -0.24), (0.44, 0.56, 0.46), 0.35, 0), ball(x, (0, 0.46, 0), (0.36, 0.26, 0.36)))
     head = join(0.05, head, ball(s, (0.20, 0.76, 0.29), (0.12, 0.13, 0.12)))
     arms = []
     for k in range(8):
-        # Out from below the head, down to the ground and along it; the end curls up.
+        # The arm leaves below the head, goes down to the ground and along it; its end curls up.
         along = np.linspace(0, 1, 14)
         curl = (-1) ** (k // 2 + k % 2) * (6.5 + 1.5 * np.sin(5 * k)) * np.maximum(along - 0.45, 0) ** 1.5
         heading = np.pi * (2 * k + 1) / 8 + curl - 0.25 * np.sign(curl[-1]) * np.sin(4 * along)
@@ -263,10 +263,10 @@ def octopus(x: FloatArray) -> FloatArray:
 
 
 def armadillo(x: FloatArray) -> FloatArray:
-    """An armadillo that stands on its hind legs, arms raised."""
+    """An armadillo that stands on its hind legs with raised arms."""
     s = mirrored(x)
     trunk = join(0.2, ball(x, (0, 0.98, -0.05), (0.44, 0.58, 0.42)), ball(x, (0, 1.42, 0.02), (0.34, 0.32, 0.32)))
-    # The shell, in bands.
+    # The banded shell.
     shell = ball(x, (0, 1.08, -0.16), (0.50, 0.72, 0.46)) + 0.022 * np.cos(26 * (x[..., 1] + 0.25 * x[..., 2]))
     shell = np.maximum(shell, x[..., 2] - 0.02 - 0.1 * x[..., 1])
     head = join(
@@ -302,7 +302,7 @@ def armadillo(x: FloatArray) -> FloatArray:
     return join(0.05, join(0.1, body, head), ear)
 
 
-# The field and the corners of its box, at whose lower end it is cut open.
+# The field and the corners of its box. The surface is cut open at the lower end of the box.
 SCULPTURES: dict[str, tuple[Field, tuple[float, float, float], tuple[float, float, float]]] = {
     "angel": (angel, (-1.4, -0.55, -0.9), (1.4, 3.1, 0.9)),
     "gargoyle": (gargoyle, (-1.35, -0.34, -0.85), (1.35, 2.15, 0.95)),
@@ -310,7 +310,7 @@ SCULPTURES: dict[str, tuple[Field, tuple[float, float, float], tuple[float, floa
     "bust": (bust, (-1.05, -0.6, -0.75), (1.05, 2.0, 0.75)),
     "hand": (hand, (-0.85, -0.45, -0.4), (0.95, 2.05, 0.75)),
 }
-# The field and the corners of its box, which has room around it.
+# The field and the corners of its box, which contains the surface with a margin.
 CREATURES: dict[str, tuple[Field, tuple[float, float, float], tuple[float, float, float]]] = {
     "octopus": (octopus, (-2.0, -0.3, -2.0), (2.0, 1.75, 2.0)),
     "armadillo": (armadillo, (-1.2, -0.15, -1.5), (1.2, 2.75, 0.95)),
@@ -319,7 +319,7 @@ CREATURES: dict[str, tuple[Field, tuple[float, float, float], tuple[float, float
 
 @lru_cache
 def creature(name: str, size: int = 64) -> tuple[FloatArray, IntArray]:
-    """A closed surface without handles, its grid ``size`` cells high.
+    """Mesh a closed surface without handles; its grid is ``size`` cells high.
 
     Returns
     -------
@@ -336,7 +336,7 @@ def creature(name: str, size: int = 64) -> tuple[FloatArray, IntArray]:
 
 @lru_cache
 def sculpture(name: str, size: int = 64) -> tuple[FloatArray, IntArray]:
-    """A surface with one boundary loop, its grid ``size`` cells high; without chords, angles mostly above 20°.
+    """Mesh a surface with one boundary loop and no chords, ``size`` grid cells high, with angles mostly above 20°.
 
     Returns
     -------
@@ -350,24 +350,24 @@ def sculpture(name: str, size: int = 64) -> tuple[FloatArray, IntArray]:
 def standing(
     field: Field, low: tuple[float, float, float], high: tuple[float, float, float], size: int
 ) -> tuple[FloatArray, IntArray]:
-    """The surface of any field, as `sculpture` has it, between two corners of a box that is cut off at its floor."""
+    """Mesh any field as `sculpture` does, between two corners of a box, cut off at the box's floor."""
     step, floor = (high[1] - low[1]) / size, low[1]
     V, F = cut_off(*surface_net(field, np.subtract(low, (0, 2 * step, 0)), high, step), floor)
     rim = np.concatenate(boundary_loops(F, len(V)))
     inside = np.setdiff1d(np.arange(len(V)), rim)
     for _ in range(12):
         V[inside] = onto_surface(field, centroids(V, F), None)[inside]
-        # Around the rim each vertex goes between its neighbours.
+        # Each vertex of the rim moves to the midpoint of its neighbours.
         V[rim] = onto_surface(field, (V[np.roll(rim, 1)] + V[np.roll(rim, -1)]) / 2, floor)
     refined = refine(V, F, chords(F, len(V)))
     return refined.V, refined.F
 
 
 def surface_net(field: Field, low: ArrayLike, high: ArrayLike, step: float) -> tuple[FloatArray, IntArray]:
-    """Mesh the surface where a field is zero: a vertex for each cell it passes, a square for each edge it crosses."""
+    """Mesh the zero set of a field: a vertex for each cell it intersects, a square for each edge it crosses."""
     axes = [np.arange(a, b + step, step) for a, b in zip(np.asarray(low), np.asarray(high), strict=True)]
     values = field(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-    # Empty all around, so that every edge crossed has four cells.
+    # Make the border of the grid empty, so that every crossed edge has four cells.
     for axis in range(3):
         ends = np.moveaxis(values, axis, 0)[[0, -1]]
         np.moveaxis(values, axis, 0)[[0, -1]] = np.maximum(ends, step)
@@ -383,7 +383,7 @@ def surface_net(field: Field, low: ArrayLike, high: ArrayLike, step: float) -> t
         place = at.astype(float)
         place[:, k] += (here / np.where(crossed, here - there, 1))[crossed]
         around = []
-        # The four cells around an edge, in a circle.
+        # The four cells around an edge, in cyclic order.
         for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)):
             cell = at.copy()
             cell[:, (k + 1) % 3] -= i
@@ -404,11 +404,11 @@ def surface_net(field: Field, low: ArrayLike, high: ArrayLike, step: float) -> t
 
 
 def well_composed(values: FloatArray, depth: float) -> FloatArray:
-    """Fill places where the solid touches itself along an edge or in a corner, so that its surface is a manifold."""
+    """Fill grid points where the solid touches itself at an edge or a corner, so that its surface is a manifold."""
     values = values.copy()
     corners = np.array(list(np.ndindex(2, 2, 2)))
     faces = [corners[corners[:, axis] == side] for axis in range(3) for side in (0, 1)]
-    # Opposite corners that must not be alone in being solid, or in being empty, among some.
+    # Two opposite corners, and the rest of their face or cell. If only one group is solid, the surface is no manifold.
     opposite = [(face[[k, 3 - k]], face[[1 - k, 2 + k]]) for face in faces for k in (0, 1)]
     opposite += [(corners[[k, 7 - k]], np.delete(corners, [k, 7 - k], axis=0)) for k in range(4)]
     while True:
@@ -426,12 +426,12 @@ def well_composed(values: FloatArray, depth: float) -> FloatArray:
 
 
 def shifted(corner: IntArray, shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """One corner of every cell of a grid."""
+    """The slices that select one corner of every cell of a grid."""
     return tuple(slice(c, n - 1 + c) for c, n in zip(corner, shape, strict=True))
 
 
 def cut_off(V: FloatArray, F: IntArray, floor: float) -> tuple[FloatArray, IntArray]:
-    """What is above a plane, without closed caves and without triangles that have all their vertices on the rim."""
+    """Keep the part above a plane, without closed cavities and without triangles whose vertices all lie on the rim."""
     F = F[(V[F, 1] > floor).all(axis=1)]
     while True:
         rim = np.zeros(len(V), dtype=bool)
@@ -444,7 +444,7 @@ def cut_off(V: FloatArray, F: IntArray, floor: float) -> tuple[FloatArray, IntAr
 
 
 def largest_piece(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
-    """Of a surface the connected piece with the most triangles, vertices that are in none left out."""
+    """Return the connected component with the most triangles, without unused vertices."""
     joined = csr_array((np.ones(F.size), (F.ravel(), np.roll(F, 1, axis=1).ravel())), shape=(len(V), len(V)))
     piece = connected_components(joined, directed=False)[1]
     F = F[piece[F[:, 0]] == np.bincount(piece[F.ravel()]).argmax()]
@@ -453,7 +453,7 @@ def largest_piece(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
 
 
 def centroids(V: FloatArray, F: IntArray) -> FloatArray:
-    """For every vertex the mean of its triangles' middles, weighted by area."""
+    """For every vertex, the area-weighted mean of the centroids of its triangles."""
     corners = V[F]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     triangle = np.arange(F.size) // 3
@@ -462,7 +462,7 @@ def centroids(V: FloatArray, F: IntArray) -> FloatArray:
 
 
 def onto_surface(field: Field, x: FloatArray, floor: float | None) -> FloatArray:
-    """Points moved to where a field is zero, in a plane y = floor if there is one."""
+    """Move points onto the zero set of a field by one Newton step, within the plane y = ``floor`` if it is given."""
     width = 1e-4
     if floor is not None:
         x = np.stack([x[:, 0], np.full(len(x), floor), x[:, 2]], axis=1)
@@ -475,7 +475,7 @@ def onto_surface(field: Field, x: FloatArray, floor: float | None) -> FloatArray
 
 
 def chords(F: IntArray, n: int) -> IntArray:
-    """Edges inside that join two vertices of the boundary."""
+    """Interior edges that join two boundary vertices."""
     rim = np.zeros(n, dtype=bool)
     rim[boundary_edges(F, n).ravel()] = True
     interior = edges(F, n).interior
@@ -484,7 +484,7 @@ def chords(F: IntArray, n: int) -> IntArray:
 
 @lru_cache
 def seven(size: int = 64) -> dict[str, Problem]:
-    """The pairs of surface and letter of the paper's Figure 10 and its tables, with our surfaces."""
+    """The pairs of surface and letter of the paper's Figure 10 and its tables, with synthetic surfaces."""
     pairs = ("angel", "GS"), ("gargoyle", "GH"), ("rabbit", "R"), ("bust", "A"), ("hand", "P")
     found = {}
     for name, letters in pairs:

@@ -1,16 +1,18 @@
 """A hidden body found from the outside: its outline moves far, and the mesh around it is never inverted
 =====================================================================================================
 
-A conducting plate has an earthed body in it that nobody sees. Currents are sent through the plate's rim in several
-patterns, and the potentials there are measured: where is the body, and what is its outline? The potential solves
-Laplace's equation around the body (scikit-fem, linear elements); the misfit's gradient by the mesh's nodes is one
-adjoint solve; and its gradient by the outline is that of the map which carries the mesh along,
-``polish_derivative(…).vjp``, one more solve. A quasi-Newton method then moves the 13 numbers of the outline.
+A conducting plate contains a hidden earthed body. Currents are applied at the plate's rim in several patterns, and the
+potentials there are measured. The task is to find the body's position and outline. The potential solves Laplace's
+equation around the body (scikit-fem, linear elements). The misfit's gradient with respect to the nodes takes one
+adjoint solve. Its gradient with respect to the outline passes through the map that moves the mesh,
+``polish_derivative(…).vjp``, and takes one more solve. A quasi-Newton method then updates the 13 numbers of the
+outline.
 
-The usual way to let a mesh follow is linear elasticity, which is shown for the same outlines. At the default size the
-misfit falls to a 2,700th in 60 steps, and the outline, which began up to 0.72 away from the hidden one, ends within
-0.08 of it. The elastic mesh has inverted triangles from the 9th step on, and from there on its misfit and gradient mean
-nothing; ours never has. The potentials that are measured come from another mesh, half as coarse again.
+The usual method to move a mesh is linear elasticity, which is shown for the same outlines. At the default size the
+misfit falls by a factor of 2,700 in 60 steps. The outline starts up to 0.72 away from the hidden one and ends within
+0.08 of it. The elastic mesh has inverted triangles from the 9th step on, and its misfit and gradient are then
+meaningless. The mesh moved by this library never has inverted triangles. The measured potentials are computed on
+another mesh, with 1.5 times as many cells a side.
 
 ``pip install scikit-fem``; the library itself does not need it.
 """
@@ -28,16 +30,16 @@ from common import INK, flips, panels, run, save, show
 from quasiharmonic import Problem, boundary_loops, polish_derivative, solve, surfaces
 
 Array = NDArray[np.float64]
-# Centre, and the logarithm of the radius around it as a Fourier series: mean, then cosines and sines in turn.
+# Centre, and the log radius around it as a Fourier series: mean, then cosines and sines alternating.
 TRUE = np.array([0.30, 0.18, -1.15, 0.10, 0.15, -0.35, -0.40, 0.10, 0.05, 0.0, 0.05, 0.0, 0.0])
 START = np.array([-0.25, -0.2, np.log(0.3), *np.zeros(10)])
 PATTERNS = 6
-# No number of the outline moves further in one step.
+# Limit on the change of each number of the outline in one step.
 LONGEST = 0.1
 
 
 class Plate:
-    """A mesh of the square [-1, 1]² around a body, and what is done on it."""
+    """A mesh of the square [-1, 1]² around a body, with the potentials and derivatives on it."""
 
     def __init__(self, size: int) -> None:
         V, self.F = surfaces.annulus(size, hole=(-0.4, -0.4, 0.4, 0.4))
@@ -45,14 +47,14 @@ class Plate:
         self.angle = np.angle(V[self.body] @ (1, 1j))
         self.fixed = np.concatenate([self.rim, self.body])
         self.walls = V[self.rim]
-        # The mesh that is carried along is one with a round body.
+        # The rest mesh has a round body.
         round_body = Problem(V, self.F, self.fixed, self.target(np.array([0, 0, np.log(0.4), *np.zeros(10)])))
         self.V = solve(round_body, polish="symmetric-dirichlet").uv
         self.problem = Problem(self.V, self.F, self.fixed, self.V[self.fixed])
         self.uv = self.V
 
     def outline(self, shape: Array) -> tuple[Array, Array]:
-        """The body's outline (l, 2), and its derivative (l, 2, 13) by the shape."""
+        """The body's outline (l, 2), and its derivative (l, 2, 13) with respect to the shape."""
         k = np.arange(1, 1 + (shape.size - 3) // 2)
         waves = np.stack([np.cos(k * self.angle[:, None]), np.sin(k * self.angle[:, None])], axis=2)
         basis = np.column_stack([np.ones(self.angle.size), waves.reshape(self.angle.size, -1)])
@@ -62,11 +64,11 @@ class Plate:
         return shape[:2] + arms, np.concatenate([by_centre, arms[:, :, None] * basis[:, None]], axis=2)
 
     def target(self, shape: Array) -> Array:
-        """Where the fixed vertices go."""
+        """Target positions of the fixed vertices."""
         return np.concatenate([self.walls, self.outline(shape)[0]])
 
     def carried(self, shape: Array) -> Any:
-        """The derivative of the mesh around a body, and by it the mesh."""
+        """The derivative of the mesh around a body, which also contains the mesh."""
         problem = self.problem.with_target(self.target(shape))
         found = solve(problem, polish="symmetric-dirichlet", start=self.uv)
         derivative = polish_derivative(self.V, self.F, found.uv, fixed=self.fixed)
@@ -76,7 +78,7 @@ class Plate:
         return derivative
 
     def potentials(self, points: Array) -> tuple[Array, Any, Array]:
-        """Potentials (n, patterns) for all patterns of current, the solver, and the form that they were found with."""
+        """Potentials (n, patterns) for all current patterns, the solver, and the bilinear form used."""
         from scipy.sparse.linalg import splu
         from skfem import Basis, BilinearForm, ElementTriP1
         from skfem.helpers import dot, grad
@@ -99,7 +101,7 @@ class Plate:
         return solved(load), solved, along
 
     def misfit(self, points: Array, measured: Array) -> tuple[float, Array]:
-        """Half the squared difference from what was measured, over the rim, and its gradient by the nodes (n, 2)."""
+        """Half the squared difference from the measurements over the rim, and its gradient by the nodes (n, 2)."""
         from skfem import Basis, ElementTriP1, ElementVector, LinearForm
         from skfem.helpers import div, dot, eye, grad, mul, transpose
 
@@ -109,7 +111,7 @@ class Plate:
         adjoint = -solved(difference)
         nodes = Basis(self.basis.mesh, ElementVector(ElementTriP1()))
 
-        # How the stiffness changes as a vector field v moves the mesh.
+        # The change of the stiffness when a vector field v moves the mesh.
         def change(v: Any, w: Any) -> Any:
             stretched = eye(div(v), 2) - grad(v) - transpose(grad(v))
             return dot(mul(stretched, grad(w.u)), grad(w.a))
@@ -123,7 +125,7 @@ class Plate:
         return value, gradient.reshape(-1, 2)
 
     def elastic(self, shape: Array) -> Array:
-        """The mesh moved by linear elasticity (Poisson's ratio 0.3) from where it began."""
+        """The rest mesh moved by linear elasticity (Poisson's ratio 0.3)."""
         from skfem import Basis, ElementTriP1, ElementVector, condense
         from skfem import solve as solve_linear
         from skfem.models.elasticity import lame_parameters, linear_elasticity
@@ -143,7 +145,7 @@ def _mesh(points: Array, F: NDArray[np.int64]) -> Any:
 
 
 def descended(value: Callable[[Array], tuple[float, Array]], x: Array, steps: int) -> list[tuple[Array, float]]:
-    """Points and values on the way down, by BFGS; what has no value is infinite."""
+    """Minimise by BFGS, and return the iterates and their values; ``value`` is infinite where it is undefined."""
     inverse, (here, slope) = 0.02 * np.eye(x.size), value(x)
     path = [(x, here)]
     for _ in range(steps):

@@ -1,13 +1,13 @@
 """A smooth surface from a mesh: mapped onto the unit square, sampled on a grid, fitted by a bicubic spline
 ===========================================================================================================
 
-A ramp that winds over itself is the graph of no function, so no spline fits its mesh as it is. Mapped onto the
-unit square, it is one: `InverseMap.sample_grid` reads points off the mesh on a regular grid of the square, the square's
-sides included, and SciPy's `RectBivariateSpline` takes them. The map is polished, since the smoother the map, the
-better the fit.
+A ramp that winds over itself is not the graph of a function, so a spline cannot fit its mesh directly. Mapped onto the
+unit square, it is a graph over the square. `InverseMap.sample_grid` reads points of the mesh on a regular grid of the
+square, sides included. SciPy's `RectBivariateSpline` interpolates them. The map is polished, because a smoother map
+gives a better fit.
 
-With 3,200 triangles and 25 × 25 samples the spline passes every vertex within 0.11 % of the surface's size; the
-triangles themselves leave the true surface by 0.07 %. Both fall with the square of the triangles' size.
+With 3,200 triangles and 25 × 25 samples the spline passes within 0.11 % of the surface's size of every vertex. The
+triangles themselves deviate from the true surface by 0.07 %. Both errors fall with the square of the triangles' size.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from quasiharmonic.plot import plot_map, plot_surface
 
 
 def ramp(at: FloatArray) -> FloatArray:
-    """Points (n, 3) of a spiral ramp of one turn and a quarter, for places (n, 2) of the unit square."""
+    """Points (n, 3) of a spiral ramp of one turn and a quarter, for parameters (n, 2) in the unit square."""
     a, b = at.T
     angle, radius = 2.5 * np.pi * a, 0.5 + b
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 1.4 * a + 0.15 * np.sin(np.pi * b)], axis=1)
 
 
 def main(output: Path, size: int = 40) -> dict[str, Any]:
-    # Irregular triangles, so that nothing is owed to rows and columns.
+    # Irregular triangles, so that the result does not depend on a regular grid.
     nx, ny = 2 * size, size // 2
     places, F = surfaces.grid(nx, ny)
     inside = np.setdiff1d(np.arange(len(places)), boundary_edges(F, len(places)))
@@ -47,7 +47,7 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
     samples = inverse.surface(at)
     splines = [RectBivariateSpline(u, v, samples[..., axis]) for axis in range(3)]
 
-    # Vertices are points of the true surface, and the spline's are theirs by the map.
+    # Compare at the vertices, which lie on the true surface, with the spline at their mapped positions.
     fitted = np.stack([spline.ev(*inverse.uv.T) for spline in splines], axis=1)
     middles = ramp(places[F].mean(axis=1)) - V[F].mean(axis=1)
     extent = float(np.linalg.norm(np.ptp(V, axis=0)))

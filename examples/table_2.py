@@ -1,14 +1,14 @@
 """Table 2: MIPS of the first map of si-log, of a quasi-harmonised one, and of one by the energy of SBP
 ======================================================================================================
 
-The paper has si-log's first map above SBP on four of seven letters, equal on one and below on two, and its last
-column, a little MIPS descended along with V₃ in tanh's tensors, below SBP on four. The surfaces here stand for its
-scans: Lucy, Gargoyle, Bunny, David and Hand.
+In the paper, si-log's first map is above SBP on four of seven letters, equal on one and below on two. The paper's last
+column minimises a little MIPS together with V₃ in tanh's tensors, and is below SBP on four. This example replaces the
+paper's scans (Lucy, Gargoyle, Bunny, David and Hand) by synthetic surfaces.
 
-SBP is another program. Its energy, MIPS with 1/128 of an area term, is `polish`'s ``"blend"``, which begins at an
-injective map where SBP has to find one: its column is what that energy comes to, and not SBP's path to it. SBP itself
-was run once on seven scans of the same names, rebuilt, on letters (``benchmarks/records/letters.csv``, with TLC's
-seconds); its MIPS there, and that of our first map polished for it:
+SBP is another program. Its energy, MIPS with 1/128 of an area term, is `polish`'s ``"blend"``. `polish` starts at an
+injective map, which SBP must find first. The column shows the minimum of that energy, not SBP's path to it. SBP itself
+was run once on seven rebuilt scans of the same names (``benchmarks/records/letters.csv``, with TLC's seconds). Its MIPS
+there, and that of this project's first map polished for MIPS:
 
 =============== ===== ==============
 map             SBP   ours, polished
@@ -22,7 +22,7 @@ David onto A    0.118 0.086
 hand onto P     1.112 0.073
 =============== ===== ==============
 
-On the surfaces of our own:
+On the synthetic surfaces:
 
 =============== ============ ====== =========== ====================
 map             SBP's energy si-log tanh + MIPS the paper's three
@@ -36,8 +36,8 @@ bust onto A     0.517        0.772  0.149       0.088, 0.512, 0.0843
 hand onto P     1.17         0.744  0.083       0.781, 0.391, 0.0910
 =============== ============ ====== =========== ====================
 
-The last column is the least on all seven. Scale is what it pays with: its largest stretch max(σ₁, 1/σ₂) is from 22 to
-nine million times that of the first column's maps. The paper's Table 4 has the same of si-log.
+The last column is the least on all seven. Its maps are strongly scaled instead: their largest stretch max(σ₁, 1/σ₂) is
+22 to nine million times that of the first column's maps. The paper's Table 4 shows the same for si-log.
 """
 
 from __future__ import annotations

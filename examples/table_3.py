@@ -1,14 +1,15 @@
 """Table 3: how long seven surfaces take onto letters
 =====================================================
 
-The paper has 1.2 to 5.2 s for tanh and 3.6 to 10 s for si-log, both in MATLAB, and 63 to 929 s for SBP, a C++ program
-on all cores; the ratio is 38 to 300.
+The paper reports 1.2 to 5.2 s for tanh and 3.6 to 10 s for si-log, both in MATLAB. SBP, a C++ program on all cores,
+takes 63 to 929 s. The ratio is 38 to 300.
 
-Here, on surfaces of our own with 14,000 to 33,000 triangles and one core, tanh takes 3 to 35 iterations and 0.1 to 0.5
-s, si-log 7 to 129 and 0.2 to 2.5 s. Beside them is one Tutte embedding of the same mesh: tanh costs 2 to 10 of those.
-SBP is another program and not run here. On seven scans rebuilt from the paper's names, 20,000 to 40,000 triangles, it
-took 104 to 569 s on one core of a busy machine, and TLC with projected Newton 7.3 to 55 s (whole processes;
-``benchmarks/records/letters.csv``). SBP lowers its energy until it has converged; these here stop at the first map.
+This example uses synthetic surfaces with 14,000 to 33,000 triangles and one core. tanh takes 3 to 35 iterations and 0.1
+to 0.5 s; si-log takes 7 to 129 iterations and 0.2 to 2.5 s. For comparison, tanh costs 2 to 10 Tutte embeddings of the
+same mesh. SBP is another program and is not run. On seven rebuilt scans of the paper's names, 20,000 to 40,000
+triangles, it took 104 to 569 s on one core of a busy machine. TLC with projected Newton took 7.3 to 55 s (whole
+processes; ``benchmarks/records/letters.csv``). SBP minimises its energy until it has converged; tanh and si-log stop at
+the first injective map.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ STAGES = {
 
 
 def afresh(problem: Problem) -> Problem:
-    """The same problem with nothing worked out in advance."""
+    """A copy of the problem without cached results."""
     return Problem(problem.V, problem.F, problem.fixed, problem.target)
 
 
 def main(output: Path, size: int = 80) -> dict[str, Any]:
     numbers: dict[str, Any] = {}
     for name, problem in seven(size).items():
-        quasi_harmonic_map(problem)  # whatever has to be imported is
+        quasi_harmonic_map(problem)  # import lazily loaded modules before timing
         start = perf_counter()
         quasi_harmonic_map(afresh(problem))
         row: dict[str, Any] = {"triangles": len(problem.F), "Tutte": {"seconds": round(perf_counter() - start, 3)}}

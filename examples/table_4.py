@@ -1,18 +1,18 @@
 """Table 4: angles or sizes, seven surfaces onto letters
 ========================================================
 
-The paper compares si-log with IsoTLC. Its MIPS energies are lower on six of seven, all but the gargoyle onto G (0.4 to
-3.7 against 1.6 to 5.7), its isometric distortion, the largest max(σ₁, 1/σ₂), is far higher (5.7 to 2.6e8 against 0.9 to
-6.7): si-log keeps angles and lets sizes go.
+The paper compares si-log with IsoTLC. si-log's MIPS energies are lower on six of seven, all but the gargoyle onto G
+(0.4 to 3.7 against 1.6 to 5.7). Its isometric distortion, the largest max(σ₁, 1/σ₂), is far higher (5.7 to 2.6e8
+against 0.9 to 6.7). si-log preserves angles but not sizes.
 
-So it does here: the first maps have MIPS 0.7 to 7.4 and isometric distortion 690 to 3e9. Least MIPS brings the former
-down to 0.08 to 2.3 and the latter no lower than 400. Polishing by symmetric Dirichlet gives up some of the angles,
-MIPS 2.2 to 10, and brings sizes to between 8.7 and 15, with every boundary vertex still in its place; IsoTLC, another
-program, moves the boundary.
+This example agrees: the first maps have MIPS 0.7 to 7.4 and isometric distortion 690 to 3e9. Minimising MIPS lowers the
+former to 0.08 to 2.3 and the latter only to 400 or more. Polishing by symmetric Dirichlet raises MIPS to 2.2 to 10 and
+lowers the isometric distortion to between 8.7 and 15, with every boundary vertex fixed. IsoTLC, another program, moves
+the boundary.
 
-The paper's isometric columns cannot be that maximum as it is: 0.853, for David onto A, is less than max(σ₁, 1/σ₂) of
-any triangle, for where σ₁ is below 1 so is σ₂, and 1/σ₂ above it. What was taken off, or divided by, the text does not
-say; those columns compare with ours in kind only.
+The paper's isometric columns cannot be this maximum itself. For David onto A the paper gives 0.853, but max(σ₁, 1/σ₂)
+is at least 1 for every triangle: if σ₁ is below 1, so is σ₂, and 1/σ₂ is above 1. The text does not say what was
+subtracted or divided by, so only a qualitative comparison with those columns is possible.
 """
 
 from __future__ import annotations

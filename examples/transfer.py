@@ -1,12 +1,12 @@
 """From one surface to another: a cat with the triangles of a dome, by way of the unit square
 =============================================================================================
 
-Two meshes that have nothing in common, a cat's head and a dome, are both mapped onto the unit square, φ and ψ. Where
-the maps are bijective, which is decided exactly, so is ψ⁻¹∘φ from the cat to the dome, and whatever is known on the
-one can be brought to the vertices of the other. Here it is the cat's own shape: the dome's triangles take it on.
+Two unrelated meshes, a cat's head and a dome, are both mapped onto the unit square, by φ and ψ. If both maps are
+certified bijective, ψ⁻¹∘φ from the cat to the dome is bijective too, and data of one surface can be transferred to the
+vertices of the other. This example transfers the cat's own shape: the dome's triangles take it on.
 
-Both squares' sides are along the axes, so that the boundaries, too, have their partners: all 1,261 vertices of the
-dome. There and back again, no vertex of the cat is further than 1e-14 of its size from where it was.
+The sides of both squares are parallel to the axes, so that boundaries correspond too, and all 1,261 vertices of the
+dome have an image. Mapped there and back, no vertex of the cat moves by more than 1e-14 of the cat's size.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SQUARE = targets.rectangle(1, 1)
 
 
 def squared(V: FloatArray, F: NDArray[np.int64]) -> InverseMap:
-    """The inverse of a map onto the unit square that keeps angles as well as it can."""
+    """The inverse of a map onto the unit square that preserves angles as far as possible."""
     problem = onto(V, F, SQUARE)
     return InverseMap(V, F, solve(problem, polish="mips").uv)
 

@@ -1,14 +1,14 @@
 """A photo warped by landmarks, without folds: corners of eyes and mouth pulled about, the border of the photo in place
 =======================================================================================================================
 
-Try it on your own photo: give the file, and a text file with a line ``x y x' y'`` for each landmark, in pixels from
-the upper left corner, where it is and where it is to go::
+To warp your own photo, pass the file and a text file with a line ``x y x' y'`` for each landmark. These are its
+position and its target position, in pixels from the upper left corner::
 
     python examples/warped_photo.py --photo me.jpg --landmarks points.txt
 
-A polynomial or thin-plate warp folds over itself where landmarks move far against each other; this one cannot: the
-map is certified bijective. Without arguments it makes Grace Hopper smile (the picture comes with matplotlib), and turns
-a small patch about its middle by 120°, which no warp that looks at displacements one by one survives.
+A polynomial or thin-plate warp folds over itself if landmarks move far relative to each other. This warp cannot fold,
+because the map is certified bijective. Without arguments the example makes Grace Hopper smile (the photo comes with
+matplotlib). It also turns a small patch about its centre by 120°, which warps based on single displacements cannot do.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SMILE = np.array(
 
 
 def whirl(x: float, y: float, radius: float, angle: float) -> FloatArray:
-    """Landmarks on a circle turned about its middle."""
+    """Landmarks on a circle turned about its centre."""
     around = radius * np.exp(2j * np.pi * np.arange(10) / 10)
     before, after = around + complex(x, y), around * np.exp(1j * angle) + complex(x, y)
     return np.stack([before.real, before.imag, after.real, after.imag], axis=1)

@@ -5,24 +5,24 @@ import signal
 
 import pytest
 
-# One thread in each process: there may be one for each core, and on small problems one thread is quicker even alone.
-# Read by libraries when they are loaded, so before NumPy is imported.
+# Use one thread per process: there may be one process per core, and on small problems one thread is faster anyway.
+# Libraries read these variables when they are loaded, so set them before NumPy is imported.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
-# What a script starts in the background ignores interrupts, and so would the commands that tests interrupt.
+# A process that a script starts in the background ignores interrupts, and so would the commands that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# From this many on a worker's memory, half a gigabyte, and its start are not worth its time.
+# Beyond this number, a worker's start and its memory (half a gigabyte) cost more than it saves.
 MOST_WORKERS = 8
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config):
-    """A worker for each core; none where files are named, most of which have ended before workers have started."""
+    """A worker for each core; no worker if files are named, because most of them end before workers have started."""
     if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
-        return None  # the plugin's own way to set it
+        return None  # the plugin then reads this variable itself
     if any(".py" in argument for argument in config.args):
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -42,7 +42,7 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture
 def rng():
-    """Random numbers, the same ones every time."""
+    """A random generator with a constant seed."""
     import numpy as np
 
     return np.random.default_rng(20231)
@@ -50,10 +50,10 @@ def rng():
 
 @pytest.fixture
 def troubled(monkeypatch):
-    """Problems of a data set are solved by a process to which what their names say happens."""
+    """Solve data sets in a process that fails or hangs as the names of the problems say."""
     from quasiharmonic.ui.batch import supervisor
     from shared.commands import TROUBLED
 
     monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)
-    # Several that get nowhere are soon solved one by one.
+    # If several problems together make no progress, soon solve them one by one.
     monkeypatch.setattr(supervisor, "TOGETHER", 1.0)

@@ -1,4 +1,4 @@
-"""Families of problems that aim at where programs break: each makes what it says."""
+"""Adversarial families of problems: each generates problems with the documented property."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def made(family, difficulty=1.0, seed=3):
 
 
 def sides(case):
-    """Lengths of all sides of the known solution's triangles, (f, 3)."""
+    """Side lengths of the known solution's triangles, (f, 3)."""
     corners = case.hidden[case.F]
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
 
@@ -45,7 +45,7 @@ def test_a_problem_is_well_formed_and_has_the_solution_it_was_made_from(family, 
 
 
 def test_the_families_published_are_the_same():
-    """Order and names make the names of a campaign's problems, and those make the problems."""
+    """The order and names of the families determine the names of a campaign's problems, and those the problems."""
     published = "noise jam flow swirl adrift pins spiral comb maze limbs carved polygon star whirl teeth glyph moved"
     assert list(problems.FAMILIES) == published.split()
     assert not set(problems.FAMILIES) & set(problems.ADVERSARIAL)
@@ -81,12 +81,12 @@ def test_hilberts_curve_visits_every_cell_once_and_steps_by_one():
 def test_a_strip_along_hilberts_curve_keeps_clear_of_itself():
     case = made("hilbert")
     assert case.simple
-    # A box of 16 × 16 cells, the strip turning in nearly all of them.
+    # A box of 16 × 16 cells; the strip turns in nearly all of them.
     np.testing.assert_allclose(np.ptp(case.target, axis=0), 16, atol=1)
 
 
 def test_kochs_snowflake_has_its_corners_and_its_area():
-    """(8 / 5) of the triangle's in the limit, less (3 / 5) (4 / 9)ⁿ of it at level n."""
+    """At level n the area is (8 / 5) of the triangle's (the limit) minus (3 / 5) (4 / 9)ⁿ of it."""
     for level in range(5):
         z = outlines.koch(level)
         assert len(z) == 3 * 4**level
@@ -109,7 +109,7 @@ def test_coils_shrink_to_a_millionth():
 def test_gaps_are_a_ten_billionth():
     case = made("gaps")
     assert case.simple
-    # The nearest two boundary vertices that are not neighbours.
+    # The nearest two boundary vertices that are not neighbours on the boundary.
     z = case.target @ (1, 1j)
     apart = abs(z[:, None] - z)
     np.fill_diagonal(apart, np.inf)

@@ -1,4 +1,4 @@
-"""The air around a flat surface: bijective together with it, nothing added on the boundary, triangles of good shape."""
+"""The air mesh around a planar surface: bijective together with it, no new boundary vertices, well-shaped triangles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 
 
 def fan(radii, angles):
-    """A star-shaped polygon around the origin, as triangles from its middle."""
+    """A star-shaped polygon around the origin, as a fan of triangles around its centre."""
     n = len(radii)
     rim = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
     k = np.arange(n)
@@ -23,7 +23,7 @@ def fan(radii, angles):
 
 
 def blocks(gap, seed=0):
-    """Two rectangles face to face across a gap, whose vertices do not face each other."""
+    """Two rectangles on opposite sides of a gap, whose vertices are not aligned."""
     rng = np.random.default_rng(seed)
     parts, places, count = [], [], 0
     for low in (-0.3, gap):
@@ -37,14 +37,14 @@ def blocks(gap, seed=0):
 
 
 def checked(F, uv, **options):
-    """Air, after every promise of it has been checked by other means; and everything that it makes with the surface."""
+    """Make the air mesh and check its guarantees independently; return it, and the joint points and triangles."""
     before = uv.copy()
     air = air_around(F, uv, boundary_loops(F, len(uv)), **options)
     assert np.array_equal(uv, before)
     points, triangles = np.concatenate([uv, air.points]), np.concatenate([F, air.F])
     verdict = certify(triangles, points)
     assert verdict.bijective, verdict.summary()
-    # One boundary is left, the frame: so every edge of the surface's boundary is one of the air's.
+    # The only remaining boundary is the frame, so the air contains every boundary edge of the surface.
     (loop,) = verdict.loops
     assert set(loop.tolist()) == set(air.frame.tolist())
     assert set(np.unique(air.F)) >= set(len(uv) + np.arange(len(air.points)))
@@ -53,7 +53,7 @@ def checked(F, uv, **options):
 
 @pytest.fixture(params=["Qhull", "one by one"])
 def way(request, monkeypatch):
-    """Both ways to the first triangles."""
+    """Both methods for the initial triangulation."""
     if request.param == "one by one":
         monkeypatch.setattr(triangulating, "by_qhull", lambda points: np.empty((0, 3), dtype=np.int64))
     return request.param
@@ -127,7 +127,7 @@ def test_a_margin_is_positive():
 
 
 def in_circles(points, triangles):
-    """Triangles whose circle has a point across an edge inside it, and the keys of those edges."""
+    """Keys of interior edges that violate the Delaunay condition."""
     n = len(points)
     apex = {(a, b): c for t in triangles.tolist() for a, b, c in (t, t[1:] + t[:1], t[2:] + t[:2])}
     for (a, b), c in apex.items():
@@ -143,7 +143,7 @@ def test_triangles_are_delaunay_but_for_segments(way):
     hull_angles = np.arange(12) * np.pi / 6
     hull = 3 * np.stack([np.cos(hull_angles), np.sin(hull_angles)], axis=1)
     points = np.concatenate([hull, rng.uniform(-1, 1, (200, 2))])
-    # Two chords through all of it, which touch no point.
+    # Two long chords that pass through no other point.
     points = np.concatenate([points, [[-1.5, 0.013], [1.5, 0.0117], [-1.4, 0.5], [1.4, 0.51]]])
     segments = np.array([[212, 213], [214, 215]])
     triangles = constrained_delaunay(points, segments, np.arange(12))
@@ -182,7 +182,7 @@ def test_squares_are_small_where_asked_and_grow_by_halves():
     level, x, y = tree.leaves()
     size = 0.5**level
     assert np.isclose((size**2).sum(), 16, rtol=1e-12)
-    # Just across each side lies a square of at most twice the size.
+    # The neighbour across each side is at most twice as large.
     for dx, dy in ((0.51, 0), (-0.51, 0), (0, 0.51), (0, -0.51)):
         beside = np.stack([(x + 0.5 + dx) * size, (y + 0.5 + dy) * size], axis=1)
         inside = np.all((beside > 0) & (beside < 4), axis=1)

@@ -1,4 +1,4 @@
-"""Elastic shapes among obstacles: certified bijective at every moment, and moved as elasticity has it."""
+"""Elastic shapes among moving obstacles: every step is certified bijective, and shapes move as elasticity predicts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from quasiharmonic.energies.measures import mean_ratio
 
 
 def square(side, x=0.0, y=0.0, count=8):
-    """A square around (x, y), with several points a side, counterclockwise."""
+    """A square around (x, y) with ``count`` points a side, counterclockwise."""
     t = np.linspace(-1, 1, count, endpoint=False)
     one = np.ones(count)
     return np.concatenate([np.stack(p, axis=1) for p in ((t, -one), (one, t), (-t, one), (-one, -t))]) * (
@@ -61,7 +61,7 @@ def test_a_shape_is_pushed_as_a_rigid_body_where_there_is_room():
         moment = air.advance([square(6), square(1, x)])
         assert moment.certificate.bijective
     shape = moment.points[: len(V)]
-    # It has been pushed to the right by at least what it would overlap otherwise, and hardly deformed.
+    # The shape is pushed right by at least the overlap, and hardly deformed.
     assert shape[:, 0].min() > 0.7 - 1e-9
     turned = np.linalg.svd((shape - shape.mean(axis=0)).T @ V)
     rotation = turned[0] @ turned[2]

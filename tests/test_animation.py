@@ -1,4 +1,4 @@
-"""Sequences of maps: certified, near to each other, and what happens where a frame has none."""
+"""Sequences of maps: certified frames, small motion between them, and frames without a map."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from quasiharmonic.ui.cli import main
 
 @pytest.fixture(scope="module")
 def head():
-    """A cat's head and its boundary."""
+    """A cat's head and its boundary loop."""
     V, F = cat(10)
     return V, F, boundary_loops(F, len(V))[0]
 
 
 def turning_stars(count, frames, depth=0.7):
-    """Targets (frames, count, 2) that begin and end as a circle, and are a star that turns between."""
+    """Targets (frames, count, 2) that start and end as a circle, with a turning star in between."""
     angle = 2 * np.pi * np.arange(count) / count
     outlines = []
     for t in np.linspace(0, 1, frames):
@@ -67,7 +67,7 @@ def test_frames_are_certified_and_follow(head):
 
 @pytest.mark.parametrize(("pinned", "most"), [(False, 2), (True, 5)])
 def test_frames_that_are_searched_for_stay_near(pinned, most):
-    """Where the map of the last frame does not do, the search goes no farther than it has to."""
+    """If a frame cannot start from the last frame's map, the search stays as close to it as possible."""
     V, F = cat(10 if pinned else 14)
     held = loop = boundary_loops(F, len(V))[0]
     targets = turning_stars(len(loop), 40, depth=0.6 if pinned else 0.75)
@@ -95,7 +95,7 @@ def test_polished_frames_do_not_leap(head):
 
 @pytest.mark.slow
 def test_the_sweeps_are_what_shortens_leaps(head):
-    """With a limit that cannot be met on the way forward alone."""
+    """The limit on motion cannot be met by the forward sweep alone."""
     V, F, loop = head
     targets = turning_stars(len(loop), 12, depth=0.85)
     problem = Problem(V, F, loop, targets[0])
@@ -121,7 +121,7 @@ def test_a_boundary_that_rests(head):
 
 @pytest.fixture
 def backwards(head):
-    """Frames of which the fifth winds the other way."""
+    """Frames, the fifth of which has the opposite orientation."""
     V, F, loop = head
     targets = turning_stars(len(loop), 9, depth=0.4)
     targets[4] = targets[4, ::-1]
@@ -137,7 +137,7 @@ def test_an_impossible_frame_is_told_with_its_reason(backwards, energy):
     assert animation.frames[4].diagnosis.forbids_injective
     assert "frame 4: " in animation.summary()
     assert animation.to_dict()["missing"] == [4]
-    # Found as soon as it is clear that more work would be in vain.
+    # The search stops as soon as the frame is known to be impossible.
     assert animation.frames[4].iterations <= 10
     json.dumps(animation.to_dict(), allow_nan=False)
 
@@ -351,7 +351,7 @@ def test_a_frame_without_a_map_is_not_written(backwards, head, tmp_path, capsys)
     assert len(list((tmp_path / "out").iterdir())) == len(targets) - 1
     assert run("animate", surface, *frames, "-o", tmp_path / "out", "--fill-gaps") == 0
     assert len(list((tmp_path / "out").iterdir())) == len(targets)
-    # A frame that is there from another run is told.
+    # A frame left by another run is reported.
     assert "not of this run" not in capsys.readouterr().out
     assert run("animate", surface, *frames, "-o", tmp_path / "out") == 1
     assert "out: 0004.obj" in capsys.readouterr().out

@@ -1,7 +1,7 @@
-"""The public functions with whatever arrays a caller may hand them.
+"""The public functions with arbitrary arrays as arguments.
 
-Each either returns or raises a `ValueError` or `TypeError` with a message. What it calls good is good, what it
-returns is finite, nothing it was given is changed, and it warns of nothing (warnings are errors here).
+Each function either returns or raises a `ValueError` or `TypeError` with a message. A positive verdict is correct,
+results are finite, arguments are unchanged, and there are no warnings (warnings are errors in the tests).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ NUMBERS = [
 
 
 def outcome(function, *arguments, **more):
-    """The result, or None where the function refused with a message; the arguments stay as they are."""
+    """Return the result, or None if the function raises an error with a message; check that arguments are unchanged."""
     given = [a.copy() for a in (*arguments, *more.values()) if isinstance(a, np.ndarray)]
     message = "none is needed"
     try:
@@ -82,14 +82,14 @@ def outcome(function, *arguments, **more):
         given, (a for a in (*arguments, *more.values()) if isinstance(a, np.ndarray)), strict=True
     ):
         assert before.dtype == after.dtype
-        # Object arrays may hold anything, NaN included.
+        # Object arrays may contain anything, NaN included.
         assert before.dtype == object or before.tobytes() == after.tobytes()
     event("refused" if result is None else "accepted")
     return result
 
 
 def dressed(draw, array):
-    """The same numbers in another type or layout, and perhaps read-only."""
+    """The same numbers in another type or layout, possibly read-only."""
     how = draw(st.sampled_from(["plain", "plain", "fortran", "strided", "backwards", "swapped", "read-only", "list"]))
     if not array.ndim:
         return array
@@ -109,7 +109,7 @@ def dressed(draw, array):
 
 @st.composite
 def positions(draw, good, wrong=3):
-    """Positions of a mesh, in any types and layouts; one in so many not as they should be."""
+    """Vertex positions of random type and layout; one in ``wrong`` is invalid."""
     array = np.array(good, dtype=float)
     spoiled = draw(st.integers(1, wrong)) == wrong
     for _ in range(draw(st.integers(0, 2 * spoiled))):
@@ -142,7 +142,7 @@ def positions(draw, good, wrong=3):
 
 @st.composite
 def indices(draw, good, n, wrong=3):
-    """Indices, of any types and layouts; one in so many not as they should be."""
+    """Indices of random type and layout; one in ``wrong`` is invalid."""
     array = np.array(good, dtype=np.int64)
     spoiled = draw(st.integers(1, wrong)) == wrong
     for _ in range(draw(st.integers(0, 2 * spoiled))):
@@ -172,7 +172,7 @@ def indices(draw, good, n, wrong=3):
 
 @st.composite
 def problems(draw, wrong=4):
-    """What `Problem` takes: a mesh, its boundary and perhaps pins, and where they go."""
+    """Arguments of `Problem`: a mesh, its boundary, possibly pins, and target positions."""
     V, F = draw(st.sampled_from(MESHES))
     fixed = boundary_of(F)
     inside = np.setdiff1d(np.arange(len(V)), fixed)
@@ -276,7 +276,7 @@ def test_certificate(data):
         assert len(corners)
         assert np.isfinite(uv[corners]).all()
         if np.abs(uv).max() < 1e100 and np.ptp(uv[corners]) > 1e-100:
-            # Far from rounding the plain formula agrees.
+            # Where rounding cannot matter, the plain formula agrees.
             areas = signed_areas(corners, uv)
             assert (areas > -1e-12 * np.ptp(uv[corners]) ** 2).all()
 
@@ -323,7 +323,7 @@ def test_refinement(data):
 @often
 @given(st.data())
 def test_arrays_of_any_kind(data):
-    """Nothing that is a mesh at all."""
+    """Arrays that need not form a mesh."""
     anything = st.one_of(
         arrays.arrays(
             data.draw(st.sampled_from([np.float64, np.int64, np.uint64, bool, np.complex128, "U3", "datetime64[s]"])),
@@ -349,7 +349,7 @@ def test_arrays_of_any_kind(data):
 @seldom
 @given(data=st.data())
 def test_command_on_damaged_files(name, data):
-    """The command ends with one of its statuses and a message, whatever stands in the file."""
+    """The command ends with a documented exit status and a message for any file content."""
     text = data.draw(damaged(VALID[name]))
     handles = data.draw(st.one_of(st.none(), damaged(VALID["handles.txt"])))
     command = data.draw(st.sampled_from(["map", "check", "diagnose", "refine", "polish"]))

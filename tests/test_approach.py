@@ -1,4 +1,4 @@
-"""Steps from afar: references between rest and the map, and what they save."""
+"""Intermediate references between rest and a distant map, and the Newton steps that they save."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RINGS = 12
 
 
 def shrunken(power):
-    """A disk drawn together at its centre, whose inmost triangles have RINGS^(2 - 2 power) of their area."""
+    """A disk contracted at its centre, whose innermost triangles have RINGS^(2 - 2 power) of their area."""
     V, F = disk(RINGS)
     fixed = np.arange(len(V) - 6 * RINGS, len(V))
     turn = np.exp(2j * (1 - V[:, 0] ** 2 - V[:, 1] ** 2))
@@ -37,7 +37,7 @@ def matrices(d):
 
 
 def afar(power=6):
-    """An energy at a map far from rest, the map, and the energy against references."""
+    """An energy at a map far from rest, the map, and the energy relative to intermediate references."""
     V, F, uv, _ = shrunken(power)
     energy, w = DeformationEnergy(V, F, SymmetricDirichlet()), in_units(uv, 0)
     towards = relative(energy, energy.deform(w))
@@ -49,7 +49,7 @@ def test_against_references_singular_values_are_powers():
     energy, w, towards = afar()
     before, after = matrices(energy.deform(w)), matrices(towards.deform(w))
     _, sigma, vt = np.linalg.svd(before)
-    # Another way to the same: references made of singular vectors, taken away from the Jacobian.
+    # An independent formula: build references from singular vectors and divide them out of the Jacobian.
     farthest = np.abs(np.log(sigma)).max()
     t = np.log(REACH) / farthest
     references = np.swapaxes(vt, 1, 2) @ (sigma[:, :, None] ** (1 - t) * vt)

@@ -1,4 +1,4 @@
-"""The imports of the packages are those of the table in docs/architecture.md."""
+"""The imports between packages match the table in docs/architecture.md."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ PLAN = {
     name: {other.strip() for other in others.split(",") if other.strip()}
     for name, others in re.findall(r"^\| `(\w+)` \|.*\| ([\w, ]*)\|$", PAGE, re.MULTILINE)
 }
-# These modules export names of packages: the public names, the command, and the short public paths.
+# These modules re-export names of packages: the public names, the command, and the short public paths.
 FACADE = {"__init__", "__main__", "atlas", "batch", "jax", "plot", "surfaces", "torch"}
 
 
 def is_module(parts):
-    """Whether there is a module or a package of this dotted name, given as parts after the library's name."""
+    """Whether a module or package has this dotted name, given as parts after the library's name."""
     path = ROOT.joinpath(*parts)
     return all(parts) and bool(parts) and (path.with_suffix(".py").exists() or (path / "__init__.py").exists())
 
@@ -35,9 +35,9 @@ def docstrings(tree):
 
 
 def imported(tree):
-    """Modules of the library that a file imports, as parts of their dotted names, imports by string included.
+    """Modules of the library that a file imports, as parts of their dotted names, including imports by string.
 
-    Public names of the library itself are an error, since each stands for a module that `quasiharmonic` imports late.
+    Public names of the library itself are an error, because `quasiharmonic` imports their modules lazily.
     """
     documentation = set(docstrings(tree))
     for node in ast.walk(tree):
@@ -54,7 +54,7 @@ def imported(tree):
         for (package, *of), name in dotted:
             if package != "quasiharmonic":
                 continue
-            # What is imported may itself be a module or a package.
+            # The imported name may itself be a module or a package.
             whole = (*of, name) if name and is_module((*of, name)) else tuple(of)
             assert whole or name == "__version__", f"{name or 'all'} from the library itself: import from its module"
             if whole:
@@ -62,7 +62,7 @@ def imported(tree):
 
 
 def imports():
-    """(package, other package, file) for every import across packages, wherever in a file it is."""
+    """(package, other package, file) for every import across packages, at any position in a file."""
     for path in sorted(ROOT.rglob("*.py")):
         package = path.relative_to(ROOT).with_suffix("").parts[0]
         if package not in FACADE:
@@ -100,7 +100,7 @@ def test_packages_import_only_from_packages_above_them():
 
 
 def test_no_cycle_between_subpackages():
-    """Subpackages of one package import each other in one direction."""
+    """Subpackages of one package import each other in one direction only."""
     graph = {}
     for path in sorted(ROOT.rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts

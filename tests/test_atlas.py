@@ -1,4 +1,4 @@
-"""Maps with seams: every command and function, island by island, and files that lose nothing."""
+"""Maps with seams: every command and function works island by island, and files preserve the seams."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shared.seamed import strips
 
 
 def seamed(path, mirrored=None, stacked=False):
-    """A file whose map is cut into three strips; one of them mirrored, or all over one another."""
+    """Write a file whose map is cut into three strips, optionally with one mirrored or with all of them overlapping."""
     V, F, uv, FT, strip = strips(6)
     if stacked:
         for k in range(3):
@@ -34,7 +34,7 @@ def vertex_lines(path):
 
 
 def faces(path):
-    """Faces by their vertices alone."""
+    """The face lines with vertex indices only."""
     return [re.sub(r"/\d*", "", line) for line in path.read_text().splitlines() if line.startswith("f ")]
 
 
@@ -89,7 +89,7 @@ class TestCommands:
             for one, other in zip(before.islands, after.islands, strict=True):
                 rim = np.unique(one.F[(one.F < 0).any(axis=1)]) if name == "free" else boundary(one)
                 assert np.array_equal(one.uv[rim], other.uv[rim])
-                # Not far from where it was, whatever its border does.
+                # Each island stays near its position, even if its border is free.
                 assert np.linalg.norm(one.uv.mean(axis=0) - other.uv.mean(axis=0)) < 0.2
         assert energy["free"] < energy["kept"]
 
@@ -187,7 +187,7 @@ class TestCut:
         assert faces(out) == faces(tmp_path / "in.obj")
         mapped = io.mapped(io.read_mesh(out))
         assert len(mapped.seams) == json.loads(told.read_text())["cut_edges"] > 0
-        # Read back, the seams are there to go on with.
+        # The written seams can be read and used by further commands.
         for command in (["polish"], ["flatten"], ["map", "--to", "letter:G", "--refine"], ["repair"]):
             assert run(command[0], out, "-o", tmp_path / "then.obj", *command[1:]) == 0
             if command[0] != "map":
@@ -227,7 +227,7 @@ class TestSeenFromOutside:
         assert run("check", source, "--boundary", "--json", tmp_path / "told.json") == 0
         loops = json.loads((tmp_path / "told.json").read_text())["loops"]
         assert len(loops) == 3
-        # By the mesh's own numbers, of which those at a seam are on two loops.
+        # Loops use the mesh's own vertex numbers, so vertices at a seam occur in two loops.
         vertices = np.concatenate([loop["vertices"] for loop in loops])
         assert vertices.max() < len(io.read_mesh(source).V)
         assert len(np.unique(vertices)) < len(vertices)
@@ -305,7 +305,7 @@ class TestConvexity:
             ([(0, 0), (1, 0), (2, 0), (1, 1)], False),
             ([(0, 1), (1, 1), (1, 0), (0, 0)], False),
             ([(0, 0), (1, 1), (1, 0), (0, 1)], False),
-            # A pentagram turns left at every corner, and runs around twice.
+            # A pentagram turns left at every corner and winds twice.
             ([(np.cos(a), np.sin(a)) for a in 4 * np.pi * np.arange(5) / 5], False),
         ],
     )

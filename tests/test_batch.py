@@ -1,4 +1,4 @@
-"""Data sets on one machine: which problems are found, that none is lost, and that troubles stay where they are."""
+"""Data sets on one machine: all problems are found and recorded, and a failure does not affect other problems."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def names(source, **options):
 
 @pytest.fixture
 def stars(tmp_path):
-    """Four problems at several depths."""
+    """Four problems at several folder depths."""
     return write_stars(tmp_path / "set", ["a", "b/c", "b/d/e", "z"])
 
 
@@ -97,7 +97,7 @@ class TestFinding:
             with pytest.raises(ValueError, match=rf"list.txt: line 2: there is no problem in the folder '{name}'"):
                 names(stars / "list.txt")
         assert names(stars / "list.txt", plain=True)[1] == "notes/other.obj"
-        # Named twice is not named in vain.
+        # A problem listed twice is found once.
         (stars / "list.txt").write_text("b/c\nb\nb\n")
         assert names(stars / "list.txt") == ["b/c", "b/d/e"]
 
@@ -166,7 +166,7 @@ class TestRun:
             assert record["isometric"] >= 1
             assert set(json.loads(record["versions"])) == {"quasiharmonic", "python", "numpy", "scipy"}
             assert set(record) <= set(batch.COLUMNS)
-        assert record["flips_before"] > 0  # of the last one; the first are easy
+        assert record["flips_before"] > 0  # of the last problem; the first ones are easy
         table = list(batch.read_table(tmp_path / "out" / "records.csv"))
         assert [row["problem"] for row in table] == ["a", "b/c", "b/d/e", "z"]
         for row in table:
@@ -176,7 +176,7 @@ class TestRun:
             }
 
     def test_distortion_is_that_of_the_map(self, stars, tmp_path):
-        """Against singular values computed here."""
+        """Compare with singular values computed in the test."""
         batch.run(stars / "a", tmp_path / "out", batch.Settings(polish="mips"))
         mesh = io.read_mesh(tmp_path / "out" / "results" / "a" / "map.obj")
         a, b, c = mesh.V[mesh.F, :2].transpose(1, 0, 2)
@@ -251,7 +251,7 @@ class TestRun:
             batch.run(stars, tmp_path)
         assert (tmp_path / "records.csv").read_text() == "mine"
         assert not (tmp_path / "results").exists()
-        # Above the problems there is room.
+        # An output folder above the problems is allowed.
         (tmp_path / "records.csv").unlink()
         assert batch.run(stars / "b", stars).solved == batch.run(stars / "b", stars).resumed == 2
 
@@ -282,7 +282,7 @@ class TestRun:
             energies.append(distortion(written.V, written.F, uv).summary("symmetric_dirichlet").mean)
         assert energies[1] < 0.95 * energies[0]
         (loop,) = boundary_loops(written.F, len(uv))
-        # On the font's own curves, and not on chords of theirs.
+        # Distances from the font's curves, not from chords of them.
         away = np.min([curve.nearest(uv[loop])[1] for curve in outline_curves("letter:O")], axis=0)
         assert away.max() < 1e-14
 
@@ -314,13 +314,13 @@ class TestRun:
         assert (record["outcome"], record["certified"], record["bijective"]) == ("bijective", True, True)
         assert (record["vertices"], record["triangles"], record["loops"]) == (len(V), len(F), 1)
         assert record["status"] == "polished"
-        # The mean of that measure is this energy.
+        # The energy is the mean of this measure.
         assert record["energy"] == pytest.approx(record["mips"], rel=1e-9)
         np.testing.assert_array_equal(io.map_of(written), flatten(V, F, energy="mips").uv)
         assert record_of(tmp_path / "out", "rings/ring.off")["loops"] == 2
         assert "closed" in record_of(tmp_path / "out", "closed.obj")["error"]
         assert "zero area" in record_of(tmp_path / "out", "flat.obj")["error"]
-        # What is finished is known again, and another energy is another question.
+        # Finished problems are not solved again; a different energy solves them again.
         assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).resumed == 4
         cats = tmp_path / "set" / "cat.obj"
         assert batch.run(cats, tmp_path / "out", batch.Settings(flatten=True), jobs=1).resumed == 0
@@ -329,7 +329,7 @@ class TestRun:
         assert "guarded descent, distances" in record_of(tmp_path / "out", "cat.obj")["stages"]
 
     def test_corners(self, tmp_path):
-        """By angle for sheets of any size, by place where they lie alike; a file of corners is part of the input."""
+        """Corners by angle for any sheet, by position for aligned sheets; a file of corners is part of the input."""
         for name, cells in (("a", (9, 6)), ("b", (5, 8))):
             (tmp_path / "set").mkdir(exist_ok=True)
             io.write_obj(tmp_path / "set" / f"{name}.obj", io.MeshData(*grid(*cells)))
@@ -352,7 +352,7 @@ class TestRun:
 
     @pytest.mark.parametrize("options", [{"to": "letter:H", "refine": True}, {"flatten": True}])
     def test_what_does_not_lie_flat_is_cut(self, tmp_path, options):
-        """Along seams: vertices and faces stay; a disk beside it is left alone where an outline is wanted."""
+        """Cuts are seams: vertices and faces are unchanged. With an outline, a disk is not cut."""
         source = tmp_path / "set"
         source.mkdir()
         V, F = refine(*(np.vstack([np.eye(3), -np.eye(3)]), OCTAHEDRON))
@@ -377,7 +377,7 @@ class TestRun:
         np.testing.assert_array_equal(after.V[: len(before.V)], before.V)
         if not added:
             np.testing.assert_array_equal(after.F, before.F)
-        # Still closed: the cut is in the map alone.
+        # The surface stays closed: the cut is in the map alone.
         assert not boundary_loops(after.F, len(after.V))
         assert certify(*io.cut_at_seams(after)[1:]).injective
         if wanted == "injective":
@@ -400,7 +400,7 @@ class TestRun:
         np.testing.assert_array_equal(written.V[: len(V), :2], V)
 
     def test_islands(self, tmp_path):
-        """Of a file with seams each is mapped, its border kept; onto an outline they have one each, side by side."""
+        """Each island of a file with seams is mapped with its border kept; onto an outline, each fills its own copy."""
         V, F = grid(6, 4)
         left = V[F].mean(axis=1)[:, 0] < 0.5
         uv = np.vstack([V, V * (-1, 1) + (4, 0)])
@@ -498,7 +498,7 @@ class TestRun:
         assert "cannot start /nonexistent" in capsys.readouterr().err
 
     def test_memory_of_the_driver_does_not_grow_with_the_problems(self, tmp_path, monkeypatch):
-        """Thousands of folders with a file each that nobody looks into."""
+        """Thousands of folders, each with one unread file."""
 
         def attend_all(supervisor, some):
             for files in some:
@@ -659,7 +659,7 @@ class TestCommand:
     def test_on_a_terminal_and_in_a_log(self, stars, tmp_path):
         pty = pytest.importorskip("pty")
         leader, follower = pty.openpty()
-        # Told of every problem, however soon the next one is done.
+        # Print every problem, however fast they follow each other.
         often = (
             "import sys; from quasiharmonic.ui.cli import main; from quasiharmonic.ui.cli.commands import batch; "
             "batch.LIVE = batch.LOG = 0; main(sys.argv[1:])"
@@ -668,7 +668,7 @@ class TestCommand:
         run = subprocess.Popen([*command, str(tmp_path / "1")], stdout=subprocess.DEVNULL, stderr=follower)
         os.close(follower)
         shown = ""
-        # The terminal's end is an error on Linux, and empty elsewhere.
+        # At the terminal's end, reading raises an error on Linux and returns nothing elsewhere.
         with contextlib.suppress(OSError):
             while part := os.read(leader, 1 << 12):
                 shown += part.decode()

@@ -1,4 +1,4 @@
-"""Data sets through a Dask cluster: a real one, of processes that talk over TCP."""
+"""Data sets solved on a real Dask cluster of processes that communicate over TCP."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PRELOAD = Path(__file__).with_name("shared") / "troubled_cluster.py"
 
 @contextmanager
 def cluster(folder, workers, **environment):
-    """A scheduler and workers of one thread each: address, scheduler process, worker processes."""
+    """A scheduler and single-threaded workers: address, scheduler process, worker processes."""
     environment = {**os.environ, **environment}
     told = folder / "scheduler.json"
 
@@ -68,7 +68,7 @@ def test_a_worker_killed_in_the_middle(tmp_path):
         assert workers[0].wait() == -signal.SIGKILL
         assert workers[1].poll() is workers[2].poll() is None
         assert progress.outcomes == {"injective": 16}
-        # The command, on what is left of the cluster.
+        # Run the command on the remaining workers of the cluster.
         assert main(["batch", str(source), "-o", str(tmp_path / "out"), "--scheduler", address]) == 0
     assert batch.run(source, tmp_path / "out").resumed == 16
     batch.run(source, tmp_path / "local")
@@ -87,7 +87,7 @@ def test_what_kills_workers_is_found_out_and_takes_no_other_along(tmp_path):
 
 
 def test_what_ends_the_run(tmp_path):
-    """A full disk, a mistake of ours, folders that a worker does not see."""
+    """A full disk, an internal error, and folders that a worker cannot see end the run."""
     source = write_stars(tmp_path / "set", ["a", "full", "mistake"])
     with cluster(tmp_path, 1) as (address, _, _):
         with pytest.raises(OSError, match=r"cannot write .*full.*o space left"):

@@ -1,4 +1,4 @@
-"""The page about a run: its numbers, its figures, and that nothing in it can do harm or reach outside."""
+"""The report page of a run: its numbers and figures, and that it contains no scripts or external links."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VILE = '<script>alert(1)</script>"><img src=x onerror=alert(2)>&amp;\u202egnp'
 
 
 class Reader(HTMLParser):
-    """Tags with attributes, and the text of a page."""
+    """The tags of a page with attributes, and its text."""
 
     def __init__(self, text):
         super().__init__()
@@ -43,7 +43,7 @@ class Reader(HTMLParser):
 
 
 def made(tmp_path, count=200, seed=0, name="t.csv", **more):
-    """A table of records that never ran."""
+    """A table of synthetic records."""
     rng = np.random.default_rng(seed)
     rows = []
     for k in range(count):
@@ -118,7 +118,7 @@ class TestPage:
         assert main(["report", str(tmp_path / "out")]) == 0
         read = Reader((tmp_path / "out" / "report.html").read_text())
         pictures = [attributes["src"] for tag, attributes in read.tags if tag == "img"]
-        # Three maps in three lists, and a surface that has no map.
+        # Three maps in three lists, and a surface without a map.
         assert len(pictures) == 10
         for picture in pictures:
             head, data = picture.split(",")
@@ -141,7 +141,7 @@ class TestPage:
         assert "2 certified bijective, 1 input cannot be used" in text
         assert "certified injective" not in text
         assert "Settings: flatten True" in text
-        # The table alone tells it too.
+        # The table alone gives the same count.
         assert "2 of 3 certified bijective" in Reader(written(tmp_path, tmp_path / "out" / "records.csv")).text
 
     def test_of_a_run_that_is_going_on(self, tmp_path):
@@ -200,7 +200,7 @@ class TestPage:
         assert "default-src 'none'" in text
 
     def test_sparse_records(self, tmp_path):
-        """What other programs leave behind."""
+        """Records of other programs, with missing fields."""
         (tmp_path / "t.csv").write_text("problem,seconds\na,1\nb,0\nc,\nd,inf\n")
         text = Reader(written(tmp_path, tmp_path / "t.csv")).text
         assert "0 of 4 certified" in text
@@ -250,7 +250,7 @@ class TestAgainst:
 
 class TestFigures:
     def heights(self, svg):
-        """Shares of the bars, read off the drawing by its own labels."""
+        """The shares of the bars, measured in the drawing by its own labels."""
         tree = ET.fromstring(svg)
         labels = [(float(t.text[:-2]) / 100, float(t.get("y")) - 4) for t in tree.iter("text") if "%" in t.text]
         (s0, y0), (s1, y1) = labels[0], labels[-1]
@@ -324,5 +324,5 @@ def test_in_a_browser_by_day_and_by_night(tmp_path):
         pictures.append(imread(tmp_path / "s.png")[..., :3])
     for picture, brightness in zip(pictures, (0.96, 0.08), strict=True):
         assert np.median(picture) == pytest.approx(brightness, abs=0.06)
-        # Ink in all of the upper part, and a figure's bars in the middle.
+        # There is ink throughout the upper part, and a figure's bars are in the middle.
         assert (np.abs(picture[:300] - picture[0, 0]).max(axis=2) > 0.3).any(axis=1).mean() > 0.3

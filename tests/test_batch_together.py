@@ -1,4 +1,4 @@
-"""Small problems of a data set solved side by side: as each would be by itself, and nothing is lost by it."""
+"""Small problems of a data set solved in one batch: results equal those of separate runs, and no problem is lost."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = [
 
 
 def jobs_of(source, out, **settings):
-    """What a process is told of all problems of a data set."""
+    """The jobs of all problems of a data set, as a process receives them."""
     orders = Orders(out, batch.Settings(**settings))
     return [
         {
@@ -38,7 +38,7 @@ def jobs_of(source, out, **settings):
 
 
 def solved_both_ways(source, tmp_path, **settings):
-    """The numbers of those solved together, after all have been solved by themselves too."""
+    """Solve all problems separately and batched; return the numbers of those that were batched."""
     told = []
     together.solve_some(jobs_of(source, tmp_path / "together", **settings), told.append)
     for job in jobs_of(source, tmp_path / "alone", **settings):
@@ -58,7 +58,7 @@ def assert_as_alone(tmp_path, names):
 
 
 def test_maps_and_records_are_those_of_each_by_itself(tmp_path):
-    """To the last bit: meshes of different sizes and with different outlines."""
+    """The results agree to the last bit, for meshes of different sizes and outlines."""
     names = [f"{k:02d}" for k in range(10)]
     for k, name in enumerate(names):
         write_problem(tmp_path / "set" / name, *star_of(3 + k, depth=0.7 - 0.02 * k, tips=3 + k % 4))
@@ -67,7 +67,7 @@ def test_maps_and_records_are_those_of_each_by_itself(tmp_path):
 
 
 def test_without_handles_with_places_in_another_order_and_onto_an_outline(tmp_path, rng):
-    """What a mesh's vt do not say by its vertices' own numbers goes the longer way."""
+    """Fixed vertices from the boundary, vt records in another order than the vertices, and an outline as target."""
     source = write_stars(tmp_path / "set", ["a", "b", "c"])
     (source / "a" / "handles.txt").unlink()
     mesh = io.read_mesh(source / "b" / "input.obj")
@@ -87,7 +87,7 @@ def test_what_cannot_be_solved_there_is_left_as_it_was(tmp_path):
     tetrahedron = [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]
     io.write_obj(source / "closed" / "input.obj", io.MeshData(np.eye(4)[:, :3], tetrahedron))
     V, F, loop, star = star_of(5)
-    # Its outline meets itself.
+    # The target outline intersects itself.
     write_problem(source / "far", V, F, loop, star * [1, 0] + np.roll(star, 7, axis=0) * [0, 1])
     both = np.concatenate([V, V + 3]), np.concatenate([F, F + len(V)])
     write_problem(source / "islands", *both, np.concatenate([loop, loop + len(V)]), np.concatenate([star, star + 3]))
@@ -98,7 +98,7 @@ def test_what_cannot_be_solved_there_is_left_as_it_was(tmp_path):
     assert_as_alone(tmp_path, ["a", "z"])
     assert not list((tmp_path / "together").rglob("[bcfil]*/map.obj"))
     assert (tmp_path / "together/results/broken/record.json").read_text() == "{}"
-    # In a run they are then solved by themselves.
+    # A run then solves them separately.
     assert batch.run(source, tmp_path / "run", jobs=1).total == 7
     for name in ("broken", "closed", "far", "islands", "large"):
         assert record_of(tmp_path / "run", name)["outcome"] == record_of(tmp_path / "alone", name)["outcome"]
@@ -165,7 +165,7 @@ def test_a_run_that_is_stopped_within_a_group_goes_on_from_there(tmp_path):
 
 
 def test_a_run_has_small_problems_solved_together(tmp_path, monkeypatch):
-    """By a process that cannot solve any by itself."""
+    """The worker process cannot solve separate problems, so all must be solved in a batch."""
     code = "from quasiharmonic.ui.batch import worker; worker.solve_files = None; worker.serve()"
     monkeypatch.setattr(supervisor, "COMMAND", [sys.executable, "-P", "-c", code])
     source = write_stars(tmp_path / "set", ["a", "b", "c"])

@@ -1,4 +1,4 @@
-"""Data sets in which things go wrong: every trouble is recorded, and stays where it is."""
+"""Data sets with failures: each failure is recorded and does not affect other problems."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ pytestmark = pytest.mark.slow
 
 
 def children_of(process):
-    """Process ids of a driver's processes."""
+    """Process ids of a driver's child processes."""
     found = []
     for task in Path(f"/proc/{process.pid}/task").iterdir():
-        with suppress(OSError):  # a thread that has ended meanwhile
+        with suppress(OSError):  # the thread may have ended meanwhile
             found += (task / "children").read_text().split()
     return found
 
 
 def runs(child):
-    """Whether a process is there and not merely waiting for its parent to take notice of its end."""
+    """Whether a process exists and is not a zombie."""
     try:
         return Path(f"/proc/{child}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -77,13 +77,13 @@ class TestTroubles:
         assert 400 << 20 < record["peak_memory"] < 800 << 20
 
     def test_real_limits(self, tmp_path):
-        """No trouble made up: a mesh that takes longer, and then more memory, than it may."""
+        """Real limits: a mesh exceeds the time limit, and then the memory limit."""
         source = tmp_path / "set"
         write_problem(source / "large", *star_of(230))
         write_problem(source / "small", *star_of(4))
         out = tmp_path / "out"
         assert batch.run(source, out, jobs=1, time_limit=0.8).outcomes == {"timeout": 1, "injective": 1}
-        # The same limit or less: nothing to be gained.
+        # With the same limit or a lower one the problem is not solved again.
         assert batch.run(source, out, jobs=1, time_limit=0.4).resumed == 2
         if Path("/proc/self/statm").exists():
             limited = batch.run(source, out, jobs=1, memory_limit=60 << 20)
@@ -139,7 +139,7 @@ class TestTroubles:
 
 
 def test_a_worker_that_nobody_listens_to_blames_no_problem(tmp_path):
-    """A driver that is killed closes both pipes to a worker, and the worker may come upon either first."""
+    """If a driver is killed, both pipes to a worker close, and the worker may notice either first."""
     (problem,) = batch.find_problems(write_stars(tmp_path / "set", ["a"]))
     folder = tmp_path / "out"
     job = {
@@ -161,7 +161,7 @@ def test_a_worker_that_nobody_listens_to_blames_no_problem(tmp_path):
 
 @linux
 def test_killed_driver_loses_what_was_in_flight_and_no_more(tmp_path):
-    # The last two keep the driver busy until it is killed, however late that is.
+    # The last two problems keep the driver busy until it is killed, however late that is.
     names = [*(f"{i:02d}" for i in range(22)), "y_sleep", "z_sleep"]
     source = write_stars(tmp_path / "set", names, rings=12)
     command = [sys.executable, "-m", "quasiharmonic", "batch", str(source), "-j", "2", "-o"]
@@ -201,7 +201,7 @@ def test_killed_driver_loses_what_was_in_flight_and_no_more(tmp_path):
 
 @linux
 def test_an_orphan_that_hangs_ends_by_itself(tmp_path, monkeypatch):
-    """With the interpreter's lock held no thread sees that the driver is gone; the system ends the process."""
+    """With the interpreter's lock taken, no thread notices that the driver is gone; the system ends the process."""
     write_stars(tmp_path / "set", ["spin"])
     script = f"import sys, quasiharmonic.ui.batch.worker as w; w.GRACE = 0.5; exec(open({str(TROUBLED[-1])!r}).read())"
     run = (

@@ -89,14 +89,14 @@ def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
     first = next(started)
     started.close()
     assert first["name"] == todo[0]
-    # A kill in the middle of a line.
+    # Simulate a kill in the middle of a line.
     with output.open("a") as file:
         file.write('{"name": "comb:0')
     rest = list(campaign.campaign(todo, output, limit=60))
     assert [record["name"] for record in rest] == todo[1:]
     assert [record["name"] for record in campaign.read(output)] == todo
     assert list(campaign.campaign(todo, output)) == []
-    # In another way they are not done, and a failure says which way that was.
+    # With other settings the problems are not done yet, and a failure reports these settings.
     (other,) = campaign.campaign(todo[:1], output, limit=60, max_iterations=1, strategy="paper")
     again = campaign.summary([other | {"outcome": "exception", "message": "lost"}])
     assert f"--case {todo[0]} --strategy paper --max-iterations 1 " in again
@@ -117,7 +117,7 @@ def test_a_hang_is_a_result_and_the_next_problem_is_solved(tmp_path, monkeypatch
         worker.spare = spares.pop(0)
 
     monkeypatch.setattr(campaign.Worker, "start", impatient)
-    # 45 000 triangles, not to be solved within the first second.
+    # A mesh of 45,000 triangles, which is not solved within the first second.
     todo = ["pins:96:0.831", "swirl:0:0.1"]
     first, second = campaign.campaign(todo, tmp_path / "results.jsonl", limit=30)
     assert first["outcome"] == "timeout"
@@ -161,7 +161,7 @@ def test_without_a_known_solution_no_map_is_no_failure():
 
 @pytest.mark.parametrize("name", ["jam:15:0.771", "jam:20:0.861", "spiral:83:0.797", "jam:84:0.415"])
 def test_fallbacks_solve_what_the_search_over_tensors_leaves(name):
-    """Problems whose last triangles have next to no room, or whose target overlaps itself."""
+    """Problems whose last triangles have almost no space, or whose target overlaps itself."""
     case = problems.make(*problems.parse(name))
     problem = Problem(case.V, case.F, case.fixed, case.target)
     assert not solve(problem, strategy=stages_of("speed", problem)[:1]).injective
@@ -210,7 +210,7 @@ def test_a_timeout_is_no_success_of_the_feasible_families():
     ],
 )
 def test_wrong_calls_of_a_campaign_are_refused(arguments, message, tmp_path, monkeypatch, capsys):
-    """Before ten thousand records say so one by one."""
+    """Invalid calls fail before any problem runs."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
         campaign.main(arguments)
@@ -272,7 +272,7 @@ def test_compiled_loops_are_compared_with_numpy(tmp_path, monkeypatch):
 
 
 def test_speed_is_measured_joined_and_limited(tmp_path, capsys):
-    """A tool past the limit gets no larger problem, ours as well."""
+    """A tool that exceeds the limit gets no larger problem, including this project's own."""
     once = ["--peers", "-r", "1", "--letters", "C", "-o", str(tmp_path)]
     speed.main([*once, "--triangles", "100", "300", "--limit", "1e-9"])
     assert "cat on C, 294 triangles: every tool has exceeded the limit" in capsys.readouterr().out
@@ -289,7 +289,7 @@ def test_speed_is_measured_joined_and_limited(tmp_path, capsys):
 
 
 def test_letters_alone(tmp_path):
-    """A row comes back as it was written; what is recorded is all of it there."""
+    """A row is read back as written, and the recorded runs are complete."""
     (V, F) = next((V, F) for name, V, F in letters_alone.made(24) if name == "hand")
     run = letters_alone.measure("hand", V, F, "A", "V₃ tanh", 100)
     assert run.flips == 0

@@ -1,4 +1,4 @@
-"""What public functions take: arrays that change under their hands, that stay the caller's, that are no indices."""
+"""Arguments of public functions: arrays changed by another thread, arrays that stay unchanged, invalid indices."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ LOOPS = boundary_loops(F, N)
 RIM = np.concatenate(LOOPS)
 SQUARE = [[(-3, -3), (3, -3), (3, 3), (-3, 3)]]
 
-# A second thread puts numbers into F that name no vertex, and takes them out again, while a function works on it.
+# While a function works on F, a second thread writes invalid indices into it and removes them again.
 REWRITTEN = """
 import sys, threading, time
 import numpy as np
@@ -97,7 +97,7 @@ while time.perf_counter() - begin < 0.4:
 done = True
 print(taken, refused)
 """
-# Of the disk, fewer where a call takes long.
+# Rings of the disk; fewer for slow functions.
 _RINGS = {"flatten": 20, "injective_map": 30, "polish": 30, "distortion": 60}
 CALLS = {
     "certify": "certify(F, V)",
@@ -124,7 +124,7 @@ def test_triangles_that_another_thread_rewrites(name):
     assert sum(map(int, ran.stdout.split())) > 0
 
 
-# Where kernels are called that rely on indices.
+# Calls of kernels that require valid indices.
 KERNELS = {
     "geometry.exact.triangles": ["sure_signs", "count_turns"],
     "geometry.exact.loops": ["doubtful_pairs"],
@@ -136,7 +136,7 @@ KERNELS = {
     "geometry.exact.point_location": ["sure_hits"],
     "geometry.exact.nested_grid": ["find_cells", "divide_cells"],
 }
-# What is called with the arrays V, F, uv and the boundary, each of which stays the caller's.
+# Calls with the arrays V, F, uv and the boundary, all of which must stay unchanged.
 FUNCTIONS = {
     "certify": lambda V, F, uv, rim: certify(F, uv),
     "certify, the loops known": lambda V, F, uv, rim: certify(F, uv * [[1.0, -1.0]], loops=[rim]),
@@ -232,7 +232,7 @@ KINDS = (plain, read_only_view, opened_again, of_a_buffer, of_a_memoryview, of_a
 
 
 def found(result):
-    """Every array of a result that makes a promise, by its name."""
+    """The arrays of a result that are guaranteed to be valid, by name."""
     if isinstance(result, Problem):
         result = result.domain
     named = {name: array for name, array in vars(result).items() if isinstance(array, np.ndarray)}
@@ -375,7 +375,7 @@ def test_what_are_no_indices_is_named(name):
             raise AssertionError(f"{what}: {error!r}") from error
         else:
             continue
-        # Raised here, and not in NumPy.
+        # The library must raise the error, not NumPy.
         assert own, (what, message)
         assert len(message) > 15, what
     assert refused > len(BAD) // 2

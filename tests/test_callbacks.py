@@ -1,4 +1,4 @@
-"""What is called at every step: taken by many, and refused by each of them at once if it cannot be called."""
+"""Step callbacks: the functions that accept one reject an object that is not callable at once."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ CORNERS = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def strip(columns, rows=1, closed=False):
-    """A band of ``columns × rows`` squares, column after column, along the first axis; closed to a ring or not."""
+    """A band of ``columns × rows`` squares along the first axis, numbered by column, optionally closed to a ring."""
     index = np.arange((columns + (not closed)) * (rows + 1)).reshape(-1, rows + 1)
     following = np.roll(index, -1, axis=0) if closed else index[1:]
     index = index if closed else index[:-1]
@@ -34,28 +34,28 @@ def polar(radius, turns):
 
 
 def spiral(turns, pitch, columns=60):
-    """A band of width one wound around the origin, its inner side first in every column."""
+    """A band of width one wound around the origin, with its inner side first in every column."""
     t = np.linspace(0, turns, columns + 1)
-    # Counterclockwise columns need the outer side first.
+    # For counterclockwise triangles the outer side must come first.
     outer, inner = polar(2 + pitch * t, t), polar(1 + pitch * t, t)
     return strip(columns), np.stack([outer, inner], axis=1).reshape(-1, 2)
 
 
 def ring(inner=1.0, outer=2.0, columns=12):
-    """An annulus: vertex 2i outside, 2i + 1 inside."""
+    """An annulus with vertex 2i on the outer loop and 2i + 1 on the inner one."""
     t = np.arange(columns) / columns
     return strip(columns, closed=True), np.stack([polar(outer, t), polar(inner, t)], axis=1).reshape(-1, 2)
 
 
 def fan(polygon, centre=(0.0, 0.0)):
-    """A disk whose boundary goes onto a polygon: vertex 0 in the middle."""
+    """A fan whose boundary is a polygon, with vertex 0 at its centre."""
     k = len(polygon)
     rim = np.arange(k)
     return np.stack([np.zeros(k, dtype=int), 1 + rim, 1 + (rim + 1) % k], axis=1), np.vstack([centre, polygon])
 
 
 def together(*parts):
-    """Several meshes as one."""
+    """The disjoint union of several meshes."""
     offsets = np.cumsum([0] + [len(uv) for _, uv in parts])
     return np.vstack([F + o for (F, _), o in zip(parts, offsets, strict=False)]), np.vstack([uv for _, uv in parts])
 
@@ -65,9 +65,9 @@ def square(x, y, size):
 
 
 def crossed_sheets():
-    """A ring of positive triangles with two branch points: two disks, a smaller one above, joined crosswise.
+    """A ring of positive triangles with two branch points: a disk and a smaller one above it, joined crosswise.
 
-    The slit is at y = 3 from x = 2 to x = 4; who crosses it changes sheet.
+    The slit is at y = 3 from x = 2 to x = 4. A path across it changes from one sheet to the other.
     """
     place, number = [], {}
 
@@ -96,7 +96,7 @@ def kinds(certificate):
 
 
 def covers_nothing_twice(F, uv):
-    """Injectivity by comparing all triangles with each other in rational arithmetic."""
+    """Decide injectivity by comparing all pairs of triangles in rational arithmetic."""
     if any(exact_orientation(*uv[t]) <= 0 for t in F):
         return False
     for s, t in itertools.combinations(F.tolist(), 2):
@@ -164,7 +164,7 @@ def test_verdicts_do_not_depend_on_scale(scale):
 
 def test_offset_of_a_hundred_million_times_the_size():
     F, uv = ring()
-    uv = uv + 4e8  # exact enough for doubles, not for singles
+    uv = uv + 4e8  # exact enough in double precision, not in single precision
     assert certify(F, uv).bijective
     single = certify(F, uv.astype(np.float32))
     assert not single.injective
@@ -263,12 +263,12 @@ def test_crossings_are_the_edges_that_cross():
 @pytest.mark.parametrize(
     "polygon",
     [
-        [[0, 0], [2, 0], [1, 0], [1, 1]],  # an edge back along the one before
-        [[0, 0], [2, 0], [2, 0], [0, 2]],  # an edge of no length
-        [[0, 0], [1, 0], [2, 0]],  # all on a line
+        [[0, 0], [2, 0], [1, 0], [1, 1]],  # an edge that turns back along the previous one
+        [[0, 0], [2, 0], [2, 0], [0, 2]],  # an edge of zero length
+        [[0, 0], [1, 0], [2, 0]],  # all vertices collinear
         [[0, 0], [0, 0], [0, 0]],
         [[0, 0], [4, 0], [4, 2], [2, 0], [0, 2]],  # a vertex on an edge
-        [[0, 0], [2, 1], [4, 0], [4, 2], [2, 1], [0, 2]],  # two vertices at one place
+        [[0, 0], [2, 1], [4, 0], [4, 2], [2, 1], [0, 2]],  # two vertices at the same position
     ],
 )
 def test_touching_is_not_simple(polygon):
@@ -289,7 +289,7 @@ def test_inner_loop_outside_the_outer_one():
 def test_inner_loop_touching_or_crossing_the_outer_one():
     for shift in (1.0, 1.5):
         F, uv = ring()
-        uv[1::2] += [shift, 0]  # vertex 1 comes to vertex 0, or passes it
+        uv[1::2] += [shift, 0]  # vertex 1 coincides with vertex 0, or passes it
         c = certify(F, uv)
         assert Obstacle.INTERSECTION in kinds(c)
         assert [r.loops for r in c.reasons if r.kind is Obstacle.INTERSECTION] == [(0, 1)]
@@ -331,14 +331,14 @@ def test_only_vertices_with_positive_triangles_are_overwound():
 
 
 def overwound_exactly(F, uv):
-    """Vertices, all triangles around them positive, with angles of more than 2π in all: by products of fractions."""
+    """Vertices with positive triangles only, whose angles sum to more than 2π, in rational arithmetic."""
     found = []
     for v in np.unique(F).tolist():
         rows = [np.roll(t, -int(np.argmax(t == v))).tolist() for t in F if v in t]
         if any(exact_orientation(*uv[row]) <= 0 for row in rows):
             continue
         following = {b: c for _, b, c in rows}
-        # A fan begins where no other triangle of it ends; a closed one anywhere.
+        # An open fan begins with the triangle that has no predecessor; a closed fan begins anywhere.
         here = next((b for b in following if b not in following.values()), rows[0][1])
         x, y, whole = Fraction(1), Fraction(0), 0
         for _ in rows:
@@ -349,7 +349,7 @@ def overwound_exactly(F, uv):
             dx, dy = bx * cx + by * cy, bx * cy - by * cx
             lower = y < 0 or (y == 0 and x < 0)
             x, y = x * dx - y * dy, x * dy + y * dx
-            # By less than half a turn: from the lower half to the upper one is past a whole turn.
+            # Steps are less than half a turn, so a step from the lower to the upper half completes a turn.
             whole += lower and (y > 0 or (y == 0 and x > 0))
             here = following[here]
         if whole > 1 or (whole == 1 and (y != 0 or x < 0)):
@@ -358,7 +358,7 @@ def overwound_exactly(F, uv):
 
 
 def open_fan(rng, triangles):
-    """Positive triangles around vertex 0, which is on the boundary, at whole numbers."""
+    """Positive triangles with integer coordinates around the boundary vertex 0."""
     points = [rng.integers(-2, 3, 2)]
     while len(points) <= triangles:
         place = rng.integers(-2, 3, 2)
@@ -387,7 +387,7 @@ def test_boundary_vertices_around_which_triangles_wind_more_than_once(rng):
 
 
 def test_maps_of_annuli_overwound_or_not(rng):
-    """Rings of whole numbers, some with a loop reflected, and torn; a third of them with triangles inverted."""
+    """Rings with integer coordinates, some torn, some with a loop reflected; a third have inverted triangles."""
     seen = 0
     for _ in range(120):
         columns = int(rng.integers(4, 9))
@@ -420,11 +420,11 @@ def test_an_annulus_with_its_inner_loop_reflected():
 
 
 def test_a_slit_that_is_closed_is_not_overwound():
-    """The angles at its end are 2π exactly: its sides lie on each other, which is a crossing."""
+    """The angles at its end sum to exactly 2π. Its sides coincide, which is a crossing."""
     t = np.arange(9) / 8
     F, uv = fan(np.round(polar(1 + 0 * t, t) * 4))
     for turn in range(8):
-        # Vertex 9 is where vertex 1 is.
+        # Vertices 9 and 1 coincide.
         np.testing.assert_array_equal(uv[1], uv[9])
         turned = uv @ [[[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[3, 4], [-4, 3]], [[5, -12], [12, 5]]][turn % 4]
         c = certify(F[:-1], turned)
@@ -551,7 +551,7 @@ def test_bijective_means_that_no_triangles_share_more_than_their_vertices(data):
     else:
         shift = data.draw(st.tuples(*[st.sampled_from([-3, -1.5, -1, 0, 0.5, 2.25])] * 2))
         F, uv = together(ring(columns=4), square(*shift, 0.75))
-    # On a coarse lattice, so that touching and collinear happen.
+    # A coarse lattice makes touching and collinear cases likely.
     cells = data.draw(st.sampled_from([2, 4, 64]))
     uv = np.round(uv * cells) / cells
     moved = data.draw(st.integers(0, len(uv) - 1))

@@ -1,4 +1,4 @@
-"""What the command says and leaves where files, folders and streams are not as they should be."""
+"""Messages and output files of the command for faulty files, folders and streams."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="closes streams by the she
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """The working directory: a mesh with a map, and nothing else."""
+    """A working directory that contains only a mesh with a map."""
     monkeypatch.chdir(tmp_path)
     V, F = disk(3)
     io.write_obj("m.obj", MeshData(V, F).with_map(V))
@@ -31,7 +31,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def full_disk(monkeypatch):
-    """No file can be written any more, after so many."""
+    """Writing fails after a given number of files."""
 
     def set_full(after=0):
         left = iter(range(after))
@@ -235,7 +235,7 @@ def test_an_option_without_effect_is_refused(folder, capsys, call, needs):
 
 
 def shell(call, streams, *, unbuffered=False):
-    """Exit status and what is said on standard error by a command with streams of its own."""
+    """Exit status and standard error of a command with its own streams."""
     command = f"set -o pipefail; {sys.executable} -m quasiharmonic {call} {streams}"
     environment = {**os.environ, "PYTHONUNBUFFERED": "1" if unbuffered else ""}
     done = subprocess.run(["bash", "-c", command], capture_output=True, env=environment)

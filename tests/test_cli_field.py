@@ -47,7 +47,7 @@ def test_a_field_and_its_inverse(tmp_path, field, capsys):
 
 
 def test_a_field_without_an_inverse(tmp_path, capsys):
-    """Its border is folded over, and no cell is."""
+    """The border of the field overlaps itself, but no cell is inverted."""
     t, r = np.meshgrid(np.linspace(0, 7, 80), np.linspace(20, 30, 6))
     ring = np.stack([r * np.sin(t), r * np.cos(t)], axis=-1)[:, ::-1]
     x, y = np.meshgrid(np.arange(80), np.arange(6))

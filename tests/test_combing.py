@@ -1,4 +1,4 @@
-"""Combing: linear programmes along directions, against brute force."""
+"""Line-shift linear programmes along directions, compared with brute force."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_frame_turns_nothing_over_and_is_as_wide_as_long(rng, angle):
     x, y, along = frame_along(w, angle)
     np.testing.assert_allclose(np.cov(x, y, bias=True), np.eye(2), atol=1e-9)
     assert np.array_equal(signed_areas(F, w) > 0, signed_areas(F, x + 1j * y) > 0)
-    # A step along x and nothing else.
+    # A step along x only.
     moved = w + 0.3 * along
     before, after = (np.linalg.lstsq(np.c_[w.real, w.imag, np.ones(9)], p, rcond=None)[0] for p in (x, y))
     there = np.c_[moved.real, moved.imag, np.ones(9)]
@@ -33,7 +33,7 @@ def test_points_on_a_line_have_no_frame():
 
 
 def test_a_vertex_goes_where_least_is_wrong(rng):
-    """A fan around a vertex that alone is free: brute force over its places along the line."""
+    """A fan whose central vertex alone is free: brute force over its positions along the line."""
     k = 9
     F = np.stack([np.full(k, k), np.arange(k), np.roll(np.arange(k), -1)], axis=1)
     righted = 0
@@ -42,7 +42,8 @@ def test_a_vertex_goes_where_least_is_wrong(rng):
         w = np.append(ring, 1.2 + 0.02j)
         step = best_shift(F, w.real, w.imag, np.arange(k + 1) < k)
         assert np.all(step[:k] == 0)
-        # Over its base's extent across the line, the area of a triangle is the apex's distance along it.
+        # Twice the area, divided by the base's extent across the line, is the apex's distance to the base along the
+        # line.
         base = np.roll(ring, -1).imag - ring.imag
         unit = np.ptp(w.real[F], axis=1).mean()
         distance = 2 * signed_areas(F, w) / np.abs(base) / unit
@@ -65,7 +66,7 @@ def test_held_vertices_stay_to_the_last_bit(rng):
 
 
 def test_a_fold_of_many_triangles_is_moved_as_a_whole():
-    """The inner half of a disk carried across its rim comes back in one programme."""
+    """The inner half of a disk, moved across its rim, returns in one programme."""
     V, F = disk(8)
     z = V[:, 0] + 1j * V[:, 1]
     w = np.where(abs(z) < 0.5, z + 1, z)

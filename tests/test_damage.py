@@ -1,4 +1,4 @@
-"""Damaged files given to the command: the campaign sees what is wrong, and a share of it runs here."""
+"""Damaged files as input of the command: the campaign detects errors, and a part of it runs in the tests."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What tests have in common: meshes and problems, exact references, samples of files, troubles. No test is in here."""
+"""Shared helpers of the tests: meshes and problems, exact references, sample files, failures. It contains no test."""

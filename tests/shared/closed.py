@@ -21,7 +21,7 @@ def torus(around=36, across=14, radius=2.0):
 
 
 def blocks(solid, rounds=3):
-    """The surface of a solid of unit blocks, (x, y, z) bool, its vertices moved between their neighbours in turn."""
+    """The surface of a solid of unit blocks, (x, y, z) bool, smoothed by averaging neighbouring vertices."""
     padded = np.pad(np.asarray(solid, dtype=bool), 1)
     quads = []
     for axis in range(3):
@@ -42,7 +42,7 @@ def blocks(solid, rounds=3):
 
 
 def double_torus(thick=3):
-    """A plate with two holes."""
+    """The surface of a plate with two holes."""
     solid = np.ones((5 * thick, 3 * thick, thick), dtype=bool)
     for x in (thick, 3 * thick):
         solid[x : x + thick, thick : 2 * thick] = False

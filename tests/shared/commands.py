@@ -1,4 +1,4 @@
-"""The command, called as from a terminal, and the processes of a data set with troubles."""
+"""The command called in process, and the worker command for data sets with failing problems."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 
 from quasiharmonic.ui.cli import main
 
-# What `quasiharmonic.ui.batch.supervisor` starts in place of its `COMMAND`.
+# Replaces `quasiharmonic.ui.batch.supervisor.COMMAND`.
 TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
 linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
 
 
 def run(*arguments):
-    """Exit status of ``qhm``."""
+    """Call ``qhm`` and return its exit status."""
     return main([str(a) for a in arguments])

@@ -1,4 +1,4 @@
-"""Small files that are right, and what may happen to them."""
+"""Small valid files, and a strategy that damages them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ splices = st.one_of(
 
 @st.composite
 def damaged(draw, data):
-    """Bytes of a file replaced, removed, repeated or put in."""
+    """A file's bytes with parts replaced, removed, repeated or inserted."""
     for _ in range(draw(st.integers(1, 4))):
         start = draw(st.integers(0, len(data)))
         stop = min(len(data), start + draw(st.integers(0, 8)))

@@ -10,7 +10,7 @@ import numpy as np
 from quasiharmonic import boundary_loops, io
 from quasiharmonic.surfaces import disk
 
-# Fields of a record that say how it went this time, and not what came out.
+# Fields of a record that describe the run, not the result.
 PASSING = {"peak_memory", "threads", "time_limit", "memory_limit", "stages"}
 
 
@@ -24,7 +24,7 @@ def star_of(rings, depth=0.5, tips=5):
 
 
 def write_problem(folder, V, F, fixed, target):
-    """One problem as a folder."""
+    """Write one problem as a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     uv = np.full((len(V), 2), 0.5)
     uv[fixed] = target
@@ -34,17 +34,17 @@ def write_problem(folder, V, F, fixed, target):
 
 
 def write_stars(root, names, rings=5):
-    """A star for every name, each another one."""
+    """Write a different star problem for every name."""
     for k, name in enumerate(names):
         write_problem(root / name, *star_of(rings, depth=0.7 - 0.4 * k / len(names)))
     return root
 
 
 def record_of(out, name):
-    """The record of a problem, straight from its file."""
+    """Read the record of a problem from its file."""
     return json.loads((Path(out) / "results" / name / "record.json").read_text())
 
 
 def lasting(record):
-    """What of a record must be the same in every run."""
+    """The part of a record that must be the same in every run."""
     return {k: v for k, v in record.items() if k not in PASSING and not k.startswith("seconds")}

@@ -1,4 +1,4 @@
-"""Problems to differentiate, and what derivatives are compared with: central differences of maps."""
+"""Problems to differentiate, and the reference for their derivatives: central differences of maps."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from quasiharmonic.surfaces import annulus
 
 
 def ring(curved=False):
-    """A square with a square hole, its vertices shaken, flat or not."""
+    """A square with a square hole and perturbed vertices, planar or curved."""
     V, F = annulus(6, hole=(-0.34, -0.34, 0.34, 0.34))
     V = V + 0.02 * np.random.default_rng(1).standard_normal(V.shape)
     return (np.column_stack([V, 0.3 * np.sin(2 * V[:, 0])]) if curved else V), F
 
 
 def held_ring(curved=False, pins=1):
-    """A problem on it: boundary and hole held, bent, and pins inside."""
+    """A problem on `ring`: boundary and hole fixed at bent positions, and ``pins`` fixed interior vertices."""
     V, F = ring(curved)
     loops = np.concatenate(boundary_loops(F, len(V)))
     fixed = np.concatenate([loops, np.setdiff1d(np.arange(len(V)), loops)[3 : 3 + pins]])
@@ -24,13 +24,13 @@ def held_ring(curved=False, pins=1):
 
 
 def tensors(f, most=0.6):
-    """Beltrami coefficients drawn at random."""
+    """Random Beltrami coefficients with modulus at most ``most``."""
     rng = np.random.default_rng(2)
     return most * np.sqrt(rng.random(f)) * np.exp(2j * np.pi * rng.random(f))
 
 
 def polished_ring(energy="symmetric-dirichlet", curved=False):
-    """The problem, and its polished map."""
+    """The problem of `held_ring`, and its polished map."""
     problem = held_ring(curved)
     found = injective_map(problem.V, problem.F, problem.fixed, problem.target, polish=energy)
     assert found.injective
@@ -38,7 +38,7 @@ def polished_ring(energy="symmetric-dirichlet", curved=False):
 
 
 def flattened_ring(pins=(), energy="symmetric-dirichlet", curved=True):
-    """Surface, held vertices (none, or moved a little from where they would go), their places, and the flat map."""
+    """Surface, fixed vertices (possibly empty), their target positions near those of the free map, and the flat map."""
     V, F = ring(curved)
     free = flatten(V, F, energy=energy)
     pins = np.array(pins, dtype=np.int64)
@@ -51,7 +51,10 @@ def flattened_ring(pins=(), energy="symmetric-dirichlet", curved=True):
 
 
 def aligned(uv, base, pin=None, scales=False):
-    """A map laid onto another by least squares: shifted and turned, or turned about a vertex, or scaled besides."""
+    """Align a map to another by least squares: by a rigid motion or, with ``scales``, a similarity.
+
+    With ``pin``, turn it about that vertex instead, without translation.
+    """
     w, there = uv @ (1, 1j), base @ (1, 1j)
     arms, goal = (z - (z.mean() if pin is None else z[pin]) for z in (w, there))
     factor = np.vdot(arms, goal)
@@ -61,9 +64,11 @@ def aligned(uv, base, pin=None, scales=False):
 
 
 def worst_difference(make, arguments, onto=None):
-    """How far derivatives are from differences, relative to the largest entry, and transposes from being such.
+    """Return the worst errors of derivatives and of their transposes.
 
-    ``make(**arguments)`` makes a derivative; ``onto(uv, base)`` lays a map onto the one at hand.
+    The first is the largest deviation from central differences, relative to the largest entry. The second is the
+    relative difference between ``jvp`` and ``vjp`` products. ``make(**arguments)`` makes a derivative; ``onto(uv,
+    base)`` aligns a map to the current one.
     """
     rng = np.random.default_rng(3)
     here = make(**arguments)

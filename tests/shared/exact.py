@@ -1,4 +1,4 @@
-"""Orientation and intersection in rational arithmetic, by other formulas than the library's."""
+"""Orientation and intersection in rational arithmetic, by formulas different from the library's."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def exact_orientation(a, b, c):
 
 
 def exact_relation(p, q, r, s):
-    """What two segments share, by solving for the common point in rational arithmetic."""
+    """The relation of two segments, found by solving for their common point in rational arithmetic."""
     p, q, r, s = (tuple(Fraction(float(x)) for x in point) for point in (p, q, r, s))
     if p == q or r == s:
         point, (a, b) = (p, (r, s)) if p == q else (r, (p, q))
@@ -26,7 +26,7 @@ def exact_relation(p, q, r, s):
     if det == 0:
         if d[0] * f[1] != d[1] * f[0]:
             return SegmentRelation.DISJOINT
-        # Positions along pq, which has length 1 there.
+        # Parameters along pq, from 0 at p to 1 at q.
         along = sorted(((x[0] - p[0]) * d[0] + (x[1] - p[1]) * d[1]) / (d[0] ** 2 + d[1] ** 2) for x in (r, s))
         lo, hi = max(along[0], 0), min(along[1], 1)
         return SegmentRelation.OVERLAPPING if lo < hi else SegmentRelation(2 * (lo == hi))
@@ -38,7 +38,7 @@ def exact_relation(p, q, r, s):
 
 
 def inverted(F, uv):
-    """An independent count, in rational numbers."""
+    """Count inverted triangles in rational arithmetic, independently of the library."""
     count = 0
     for i, j, k in F:
         (ax, ay), (bx, by), (cx, cy) = ((Fraction(x), Fraction(y)) for x, y in uv[[i, j, k]])

@@ -1,4 +1,4 @@
-"""What is asked of every mesh format: maps come back as they were, and what is no such file is told so."""
+"""Tests for every mesh format: a round trip preserves maps, and a reader rejects invalid files with a message."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SINGLE = ".glb", ".gltf"
 
 
 def maps():
-    """A planar mesh, two maps of it that are not its positions, and the triangles that each inverts."""
+    """A planar mesh, and two maps that differ from its positions: one injective, the other with inverted triangles."""
     V, F = disk(4)
     uv = V * (1 + 0.3 * V[:, :1]) / 3
     inverted = uv.copy()
@@ -25,18 +25,18 @@ def maps():
 
 
 def single(uv):
-    """What glTF keeps of a map: its places with v downwards, rounded to single precision."""
+    """A map after a round trip through glTF: v is stored downwards, and coordinates are rounded to single precision."""
     down = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32).astype(np.float64)
     return np.stack([down[:, 0], 1 - down[:, 1]], axis=1)
 
 
 def with_map(write):
-    """A writer of a mesh that carries its map, as one that takes both."""
+    """Wrap a writer of a mesh with its map as a writer that takes both."""
     return lambda path, mesh, uv: write(path, mesh.with_map(uv))
 
 
 def try_format(read, write, path):
-    """Put a reader and a writer of maps through their trials, at a path with their suffix."""
+    """Test a reader and a writer of maps at a path with their suffix: round trips, bad maps and damaged files."""
     mesh, uvs = maps()
     for uv in uvs:
         write(path, mesh, uv)

@@ -1,4 +1,4 @@
-"""glTF files made by hand, with what exporters put into them."""
+"""glTF files built by hand, with the features that exporters use."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HALVES = np.array([[0, 1, 2], [0, 2, 3]], dtype="u2")
 
 
 class Gltf:
-    """A document that grows: add accessors, then meshes by them."""
+    """A glTF document under construction: add accessors first, then meshes that use them."""
 
     def __init__(self):
         self.tree = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], "meshes": []}
@@ -58,7 +58,7 @@ class Gltf:
 
 
 def square(**attributes):
-    """A square of two triangles with further attributes; the document is returned."""
+    """A document with a square of two triangles and further attributes."""
     made = Gltf()
     given = {"POSITION": SQUARE} | attributes
     accessors = {name: made.accessor(table) for name, table in given.items()}
@@ -67,13 +67,13 @@ def square(**attributes):
 
 
 def opened(data):
-    """The JSON and the buffer of a binary file."""
+    """The JSON and the buffer of a binary glTF file."""
     size = int.from_bytes(data[12:16], "little")
     return json.loads(data[20 : 20 + size]), data[28 + size :]
 
 
 def numbers(data, index):
-    """What an accessor of a binary file refers to, plain ones only."""
+    """The array of an accessor of a binary glTF file, without sparse data or strides."""
     tree, buffer = opened(data)
     accessor = tree["accessors"][index]
     view = tree["bufferViews"][accessor["bufferView"]]

@@ -1,4 +1,4 @@
-"""Files written and read by Gmsh, for tests that call it in a process of its own."""
+"""Read and write files with Gmsh, for tests that run it in a separate process."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def _gmsh():
-    """Gmsh, quiet and empty."""
+    """Gmsh, initialised without output and without a model."""
     import gmsh
 
     if not gmsh.isInitialized():
@@ -17,7 +17,7 @@ def _gmsh():
 
 
 def missing():
-    """Why Gmsh cannot be had here, if it cannot: it is not installed, or some library of the system is not."""
+    """The reason why Gmsh cannot be used, if there is one: it or a library of the system is not installed."""
     try:
         _gmsh()
     except (ImportError, OSError) as error:
@@ -26,7 +26,7 @@ def missing():
 
 
 def content(path):
-    """All that Gmsh finds in a file, positions apart from the rest."""
+    """The content that Gmsh finds in a file, with positions separate from the rest."""
     gmsh = _gmsh()
     gmsh.merge(str(path))
     model = gmsh.model
@@ -61,7 +61,7 @@ def content(path):
 
 
 def square(path, version, binary, *, groups=True, gaps=False, parametric=False, repeated=False):
-    """A square with a curve in two physical groups, data of nodes over times, of elements and their corners."""
+    """A square with a curve in two physical groups, and data of nodes over time, of elements and of their corners."""
     gmsh = _gmsh()
     gmsh.model.add("square")
     occ, mesh = gmsh.model.occ, gmsh.model.mesh
@@ -83,7 +83,7 @@ def square(path, version, binary, *, groups=True, gaps=False, parametric=False, 
     gmsh.option.setNumber("PostProcessing.SaveMesh", int(repeated))
     gmsh.write(str(path))
     if version == 4.0:
-        return  # Gmsh writes views in its own version only.
+        return  # Gmsh writes views only in its own version of the format.
     tags, points, _ = mesh.getNodes()
     points = points.reshape(-1, 3)
     for step in range(3):

@@ -1,4 +1,4 @@
-"""Arguments for kernels, by name: what a kernel's text in NumPy and its text in C are both given."""
+"""Arguments for kernels, by name, to compare their NumPy and C implementations."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ ARGUMENTS: dict[str, list[Callable[[np.random.Generator], Arguments]]] = {}
 
 
 def arguments_of(name: str) -> Callable[[Callable[[np.random.Generator], Arguments]], object]:
-    """Arguments of the kernel of this name, of which there may be several; what it is to fill in holds anything."""
+    """Register a function that makes arguments of a kernel, of which there may be several; outputs hold any values."""
     return lambda make: ARGUMENTS.setdefault(name, []).append(make)
 
 
 def numbers(rng: np.random.Generator, *shape: int) -> Any:
-    """Complex ones of many magnitudes."""
+    """Random complex numbers of many magnitudes."""
     return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * 2.0 ** rng.uniform(-20, 20, shape)
 
 
@@ -36,14 +36,14 @@ def _(rng):
 
 @arguments_of("wirtinger")
 def _(rng):
-    """Gradients that are the same everywhere, of some of the triangles."""
+    """Constant gradients, and a subset of the triangles."""
     V, F = disk(4)
     gamma = np.broadcast_to(numbers(rng, 2, 1), (2, len(F)))[:, 5:40]
     return numbers(rng, len(V)), F[5:40], gamma, numbers(rng, 35), numbers(rng, 35), np.empty(35)
 
 
 def soup(rng, n: int, f: int) -> Any:
-    """Triangles at random: edges of one, two, three and more of them, wound alike and not, corners repeated."""
+    """Random triangles: edges with one or more triangles, of equal and opposite orientation, and repeated corners."""
     return rng.integers(0, n, (f, 3))
 
 
@@ -77,7 +77,7 @@ def _(rng):
 
 @arguments_of("link_nodes")
 def _(rng):
-    """Columns of triangles, as components has them."""
+    """Columns of triangles, as for connected components."""
     F = soup(rng, 200, 40)
     return F[:, :2], F[:, 1:], np.empty(200, dtype=np.int64)
 
@@ -89,13 +89,13 @@ def _(rng):
 
 @arguments_of("link_nodes")
 def _(rng):
-    """A node that is not there, in the first link."""
+    """A node index out of range, in the first link."""
     return np.array([9, 0]), np.array([0, 1]), np.arange(9)
 
 
 @arguments_of("follow_loops")
 def _(rng):
-    """A short loop, and a long one."""
+    """A short loop and a long one."""
     around = rng.permutation(60)
     loops = np.concatenate([np.stack([some, np.roll(some, 1)], axis=1) for some in (around[:4], around[4:])])
     return rng.permutation(loops), np.zeros(60, dtype=np.int64), np.zeros(60, dtype=np.int64)
@@ -103,14 +103,14 @@ def _(rng):
 
 @arguments_of("follow_loops")
 def _(rng):
-    """A vertex passed twice."""
+    """A vertex that the loop visits twice."""
     loops = np.array([[0, 1], [1, 2], [2, 0], [2, 3], [3, 4], [4, 2]])
     return rng.permutation(loops), np.zeros(6, dtype=np.int64), np.zeros(6, dtype=np.int64)
 
 
 @arguments_of("sure_signs")
 def _(rng):
-    """Triangles of whole numbers, many of them without area, and of what has no orientation."""
+    """Integer triangles, many of zero area, and some with NaN or infinite coordinates."""
     uv = rng.integers(0, 4, (30, 2)) * rng.choice([1.0, 1e200, 1e-320, 0.1], (30, 1))
     uv[rng.integers(0, 30, 3), rng.integers(0, 2, 3)] = np.nan, np.inf, -np.inf
     return soup(rng, 30, 400), uv, np.zeros(400, dtype=np.int8)
@@ -118,14 +118,14 @@ def _(rng):
 
 @arguments_of("sure_signs")
 def _(rng):
-    """Slivers within rounding of none."""
+    """Slivers whose area is zero up to rounding."""
     uv = np.ldexp(np.linspace(0, 1, 40)[:, None] * [1, 3] + rng.integers(-2, 3, (40, 2)) * 2.0**-52, 3)
     return soup(rng, 40, 500), uv, np.zeros(500, dtype=np.int8)
 
 
 @arguments_of("sure_signs")
 def _(rng):
-    """A vertex that is not there, in the first triangle."""
+    """A vertex index out of range, in the first triangle."""
     F = soup(rng, 7, 5)
     F[0] = -1, 6, 7
     return F, rng.normal(size=(7, 2)), np.zeros(5, dtype=np.int8)
@@ -133,13 +133,13 @@ def _(rng):
 
 @arguments_of("count_turns")
 def _(rng):
-    """On whole numbers many corners are level; one is nowhere."""
+    """Integer coordinates, so many corners have equal heights; one vertex has a NaN coordinate."""
     uv = np.append(rng.integers(0, 5, (29, 2)), [[0, np.nan]], axis=0)
     return soup(rng, 30, 400), uv, rng.integers(0, 3, 30)
 
 
 def curves(places: Any, lengths: Any) -> Arguments:
-    """Closed curves one after another, and room for what may meet."""
+    """Closed curves stored consecutively, and an output array for pairs of edges."""
     starts = np.cumsum([0, *lengths])
     tails, heads = np.arange(len(places)), np.arange(1, len(places) + 1)
     heads[starts[1:] - 1] = starts[:-1]
@@ -148,13 +148,13 @@ def curves(places: Any, lengths: Any) -> Arguments:
 
 @arguments_of("doubtful_pairs")
 def _(rng):
-    """Places on a coarse grid: edges cross, touch, overlap, turn back and have no length."""
+    """Points on a coarse grid: edges cross, touch, overlap, turn back and have zero length."""
     return curves(rng.integers(0, 9, (60, 2)) * 0.1, [3, 4, 53])
 
 
 @arguments_of("doubtful_pairs")
 def _(rng):
-    """A star-shaped curve, and the same within rounding of a line."""
+    """A star-shaped curve, and the same curve flattened to a line up to rounding."""
     angle = np.sort(rng.uniform(0, 2 * np.pi, 300))
     star = rng.uniform(0.5, 1, (300, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return curves(np.concatenate([star, star[::5] * [1, 1e-17] + [0, 0.5]]), [300, 60])
@@ -162,14 +162,14 @@ def _(rng):
 
 @arguments_of("doubtful_pairs")
 def _(rng):
-    """Segments between any of a few places, of no length too, in one group; and none at all."""
+    """Segments between a few points, some of zero length, in one group; or no segment."""
     tails, heads = rng.integers(0, 20, (2, 40 * rng.integers(2)))
     places = rng.integers(0, 9, (20, 2)) * 0.1
     return places, tails, heads, np.array([0, len(tails)]), np.zeros((800, 2), dtype=np.int64)
 
 
 def pattern_of(F: Any, place: Any) -> Arguments:
-    """What a pattern takes at most, and something in it."""
+    """Arguments with output arrays of the maximum size of a pattern."""
     size, halves = int(place.max(initial=-1)) + 1, F.size
     lengths = size + 1, size + halves, halves, halves, halves, halves + 1, halves, halves, halves
     kinds = np.int32, np.int32, np.int64, np.int64, np.int32, np.int32, np.int64, np.int64, np.int64
@@ -178,7 +178,7 @@ def pattern_of(F: Any, place: Any) -> Arguments:
 
 @arguments_of("find_pattern")
 def _(rng):
-    """A mesh with its boundary held, unknowns in any order."""
+    """A mesh with fixed vertices, and unknowns in random order."""
     V, F = disk(4)
     free = rng.permutation(len(V))[: len(V) - 20]
     place = np.full(len(V), -1, dtype=np.int32)
@@ -188,19 +188,19 @@ def _(rng):
 
 @arguments_of("find_pattern")
 def _(rng):
-    """Edges of many triangles, among few vertices; half of them fixed."""
+    """Edges shared by many triangles, among few vertices; about half of the vertices are fixed."""
     place = rng.permutation([-1, -1, -1, -1, 0, 1, 2, 3, 4]).astype(np.int32)
     return pattern_of(soup(rng, 9, 200), place)
 
 
 @arguments_of("find_pattern")
 def _(rng):
-    """All vertices fixed, and none."""
+    """All vertices fixed, with triangles or without."""
     return pattern_of(soup(rng, 9, rng.integers(2) * 20), np.full(9, -1, dtype=np.int32))
 
 
 def gradients(rng, f: int) -> Any:
-    """Of the hat functions of triangles (3, f), nearly summing up to zero."""
+    """Gradients of the hat functions of triangles (3, f), which sum to nearly zero."""
     g = numbers(rng, 3, f)
     g[0] = -g[1] - g[2]
     return g
@@ -208,7 +208,7 @@ def gradients(rng, f: int) -> Any:
 
 @arguments_of("jacobians")
 def _(rng):
-    """Triangles with repeated corners, whose areas are rounding; a place that is no number."""
+    """Triangles with repeated corners, whose areas are rounding errors; and a NaN position."""
     n, f = 30, 1 + rng.integers(400)
     F = soup(rng, n, f)
     F[::5, 2] = F[::5, 1]
@@ -219,7 +219,7 @@ def _(rng):
 
 @arguments_of("pulls")
 def _(rng):
-    """Vertices without triangle, and triangles without share."""
+    """Vertices without triangles, and triangles with zero weight."""
     n, f = 40, rng.integers(300)
     share = rng.uniform(0, 1, f) * rng.integers(2, size=f)
     return numbers(rng, f), numbers(rng, f), share, soup(rng, n - 5, f), gradients(rng, f), numbers(rng, n)
@@ -227,7 +227,7 @@ def _(rng):
 
 @arguments_of("collapses")
 def _(rng):
-    """Steps of many lengths, none at some vertices, overflow at one; upright triangles, inverted and flat ones."""
+    """Steps of many lengths, zero at some vertices, overflow at one; positive, inverted and degenerate triangles."""
     n, f = 60, rng.integers(400)
     step = numbers(rng, n) * rng.integers(2, size=n)
     step[7] = 1e300
@@ -235,7 +235,7 @@ def _(rng):
 
 
 def strained(rng) -> Arguments:
-    """Derivatives p, q and determinants: also p = 0 and q = 0, no number, inverted triangles, and ones on the brink."""
+    """Derivatives p, q and determinants, with p = 0, q = 0, NaN, inverted and nearly degenerate triangles."""
     f = rng.integers(400)
     p, q = np.array([[1], [0]]) + 0.4 * (rng.normal(size=(2, f, 2)) @ (1, 1j))
     p[::7], q[::5] = 0, 0
@@ -250,7 +250,7 @@ MIXTURES = np.concatenate([np.eye(4), [[127 / 128, 0, 0, 1 / 128], [0, 0, 1, 0.1
 
 @arguments_of("mixed_energy")
 def _(rng):
-    """With a triangle that makes the sum infinite, now and then."""
+    """Sometimes with a triangle of infinite energy."""
     p, q, det = strained(rng)
     keep = np.isfinite(p) & (det > -rng.integers(2))
     return MIXTURES[rng.integers(7)], p[keep], q[keep], det[keep], rng.uniform(size=int(keep.sum()))
@@ -278,7 +278,7 @@ def _(rng):
 
 @arguments_of("add_up")
 def _(rng):
-    """Pairs of entries anywhere, often at the same place."""
+    """Pairs of entries at random positions, often repeated."""
     f, size = rng.integers(200), 50
     form = *rng.normal(size=(2, f)), *numbers(rng, 4, f)
     slots = rng.integers(size - 1, size=(2, 2, 3, f)).astype(np.int32)
@@ -286,7 +286,7 @@ def _(rng):
 
 
 def field_on(rng, triangles: int, scale: float) -> Any:
-    """ξ of some triangles, of few magnitudes and among them zero."""
+    """Random ξ of triangles, of few magnitudes, some of them zero."""
     xi = scale * (rng.normal(size=triangles) + 1j * rng.normal(size=triangles))
     xi[::7] = 0
     xi[1::7] *= 1e-9
@@ -300,7 +300,7 @@ def _(rng):
 
 @arguments_of("fill_stiffness")
 def _(rng):
-    """Triangles all alike, none of them, and tensors that are no numbers."""
+    """Identical triangles, and NaN and infinite ξ."""
     xi = field_on(rng, 20, 1e4)
     xi[3], xi[4] = np.nan, np.inf
     return xi, 1, np.broadcast_to(rng.normal(size=(9, 1)), (9, 20)), np.empty((3, 20))
@@ -312,7 +312,7 @@ def _(rng):
 
 
 def swept(rng, number: int, scale: float, starts: list[int]) -> Arguments:
-    """A stirred mesh's triangles, in runs."""
+    """The triangles of a perturbed mesh, in runs."""
     V, F = disk(6)
     w, f = (V[:, 0] + 1j * V[:, 1]) + 0.1 * rng.normal(size=len(V)), starts[-1]
     gamma = np.broadcast_to(0.5 * (rng.normal(size=(2, 1)) + 1j * rng.normal(size=(2, 1))), (2, f))
@@ -333,7 +333,7 @@ def _(rng):
 
 @arguments_of("dirichlet_sweep")
 def _(rng):
-    """A vertex that lies nowhere, weights and gradients of each triangle's own."""
+    """A vertex with NaN position; separate weights and gradients for each triangle."""
     w, F, gamma, _, xi, *rest = swept(rng, 0, 1.0, [0, 40, 60])
     w[F[50, 1]] = np.nan
     return w, F, rng.normal() * gamma.copy(), rng.uniform(1, 2, 60), xi, *rest
@@ -341,7 +341,7 @@ def _(rng):
 
 @arguments_of("at_own_tensors")
 def _(rng):
-    """Triangles of all shapes, one without area, one without sides, one vertex that lies nowhere."""
+    """Triangles of all shapes: one of zero area, one of zero size, and a vertex with NaN position."""
     w, F, gamma, m, _, _, starts, gradient, _ = swept(rng, 0, 1.0, [0, 1, 40, 60])
     w[F[50, 1]] = np.nan
     w[F[3]] = 0.5
@@ -351,7 +351,7 @@ def _(rng):
 
 @arguments_of("at_own_tensors")
 def _(rng):
-    """A map without inverted triangles, weights and gradients of each triangle's own."""
+    """A map with few or no inverted triangles; separate weights and gradients for each triangle."""
     V, F = disk(4)
     f, gamma = len(F), np.broadcast_to(numbers(rng, 2, 1), (2, len(F))).copy()
     w = V[:, 0] + 1j * V[:, 1] + rng.normal(size=len(V)) / 30
@@ -367,7 +367,7 @@ def _(rng):
 
 @arguments_of("assemble")
 def _(rng):
-    """Of a triangle's three edges between unknowns, one with two half-edges, and four unknowns."""
+    """Three edges between four unknowns, one of them with two half-edges."""
     halves, offsets = np.array([0, 5, 7, 2], dtype=np.int32), np.array([0, 2, 3, 4], dtype=np.int32)
     row, column, border = np.array([0, 0, 2]), np.array([1, 2, 3]), np.array([1, 3, 4])
     border_row, indptr = np.array([3, 1, 3]), np.array([0, 3, 4, 6, 7], dtype=np.int32)
@@ -376,7 +376,7 @@ def _(rng):
 
 @arguments_of("assemble")
 def _(rng):
-    """One unknown, all of whose neighbours are fixed."""
+    """One unknown whose neighbours are all fixed."""
     none, border = np.empty(0, dtype=np.int64), np.array([0, 2, 3, 5])
     indptr, offsets, border_row = np.arange(2, dtype=np.int32), np.zeros(1, dtype=np.int32), np.zeros(4, dtype=np.int64)
     return rng.normal(size=6), indptr, none, none, none.astype(np.int32), offsets, border, border_row, np.empty(1)
@@ -394,7 +394,7 @@ def _(rng):
 
 
 def upper_triangle(rng, size: int) -> Any:
-    """A pattern with a diagonal, and positive values."""
+    """An upper triangular pattern with a diagonal, and positive values."""
     full = np.triu(rng.random((size, size)) < 0.2, 1) | np.eye(size, dtype=bool)
     indptr = np.append(0, np.cumsum(full.sum(axis=1))).astype(np.int32)
     return indptr, np.nonzero(full)[1].astype(np.int32), rng.uniform(0.1, 2, indptr[-1])
@@ -407,7 +407,7 @@ def _(rng):
 
 @arguments_of("probe_matrix")
 def _(rng):
-    """A diagonal with a zero and with what is no number."""
+    """A diagonal with a zero and a NaN."""
     indptr, indices, values = upper_triangle(rng, 12)
     values[indptr[[5, 9]]] = 0.0, np.nan
     return indptr, indices, values, np.ones(12), np.zeros(12), np.zeros(12), np.zeros(12)
@@ -425,7 +425,7 @@ def _(rng):
 
 @arguments_of("adam_step")
 def _(rng):
-    """Of triangles of which some have never had a gradient."""
+    """Triangles, some of which never had a gradient."""
     gradient, square = field_on(rng, 40, 1.0), rng.uniform(0, 1, 40)
     mean = numbers(rng, 40)
     mean[::14] = square[::14] = 0
@@ -433,7 +433,7 @@ def _(rng):
 
 
 def stirred_disks(rng, stirred: list[int]) -> Arguments:
-    """Disks side by side, of each so many of its interior vertices thrown elsewhere."""
+    """Copies of a disk, in each of which a given number of interior vertices is moved far."""
     V, F = disk(6)
     n, count = len(V), len(stirred)
     w = np.tile((V[:, 0] + 1j * V[:, 1]) + 0.01 * rng.normal(size=n), count)
@@ -458,7 +458,7 @@ def _(rng):
 
 @arguments_of("place_inverted")
 def _(rng):
-    """One triangle that cannot be helped, a vertex that lies nowhere, one with many triangles around it."""
+    """An inverted triangle with all vertices fixed, a vertex with NaN position, and a vertex of high degree."""
     F, moves, mesh, w, *_ = stirred_disks(rng, [1, 2])
     w[np.flatnonzero(moves)[-4]] = np.nan
     n, spokes = w.size, 20
@@ -473,7 +473,7 @@ def _(rng):
 
 
 def divided_cells(rng, triangles: int, parents: int, room: int) -> Arguments:
-    """Small and large triangles in the unit box, some in a corner of it, to be listed in parts of cells."""
+    """Small and large triangles in the unit box, some in a corner of it, to be listed by subcells."""
     corners = np.clip(rng.random((triangles, 1, 2)) + 0.2 * rng.normal(size=(triangles, 3, 2)), 0, 1 - 2.0**-40)
     corners[::3] *= 2.0**-6
     tail, head = corners, np.roll(corners, -1, axis=1)
@@ -497,7 +497,7 @@ def _(rng):
 
 @arguments_of("divide_cells")
 def _(rng):
-    """Into lists for which there is no room."""
+    """Output lists that are too short."""
     return divided_cells(rng, 40, 9, 3)
 
 
@@ -521,14 +521,14 @@ for _indptr, _indices in (
 
 @arguments_of("lay_flat")
 def _(rng):
-    """Triangles in space, some of them without area, some with corners that coincide."""
+    """Triangles in space, some of zero area, some with coincident corners."""
     V = rng.integers(-3, 4, (30, 3)) / 10
     return V, soup(rng, 30, 200), -1, np.empty(200), np.empty(200, dtype=np.complex128)
 
 
 @arguments_of("lay_flat")
 def _(rng):
-    """In the plane, every other vertex of an array, near the largest doubles and among the smallest."""
+    """Planar triangles in a strided array, near the largest or smallest doubles."""
     exponent = (1024, -1070)[rng.integers(2)]
     V = np.ldexp(rng.uniform(-0.5, 0.5, (60, 2)), exponent)[::2]
     return V, soup(rng, 30, 200), exponent, np.empty(200), np.empty(200, dtype=np.complex128)
@@ -536,7 +536,7 @@ def _(rng):
 
 @arguments_of("find_cells")
 def _(rng):
-    """In 3 × 2 cells, of which two are divided, and one of their parts again."""
+    """3 × 2 cells, of which two are divided, and one subcell divided again."""
     parts = np.full(6 + 3 * 16, -1)
     parts[[1, 4, 6 + 7]] = 6 + 16 * np.arange(3)
     points = rng.random((50, 2)) * [3 / 4, 2 / 4]
@@ -546,14 +546,14 @@ def _(rng):
 
 @arguments_of("sure_hits")
 def _(rng):
-    """Among points are corners of the triangles, and middles of their sides; some have no triangle listed."""
+    """Points include corners of triangles and midpoints of sides; some points have no triangle listed."""
     rows, begin = rng.integers(0, 9, (30, 6)) / 8.0, rng.integers(0, 40, 60)
     points = np.concatenate([rng.random((40, 2)), rows[:10, :2], rows[:10, :2] / 2 + rows[:10, 2:4] / 2])
     return points, begin, begin + rng.integers(0, 20, 60), rng.integers(0, 30, 60, np.int32), rows, np.empty(60, int)
 
 
 def round_of_coarsening(rng: np.random.Generator, size: int) -> Arguments:
-    """Arguments of `remove_vertices`: a mesh of which no vertex has been taken out yet."""
+    """Arguments of `remove_vertices`: a mesh from which no vertex has been removed yet."""
     T, free = tangled(rng, size)
     return T, free, 12 * rng.random(free.size), *(np.zeros_like(each) for each in room_for_round(T))
 
@@ -564,7 +564,7 @@ for size in (0, 1, 60, 300):
 
 @arguments_of("remove_vertices")
 def _(rng):
-    """No triangles, and a vertex without."""
+    """A vertex, and no triangle."""
     T = np.empty((3, 0), dtype=np.int64)
     return T, np.ones(1, dtype=bool), rng.random(1), *(np.zeros_like(each) for each in room_for_round(T))
 
@@ -581,13 +581,13 @@ def _(rng):
 
 @arguments_of("fill_rings")
 def _(rng):
-    """Nothing that goes."""
+    """No vertex is removed."""
     T, free, _, _, rings, of_degree = round_of_coarsening(rng, 20)
     return T, np.ones(free.size, dtype=bool), rings, of_degree, np.empty_like(T)
 
 
 def rings(rng: np.random.Generator, d: int) -> Arguments:
-    """Some that have a good place, some with a place next to the apex alone, some with none, and odd ones."""
+    """Random, degenerate, NaN and infinite rings of degree d, with and without a valid position for their centre."""
     ring = np.exp(2j * np.pi * (np.sort(rng.random((200, d)), axis=1))) * 2.0 ** rng.uniform(-3, 0, (200, d))
     ring[50:80] = numbers(rng, 30, d)
     ring[80:90, rng.integers(d)] = ring[80:90, rng.integers(d)]
@@ -603,7 +603,7 @@ arguments_of("find_places")(lambda rng: (numbers(rng, 0, 4), numbers(rng, 0)))
 
 @arguments_of("smooth")
 def _(rng):
-    """A map that is injective nearly everywhere, and gets inverted triangles."""
+    """A nearly injective map that gets inverted triangles."""
     V, F = disk(9)
     held = rng.random(len(V)) < 0.1
     return V[:, 0] * (1 + 9 * V[:, 0] ** 2) + 0.3 * rng.random(len(V)) / 9 + 1j * V[:, 1], F, held
@@ -611,6 +611,6 @@ def _(rng):
 
 @arguments_of("smooth")
 def _(rng):
-    """Triangles corner by corner, and vertices that none of them has."""
+    """Triangles in column-major order, and vertices without triangles."""
     V, F = disk(5)
     return numbers(rng, len(V)), np.asfortranarray(F[: len(F) // 2]), np.zeros(len(V), dtype=bool)

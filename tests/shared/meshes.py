@@ -1,4 +1,4 @@
-"""Small problems that the tests share."""
+"""Small meshes and maps shared by the tests."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from quasiharmonic.surfaces import annulus, disk, random_delaunay
 
 
 def bend(points):
-    """A smooth injective map of the unit disk's neighbourhood: a quadratic shear after a turn and a stretch."""
+    """A smooth injective map of the unit disk's neighbourhood: a rotation and a stretch, then a quadratic shear."""
     x, y = points[:, 0], points[:, 1]
     turn = np.exp(0.4j)
     z = (x + 1j * y) * turn
@@ -18,13 +18,13 @@ def bend(points):
 
 
 def lift(points):
-    """A curved surface over a planar mesh."""
+    """Lift a planar mesh to a curved surface."""
     x, y = points[:, 0], points[:, 1]
     return np.stack([x, y, 0.8 * np.exp(-2 * x**2 - y**2) + 0.3 * x * y], axis=1)
 
 
 def surfaces():
-    """(name, V, F): planar and curved, with one loop and with two."""
+    """(name, V, F) of planar and curved meshes with one or two boundary loops."""
     flat, flat_faces = random_delaunay(150, seed=3)
     ring, ring_faces = annulus(8)
     return [
@@ -37,7 +37,7 @@ def surfaces():
 
 
 def random_annulus(n=220, seed=1, radius=0.35):
-    """An irregular disk with a hole, without vertices that nothing uses."""
+    """An irregular disk with a hole, without unused vertices."""
     V, F = random_delaunay(n, seed=seed)
     F = F[np.hypot(*V[F].mean(axis=1).T) > radius]
     used, F = np.unique(F, return_inverse=True)
@@ -45,12 +45,12 @@ def random_annulus(n=220, seed=1, radius=0.35):
 
 
 def boundary_of(F):
-    """Boundary vertices, ascending."""
+    """Boundary vertices in ascending order."""
     return np.unique(boundary_edges(F, int(F.max()) + 1))
 
 
 def signed_areas(F, uv):
-    """Twice the signed areas, by the formula nobody gets wrong."""
+    """Twice the signed areas, by the standard formula."""
     a, b, c = uv[F[:, 0]], uv[F[:, 1]], uv[F[:, 2]]
     return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
 
@@ -62,7 +62,7 @@ def random_xi(F, scale=0.7, seed=0):
 
 
 def tangled(rng, size):
-    """Triangles (3, f) of a disk, many vertices of which have few neighbours, and the same; which are interior (n,)."""
+    """A disk with many vertices of low degree: triangles (3, f), and a mask of its interior vertices (n,)."""
     V, F = disk(3)
     F, n = F.tolist(), len(V)
     for new in range(n, n + size):

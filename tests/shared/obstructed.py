@@ -1,4 +1,4 @@
-"""Problems without a map, each for a reason of its own."""
+"""Problems without a map, each for a different reason."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shared.small_meshes import eared, handle, loose_wheel, two_wheels, wheel
 
 
 def moved(mesh, at=None, pins=()):
-    """The boundary (the first few vertices, or those named) and the pins of a planar mesh elsewhere."""
+    """A planar mesh with its boundary and pins fixed, some at other positions: ``at`` lists the first or names them."""
     V, F = mesh
     where = np.array(V[:, :2])
     for vertex, position in at.items() if isinstance(at, dict) else enumerate([] if at is None else at):
@@ -23,7 +23,7 @@ def moved(mesh, at=None, pins=()):
 
 
 def onto(mesh, *targets):
-    """The loops of a mesh, in the order of `boundary_loops`, onto polygons of as many corners."""
+    """Map the loops of a mesh, in the order of `boundary_loops`, onto polygons with as many corners."""
     V, F = mesh
     where = np.full((len(V), 2), np.nan)
     for loop, target in zip(boundary_loops(F, len(V)), targets, strict=True):
@@ -34,13 +34,13 @@ def onto(mesh, *targets):
 
 RING = annulus(4)  # loops of 24 and 8
 CELLS = grid(6, 6)  # vertex i + 7 j at (i / 6, j / 6)
-HOUSE = [[4, 0], [4, 6], [2, 7], [0, 6], [0, 0]]  # goes on above the chord of two wheels
+HOUSE = [[4, 0], [4, 6], [2, 7], [0, 6], [0, 0]]  # the rest of the outline above the chord of `two_wheels`
 SQUARE = [[0, 0], [8, 0], [8, 8], [0, 8]]
 LAP = 2 * np.pi * np.arange(18) / 18
 BAND = [(1.5 - 0.5 * y) * np.array([np.cos(8 * x), np.sin(8 * x)]) for x, y in grid(12, 2)[0]]
 OUTER, HOLE = 4 * circle(24), circle(8)[::-1]
 
-# name: (problem, kind, what it forbids, elements to be found in the obstruction)
+# name: (problem, (kind, property that it excludes, elements expected in the obstruction))
 OBSTRUCTED = {
     "collapsed boundary edge": (
         moved(wheel(5), {1: circle(5)[0]}),

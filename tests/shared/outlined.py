@@ -1,4 +1,4 @@
-"""Problems whose target is simple and whose mesh nobody has asked whether it fits: for what splits edges."""
+"""Problems with a simple target whose mesh may admit no map, for tests of edge splitting."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.polygons import random_polygon, spiral, spread
 
 
 def without_inner_vertices(rng, n):
-    """A random triangulation of a regular polygon of ``n`` corners: every inner edge is a chord."""
+    """A random triangulation of a regular polygon with ``n`` corners, in which every interior edge is a chord."""
     triangles, waiting = [], [(0, n - 1)]
     while waiting:
         i, j = waiting.pop()
@@ -23,7 +23,7 @@ def without_inner_vertices(rng, n):
 
 
 def comb(teeth, depth):
-    """A polygon with ``4 teeth + 2`` corners."""
+    """A comb-shaped polygon with ``4 teeth + 2`` corners."""
     right = 4.0 * np.arange(teeth)[::-1, None] + [3, 3, 1, 1]
     high = np.broadcast_to([0, depth, depth, 0], right.shape)
     tooth = np.stack([right, high], axis=2).reshape(-1, 2)
@@ -31,18 +31,18 @@ def comb(teeth, depth):
 
 
 def burst(rng, n, spread_of_radii):
-    """A polygon that is star-shaped, of radii wildly distributed."""
+    """A star-shaped polygon whose radii have a log-normal distribution."""
     t = 2 * np.pi * (np.arange(n) + 0.8 * rng.random(n)) / n
     radius = np.exp(spread_of_radii * rng.normal(size=n))[:, None]
     return radius * np.stack([np.cos(t), np.sin(t)], axis=1)
 
 
 def polygon(rng, kind, n):
-    """A simple polygon, counterclockwise, of ``n`` points."""
+    """A simple polygon with ``n`` points, counterclockwise."""
     if kind == "burst":
         return burst(rng, n, rng.choice([0.3, 1.0, 2.0]))
     if kind == "spiral":
-        # Eight steps a turn at the least, so that sides do not cut through the coil within.
+        # At least eight steps per turn, so that sides do not cross the inner coil.
         return spread(spiral(n // 2, rng.uniform(0.5, 1) * n / 16, 10.0 ** rng.uniform(-6, -0.3)), n)
     if kind == "comb":
         return spread(comb((n - 2) // 4, 10.0 ** rng.uniform(0, 6)), n)
@@ -54,7 +54,7 @@ def polygon(rng, kind, n):
 
 
 def onto_polygon(seed, kind):
-    """A disk onto a polygon: of many inner vertices, or of none."""
+    """A disk onto a polygon, with many interior vertices or without any."""
     rng = np.random.default_rng(seed)
     if seed % 2:
         V, F = without_inner_vertices(rng, int(rng.integers(6, 40)))
@@ -65,9 +65,10 @@ def onto_polygon(seed, kind):
 
 
 def with_holes(rng, holes, pins, *, size=9):
-    """A square sheet, some of its cells taken out and some of its vertices pinned, all moved about at random.
+    """A square sheet with holes and pins whose target positions are random.
 
-    The holes are small squares anywhere in a big one, pins points anywhere else, in no order that the mesh knows.
+    The target positions of the holes are small squares and those of the pins are points, at distinct lattice points of
+    the sheet in random order.
     """
     from quasiharmonic.surfaces import grid
 
@@ -84,7 +85,7 @@ def with_holes(rng, holes, pins, *, size=9):
     target[outer] = V[outer]
     free = np.setdiff1d(np.arange(len(V)), np.concatenate(loops))
     pinned = rng.choice(free, pins, replace=False)
-    # Places on a lattice, each used once.
+    # Lattice points, each used once.
     rooms = rng.permutation([(i, j) for i in range(1, 8) for j in range(1, 8)]) / 8.0
     inner = [loop for loop in loops if loop is not outer]
     for loop, room in zip(inner, rooms, strict=False):
@@ -96,7 +97,7 @@ def with_holes(rng, holes, pins, *, size=9):
 
 
 def turned_ring(quarters):
-    """An annulus whose hole is turned by so many quarters."""
+    """An annulus whose hole is turned by ``quarters`` quarter turns."""
     V, F = annulus()
     outer, inner = sorted(boundary_loops(F, len(V)), key=len, reverse=True)
     turn = np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarters)

@@ -1,4 +1,4 @@
-"""A page without a browser: what a visitor does, and what the page is told."""
+"""A test client of the studio's session that replaces the browser page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from quasiharmonic.ui.studio.surface import sheet_of
 
 
 class Visitor:
-    """Has a session, and keeps all that it tells."""
+    """A client with a session, which records every frame that the session sends."""
 
     def __init__(self, V=None, F=None, name="surface.obj", waiting=lambda: False):
         self.told: list[Frame] = []
@@ -24,31 +24,31 @@ class Visitor:
         self.session.open(sheet_of(io.MeshData(V, F, source=name), name))
 
     def _hear(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-        # By way of bytes, as a socket would have it.
+        # Encode to bytes and back, as a socket would.
         self.told.append(decode(encode(header, arrays)))
 
     def does(self, what: str, arrays: Mapping[str, np.ndarray] | None = None, **words: Any) -> list[Frame]:
-        """Send a message; what was told since."""
+        """Send a message; return the frames received since."""
         before = len(self.told)
         self.session.handle(decode(encode({"do": what, **words}, arrays)))
         return self.told[before:]
 
     def drags(self, vertex: int, *places: tuple[float, float]) -> list[Frame]:
-        """Take hold of a vertex, lead it along places and let go; the maps shown meanwhile."""
+        """Grab a vertex, drag it along positions and drop it; return the map frames in between."""
         self.does("grab", vertex=vertex)
         shown = [self.does("drag", seq=i, to=list(place))[-1] for i, place in enumerate(places)]
         self.does("drop")
         return shown
 
     def last(self, kind: str) -> Frame:
-        """The last frame of a kind."""
+        """The last received frame of a kind."""
         return next(frame for frame in reversed(self.told) if frame.header["kind"] == kind)
 
     def place(self, vertex: int) -> np.ndarray:
-        """Where a vertex is in the map."""
+        """The position of a vertex in the map."""
         return self.session.moment.result.uv[vertex]
 
     def files(self) -> dict[str, bytes]:
-        """What is saved."""
+        """The saved files, by name."""
         frames = [frame for frame in self.does("save") if frame.header["kind"] == "file"]
         return {frame.header["name"]: frame.arrays["content"].tobytes() for frame in frames}

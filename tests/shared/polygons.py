@@ -1,4 +1,4 @@
-"""Outlines in the plane: simple ones, a spiral one, random ones."""
+"""Outlines in the plane: simple, spiral and random ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, segment_relation
 
-# A corridor around three sides of a square: nobody sees from one end to the other.
+# A corridor around three sides of a square: its ends are not visible from each other.
 U = [[0, 0], [9, 0], [9, 9], [6, 9], [6, 3], [3, 3], [3, 9], [0, 9]]
 
 
@@ -16,7 +16,7 @@ def circle(n, radius=1.0, turns=1):
 
 
 def spread(polygon, n):
-    """``n`` points on a polygon: its corners, and others halfway along its longest sides."""
+    """``n`` points on a polygon: its corners, and repeated midpoints of its longest sides."""
     points = [np.asarray(p, dtype=float) for p in polygon]
     while len(points) < n:
         k = int(np.argmax([np.linalg.norm(points[k] - points[k - 1]) for k in range(len(points))]))
@@ -25,7 +25,7 @@ def spread(polygon, n):
 
 
 def spiral(n, turns, width=0.6):
-    """A band that winds around itself without touching, as a polygon with ``2 n`` corners."""
+    """A band wound around itself without touching, as a polygon with ``2 n`` corners."""
     t = np.linspace(0, 2 * np.pi * turns, n)
     outward = np.stack([np.cos(t), np.sin(t)], axis=1)
     middle = 1 + t[:, None] / (2 * np.pi)
@@ -33,14 +33,14 @@ def spiral(n, turns, width=0.6):
 
 
 def random_polygon(rng, n, size):
-    """A simple polygon, counterclockwise, on a grid of so many points a side; often with straight angles."""
+    """A simple polygon, counterclockwise, on a grid of ``size`` points a side, often with straight angles."""
     while True:
         p = rng.permutation(np.stack(np.divmod(rng.permutation(size**2)[:n], size), axis=1)).astype(float)
         for _ in range(20 * n):
             q = np.roll(p, -1, axis=0)
             i, j = np.triu_indices(n, 2)
             relation = segment_relation(p[i], q[i], p[j], q[j])
-            # The first edge and the last have an end in common.
+            # The first edge and the last share an endpoint.
             crossed = np.flatnonzero((relation != SegmentRelation.DISJOINT) & ((i > 0) | (j < n - 1)))
             if not crossed.size:
                 break

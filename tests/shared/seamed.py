@@ -10,14 +10,14 @@ from shared.meshes import bend, lift
 
 
 def islands(F, uv, FT=None):
-    """The islands of a map, wherever the surface is."""
+    """The islands of a map; the positions on the surface are irrelevant."""
     return list(SeamedMesh(np.zeros((np.max(F) + 1, 2)), F, FT, uv).islands)
 
 
 def strips(cells=12):
-    """A curved square, its map cut into three strips that lie apart and differ in shape.
+    """A curved square whose map is cut into three disjoint strips of different shapes.
 
-    Returns V, F, places, their indices by corner, and the strip of each triangle.
+    Returns V, F, UV positions, their indices by corner, and the strip of each triangle.
     """
     plane, F = grid(3 * cells, cells)
     strip = np.minimum((plane[F, 0].mean(axis=1) * 3).astype(int), 2)

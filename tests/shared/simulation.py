@@ -1,4 +1,4 @@
-"""Meshes of simulations: quadrilaterals, second-order triangles, channels with a body in them."""
+"""Meshes of simulations: quadrilaterals, second-order triangles, channels around a body."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def quadrilaterals(n, m):
 
 
 def channel(n):
-    """Quadrilaterals of the square from -1 to 1 around a flat body, and the nodes on that; n is a multiple of 8."""
+    """Quadrilaterals of the square from -1 to 1 around a flat body, and the body's nodes; n is a multiple of 8."""
     points, F = quadrilaterals(n, n)
     points = 2 * points - 1
     middle = np.abs(points[F].mean(axis=1))
@@ -29,7 +29,7 @@ def channel(n):
 
 
 def second_order(points, F):
-    """The same triangles with a node in the middle of every side, behind the others."""
+    """The same triangles with a node in the middle of every side, numbered after the others."""
     pairs, number = np.unique(np.sort(F[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_inverse=True)
     middles = points[pairs].mean(axis=1)
     return np.concatenate([points, middles]), np.concatenate([F, len(points) + number.reshape(-1, 3)], axis=1)
@@ -42,10 +42,10 @@ def turned(points, degrees):
 
 
 def least_jacobian(nodes):
-    """The least Jacobian determinant of a six-node triangle (6, 2), as a fraction, by its shape functions.
+    """The minimum Jacobian determinant of a six-node triangle (6, 2), as a fraction, from its shape functions.
 
-    The determinant is a quadratic polynomial of (s, t), known by its values at six points; its least value is at a
-    corner, or where it is at rest on a side or inside.
+    The determinant is a quadratic polynomial of (s, t), determined by its values at six points. Its minimum is at a
+    corner or at a stationary point on a side or inside.
     """
     X = [[Fraction(x) for x in row] for row in np.asarray(nodes).tolist()]
 

@@ -1,4 +1,4 @@
-"""Problems that have a map, where Tutte's embedding is none."""
+"""Problems that have an injective map and whose Tutte embedding has inverted triangles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.meshes import boundary_of, lift
 
 
 def star_problem(depth=0.55, points=5, n=300, seed=0):
-    """An irregular disk onto a star, whose Tutte embedding has flips."""
+    """An irregular disk onto a star, whose Tutte embedding has inverted triangles."""
     V, F = random_delaunay(n, seed=seed)
     (loop,) = boundary_loops(F, len(V))
     angle = np.linspace(0, 2 * np.pi, len(loop), endpoint=False)
@@ -20,7 +20,7 @@ def star_problem(depth=0.55, points=5, n=300, seed=0):
 
 
 def turned_ring(degrees, cells=12):
-    """A square annulus whose hole is turned, Figure 6."""
+    """A square annulus whose hole is turned (Figure 6)."""
     V, F = annulus(cells)
     fixed = boundary_of(F)
     target = V[fixed].copy()

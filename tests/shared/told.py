@@ -1,10 +1,10 @@
-"""What a callback is told."""
+"""A recorder for the steps reported to a callback."""
 
 from __future__ import annotations
 
 
 class Told(list):
-    """Steps, without those that are told again because nothing new has come for a while."""
+    """A list of steps that ignores consecutive repetitions, which callbacks receive during long steps."""
 
     def append(self, step):
         if not (self and self[-1] is step):

@@ -1,4 +1,4 @@
-"""Loaded by the workers of a test's cluster: problems with certain names kill the worker, or hang."""
+"""Loaded by the workers of a test cluster: problems with certain names kill the worker, hang or raise errors."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ def attend(supervisor, files):
     return plain_attend(supervisor, files)
 
 
-# Dask loads this file more than once.
+# Dask loads this file more than once, so keep the original function.
 attend.plain = plain_attend
 Supervisor.attend = attend

@@ -1,4 +1,4 @@
-"""The process that `quasiharmonic.batch` solves problems in, with troubles: what a problem's name says befalls it."""
+"""The worker process of `quasiharmonic.batch` with failures, chosen by the name of the problem."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def noise():
 
 TROUBLES = {
     "sleep": lambda: time.sleep(600),
-    # In C, and with the interpreter's lock held: no thread of the process runs until the end of days.
+    # Runs in C and holds the interpreter's lock, so no other thread of the process can run.
     "spin": lambda: re.match(r"(a+)+$", "a" * 60 + "b"),
     "hog": hog,
     "refused": lambda: bytearray(1 << 62),

@@ -1,4 +1,4 @@
-"""Files written and read by VTK, for tests that call it in a process of its own."""
+"""Read and write files with VTK, for tests that run it in a separate process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from quasiharmonic import surfaces
 
 
 def _vtk():
-    """What is needed of VTK, quiet."""
+    """The required modules of VTK, without output."""
     from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkIOCore, vtkIOLegacy, vtkIOXML
 
     vtkCommonCore.vtkObject.GlobalWarningDisplayOff()
@@ -19,7 +19,7 @@ def _vtk():
 
 
 def _square(vtk, single, polygons):
-    """A square with data of every kind: small integers, strings, two fields, several of one shape."""
+    """A square with data of every kind: small integers, strings, two fields, several arrays of one shape."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
     flat, F = surfaces.grid(6, 6)
@@ -70,7 +70,7 @@ def _square(vtk, single, polygons):
 
 
 def content(path):
-    """All that VTK finds in a file, positions apart from the rest."""
+    """The content that VTK finds in a file, with positions separate from the rest."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     vtk = _vtk()
@@ -112,7 +112,7 @@ def write(
     words=32,
     big=False,
 ):
-    """Write a square in one of VTK's ways."""
+    """Write a square in one of VTK's formats."""
     vtk = _vtk()
     if path.suffix == ".vtu":
         writer = vtk.vtkXMLUnstructuredGridWriter()

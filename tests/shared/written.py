@@ -1,4 +1,4 @@
-"""A map judged from the text of the file it was written to, as any reader would: nothing of the library is used."""
+"""A reader of OBJ files for checking maps independently of the library."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from shared.exact import exact_orientation
 
 
 class Written(NamedTuple):
-    """What an OBJ file says.
+    """The content of an OBJ file.
 
     Attributes
     ----------
     V : (n, 3) float64
-        Its ``v``.
+        Its ``v`` records.
     F : (f, 3) int64
         Its triangles.
     uv : (n, 2) float64
-        The ``vt`` that each vertex has in them, NaN where it has none.
+        The ``vt`` record of each vertex, NaN for vertices without one.
     """
 
     V: np.ndarray
@@ -28,12 +28,12 @@ class Written(NamedTuple):
     uv: np.ndarray
 
     def signs(self):
-        """Of every triangle's area in the plane, in rational arithmetic."""
+        """Signs of the triangles' areas in the plane, in rational arithmetic."""
         return np.array([exact_orientation(*self.uv[corners]) for corners in self.F])
 
 
 def written(path):
-    """Read a file of triangles in which every vertex has one place."""
+    """Read a file of triangles in which every vertex has at most one UV position."""
     rows = {"v": [], "vt": [], "f": []}
     for line in Path(path).read_text(encoding="utf-8").splitlines():
         word, *rest = line.split() or [""]
