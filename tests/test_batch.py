@@ -243,11 +243,11 @@ class TestRun:
 
     def test_nothing_that_is_not_of_a_run_is_written_over(self, stars, tmp_path):
         for out in (stars, stars / "b", stars / "a"):
-            with pytest.raises(ValueError, match=r"holds a problem, .*input.obj: name another folder"):
+            with pytest.raises(ValueError, match=r"contains a problem, .*input.obj: choose another folder"):
                 batch.run(stars, out)
             assert not list(stars.rglob("qhm-batch*"))
         (tmp_path / "records.csv").write_text("mine")
-        with pytest.raises(OSError, match=r"has a records.csv that is of no run"):
+        with pytest.raises(OSError, match=r"has a records.csv that belongs to no run"):
             batch.run(stars, tmp_path)
         assert (tmp_path / "records.csv").read_text() == "mine"
         assert not (tmp_path / "results").exists()
@@ -424,15 +424,24 @@ class TestRun:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"flatten": True, "corners": "auto"}, "corners is of maps onto a given boundary"),
-            ({"flatten": True, "refine": True}, "refine is of maps onto a given boundary"),
-            ({"cut": True}, "cut is of plain meshes and the outline that they go to: give the outline by to"),
-            ({"corners": "auto"}, "corners is of plain meshes and the outline"),
+            (
+                {"flatten": True, "corners": "auto"},
+                "corners needs a given boundary, but flatten leaves the boundary free",
+            ),
+            ({"flatten": True, "refine": True}, "refine needs a given boundary, but flatten leaves the boundary free"),
+            ({"cut": True}, "cut applies only to plain meshes with an outline: give the outline by to"),
+            ({"corners": "auto"}, "corners applies only to plain meshes with an outline"),
             ({"to": "rect:1x1", "corners": "near:1,2"}, "'near:1,2' is not one of V, V:K and V:X:Y"),
-            ({"flatten": True, "to": "letter:O"}, "to is of maps onto a given boundary, and flatten sets it free"),
-            ({"flatten": True, "polish": "mips"}, "polish is of maps onto a given boundary"),
-            ({"flatten": True, "slide": True}, "slide is of maps onto a given boundary"),
-            ({"slide": True}, "slides while distortion is lowered: give an energy as well, by polish"),
+            ({"flatten": True, "to": "letter:O"}, "to needs a given boundary, but flatten leaves the boundary free"),
+            (
+                {"flatten": True, "polish": "mips"},
+                "polish needs a given boundary, but flatten leaves the boundary free",
+            ),
+            ({"flatten": True, "slide": True}, "slide needs a given boundary, but flatten leaves the boundary free"),
+            (
+                {"slide": True},
+                "the boundary slides only while distortion is lowered: give an energy as well, by polish",
+            ),
             ({"energy": "mips"}, "energy applies only to flatten"),
             ({"flatten": True, "energy": "arap"}, "energy must be one of .*arap-barrier, distances, not 'arap'"),
         ],
@@ -486,7 +495,7 @@ class TestRun:
         (tmp_path / "file").write_text("")
         with pytest.raises(OSError, match="cannot create the folder"):
             batch.run(stars, tmp_path / "file" / "out")
-        with pytest.raises(OSError, match="it is no folder"):
+        with pytest.raises(OSError, match="it is not a folder"):
             batch.run(stars, tmp_path / "file")
 
     def test_worker_that_does_not_start(self, stars, tmp_path, monkeypatch, capsys):
@@ -566,9 +575,9 @@ class TestTables:
             {"problem": "b", "seconds": None, "host": "y"},
         ]
         for text, words in (
-            ("name,seconds\na,1\n", "record 1 names no problem"),
-            ("problem,seconds\na,fast\n", "record 1: 'fast' is no float for seconds"),
-            ("problem,certified\na,maybe\n", "'maybe' is no bool"),
+            ("name,seconds\na,1\n", "record 1 has no problem; a column `problem` is needed"),
+            ("problem,seconds\na,fast\n", "record 1: 'fast' is not a valid float for seconds"),
+            ("problem,certified\na,maybe\n", "'maybe' is not a valid bool"),
         ):
             path.write_text(text)
             with pytest.raises(io.MeshFileError, match=words):
@@ -626,7 +635,7 @@ class TestCommand:
         sliding = ["--polish", "mips", "--slide"]
         assert main(["batch", str(stars / "b"), "-o", out, "-j", "1", "--to", "disk", *sliding]) == 0
         assert main(["batch", str(stars / "b"), "-o", out, "--slide"]) == 2
-        assert "name an energy" in capsys.readouterr().err
+        assert "give an energy as well, by polish" in capsys.readouterr().err
         assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
         assert "there is no folder" in capsys.readouterr().err
 

@@ -112,7 +112,7 @@ def test_a_client_and_a_lost_scheduler(tmp_path):
             if progress.done == 2:
                 scheduler.kill()
 
-        with pytest.raises(ConnectionError, match="scheduler has gone"):
+        with pytest.raises(ConnectionError, match="scheduler ended or dropped a problem"):
             batch.run(source, tmp_path / "out", scheduler=address, callback=kill)
     assert record_of(tmp_path / "out", "b")["certified"]
 

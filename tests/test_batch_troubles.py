@@ -48,8 +48,8 @@ class TestTroubles:
         found = {record["problem"]: record for record in batch.read_table(tmp_path / "out" / "records.csv")}
         assert len(found) == progress.total == progress.done
         expected = {
-            "sleep": ("timeout", "not done within 2.5 s"),
-            "spin": ("timeout", "not done within 2.5 s"),
+            "sleep": ("timeout", "not finished within 2.5 s"),
+            "spin": ("timeout", "not finished within 2.5 s"),
             "refused": ("memory", ""),
             "late": ("memory", "out of memory"),
             "segfault": ("crash", "ended by SIGSEGV.*Segmentation fault"),
@@ -73,7 +73,7 @@ class TestTroubles:
         progress = batch.run(source, tmp_path / "out", jobs=1, time_limit=60, memory_limit=400 << 20)
         assert progress.outcomes == {"injective": 2, "memory": 1}
         record = record_of(tmp_path / "out", "hog")
-        assert record["error"] == "took more than 400 MiB of memory"
+        assert record["error"] == "used more than 400 MiB of memory"
         assert 400 << 20 < record["peak_memory"] < 800 << 20
 
     def test_real_limits(self, tmp_path):

@@ -350,7 +350,7 @@ class TestCommand:
         assert run("repair", uv_file, "-o", out) == 0
         capsys.readouterr()
         assert run("check", out) == 0
-        assert f"vertices from {len(mesh.V)} on are further places" in capsys.readouterr().out
+        assert f"vertices from {len(mesh.V)} on are copies of vertices" in capsys.readouterr().out
         assert run("measure", out, "--export", faces) == 0
         # The same corner by corner: no triangle shares anything with another.
         written = io.read_obj(out)

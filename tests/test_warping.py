@@ -129,7 +129,7 @@ def test_points_without_a_place_are_named():
 
 @pytest.mark.slow
 def test_a_warp_that_cannot_be_says_what_to_do():
-    with pytest.raises(RuntimeError, match="Move them less far"):
+    with pytest.raises(RuntimeError, match="Move them less, or give more landmarks"):
         warp_by_landmarks(np.zeros((50, 50)), [[31.5, 49], [20, 20]], [[31.5, 30], [31.5, 40]])
 
 

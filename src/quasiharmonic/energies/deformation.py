@@ -169,7 +169,7 @@ class DeformationEnergy:
             bad = np.flatnonzero(wrong & ordinary)
             if bad.size:
                 where = named("triangle", "triangles", bad)
-                how = "no number (NaN)" if not_a_number[bad[0]] else "infinite"
+                how = "NaN" if not_a_number[bad[0]] else "infinite"
                 raise ValueError(
                     f"{type(self.energy).__name__}: the {what} is {how} at {where}, "
                     f"where |p| = {abs(d.p[bad[0]]):.6g} and |q| = {abs(d.q[bad[0]]):.6g} at the first; "
