@@ -183,7 +183,7 @@ def test_positions_too_large_for_single_precision(vtk, tmp_path, capsys):
     corner = int(np.flatnonzero((mesh.points == mesh.points.max(axis=0)).all(axis=1))[0])
     table.write_text(f"{corner},1e39,0.3\n")
     assert main(["morph", str(path), "-o", str(out), "--positions", str(table)]) == 2
-    assert "too large for single precision" in capsys.readouterr().err
+    assert "too large for the file's single precision" in capsys.readouterr().err
     assert not out.exists()
 
 
@@ -196,8 +196,12 @@ def test_positions_too_large_for_single_precision(vtk, tmp_path, capsys):
             "0 arrays of Po",
         ),
         ("raw-zlib.vtu", lambda d: d.replace(b"vtkZLib", b"vtkLZ4X"), "compressed by vtkLZ4X"),
-        ("text.vtu", lambda d: d.replace(b"</VTKFile>", b""), "not the XML"),
-        ("raw.vtu", lambda d: d[: d.index(b"<AppendedData") + 60], "ends too early|refers to what"),
+        ("text.vtu", lambda d: d.replace(b"</VTKFile>", b""), "not well-formed XML"),
+        (
+            "raw.vtu",
+            lambda d: d[: d.index(b"<AppendedData") + 60],
+            "ends too early|refers to appended data that do not exist",
+        ),
         ("inline-zlib.vtu", lambda d: d.replace(b"eJ", b"!!"), "base64|damaged"),
         ("42-text.vtk", lambda d: d.replace(b"UNSTRUCTURED_GRID", b"STRUCTURED_GRID"), "data set is STRUCTURED_GRID"),
         (
@@ -207,7 +211,7 @@ def test_positions_too_large_for_single_precision(vtk, tmp_path, capsys):
         ),
         ("42-binary.vtk", lambda d: d[:900], "ends too early|not known|missing"),
         ("42-text.vtk", lambda d: d.replace(b"ASCII", b"ENGLISH"), "must be ASCII or BINARY"),
-        ("42-text.vtk", lambda d: d[30:], "does not begin as"),
+        ("42-text.vtk", lambda d: d[30:], "does not start like"),
     ],
 )
 def test_damaged_vtk_files_are_refused(vtk, tmp_path, name, change, message):
@@ -226,8 +230,11 @@ def test_damaged_vtk_files_are_refused(vtk, tmp_path, name, change, message):
         (lambda d: d[: d.index(b"$EndNodes")], "Nodes does not end"),
         (lambda d: d.replace(b"Nodes", b"ParametricNodes"), "save it as 4.1, or without them"),
         (lambda d: d.replace(b"$Nodes", b"$Knots").replace(b"$EndNodes", b"$EndKnots"), r"no section \$Nodes"),
-        (lambda d: b"solid x\n", "does not begin as an MSH file"),
-        (lambda d: re.sub(rb"\n2 1 2 (\d+)\n", rb"\n2 1 4 \1\n", d), "tetrahedron: triangles of three or six"),
+        (lambda d: b"solid x\n", "does not start like an MSH file"),
+        (
+            lambda d: re.sub(rb"\n2 1 2 (\d+)\n", rb"\n2 1 4 \1\n", d),
+            "tetrahedron are not supported: use triangles of three or six",
+        ),
         (lambda d: re.sub(rb"\n2 1 2 \d+\n", rb"\n2 1 2 999999\n", d), "ends too early"),
     ],
 )

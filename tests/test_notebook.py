@@ -48,7 +48,7 @@ def test_pictures_appear_by_themselves_in_a_fresh_kernel(tmp_path):
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     outputs = [output for cell in code for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
-    assert "strictly positive, decided exactly" in code[0].outputs[0].text
+    assert "strictly positive, verified exactly" in code[0].outputs[0].text
     # Each of the others shows one picture, in the page of a result or as a figure.
     assert len(code) > 4
     for cell in code[1:]:

@@ -20,7 +20,7 @@ def test_torch():
         np.testing.assert_array_equal(injective_map(*map(tensor, (V, F, LOOP, BEAN))).uv, MAP.uv)
     assert certify(torch.tensor(F), torch.tensor(MAP.uv)).bijective
     with pytest.raises(
-        ValueError, match=r"V is a Tensor that requires grad.*V\.detach\(\), or see quasiharmonic\.torch"
+        ValueError, match=r"V is a Tensor that requires grad.*V\.detach\(\), or use quasiharmonic\.torch"
     ):
         flatten(torch.tensor(V, requires_grad=True), F)
     with pytest.raises(ValueError, match=r"uv is a Tensor on meta: pass uv\.cpu\(\)"):

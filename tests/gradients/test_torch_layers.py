@@ -113,7 +113,7 @@ def test_compiled_as_one_it_says_why_not():
     problem = held_ring()
     target = torch.tensor(problem.target)
     whole = torch.compile(lambda t: layers.quasi_harmonic_map(problem, target=t), backend="eager", fullgraph=True)
-    with pytest.raises(Exception, match="maps are made by NumPy and SciPy"):
+    with pytest.raises(Exception, match="maps are computed by NumPy and SciPy"):
         whole(target)
 
 
@@ -135,7 +135,7 @@ def test_what_is_refused():
         layers.injective_map(problem, target=target.float())
     with pytest.raises(TypeError, match=r"mu must be of torch.complex128, not torch.float64"):
         layers.quasi_harmonic_map(problem, torch.zeros(len(problem.F), dtype=torch.float64))
-    with pytest.raises(ValueError, match="target is on meta, and maps are computed on the CPU"):
+    with pytest.raises(ValueError, match="target is on meta, but maps are computed on the CPU"):
         layers.injective_map(problem, target=target.to("meta"))
     with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\), or that with a batch in front, not \(3"):
         layers.injective_map(problem, target=target[:3])
