@@ -107,7 +107,7 @@ def test_what_the_kernel_asks_for(cell):
     assert widget.result.injective
     with pytest.raises(ValueError, match="unknown outline 'nonsense'"):
         widget.outline("nonsense")
-    with pytest.raises(ValueError, match="'heat' is no energy"):
+    with pytest.raises(ValueError, match="unknown energy 'heat'"):
         widget.polish("heat")
     assert widget.result.injective, "as it was"
 

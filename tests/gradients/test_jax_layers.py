@@ -132,7 +132,7 @@ def test_what_is_refused():
         layers.injective_map(problem, target=problem.target.astype(np.float32))
     with pytest.raises(TypeError, match="mu must be of complex128"):
         layers.quasi_harmonic_map(problem, np.zeros(len(problem.F)))
-    with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\), or that with a batch in front, not \(3"):
+    with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\), or batch axes before it, not \(3"):
         layers.injective_map(problem, target=problem.target[:3])
     with pytest.raises(TypeError, match="forward-mode"):
         jax.jvp(lambda target: layers.injective_map(problem, target=target), (problem.target,), (problem.target,))

@@ -137,7 +137,7 @@ def test_what_is_refused():
         layers.quasi_harmonic_map(problem, torch.zeros(len(problem.F), dtype=torch.float64))
     with pytest.raises(ValueError, match="target is on meta, but maps are computed on the CPU"):
         layers.injective_map(problem, target=target.to("meta"))
-    with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\), or that with a batch in front, not \(3"):
+    with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\), or batch axes before it, not \(3"):
         layers.injective_map(problem, target=target[:3])
     with pytest.raises(ValueError, match="give fixed and target together"):
         layers.flatten(leaf(problem.V), problem.F, target=target)
