@@ -141,9 +141,9 @@ def test_what_is_refused():
         layers.injective_map(problem, target=target[:3])
     with pytest.raises(ValueError, match="give fixed and target together"):
         layers.flatten(leaf(problem.V), problem.F, target=target)
-    with pytest.raises(NotImplementedError, match=r"leave torch\.func\.vmap out"):
+    with pytest.raises(NotImplementedError, match=r"do not use torch\.func\.vmap"):
         torch.func.vmap(lambda target: layers.quasi_harmonic_map(problem, target=target))(target[None])
-    with pytest.raises(NotImplementedError, match=r"not by torch\.func"):
+    with pytest.raises(NotImplementedError, match=r"but not torch\.func"):
         torch.func.grad(lambda target: layers.quasi_harmonic_map(problem, target=target).sum())(target)
 
 
