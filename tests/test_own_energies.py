@@ -67,7 +67,7 @@ class Spoilt(SymmetricDirichlet):
         return values
 
 
-@pytest.mark.parametrize(("value", "how"), [(np.nan, r"no number \(NaN\)"), (np.inf, "infinite")])
+@pytest.mark.parametrize(("value", "how"), [(np.nan, r"NaN"), (np.inf, "infinite")])
 @pytest.mark.parametrize("part", WORDS)
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_an_energy_that_is_no_number_is_named(function, part, value, how):
@@ -88,7 +88,7 @@ def test_an_energy_that_no_barrier_is_and_no_number_where_triangles_are_inverted
 
     uv = UV.copy()
     uv[0] = 0.6, 0
-    with pytest.raises(ValueError, match=r"NoLogarithm: the energy is no number \(NaN\) at triangles 0, "):
+    with pytest.raises(ValueError, match=r"NoLogarithm: the energy is NaN at triangles 0, "):
         harmonise(V, F, uv, fixed=RIM, energy=NoLogarithm())
 
 
