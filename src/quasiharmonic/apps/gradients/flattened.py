@@ -26,7 +26,6 @@ _SAME = 1e-6
 
 
 @accepts_mesh
-@accepts_mesh
 def flatten_derivative(
     V: ArrayLike,
     F: ArrayLike,

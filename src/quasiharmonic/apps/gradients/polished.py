@@ -25,7 +25,6 @@ NOT_FOUND = "no map was found, so there is no derivative"
 
 
 @accepts_mesh
-@accepts_mesh
 def polish_derivative(
     V: ArrayLike,
     F: ArrayLike,

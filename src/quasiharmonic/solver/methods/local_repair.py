@@ -118,9 +118,7 @@ class LocalRepair(VertexDescent):
                 if patch is None:
                     continue
                 tries -= 1
-                moved = w.copy()
-                moved[patch.vertices] = last_untangled(patch, w[patch.vertices], patch.held, 0.0, solver)
-                now = inverted_triangles(problem.F, problem.positions(moved))
+                moved, now = _with_patch_untangled(problem, w, patch, 0.0, solver)
                 if now.size < left.size:
                     w, left = moved, now
                     yield objective.of_map(w)
@@ -161,13 +159,20 @@ class WideRepair(VertexDescent):
             if patch is None:
                 continue
             tried |= np.isin(problem.F, patch.vertices).all(axis=1)
-            moved = w.copy()
-            moved[patch.vertices] = last_untangled(patch, w[patch.vertices], patch.held, _WIDE_GRADING, solver)
-            now = inverted_triangles(problem.F, problem.positions(moved))
+            moved, now = _with_patch_untangled(problem, w, patch, _WIDE_GRADING, solver)
             if now.size < left.size:
                 w, left = moved, now
                 yield objective.of_map(w)
         return True
+
+
+def _with_patch_untangled(
+    problem: Problem, w: ComplexArray, patch: Patch, grading: float, solver: str
+) -> tuple[ComplexArray, IntArray]:
+    """Return the map with one patch untangled, and the triangles that are then inverted."""
+    moved = w.copy()
+    moved[patch.vertices] = last_untangled(patch, w[patch.vertices], patch.held, grading, solver)
+    return moved, inverted_triangles(problem.F, problem.positions(moved))
 
 
 def patch_around(problem: Problem, triangle: int, rings: int, most: int) -> Patch | None:

@@ -71,8 +71,8 @@ class CoarseToFine(SearchStage):
 
 
 @dataclass(frozen=True)
-class TentativeStage(SearchStage):
-    """Stage whose iterations are discarded if it finds no map (§9.2); later stages continue from the state before it.
+class _OneDescent(SearchStage):
+    """Stage of one way to descend, under conditions of its own.
 
     Attributes
     ----------
@@ -90,32 +90,18 @@ class TentativeStage(SearchStage):
     def begins_with(self) -> Descent:
         """``tried``."""
         return self.tried
+
+
+class TentativeStage(_OneDescent):
+    """Stage whose iterations are discarded if it finds no map (§9.2). Later stages continue from the earlier state."""
 
     def run(self, search: StageRunner, before: Status) -> Status:
         """See `SearchStage`."""
         return search.attempt_tentatively(self.tried, before)
 
 
-@dataclass(frozen=True)
-class WhereMany(SearchStage):
-    """Stage that runs only if so many triangles are inverted that local repair would be slower.
-
-    Attributes
-    ----------
-    tried : Descent
-    """
-
-    tried: Descent
-
-    @property
-    def name(self) -> str:
-        """Name of this stage in reports."""
-        return self.tried.name
-
-    @property
-    def begins_with(self) -> Descent:
-        """``tried``."""
-        return self.tried
+class WhereMany(_OneDescent):
+    """Stage that runs only if so many triangles are inverted that local repair would be slower."""
 
     def run(self, search: StageRunner, before: Status) -> Status:
         """See `SearchStage`."""
