@@ -4,12 +4,14 @@ Without a compiler, or with ``QUASIHARMONIC_PURE=1``, the package is built witho
 """
 
 import os
+import runpy
 import sys
 import sysconfig
 from pathlib import Path
 
 from setuptools import Extension, setup
 
+PACKAGE = Path(__file__).parent / "src/quasiharmonic"
 KERNELS = Path("src/quasiharmonic/util/kernels/c")
 # Fused multiply-add would make results differ between machines, so it is disabled.
 # The other flags do not change results: errno and floating-point flags are not read, so branches can be avoided.
@@ -17,6 +19,11 @@ PRECISE = "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"
 FLAGS = ["/std:c11"] if sys.platform == "win32" else ["-std=c11", "-O3", "-fvisibility=hidden", *PRECISE]
 # One wheel serves this Python version and all later ones, except free-threaded builds.
 STABLE = not sysconfig.get_config_var("Py_GIL_DISABLED")
+
+# Constants that the C files share with the Python source.
+generator = runpy.run_path(str(PACKAGE / "util/kernels/constants.py"))
+text = generator["header"](generator["shared_constants"](PACKAGE))
+(PACKAGE / "util/kernels/c/constants.h").write_text(text, encoding="utf-8")
 
 if os.environ.get("QUASIHARMONIC_PURE", "0") not in ("", "0"):
     setup()

@@ -1,27 +1,8 @@
-"""A human cortex laid flat: distances along it kept better than by the brain mappers' own programs, and bijective
-==================================================================================================================
+"""A human cortex flattened
+===========================
 
-The left half of FreeSurfer's average brain, fsaverage5, as nilearn provides it: 18,654 triangles of the white matter's
-surface. The medial wall is removed, and the five cuts of the flat map published with it are applied. Top: sulcal depth,
-on the inflated surface from outside and on the flat maps. Bottom: the cuts, and the distance errors around each vertex.
-
-The table measures distances between vertices at most 20 edges apart, from every vertex to 150 others drawn at random.
-Distances along the surface are lengths of straight segments in a chain, each of which crosses at most five edges and no
-cut. The error of a pair is |scale · plane / surface − 1|, with one scale per map, which minimises the mean error. "rms"
-is the root-mean-square error. All maps are measured in the same way. Seconds are CPU seconds of one thread; the times
-in the figure are wall-clock times.
-
-=============================== ======= =================== ==================== ====== ==============
-map                             seconds symmetric Dirichlet distance error, mean rms    bijective
-=============================== ======= =================== ==================== ====== ==============
-published                             –               0.868               15.2 % 22.8 % yes
-autoflatten 1.0.7                   144                   ∞               14.9 % 19.6 % no, 6 inverted
-``flatten``                         0.5               0.298               14.6 % 23.8 % yes
-that, and ``keep_distances``        5.2               0.639               13.6 % 19.0 % yes
-=============================== ======= =================== ==================== ====== ==============
-
-``--autoflatten`` also runs that program (``pip install autoflatten``; some minutes) and shows its map. ``--subdivided``
-also flattens the surface with each triangle split into sixteen, and measures distances from 1,500 vertices to 200 each.
+The left half of FreeSurfer's fsaverage5 (nilearn), flattened by ``flatten`` and ``keep_distances``, beside its
+published flat map. Top: sulcal depth; bottom: cuts, and distance errors.
 """
 
 from __future__ import annotations
@@ -41,9 +22,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from numpy.typing import NDArray
 
 from common import INK, RED, FloatArray, colorbar, panels, run, save
-from quasiharmonic import certify, distortion
-from quasiharmonic.apps.flattening.distances.descent import keep_distances
-from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic import certify, distortion, flatten, keep_distances
 from quasiharmonic.energies.distances import SurfaceDistances, surface_distances
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.ui.plot.shading import lit
@@ -174,7 +153,7 @@ def around_vertices(sample: SurfaceDistances, uv: FloatArray) -> FloatArray:
     return np.bincount(sample.target, off, len(uv)) / np.maximum(np.bincount(sample.target, minlength=len(uv)), 1)
 
 
-def halved(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
+def subdivide(V: FloatArray, F: IntArray) -> tuple[FloatArray, IntArray]:
     """Split each triangle into four at the midpoints of its sides: the same surface with twice as many rings."""
     sides = np.sort(np.stack([F, np.roll(F, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     ends, middle = np.unique(sides, axis=0, return_inverse=True)
@@ -218,7 +197,7 @@ def main(output: Path, rings: int = 20, autoflatten: bool = False, subdivided: b
             size=11,
             color=INK if judged.bijective else RED,
         )
-        symmetric = distortion(brain.V, brain.F, uv).summary("symmetric_dirichlet").mean
+        symmetric = distortion(brain.V, brain.F, uv).statistics("symmetric_dirichlet").mean
         numbers[name] = {
             "seconds": seconds,
             "symmetric Dirichlet": symmetric if np.isfinite(symmetric) else None,
@@ -228,13 +207,13 @@ def main(output: Path, rings: int = 20, autoflatten: bool = False, subdivided: b
             "bijective": judged.bijective,
         }
     if subdivided:
-        V, F = halved(*halved(brain.V, brain.F))
+        V, F = subdivide(*subdivide(brain.V, brain.F))
         flat = flatten(V, F, energy="distances", rings=rings)
         error = surface_distances(V, F, rings=rings, sources=1500, targets=200).error(flat.uv)
         numbers["subdivided"] = {
             "triangles": len(F),
             "seconds": flat.seconds,
-            "symmetric Dirichlet": distortion(V, F, flat.uv).summary("symmetric_dirichlet").mean,
+            "symmetric Dirichlet": distortion(V, F, flat.uv).statistics("symmetric_dirichlet").mean,
             "distance error, mean": error.mean,
             "distance error, rms": error.rms,
             "bijective": flat.certificate.bijective,

@@ -1,12 +1,8 @@
-"""An octopus and an armadillo, cut open and laid flat with their boundaries free
-==================================================================================
+"""An octopus and an armadillo, cut and flattened
+=================================================
 
-Two closed surfaces defined by formulas. Middle: ``flatten`` after one cut, ``cut_open(V, F)``, between two distant
-points. A limb without a cut becomes a disk with a stretched rim and a compressed tip. Right: ``flatten`` after all cuts
-that reduce distortion enough for their length, ``cut_open(V, F, min_gain=0.1)``. These cuts, drawn at the left, reach
-the ends of arms, legs, ears and fingers. They reduce the energy by a factor of 80 for one creature and of 25 for the
-other. Colours show the largest change of length, max(σ₁, 1/σ₂); the surfaces at the left have the colours of the map at
-the right. All four maps are bijective and took 1 to 7 s on one core.
+Left: the cuts of ``find_cuts``. Middle: flattened after one cut only. Right: flattened after all cuts. Colours show
+the largest change of length.
 """
 
 from __future__ import annotations
@@ -29,7 +25,7 @@ from quasiharmonic.util.arrays import IntArray
 from sculptures import creature
 
 # Angles of view in degrees: rotation about the vertical axis, and elevation.
-CREATURES = {"octopus": (-25, 30), "armadillo": (-30, 12)}
+SURFACES = {"octopus": (-25, 30), "armadillo": (-30, 12)}
 # Minimum gain of a cut for its length.
 GAIN = 0.1
 # Ticks of the colour bar.
@@ -82,7 +78,7 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
     colors = ScalarMappable(LogNorm(1, 5), "magma_r")
     figure, axes = panels(2, 3, (4.6, 4.6))
     numbers: dict[str, Any] = {}
-    for row, (name, turned) in zip(axes, CREATURES.items(), strict=True):
+    for row, (name, turned) in zip(axes, SURFACES.items(), strict=True):
         V, F = creature(name, size)
         cut = find_cuts(V, F, min_gain=GAIN)
         one, every = cut_open(V, F), cut_open(V, F, edges=cut)
@@ -100,8 +96,8 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
             numbers[name][title] = {
                 "bijective": result.certificate.bijective,
                 "symmetric Dirichlet": energy,
-                "median stretch": found.summary("isometric").median,
-                "worst stretch": found.summary("isometric").maximum,
+                "median stretch": found.statistics("isometric").median,
+                "worst stretch": found.statistics("isometric").maximum,
                 "seconds": result.seconds,
             }
         show_creature(row[0], V, F, turned, color, cut)

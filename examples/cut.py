@@ -1,12 +1,8 @@
-"""Closed surfaces, cut open and laid flat by ``qhm map surface.obj --to … --cut --refine`` alone
-=================================================================================================
+"""Closed surfaces, cut open and mapped onto an outline
+=======================================================
 
-The examples map a sphere onto a disk, a torus onto a square, and a surface with two handles onto the letter O without
-its hole. Closed surfaces and handles cannot be flattened, so the surfaces are first cut along edges. The cuts are drawn
-as red lines, except on the far side. In the written file the cuts are seams: the vertices and faces of the surface stay
-unchanged, and a vertex on a cut has several positions in the plane. Next to a cut, a triangle can have all three
-vertices on it and would be degenerate on a straight side of the target. The edges of these triangles are split. All
-three maps are bijective.
+A sphere, a torus and a surface with two handles, mapped by ``qhm map … --cut --refine``. Cuts are red; in the written
+file they are seams.
 """
 
 from __future__ import annotations

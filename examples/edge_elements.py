@@ -1,21 +1,8 @@
-"""What V₄ adds to V₃: in linear elements zeros that are no maps, in Crouzeix and Raviart's nothing
-=====================================================================================================
+"""V₄ in two kinds of elements
+==============================
 
-The paper's Poisson functional V₄ is the dual of V₃. It applies the target's normal forces at the boundary, frees the
-boundary, and compares energies. Propositions 7.1 and E.1 say that its minimum is zero and is reached at injective maps.
-This holds in the continuous setting.
-
-*In linear elements* it does not hold. Left: a disk mapped onto a star with random tensors, scaled such that V₄ is zero;
-the inverted triangles are red. With slightly rougher tensors V₄ is negative (middle). It has no minimum, only a lower
-bound, which is minus the target's area.
-
-*In elements that are continuous at edge midpoints* V₄ is never negative (`edge-poisson`), but there it equals V₃.
-Divergence-free fields of one kind of element are rotated gradients of the other, and tensors of determinant 1 give both
-the same energy. The curves of the middle panel agree to the last digits, and descents of both take the same steps.
-
-V₄ ignores pins and the positions of inner loops (right). A ring whose hole is moved across its outer boundary has the
-same V₄ as the ring whose hole stays fixed, so V₄ is zero where V₃ is not. Because the hole is free to move, the ring of
-Figure 6 takes fewer iterations: 192 instead of 232 for V₃. This is the only advantage of V₄.
+In linear elements V₄ is zero at a map with inverted triangles (left, red), and can be negative (middle). In
+Crouzeix–Raviart elements it equals V₃. In both it ignores the position of a hole (right).
 """
 
 from __future__ import annotations
@@ -54,7 +41,7 @@ def iterations(problem: Problem, functional: str, parameterisation: str) -> int 
     """Iterations of VectorAdam to an injective map, or the number of triangles left inverted."""
     stage = VectorAdam(functional=functional, parameterisation=parameterisation, iterations=600)
     result = solve(problem, strategy=[stage])
-    return result.iterations if result.injective else f"{len(result.certificate.inverted)} inverted"
+    return result.n_iterations if result.injective else f"{len(result.certificate.inverted)} inverted"
 
 
 def main(output: Path, size: int = 10, cells: int = 24) -> dict[str, Any]:

@@ -1,16 +1,8 @@
-"""Figure 2: how the first map of si-log distributes σ₁/σ₂, on the angel that goes onto a G
-========================================================================================
+"""Figure 2: the distribution of σ₁/σ₂
+======================================
 
-The paper compares si-log's first map with TLC's map after 28,000 iterations. si-log has an order of magnitude less
-MIPS, and its distribution of σ₁/σ₂ lacks TLC's long tail. TLC is another program and is not run. tanh's first map is
-shown instead, because tanh does not favour conformal maps either. Beside them is the map of least MIPS that
-quasi-harmonisation finds from tanh's map (§11). Its mean MIPS is even lower, but a tail of triangles has large ratios.
-Dotted lines are means over the surface, solid lines the worst triangles. The colours reach the worst of all three maps.
-
-Mean MIPS is 22 for tanh, 6.8 for si-log and 1.7 for the last map. 99 % of the triangles are below 58, 11 and 22.
-si-log's distribution is narrow, as in the paper (see Figure 12), except for a few triangles at the inner corner that
-were untangled last. The worst of them has 2,900; the worst of the other maps have 197 and 46. In the paper si-log's
-largest ratio is also below TLC's.
+First maps of tanh and si-log, and a quasi-harmonised map of the angel. Dotted: means; solid: worst triangles. The paper
+shows TLC instead of tanh.
 """
 
 from __future__ import annotations
@@ -21,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from common import COLORS, colorbar, first_map, flips, mips, panels, ratios, run, save, show_ratios
-from quasiharmonic.solver.search.harmonising import harmonise_map
+from quasiharmonic import harmonise
 from sculptures import seven
 
 
@@ -29,7 +21,9 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
     problem = seven(size)["angel onto G"]
     runs = {name: first_map(problem, name) for name in ("tanh", "si-log")}
     maps = {name: result.uv for name, result in runs.items()}
-    maps["tanh + MIPS"] = harmonise_map(problem.domain, maps["tanh"], energy="mips", conformal=0).uv
+    maps["tanh + MIPS"] = harmonise(
+        problem.V, problem.F, maps["tanh"], fixed=problem.fixed, energy="mips", conformal=0
+    ).uv
     colors = {**COLORS, "tanh + MIPS": (0.35, 0.55, 0.25)}
     figure, axes = panels(2, len(maps), (3.6, 3.9))
     numbers: dict[str, Any] = {"triangles": len(problem.F)}
@@ -53,7 +47,7 @@ def main(output: Path, size: int = 56) -> dict[str, Any]:
             "max": float(f"{ratio.max():.3g}"),
         }
     for name, result in runs.items():
-        numbers[name]["iterations"] = result.iterations
+        numbers[name]["iterations"] = result.n_iterations
     colorbar(figure, drawn, extend="neither")
     save(figure, output, "figure_02")
     return numbers

@@ -1,25 +1,8 @@
-"""Figure 4: the inner rectangle turned by π, until something breaks
-====================================================================
+"""Figure 4: a rectangle turned by π in a ring
+==============================================
 
-The paper shows one ring, which its method maps with triangles that become very thin. This example has fourteen rings:
-narrower, finer, off-centre and stretched ones. Each is solved from several functionals. The functional's own descent
-runs first; Newton's method on V₃ then untangles the remaining triangles.
-
-The first obstacle is existence. On the three rings with only two layers of triangles somewhere, the diagnosis proves
-that no map exists: it names vertices that cannot see all their fixed neighbours from any point of the target. With one
-or two more layers a map exists. On the rings that the diagnosis does not exclude:
-
-- V₃ with si-log always succeeds (232 to 499 iterations), down to a strip of 1/40 of the width. With tanh (64 to 188
-  iterations) it fails only on that strip: 10 of 7,800 triangles stay inverted, which later stages of `solve` untangle.
-- V₂ and V₁ with si-log fail only on that strip (2 and 8 triangles). With tanh they fail on five and four of eleven
-  rings.
-- V₄ fails on six rings with tanh and on seven with si-log, for the reason given in Figure 6. Newton's method then
-  solves these rings.
-
-A finer mesh is not harder: 6 and 12 layers take 108 and 113 iterations.
-
-By default every combination runs on the first ring, and the promising ones on the others. ``--full`` runs all
-combinations on all rings. ``--size 14`` adds the two narrowest rings.
+Rings of several widths, each by several functionals. The diagnosis proves that three rings have no map. ``--full``
+runs all combinations.
 """
 
 from __future__ import annotations
@@ -76,7 +59,7 @@ def search(problem: Problem, column: str) -> MapResult:
 def outcome(result: MapResult) -> str:
     """The text of a table cell: iterations, or what is left to untangle."""
     if result.injective:
-        return f"{result.iterations}"
+        return f"{result.n_iterations}"
     return "none exists" if result.status is Status.IMPOSSIBLE else f"{len(result.certificate.inverted)} inverted"
 
 

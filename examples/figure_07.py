@@ -1,9 +1,8 @@
-"""Figure 7: the curves |ξ| ↦ |μ| of the two parameterisations, and what they are for
-=====================================================================================
+"""Figure 7: the two parameterisations
+======================================
 
-The paper draws ``r = tanh`` and ``r = si-log``. This example also draws the distance |ξ| needed for a given angle
-distortion σ₁/σ₂ = (1 + |μ|)/(1 − |μ|). For tanh the distance grows with the logarithm of the distortion; for si-log
-it grows exponentially. For σ₁/σ₂ = 19, which is |μ| = 0.9, tanh needs |ξ| = 1.5 and si-log 8,100.
+The curves |ξ| ↦ |μ|, and the |ξ| that a given σ₁/σ₂ needs. It grows logarithmically for tanh and exponentially for
+si-log.
 """
 
 from __future__ import annotations

@@ -1,13 +1,7 @@
-"""Figures 9 and 22: the surfaces at rest, their boundaries in red
-===============================================================
+"""Figures 9 and 22: the surfaces at rest
+=========================================
 
-The paper's surfaces are scans: Lucy, a gargoyle, a bunny, David, a hand, and similar ones in Figure 22. To need no
-external data, this example builds its own: an angel, a gargoyle, a rabbit, a bust and a hand. Each is a formula that is
-negative inside, meshed and cut open below (``examples/sculptures.py``). Like the scans they have limbs far from the
-boundary, which are hard to map: only the last row of triangles above the boundary touches it.
-
-All are disks with angles above 17° at this size. No interior edge joins two boundary vertices, so the mesh does not
-exclude a map.
+Five generated surfaces replace the paper's scans. Their boundaries are red.
 """
 
 from __future__ import annotations

@@ -1,24 +1,7 @@
-"""Figures 13 to 16: beside TLC and SBP, from records of theirs
-=============================================================
+"""Figures 13 to 16: recorded runs of TLC and SBP
+=================================================
 
-The paper shows maps of TLC alone (Figure 13) and of SBP alone (Figure 15). Figure 14 shows MIPS over a benchmark, lower
-than TLC's. Figure 16 shows times of 0.01 to 5 s for most meshes where SBP takes 1 to 100 s.
-
-TLC and SBP are not installable packages. Their results on 68 problems of this project's generator, with 300 to 6,000
-triangles, were measured once. ``benchmarks/records`` keeps the results with versions, settings and machine, but not the
-maps. Figures 13 and 15 are therefore drawn as statistics. TLC's first maps have median MIPS energies of 90 and 46,
-this project's 14. SBP minimises its energy until it has converged and reaches 6.4, below this project's first maps.
-The claim of Figure 14 about TLC is thus reproduced; the paper makes no such claim about SBP. After polishing for least
-MIPS all methods reach 6.3 to 6.6.
-
-Of 44 problems known to have a map this project solves 44, SBP 42, TLC-QN 36 and TLC-PN 34, with default tolerances. In
-CPU time it is faster than SBP on 49 of 50 problems that both solve, and than TLC-PN on 41 of 43. TLC-QN is close: its
-median time is 1.5 times as long, and it is faster on 17 of 42. This project's defaults were developed on problems of
-this generator, and those of the other programs elsewhere.
-
-The comparison used version 0.1.0 of this project. `Untangling`, which minimises SBP's regularised energy by Newton's
-method, was run later on the same problems. Compared with `speed` on the same day it solves 43 of the 44 in 2.2
-times the time, with MIPS energies of 9.6. ``benchmarks/rivals.py --anew`` runs this project's solver again.
+Distortion and time on 68 generated problems, from ``benchmarks/records``. The paper shows maps and another benchmark.
 """
 
 from __future__ import annotations
@@ -32,7 +15,7 @@ import numpy as np
 from common import BENCHMARKS, COLORS, GREEN, INK, panels, run, save
 
 sys.path.append(str(BENCHMARKS))
-from rivals import kept, on_common_problems, recorded, summary
+from tlc_foldover import on_common_problems, read_records, read_repeated_runs, summary
 
 PROGRAMS = {
     "ours speed": COLORS["tanh"],
@@ -44,7 +27,7 @@ PROGRAMS = {
 
 
 def main(output: Path) -> dict[str, Any]:
-    rows = on_common_problems([*recorded(), *kept()])
+    rows = on_common_problems([*read_records(), *read_repeated_runs()])
     figure, (axes,) = panels(1, 2, (5.6, 4.4))
     for k, ax in enumerate(axes):
         ax.set_position((0.07 + 0.5 * k, 0.13, 0.41, 0.75))

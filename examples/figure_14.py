@@ -1,28 +1,7 @@
-"""Figures 14 and 16: distortion and time over a data set, by size and by family
-=============================================================================
+"""Figures 14 and 16: distortion and time over a data set
+=========================================================
 
-The paper shows the distribution of MIPS over the maps of a benchmark (Du et al. 2020), lower than TLC's. It also shows
-the time for each mesh beside that of SBP: 0.01 to 5 s for most, where SBP takes 1 to 100 s.
-
-This example has 2,010 generated problems of 100 to 20,000 triangles, evenly spread on a logarithmic scale. Eleven
-families are built from a solution, three are laid along outlines, and five map this project's surfaces onto letters.
-``benchmarks/evaluation.py`` ran them once and recorded the results. The paper's pipeline, ``paper``, solves 1,945 of
-them, in 0.08 s (median; 3.7 s for 95 %). ``speed`` solves 1,999 in 0.015 s (0.45 s). The median MIPS is 5.8 and 5.9.
-TLC's is far above that (Figure 13, on other problems of the same kind).
-
-si-log, the first stage of ``paper``, succeeds on 72 %; the paper reports more than 90 % on its own benchmark. On 1,056
-of these Tutte's embedding is not injective and tanh also finds a map on the same triangles. There si-log has the lower
-MIPS on 37 %: on 30 % of those below 1,000 triangles and 43 % of those above. Its median MIPS is 1.04 times tanh's.
-si-log is better for displaced holes (adrift) and glyphs, about even for stars, polygons and sculptures, and clearly
-worse for mazes, spirals, limbs and noise.
-
-The reason is that MIPS is a mean dominated by the worst hundredth of the surface. Solving 240 of these problems again
-shows this. On nine tenths of the surface, si-log is less distorted for 68 to 87 % of them, by 5 to 22 % in the median,
-and by more if more triangles were inverted at the start. On 99 % of the surface it is still better by 3 to 16 %. This
-agrees with the paper and with Figures 8 and 12. The remaining triangles lie in narrow parts of the target, must be thin
-for any method, and are no better with si-log. The number of iterations has little influence: 0.99 times tanh's MIPS
-within three iterations, 1.04 to 1.09 beyond. In a trial on some twenty problems, shorter steps and Adam's own momenta,
-for both, did not change the result.
+2,010 generated problems, from ``benchmarks/records/evaluation.csv.gz``: MIPS and time by size and family.
 """
 
 from __future__ import annotations

@@ -1,31 +1,8 @@
-"""Figure 20: collision avoidance by way of bijectivity, figures squeezed into an hourglass, a flask and a bend
-============================================================================================================
+"""Figure 20: collision avoidance
+=================================
 
-The paper puts a figure with holes into an hourglass in one step. Figure and air are one mesh. The quasi-harmonised ARAP
-energy applies to the figure (blue) alone, and the air (yellow) has no weight. Since no triangle of the air may be
-inverted, nothing overlaps. That is ``harmonise(…, energy="arap-unsigned", weights=0 on the air, scaled=False)``. With
-``scaled=False`` the figure keeps its own size, where the paper's Figure 23 scales the whole mesh. *Longer* means up to
-200 solves in each of the four rounds instead of the default 40.
-
-The second method adds a barrier to the same energy, a tenth of det J + 1/det J, and minimises it by Newton's method.
-The air has a thousandth of the weight. It runs on the same mesh, and with `AirMesh`, which triangulates the air again.
-The table gives ARAP of the figure, solves, and CPU seconds on one core:
-
-======================  ================  ==================  ==================
-way                     man, hourglass    starfish, flask     wrench, bend
-======================  ================  ==================  ==================
-first map               0.595             0.685               0.695
-paper's, η = 1e-4       0.233, 188, 0.6   0.296, 192, 0.6     0.141, 190, 0.6
-paper's, four rounds    0.052, 155, 0.5   0.060, 153, 0.4     0.016, 153, 0.5
-paper's, longer         0.025, 570, 1.8   0.039, 597, 1.7     0.012, 469, 1.3
-barrier, the same air   0.008, 39, 0.2    0.013, 60, 0.3      0.007, 21, 0.1
-barrier, fresh air      0.006, 0.3 s      0.026, 0.3 s        0.006, 0.1 s
-======================  ================  ==================  ==================
-
-All maps are bijective. The paper's method works from the first map on, but Newton's method with a barrier gives better
-maps of the same mesh in less time. Only the paper's method can start at a map that is not injective. Triangulating the
-air again lets figures slide; otherwise they keep their neighbours. The starfish has several local minima, and the
-methods find different ones.
+Shapes (blue) pressed into an hourglass, a flask and a bend. The air (yellow) has no weight, and nothing overlaps.
+Columns: the problem, the paper's method and a barrier method.
 """
 
 from __future__ import annotations
@@ -45,7 +22,7 @@ from common import INK, panels, run, save
 from quasiharmonic import AirMesh, certify, harmonise, injective_map
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP, AreaBarrier, Combination, UnsignedARAP
-from quasiharmonic.energies.newton.newton_descent import NewtonDescent
+from quasiharmonic.energies.newton.map_model import newton_descent
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
@@ -181,10 +158,10 @@ def newton(here: Scene, uv: FloatArray, air_weight: float = 1e-3, steps: int = 3
     """Minimise ARAP with a barrier on the same mesh; return the map and the number of steps."""
     weights = np.where(here.body, 1.0, air_weight)
     energy = DeformationEnergy(here.V, here.F, Combination((1.0, ARAP()), (0.1, AreaBarrier())), weights=weights)
-    descent, taken = NewtonDescent(energy, uv, here.rim, 0, "auto"), 0
+    (descent, model), taken = newton_descent(energy, uv, here.rim, 0, "auto"), 0
     while taken < steps and descent.step(1e-4) is None:
         taken += 1
-    return descent.positions(descent.w), taken
+    return model.positions(descent.w), taken
 
 
 def draw(ax: Axes, points: FloatArray, body: IntArray, air: IntArray, title: str) -> None:
@@ -224,7 +201,7 @@ def main(output: Path, size: int = 10, iterations: int = 200) -> dict[str, Any]:
 
         began = time.process_time()
         first = injective_map(here.V, here.F, here.rim, target)
-        energy = note("first map", first.uv[used], began, first.certificate, first.iterations)
+        energy = note("first map", first.uv[used], began, first.certificate, first.n_iterations)
         draw(row[0], first.uv, body, air, f"{name}:\nfirst map, ARAP {energy:.3f}")
         weights = here.body.astype(np.float64)
         for ax, how, options in (

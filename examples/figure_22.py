@@ -1,14 +1,7 @@
-"""Figure 22: a cactus that is badly meshed at the bottom, which does not matter
-==============================================================================
+"""Figure 22: a cactus with bad triangles
+=========================================
 
-The paper's Figure 22 has a cactus with bad triangles at the bottom, and finds that they cause no problem. This cactus
-is made bad deliberately: below a certain height, points next to corners and sides are inserted into every triangle,
-three times. Of 17,040 triangles 7,827 have an angle below 1°. The smallest angle is 6.5e-9°.
-
-Tutte's embedding alone maps it onto the disk, in any reference triangles. The map onto G takes 9 iterations on a coarse
-mesh. On the fine mesh VectorAdam alone with tanh takes 13 iterations in the rest triangles, 17 in corrected ones and 21
-in equilateral ones. With si-log it takes 110 in the rest triangles. In the other two it leaves triangles inverted after
-a thousand iterations.
+Almost half of the triangles have an angle below 1°. The map of the cactus is injective all the same.
 """
 
 from __future__ import annotations
@@ -41,7 +34,7 @@ def cactus(x: FloatArray) -> FloatArray:
     return join(0.12, trunk, left, right)
 
 
-def spoiled(V: FloatArray, F: IntArray, height: float, rounds: int = 3) -> tuple[FloatArray, IntArray]:
+def make_slivers(V: FloatArray, F: IntArray, height: float, rounds: int = 3) -> tuple[FloatArray, IntArray]:
     """Insert points near corners and sides into the triangles below a height, in several rounds: needles and caps."""
     random = np.random.default_rng(22)
     for _ in range(rounds):
@@ -62,16 +55,16 @@ def least_angles(V: FloatArray, F: IntArray) -> FloatArray:
     return np.degrees(np.arctan2(sines, (sides * other).sum(axis=2))).min(axis=1)
 
 
-def solved(problem: Problem, parameterisation: str, reference: Reference) -> int | None:
+def count_iterations(problem: Problem, parameterisation: str, reference: Reference) -> int | None:
     """Iterations of VectorAdam alone to the first injective map, or None after a thousand."""
     stage = VectorAdam(parameterisation=parameterisation, reference=reference, iterations=1000)
     result = solve(problem, strategy=[stage], max_iterations=1000)
-    return result.iterations if result.injective else None
+    return result.n_iterations if result.injective else None
 
 
 def main(output: Path, size: int = 44) -> dict[str, Any]:
     figure, (axes,) = panels(1, 4, (3.2, 4.0))
-    V, F = spoiled(*standing(cactus, (-1.15, -0.5, -0.6), (1.05, 2.4, 0.6), size), height=-0.15)
+    V, F = make_slivers(*standing(cactus, (-1.15, -0.5, -0.6), (1.05, 2.4, 0.6), size), height=-0.15)
     angles = least_angles(V, F)
     plot_surface(V, F, axes[0])
     axes[0].set_title(f"{len(F):,} triangles,\nleast angle {angles.min():.1e}°", size=10)
@@ -92,12 +85,12 @@ def main(output: Path, size: int = 44) -> dict[str, Any]:
         else:
             problem = onto(V, F, targets.disk())
         result = solve(problem)
-        show(ax, problem, result.uv, f"onto {name}: iterations {result.iterations}")
+        show(ax, problem, result.uv, f"onto {name}: iterations {result.n_iterations}")
         numbers[name] = {
             "flips": flips(problem, result.uv),
-            "iterations": result.iterations,
+            "iterations": result.n_iterations,
             "alone": {
-                f"{p}, {reference}": solved(problem, p, reference)
+                f"{p}, {reference}": count_iterations(problem, p, reference)
                 for p in ("tanh", "si-log")
                 for reference in ("equilateral", "corrected", "rest")
             },

@@ -1,38 +1,8 @@
-"""Beyond det A = 1: tensors of two Beltrami coefficients, and the boundary's condition (§8.1, §D)
-===============================================================================================
+"""Tensors of two Beltrami coefficients
+=======================================
 
-This example is theory for study; the solver uses none of it. The figure shows Proposition D.2's ``s`` along the
-boundary of a disk, for Tutte's embedding onto a star and for an injective map. It is negative exactly where the
-triangle at the boundary edge is inverted. The injective map is also the conjugate quasi-harmonic map of tensors with
-random determinants.
-
-For any elliptic A, the equations ``∇·(A∇u) = 0`` and ``∇v = * A ∇u`` are one complex Beltrami equation for
-``f = u + i v``::
-
-    f_z̄ = μ f_z + ν conj(f_z),      |μ| + |ν| < 1,      * = [[0, −1], [1, 0]],
-
-and with ``d = |1 + ν|² − |μ|²``::
-
-        1  ⎡ |1 − μ|² − |ν|²     2 Im(ν − μ)     ⎤                       1         ⎡ a22 − a11 − i (a12 + a21) ⎤
-    A = ─  ⎢                                     ⎥ ,   [μ, ν] = ──────────────── · ⎢                           ⎥
-        d  ⎣ −2 Im(ν + μ)        |1 + μ|² − |ν|² ⎦               1 + tr A + det A  ⎣ 1 − det A + i (a12 − a21) ⎦
-
-as in Astala, Iwaniec and Martin (2008, §16.1). The paper's eq. 32 has ``−2 Im μ`` in both off-diagonal entries and
-calls ν complex. This is right for real ν, which belongs to symmetric tensors (three numbers a triangle: μ and ν). For
-complex ν it keeps only the symmetric part, and the Beltrami equation fails. Determinant and eigenvalues are::
-
-    det A = (|1 − ν|² − |μ|²) / (|1 + ν|² − |μ|²)
-    eigenvalues (1 + |μ| − ν) / (1 − |μ| + ν) and (1 − |μ| − ν) / (1 + |μ| + ν)       for real ν
-
-So for symmetric A the condition det A = 1 is ν = 0, and A is eq. 33.
-
-The solver uses ν = 0 alone: one complex number per triangle and the same tensor for u and for v. No map is lost by this
-(Theorem 6.4). With ν ≠ 0 the same holds for conjugate maps. Any map without inverted triangles is the conjugate
-quasi-harmonic map of *every* pair that satisfies the Beltrami equation on its triangles. So ν adds freedom that no map
-needs.
-
-The tensors are given in the frames of the reference triangles (`ReferenceMesh`), without the area factor. In a frame
-turned by φ, μ becomes ``μ e^{−2iφ}`` and ν is unchanged.
+Proposition D.2's ``s`` along the boundary, for Tutte's embedding and an injective map. It is negative exactly where a
+boundary triangle is inverted (red). The solver does not use these tensors.
 """
 
 from __future__ import annotations
@@ -50,7 +20,40 @@ from quasiharmonic import Problem, boundary_loops, quasi_harmonic_map, solve
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.geometry.mesh.reference import Reference, ReferenceMesh
 from quasiharmonic.surfaces import disk
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, named
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, names_of
+
+# This example is theory for study; the solver uses none of it. The figure shows Proposition D.2's ``s`` along the
+# boundary of a disk, for Tutte's embedding onto a star and for an injective map. It is negative exactly where the
+# triangle at the boundary edge is inverted. The injective map is also the conjugate quasi-harmonic map of tensors with
+# random determinants.
+#
+# For any elliptic A, the equations ``∇·(A∇u) = 0`` and ``∇v = * A ∇u`` are one complex Beltrami equation for
+# ``f = u + i v``
+#
+#     f_z̄ = μ f_z + ν conj(f_z),      |μ| + |ν| < 1,      * = [[0, −1], [1, 0]],
+#
+# and with ``d = |1 + ν|² − |μ|²``
+#
+#         1  ⎡ |1 − μ|² − |ν|²     2 Im(ν − μ)     ⎤                       1         ⎡ a22 − a11 − i (a12 + a21) ⎤
+#     A = ─  ⎢                                     ⎥ ,   [μ, ν] = ──────────────── · ⎢                           ⎥
+#         d  ⎣ −2 Im(ν + μ)        |1 + μ|² − |ν|² ⎦               1 + tr A + det A  ⎣ 1 − det A + i (a12 − a21) ⎦
+#
+# as in Astala, Iwaniec and Martin (2008, §16.1). The paper's eq. 32 has ``−2 Im μ`` in both off-diagonal entries and
+# calls ν complex. This is right for real ν, which belongs to symmetric tensors (three numbers a triangle: μ and ν). For
+# complex ν it keeps only the symmetric part, and the Beltrami equation fails. Determinant and eigenvalues are
+#
+#     det A = (|1 − ν|² − |μ|²) / (|1 + ν|² − |μ|²)
+#     eigenvalues (1 + |μ| − ν) / (1 − |μ| + ν) and (1 − |μ| − ν) / (1 + |μ| + ν)       for real ν
+#
+# So for symmetric A the condition det A = 1 is ν = 0, and A is eq. 33.
+#
+# The solver uses ν = 0 alone: one complex number per triangle and the same tensor for u and for v. No map is lost by
+# this (Theorem 6.4). With ν ≠ 0 the same holds for conjugate maps. Any map without inverted triangles is the conjugate
+# quasi-harmonic map of *every* pair that satisfies the Beltrami equation on its triangles. So ν adds freedom that no
+# map needs.
+#
+# The tensors are given in the frames of the reference triangles (`ReferenceMesh`), without the area factor. In a frame
+# turned by φ, μ becomes ``μ e^{−2iφ}`` and ν is unchanged.
 
 
 def beltrami_tensor(mu: ArrayLike, nu: ArrayLike) -> FloatArray:
@@ -74,7 +77,7 @@ def beltrami_tensor(mu: ArrayLike, nu: ArrayLike) -> FloatArray:
     mu, nu = np.broadcast_arrays(np.asarray(mu, dtype=np.complex128), np.asarray(nu, dtype=np.complex128))
     bad = np.flatnonzero(~(np.abs(mu) + np.abs(nu) < 1))
     if bad.size:
-        raise ValueError(f"|μ| + |ν| must be below 1, but is not at {named('entry', 'entries', bad)}")
+        raise ValueError(f"|μ| + |ν| must be below 1, but is not at {names_of('entry', 'entries', bad)}")
     square = np.abs(nu) ** 2
     A = np.empty((*mu.shape, 2, 2))
     A[..., 0, 0] = np.abs(1 - mu) ** 2 - square
@@ -312,7 +315,7 @@ def _elliptic(A: ArrayLike, f: int) -> FloatArray:
     both = A + np.swapaxes(A, 1, 2)
     bad = np.flatnonzero(~((both[:, 0, 0] > 0) & (both[:, 0, 0] * both[:, 1, 1] > both[:, 0, 1] ** 2)))
     if bad.size:
-        raise ValueError(f"A is not positive definite on {named('triangle', 'triangles', bad)}")
+        raise ValueError(f"A is not positive definite on {names_of('triangle', 'triangles', bad)}")
     return A
 
 

@@ -1,17 +1,8 @@
-"""A network that learns to flatten a family of surfaces such that their landmarks meet
-====================================================================================
+"""A network that aligns landmarks
+==================================
 
-The faces are disks with two bumps and a ridge between them, at varying positions. Each face has four landmarks: the
-tops of the bumps and the ends of the ridge. A small network reads features of every triangle (its position, its slope
-and its distances to the landmarks) and returns the Beltrami coefficient of a tensor.
-``quasiharmonic.torch.quasi_harmonic_map`` is a layer that maps the face onto the unit disk with these tensors. The loss
-is the distance of the landmarks from those of the mean face. Its gradient passes through the map into the network.
-
-At the default size there are 60 training faces and 12 test faces. The root-mean-square distance of the test faces'
-landmarks from their targets is 0.24 with identity tensors, and 0.11 after 150 steps. No map of a test face has an
-inverted triangle. Top: faces in space; middle: flattened before training; bottom: flattened after training.
-
-``pip install torch``; the library itself does not need it.
+A small network learns tensors for which the landmarks of many surfaces coincide in the plane (PyTorch). Top: surfaces;
+middle: maps before training; bottom: after.
 """
 
 from __future__ import annotations

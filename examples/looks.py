@@ -1,10 +1,7 @@
-"""Ways to look at a map: distortion, a checkerboard, the way there, a window
-==========================================================================
+"""Ways to draw a map
+=====================
 
-The map of a cat's head onto the letter R, drawn as by ``qhm plot`` and ``qhm view``. ``--kind distortion`` colours the
-triangles by their stretch and adds a histogram. ``--kind texture`` draws a checkerboard on the surface, which shows
-where the map changes angles or sizes. The window shows both in 3D (polyscope, the extra ``view``). The animation shows
-the search: ``record_every=1`` records every iteration's map, and inverted triangles are red.
+Distortion, a checkerboard, and an animation of the search in which inverted triangles are red.
 """
 
 from __future__ import annotations
@@ -34,7 +31,7 @@ def main(output: Path, size: int = 24, window: bool = False) -> dict[str, Any]:
         "frames": len(frames),
         "inverted at first": int(result.history[0].inverted),
         "inverted": int(result.history[-1].inverted),
-        "median stretch": float(distortion(V, F, result.uv).summary("isometric").median),
+        "median stretch": float(distortion(V, F, result.uv).statistics("isometric").median),
     }
     if window and find_spec("polyscope") is not None:
         show(V, F, result.uv, screenshot=output / "looks_window.png")

@@ -1,12 +1,7 @@
-"""A sewing pattern: a plush fish of four panels, flattened and written true to scale with a seam allowance
-============================================================================================================
+"""A sewing pattern
+===================
 
-The body of a fish, 30 cm long, is cut along its back, its belly and its sides. The upper panels have a hole for an eye.
-Each panel is flattened separately, true to scale and bijectively. All four go into one drawing, ``pattern.svg``. Its
-dashed lines are the seams; the outer lines, 7 mm outside, are the cutting lines. The drawing is printed at full size.
-For a name that ends in ``.dxf``, ``write_pattern`` writes a DXF drawing. Cloth stretches by a few percent, and the
-colours show that the changes of length are about as small. Two sides that are sewn together must be equally long. Along
-the sides of the fish they differ by 0.5 mm in 327, and along the back and the belly by less than 0.01 mm.
+A plush fish of four panels, flattened to scale and written with a seam allowance. Colours show changes of length.
 """
 
 from __future__ import annotations
@@ -21,8 +16,7 @@ from matplotlib.colors import TwoSlopeNorm
 from numpy.typing import NDArray
 
 from common import INK, FloatArray, colorbar, panels, run, save
-from quasiharmonic import distortion, surfaces
-from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic import distortion, flatten, surfaces
 from quasiharmonic.apps.flattening.patterns import pattern, write_pattern
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.ui.plot.shading import lit

@@ -1,12 +1,8 @@
-"""A cheese with holes pushed through an hourglass: collision avoidance while time goes on
-========================================================================================
+"""Collision avoidance over time
+================================
 
-A piston moves down and pushes a cheese with five holes into the neck of an hourglass. At every step piston, cheese
-(blue) and air (yellow) are one mesh that is certified bijective, so nothing overlaps. This includes the holes, whose
-walls come close to each other. The air is triangulated again at every step and has a thousandth of the weight. No
-collision detection or response is needed. In `figure_20` a figure is pressed into its target in one step.
-
-The example also writes an animation, ``piston.gif``, beside the figure of six steps.
+A piston pushes a cheese with holes into an hourglass. All parts and the air form one bijective mesh, so nothing
+overlaps.
 """
 
 from __future__ import annotations
@@ -23,8 +19,9 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from common import panels, run, save
-from quasiharmonic import AirMesh, AirMeshState
+from quasiharmonic import AirMesh
 from quasiharmonic.plot import save_figures
+from quasiharmonic.results import AirMeshState
 from quasiharmonic.util.arrays import FloatArray
 
 HOLES = np.array([(0.0, 0.35, 0.2), (-0.42, 0.08, 0.17), (0.4, 0.02, 0.19), (-0.12, -0.42, 0.21), (0.3, -0.55, 0.1)])

@@ -1,10 +1,7 @@
-"""A UV map with flips, repaired in place: two islands, seams kept, only what must move moves
-=============================================================================================
+"""A UV map repaired
+====================
 
-A cat's head is cut along its middle into two islands, as in a modelling program. In one island a few vertices were
-dragged, and the other was scrambled with a brush: 91 triangles are inverted. After the repair no triangle is inverted.
-Of the 117 displaced vertices, 60 move (the dots), and no other vertex moves. The boundaries are unchanged to the last
-bit.
+Two islands with inverted triangles (red), before and after ``repair``. Dots are the vertices that moved.
 """
 
 from __future__ import annotations

@@ -57,14 +57,14 @@ def carve(smooth: float, field: FloatArray, *others: FloatArray) -> FloatArray:
     return -join(smooth, -field, *others)
 
 
-def mirrored(x: FloatArray) -> FloatArray:
+def mirror(x: FloatArray) -> FloatArray:
     """Reflect points to x ≥ 0, so that a field evaluated there is symmetric."""
     return np.concatenate([np.abs(x[..., :1]), x[..., 1:]], axis=-1)
 
 
 def bust(x: FloatArray) -> FloatArray:
     """A head with shoulders."""
-    s = mirrored(x)
+    s = mirror(x)
     skull = join(0.15, ball(x, (0, 1.32, -0.06), (0.40, 0.47, 0.48)), ball(x, (0, 1.08, 0.16), (0.29, 0.36, 0.27)))
     face = carve(0.10, skull, ball(s, (0.16, 1.24, 0.50), (0.12, 0.075, 0.12)))
     face = join(0.04, face, ball(s, (0.155, 1.235, 0.365), (0.075, 0.06, 0.06)))
@@ -117,7 +117,7 @@ def hand(x: FloatArray) -> FloatArray:
 
 def rabbit(x: FloatArray) -> FloatArray:
     """A sitting rabbit."""
-    s = mirrored(x)
+    s = mirror(x)
     body = join(0.35, ball(x, (0, 0.42, -0.30), (0.50, 0.52, 0.62)), ball(x, (0, 0.55, 0.15), (0.36, 0.44, 0.38)))
     body = join(0.10, body, ball(s, (0.40, 0.26, -0.38), (0.20, 0.36, 0.40)))
     body = join(
@@ -139,7 +139,7 @@ def rabbit(x: FloatArray) -> FloatArray:
 
 def gargoyle(x: FloatArray) -> FloatArray:
     """A gargoyle crouching on its plinth, with wings half spread."""
-    s = mirrored(x)
+    s = mirror(x)
     body = join(0.25, ball(x, (0, 0.50, -0.05), (0.38, 0.60, 0.34)), ball(x, (0, 0.95, 0.08), (0.40, 0.30, 0.30)))
     legs = join(
         0.1,
@@ -197,7 +197,7 @@ def gargoyle(x: FloatArray) -> FloatArray:
 
 def angel(x: FloatArray) -> FloatArray:
     """An angel with a torch, on a round base."""
-    s = mirrored(x)
+    s = mirror(x)
     folds = 0.035 * np.sin(11 * np.arctan2(x[..., 0], x[..., 2])) * np.clip(1.1 - x[..., 1], 0, 1)
     robe = cone(x, (0, -0.2, 0), (0, 1.25, 0), 0.60, 0.20) * 0.92 + folds
     chest = join(0.15, ball(x, (0, 1.42, 0.0), (0.30, 0.34, 0.21)), ball(s, (0.24, 1.60, 0.0), (0.15, 0.12, 0.14)))
@@ -247,7 +247,7 @@ def arm(x: FloatArray, points: FloatArray, thick: float, thin: float) -> FloatAr
 
 def octopus(x: FloatArray) -> FloatArray:
     """A walking octopus, each of whose eight arms is curled differently."""
-    s = mirrored(x)
+    s = mirror(x)
     head = join(0.25, ball(x, (0, 1.02, -0.24), (0.44, 0.56, 0.46), 0.35, 0), ball(x, (0, 0.46, 0), (0.36, 0.26, 0.36)))
     head = join(0.05, head, ball(s, (0.20, 0.76, 0.29), (0.12, 0.13, 0.12)))
     arms = []
@@ -264,7 +264,7 @@ def octopus(x: FloatArray) -> FloatArray:
 
 def armadillo(x: FloatArray) -> FloatArray:
     """An armadillo that stands on its hind legs with raised arms."""
-    s = mirrored(x)
+    s = mirror(x)
     trunk = join(0.2, ball(x, (0, 0.98, -0.05), (0.44, 0.58, 0.42)), ball(x, (0, 1.42, 0.02), (0.34, 0.32, 0.32)))
     # The banded shell.
     shell = ball(x, (0, 1.08, -0.16), (0.50, 0.72, 0.46)) + 0.022 * np.cos(26 * (x[..., 1] + 0.25 * x[..., 2]))
@@ -371,7 +371,7 @@ def surface_net(field: Field, low: ArrayLike, high: ArrayLike, step: float) -> t
     for axis in range(3):
         ends = np.moveaxis(values, axis, 0)[[0, -1]]
         np.moveaxis(values, axis, 0)[[0, -1]] = np.maximum(ends, step)
-    values = well_composed(values, 0.01 * step)
+    values = make_well_composed(values, 0.01 * step)
     inside = values < 0
     cells = np.array(values.shape) - 1
     total, count = np.zeros((*cells, 3)), np.zeros(cells, dtype=int)
@@ -403,7 +403,7 @@ def surface_net(field: Field, low: ArrayLike, high: ArrayLike, step: float) -> t
     return V, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def well_composed(values: FloatArray, depth: float) -> FloatArray:
+def make_well_composed(values: FloatArray, depth: float) -> FloatArray:
     """Fill grid points where the solid touches itself at an edge or a corner, so that its surface is a manifold."""
     values = values.copy()
     corners = np.array(list(np.ndindex(2, 2, 2)))
@@ -415,7 +415,7 @@ def well_composed(values: FloatArray, depth: float) -> FloatArray:
         solid = values < 0
         bad = np.zeros(np.array(values.shape) - 1, dtype=bool)
         for pair, rest in opposite:
-            here, there = (np.array([solid[shifted(c, solid.shape)] for c in which]) for which in (pair, rest))
+            here, there = (np.array([solid[corner_slices(c, solid.shape)] for c in which]) for which in (pair, rest))
             bad |= here.all(axis=0) & ~there.any(axis=0)
             bad |= ~here.any(axis=0) & there.all(axis=0)
         if not bad.any():
@@ -425,7 +425,7 @@ def well_composed(values: FloatArray, depth: float) -> FloatArray:
             cell[cell == np.where(cell < 0, np.inf, cell).min()] = -depth
 
 
-def shifted(corner: IntArray, shape: tuple[int, ...]) -> tuple[slice, ...]:
+def corner_slices(corner: IntArray, shape: tuple[int, ...]) -> tuple[slice, ...]:
     """The slices that select one corner of every cell of a grid."""
     return tuple(slice(c, n - 1 + c) for c, n in zip(corner, shape, strict=True))
 

@@ -1,14 +1,8 @@
-"""A photo warped by landmarks, without folds: corners of eyes and mouth pulled about, the border of the photo in place
-=======================================================================================================================
+"""A photo warped by landmarks
+==============================
 
-To warp your own photo, pass the file and a text file with a line ``x y x' y'`` for each landmark. These are its
-position and its target position, in pixels from the upper left corner::
-
-    python examples/warped_photo.py --photo me.jpg --landmarks points.txt
-
-A polynomial or thin-plate warp folds over itself if landmarks move far relative to each other. This warp cannot fold,
-because the map is certified bijective. Without arguments the example makes Grace Hopper smile (the photo comes with
-matplotlib). It also turns a small patch about its centre by 120°, which warps based on single displacements cannot do.
+The border stays fixed and nothing folds. For your own photo: ``python examples/warped_photo.py --photo me.jpg
+--landmarks points.txt``, with a line ``x y x' y'`` for each landmark.
 """
 
 from __future__ import annotations
@@ -72,7 +66,7 @@ def main(output: Path, photo: Path | None = None, landmarks: Path | None = None)
         "pixels": list(image.shape[:2]),
         "landmarks": len(moves),
         "bijective": warped.result.certificate.bijective,
-        "iterations": warped.result.iterations,
+        "iterations": warped.result.n_iterations,
     }
 
 

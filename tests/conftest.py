@@ -49,11 +49,11 @@ def rng():
 
 
 @pytest.fixture
-def troubled(monkeypatch):
+def failing_worker(monkeypatch):
     """Solve data sets in a process that fails or hangs as the names of the problems say."""
     from quasiharmonic.ui.batch import supervisor
-    from shared.commands import TROUBLED
+    from shared.commands import FAILING_WORKER
 
-    monkeypatch.setattr(supervisor, "COMMAND", TROUBLED)
+    monkeypatch.setattr(supervisor, "COMMAND", FAILING_WORKER)
     # If several problems together make no progress, soon solve them one by one.
     monkeypatch.setattr(supervisor, "TOGETHER", 1.0)

@@ -9,7 +9,7 @@ import campaign
 import outlines
 import problems
 from quasiharmonic import Problem, boundary_loops, certify
-from quasiharmonic.geometry.exact.loops import judge_loops
+from quasiharmonic.geometry.exact.loops import check_loops
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +28,7 @@ def sides(case):
 
 @pytest.mark.parametrize("family", problems.ADVERSARIAL)
 @pytest.mark.parametrize("difficulty", [0.0, 0.4, 0.8])
-def test_a_problem_is_well_formed_and_has_the_solution_it_was_made_from(family, difficulty):
+def test_a_problem_is_well_formed_and_has_its_known_solution(family, difficulty):
     case = made(family, difficulty)
     problem = Problem(case.V, case.F, case.fixed, case.target)
     assert case.feasible == (family not in UNKNOWN)
@@ -44,14 +44,14 @@ def test_a_problem_is_well_formed_and_has_the_solution_it_was_made_from(family, 
         np.testing.assert_array_equal(one, other)
 
 
-def test_the_families_published_are_the_same():
+def test_the_published_families_are_unchanged():
     """The order and names of the families determine the names of a campaign's problems, and those the problems."""
     published = "noise jam flow swirl adrift pins spiral comb maze limbs carved polygon star whirl teeth glyph moved"
     assert list(problems.FAMILIES) == published.split()
     assert not set(problems.FAMILIES) & set(problems.ADVERSARIAL)
 
 
-def test_needles_are_a_million_times_as_long_as_wide():
+def test_needles_have_an_aspect_ratio_of_a_million():
     case = problems.make("needles", 1, 1.0, triangles=60)
     spread = np.linalg.svd(case.target - case.target.mean(axis=0), compute_uv=False)
     assert spread[0] / spread[1] > 1e5
@@ -78,7 +78,7 @@ def test_hilberts_curve_visits_every_cell_once_and_steps_by_one():
     np.testing.assert_allclose(abs(np.diff(curve)), 1)
 
 
-def test_a_strip_along_hilberts_curve_keeps_clear_of_itself():
+def test_a_strip_along_hilberts_curve_does_not_touch_itself():
     case = made("hilbert")
     assert case.simple
     # A box of 16 × 16 cells; the strip turns in nearly all of them.
@@ -122,7 +122,7 @@ def test_a_sieve_has_ninety_holes(difficulty, holes):
     assert len(boundary_loops(case.F, len(case.V))) == 1 + holes
 
 
-def test_three_thousand_pins_are_held():
+def test_three_thousand_vertices_are_pinned():
     case = made("nailed")
     assert Problem(case.V, case.F, case.fixed, case.target).domain.pins.size > 2900
 
@@ -141,17 +141,17 @@ def test_scales_reach_the_ends_of_doubles():
 @pytest.mark.parametrize("difficulty", [0.1, 0.5, 0.95])
 def test_outlines_are_simple(family, difficulty):
     target = made(family, difficulty).target
-    meeting, reasons = judge_loops([np.arange(len(target))], target)
+    meeting, reasons = check_loops([np.arange(len(target))], target)
     assert not len(meeting)
     assert not reasons
 
 
-def test_a_snowflake_is_reached_in_every_corner():
+def test_a_snowflake_is_reached_at_every_corner():
     target = made("snowflake", 0.6).target @ (1, 1j)
     assert abs(outlines.koch(3)[:, None] - target).min(axis=1).max() < 1e-12
 
 
-def test_a_campaign_of_them_is_run_by_a_word(tmp_path, capsys):
+def test_an_option_runs_a_campaign_of_these_families(tmp_path, capsys):
     output = tmp_path / "results.jsonl"
     assert campaign.main(["--adversarial", "-n", "2", "-o", str(output)]) == 0
     assert [record["family"] for record in campaign.read(output)] == ["needles", "sizes"]

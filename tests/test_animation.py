@@ -10,7 +10,7 @@ import pytest
 
 from quasiharmonic import Problem, Status, animate, boundary_loops, certify, io, polish
 from quasiharmonic.apps.animation.frames import FrameStep
-from quasiharmonic.energies.newton.proximal import Nearness
+from quasiharmonic.energies.newton.proximal import ProximalPenalty
 from quasiharmonic.surfaces import cat, disk
 from quasiharmonic.ui.cli import main
 
@@ -33,9 +33,9 @@ def turning_stars(count, frames, depth=0.7):
     return np.array(outlines)
 
 
-def test_nearness_against_differences():
+def test_proximal_penalty_against_differences():
     rng = np.random.default_rng(0)
-    near = Nearness(3.0, 0.7)
+    near = ProximalPenalty(3.0, 0.7)
     away = rng.normal(size=40) + 1j * rng.normal(size=40)
     away[0] = 0
     h = 1e-6
@@ -52,7 +52,7 @@ def test_nearness_against_differences():
             assert second[v] == pytest.approx(slope, abs=1e-7)
 
 
-def test_frames_are_certified_and_follow(head):
+def test_frames_are_certified_and_follow_the_target(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 24)
     animation = animate(Problem(V, F, loop, targets[0]), targets)
@@ -66,7 +66,7 @@ def test_frames_are_certified_and_follow(head):
 
 
 @pytest.mark.parametrize(("pinned", "most"), [(False, 2), (True, 5)])
-def test_frames_that_are_searched_for_stay_near(pinned, most):
+def test_searched_frames_stay_close_to_the_previous_one(pinned, most):
     """If a frame cannot start from the last frame's map, the search stays as close to it as possible."""
     V, F = cat(10 if pinned else 14)
     held = loop = boundary_loops(F, len(V))[0]
@@ -77,12 +77,12 @@ def test_frames_that_are_searched_for_stay_near(pinned, most):
         targets = np.concatenate([targets, np.zeros((40, 1, 2))], axis=1)
     animation = animate(Problem(V, F, held, targets[0]), targets)
     assert animation.found.all()
-    assert any(frame.iterations for frame in animation.frames[1:])
+    assert any(frame.n_iterations for frame in animation.frames[1:])
     assert animation.largest_move <= most
 
 
 @pytest.mark.slow
-def test_polished_frames_do_not_leap(head):
+def test_polished_frames_do_not_jump(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 24)
     problem = Problem(V, F, loop, targets[0])
@@ -94,7 +94,7 @@ def test_polished_frames_do_not_leap(head):
 
 
 @pytest.mark.slow
-def test_the_sweeps_are_what_shortens_leaps(head):
+def test_the_sweeps_shorten_jumps(head):
     """The limit on motion cannot be met by the forward sweep alone."""
     V, F, loop = head
     targets = turning_stars(len(loop), 12, depth=0.85)
@@ -109,7 +109,7 @@ def test_the_sweeps_are_what_shortens_leaps(head):
     assert loose.energies.mean() < tight.energies.mean()
 
 
-def test_a_boundary_that_rests(head):
+def test_a_boundary_without_motion(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 8)[[0, 0, 1, 2, 2, 2, 3]]
     animation = animate(Problem(V, F, loop, targets[0]), targets, polish="mips")
@@ -129,7 +129,7 @@ def backwards(head):
 
 
 @pytest.mark.parametrize("energy", [None, "symmetric-dirichlet"])
-def test_an_impossible_frame_is_told_with_its_reason(backwards, energy):
+def test_an_impossible_frame_is_reported_with_its_reason(backwards, energy):
     problem, targets = backwards
     animation = animate(problem, targets, polish=energy)
     assert np.flatnonzero(~animation.found).tolist() == [4]
@@ -138,11 +138,11 @@ def test_an_impossible_frame_is_told_with_its_reason(backwards, energy):
     assert "frame 4: " in animation.summary()
     assert animation.to_dict()["missing"] == [4]
     # The search stops as soon as the frame is known to be impossible.
-    assert animation.frames[4].iterations <= 10
+    assert animation.frames[4].n_iterations <= 10
     json.dumps(animation.to_dict(), allow_nan=False)
 
 
-def test_a_frame_that_crosses_itself_is_told(head):
+def test_a_frame_that_crosses_itself_is_reported(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 5, depth=0.4)
     targets[2, :3] = targets[2, [2, 1, 0]]
@@ -151,7 +151,7 @@ def test_a_frame_that_crosses_itself_is_told(head):
     assert "frame 2" in animation.summary()
 
 
-def test_an_impossible_frame_is_bridged(backwards):
+def test_an_impossible_frame_is_interpolated(backwards):
     problem, targets = backwards
     animation = animate(problem, targets, fill_gaps=True)
     assert animation.found.all()
@@ -160,14 +160,14 @@ def test_an_impossible_frame_is_bridged(backwards):
     assert "between their neighbours: frame 4" in animation.summary()
 
 
-def test_the_first_frame_has_none_before_it(backwards):
+def test_the_first_frame_has_no_previous_one(backwards):
     problem, targets = backwards
     animation = animate(problem, targets[4:], fill_gaps=True)
     assert np.flatnonzero(~animation.found).tolist() == [0]
     assert not animation.bridged.any()
 
 
-def test_wrong_targets_are_named(head):
+def test_invalid_targets_are_named(head):
     V, F, loop = head
     targets = list(turning_stars(len(loop), 60))
     problem = Problem(V, F, loop, targets[0])
@@ -189,7 +189,7 @@ def test_wrong_targets_are_named(head):
         animate(V, targets[:2])
 
 
-def test_wrong_options_are_told(head):
+def test_invalid_options_are_reported(head):
     V, F, loop = head
     problem = Problem(V, F, loop, V[loop, :2])
     targets = turning_stars(len(loop), 2)
@@ -200,7 +200,7 @@ def test_wrong_options_are_told(head):
         animate(problem, targets, max_motion_ratio=2)
 
 
-def test_what_is_given_is_not_changed(head):
+def test_inputs_are_not_changed(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 4).astype(np.float32)
     before = targets.copy()
@@ -228,7 +228,7 @@ def test_interrupted_before_the_first_frame(head, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("quasiharmonic.apps.animation.following.solve", interrupted)
+    monkeypatch.setattr("quasiharmonic.apps.animation.frame_search.solve", interrupted)
     targets = turning_stars(len(loop), 3)
     animation = animate(Problem(V, F, loop, targets[0]), targets, polish="mips", fill_gaps=True)
     assert animation.interrupted
@@ -240,7 +240,7 @@ def test_interrupted_before_the_first_frame(head, monkeypatch):
 
 
 @pytest.mark.parametrize("sweep", [0, 1])
-def test_interrupted_with_what_is_there(head, sweep):
+def test_interrupted_with_the_finished_frames(head, sweep):
     V, F, loop = head
     targets = turning_stars(len(loop), 12, depth=0.85)
 
@@ -299,7 +299,7 @@ def test_the_command(head, tmp_path, capsys):
     assert len(list(second.iterdir())) == 5
 
 
-def test_what_the_command_refuses(head, tmp_path, capsys):
+def test_errors_of_the_command(head, tmp_path, capsys):
     V, F, _ = head
     surface = tmp_path / "head.obj"
     io.write_obj(surface, io.MeshData(V, F))
@@ -325,7 +325,7 @@ def test_what_the_command_refuses(head, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_film_that_cannot_be_written_is_told_before_the_work(head, tmp_path, capsys, monkeypatch):
+def test_an_unwritable_film_is_reported_before_the_work(head, tmp_path, capsys, monkeypatch):
     V, F, loop = head
     io.write_obj(tmp_path / "head.obj", io.MeshData(V, F))
     (tmp_path / "held.txt").write_text("\n".join(map(str, loop)))

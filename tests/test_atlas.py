@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from quasiharmonic import atlas, io
-from quasiharmonic.geometry.exact.convexity import not_convex
-from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.exact.convexity import find_concave
+from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.surfaces import grid, starfish
 from shared.commands import run
 from shared.meshes import lift
-from shared.seamed import strips
+from shared.seam_meshes import strips
 
 
 def seamed(path, mirrored=None, stacked=False):
@@ -57,12 +57,12 @@ class TestCommands:
             ["map", "--to", "disk"],
             ["flatten"],
             ["flatten", "--start"],
-            ["flatten", "--pack", "--margin", "0.02"],
+            ["flatten", "--pack", "--padding", "20"],
             ["repair"],
         ],
         ids=" ".join,
     )
-    def test_every_island_is_injective_and_the_model_stays(self, source, tmp_path, command):
+    def test_every_island_is_injective_and_the_surface_is_unchanged(self, source, tmp_path, command):
         out, told = tmp_path / "out.obj", tmp_path / "told.json"
         assert run(command[0], source, "-o", out, "--json", told, *command[1:]) == 0
         verdict = atlas.certify(io.mapped(io.read_mesh(out)))
@@ -79,7 +79,7 @@ class TestCommands:
             assert uv.max() <= 1
             assert not len(verdict.overlapping)
 
-    def test_borders_are_kept_or_free(self, source, tmp_path):
+    def test_borders_are_fixed_or_free(self, source, tmp_path):
         before = io.mapped(io.read_mesh(source))
         energy = {}
         for name, options in {"kept": [], "free": ["--free"]}.items():
@@ -120,7 +120,7 @@ class TestCommands:
             ("0 100\n", "not an edge of the mesh, so it cannot be cut"),
         ],
     )
-    def test_bad_lists_of_edges(self, source, tmp_path, capsys, text, words):
+    def test_invalid_lists_of_edges(self, source, tmp_path, capsys, text, words):
         (tmp_path / "edges.txt").write_text(text)
         assert run("flatten", source, "-o", tmp_path / "out.obj", "--seams", tmp_path / "edges.txt") == 2
         assert words in capsys.readouterr().err
@@ -134,7 +134,7 @@ class TestCommands:
 
 
 class TestMirroredAndStacked:
-    def test_a_mirrored_island_stays_so_and_is_told(self, tmp_path, capsys):
+    def test_a_mirrored_island_stays_mirrored_and_is_reported(self, tmp_path, capsys):
         before = seamed(tmp_path / "in.obj", mirrored=1)
         assert run("check", tmp_path / "in.obj") == 1
         assert "Mirrored, every triangle negative: island 1" in capsys.readouterr().out
@@ -146,7 +146,7 @@ class TestMirroredAndStacked:
             rim = boundary(before.islands[1])
             assert np.array_equal(after.islands[1].uv[rim], before.islands[1].uv[rim])
 
-    def test_a_mirrored_island_is_measured_as_the_other_side_shows_it(self, tmp_path, capsys):
+    def test_a_mirrored_island_is_measured_from_the_other_side(self, tmp_path, capsys):
         seamed(tmp_path / "in.obj")
         run("measure", tmp_path / "in.obj", "--json", tmp_path / "straight.json")
         seamed(tmp_path / "in.obj", mirrored=1)
@@ -159,12 +159,12 @@ class TestMirroredAndStacked:
         assert "inf" not in said
         assert "strictly positive" not in said
 
-    def test_flattened_anew_nothing_is_mirrored(self, tmp_path):
+    def test_flattening_mirrors_no_island(self, tmp_path):
         seamed(tmp_path / "in.obj", mirrored=1)
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
         assert not atlas.certify(io.mapped(io.read_mesh(tmp_path / "out.obj"))).mirrored.size
 
-    def test_islands_over_one_another_are_told_and_left(self, tmp_path, capsys):
+    def test_overlapping_islands_are_reported_and_left(self, tmp_path, capsys):
         seamed(tmp_path / "in.obj", stacked=True)
         assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
         assert "Islands overlap or touch each other" in capsys.readouterr().out
@@ -201,7 +201,7 @@ class TestCut:
         assert "nothing to cut" in capsys.readouterr().out
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--cut") == 0
 
-    def test_quads_are_cut_between_each_other_only(self, tmp_path):
+    def test_cuts_run_along_edges_of_quads(self, tmp_path):
         write_cube(tmp_path / "in.obj", 4)
         out = tmp_path / "out.obj"
         assert run("flatten", tmp_path / "in.obj", "-o", out, "--cut") == 0
@@ -212,7 +212,7 @@ class TestCut:
         inside = {tuple(sorted(e)) for e in mesh.polygons.diagonals(mesh.F).tolist()}
         assert not inside & {tuple(e) for e in io.mapped(mesh).seams.tolist()}
 
-    def test_a_seam_inside_a_quad_is_refused(self, tmp_path, capsys):
+    def test_a_seam_inside_a_quad_is_rejected(self, tmp_path, capsys):
         write_cube(tmp_path / "in.obj", 2)
         mesh = io.read_mesh(tmp_path / "in.obj")
         a, b = mesh.polygons.diagonals(mesh.F)[0]
@@ -223,7 +223,7 @@ class TestCut:
 
 
 class TestSeenFromOutside:
-    def test_the_boundary_is_that_which_seams_make(self, source, tmp_path, capsys):
+    def test_the_boundary_is_that_of_the_seams(self, source, tmp_path, capsys):
         assert run("check", source, "--boundary", "--json", tmp_path / "told.json") == 0
         loops = json.loads((tmp_path / "told.json").read_text())["loops"]
         assert len(loops) == 3
@@ -233,11 +233,11 @@ class TestSeenFromOutside:
         assert len(np.unique(vertices)) < len(vertices)
 
     @pytest.mark.slow
-    def test_a_batch_with_seams_has_its_page(self, source, tmp_path):
+    def test_a_batch_with_seams_has_a_report(self, source, tmp_path):
         assert run("batch", tmp_path, "-o", tmp_path / "out", "--flatten", "-j", "1") == 0
-        assert run("report", tmp_path / "out") == 0
+        assert run("batch", "-o", tmp_path / "out", "--report") == 0
 
-    def test_isometric_islands_let_go(self, tmp_path):
+    def test_isometric_islands_are_released(self, tmp_path):
         write_cube(tmp_path / "in.obj", 1)
         text = (tmp_path / "in.obj").read_text().replace("f ", "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf ", 1)
         lines = text.splitlines()
@@ -247,7 +247,7 @@ class TestSeenFromOutside:
         (tmp_path / "in.obj").write_text("\n".join(lines) + "\n")
         assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--free") == 0
 
-    def test_a_face_without_places_is_named(self, tmp_path, capsys):
+    def test_a_face_without_coordinates_is_named(self, tmp_path, capsys):
         V, F = grid(3, 3)
         io.write_obj(tmp_path / "in.obj", io.MeshData(V, F).with_map(V))
         text = (tmp_path / "in.obj").read_text()
@@ -259,7 +259,7 @@ class TestSeenFromOutside:
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--seams", "none") == 0
 
 
-class TestRefused:
+class TestErrors:
     def test_an_island_that_is_not_injective_is_named(self, tmp_path, capsys):
         mesh = seamed(tmp_path / "in.obj")
         uv = mesh.uv.copy()
@@ -271,7 +271,7 @@ class TestRefused:
         assert f"the island at triangle {first} (" in capsys.readouterr().err
         assert not (tmp_path / "out.obj").exists()
 
-    def test_faces_without_places_beside_faces_with(self, source, tmp_path, capsys):
+    def test_faces_without_coordinates_among_others(self, source, tmp_path, capsys):
         lines = source.read_text().splitlines()
         at = next(i for i, line in enumerate(lines) if line.startswith("f "))
         lines[at] = re.sub(r"/\d*", "", lines[at])
@@ -311,12 +311,12 @@ class TestConvexity:
     )
     def test_rings(self, ring, convex):
         uv = np.array(ring, dtype=float)
-        mesh = io.meshdata.polygon_mesh(
+        mesh = io.models.meshdata.polygon_mesh(
             np.column_stack([uv, np.zeros(len(uv))]), np.arange(len(uv)), np.array([0, len(uv)])
         )
-        assert (not_convex(mesh.polygons, mesh.F, uv).size == 0) == convex
+        assert (find_concave(mesh.polygons, mesh.F, uv).size == 0) == convex
 
-    def test_the_command_says_which(self, tmp_path, capsys):
+    def test_the_command_names_the_islands(self, tmp_path, capsys):
         (tmp_path / "dart.obj").write_text("v 0 0 0\nv 1 0 0\nv 0.4 0.4 0\nv 0 1 0\nv 1 1 0\nf 1 2 3 4\nf 2 5 4 3\n")
         assert run("check", tmp_path / "dart.obj") == 0
         said = capsys.readouterr().out
@@ -326,12 +326,12 @@ class TestConvexity:
 
 
 class TestFunctions:
-    def test_what_is_fixed_must_be_there(self):
+    def test_fixed_vertices_must_exist(self):
         V, F, uv, FT, _ = strips(4)
         with pytest.raises(ValueError, match="fixed refers to vertex 9999"):
             atlas.polish(SeamedMesh(V, F, FT, uv), fixed=[9999])
 
-    def test_a_callback_that_interrupts_leaves_the_others_where_they_were(self):
+    def test_an_interrupting_callback_leaves_the_other_islands_unchanged(self):
         V, F, uv, FT, _ = strips(6)
         mesh = SeamedMesh(V, F, FT, uv)
 
@@ -351,7 +351,7 @@ class TestFunctions:
         atlas.flatten(SeamedMesh(V, F, FT, uv))
         assert all(np.array_equal(a, b) for a, b in zip((V, F, uv, FT), copies, strict=True))
 
-    def test_pins_decide_the_size(self):
+    def test_pins_determine_the_size(self):
         V, F, uv, FT, _ = strips(4)
         with pytest.raises(ValueError, match="fixed vertices determine the size of the map"):
             atlas.flatten(SeamedMesh(V, F, FT, uv), fixed=[0], unit_square=True)

@@ -52,7 +52,7 @@ class TestFinding:
         assert found[1].fixed == stars / "b/c/handles.txt"
 
     @pytest.mark.skipif(os.name != "posix", reason="makes links and pipes")
-    def test_files_that_cannot_be_read_are_invalid_and_hold_nobody_up(self, stars, tmp_path):
+    def test_unreadable_files_are_invalid_and_delay_nothing(self, stars, tmp_path):
         (stars / "a" / "handles.txt").unlink()
         (stars / "a" / "handles.txt").symlink_to("nowhere")
         (stars / "z" / "input.obj").unlink()
@@ -62,7 +62,7 @@ class TestFinding:
         assert re.fullmatch(r"\S+/a/handles.txt: cannot be read: No such file or directory", a)
         assert re.fullmatch(r"\S+/z/input.obj: cannot be read: it is not a regular file", z)
 
-    def test_a_folder_that_cannot_be_read_is_not_passed_over(self, stars, tmp_path, monkeypatch):
+    def test_an_unreadable_folder_is_reported(self, stars, tmp_path, monkeypatch):
         def refuse(folder):
             if folder == stars / "b" / "d":
                 raise PermissionError(errno.EACCES, "Permission denied", str(folder))
@@ -73,7 +73,7 @@ class TestFinding:
         with pytest.raises(OSError, match=r"\S+/b/d: the folder cannot be read: Permission denied"):
             batch.run(stars, tmp_path / "out")
 
-    def test_a_problem_may_have_others_below_and_be_alone(self, stars):
+    def test_a_problem_folder_may_contain_others(self, stars):
         write_stars(stars, ["b"])
         assert names(stars) == ["a", "b", "b/c", "b/d/e", "z"]
         assert names(stars / "a") == ["a"]
@@ -88,7 +88,7 @@ class TestFinding:
         ]  # fmt: skip
         assert names(stars / "a" / "input.obj") == ["input.obj"]
 
-    def test_a_list_names_no_folder_in_vain(self, stars):
+    def test_every_entry_of_a_list_is_a_folder(self, stars):
         (stars / "empty").mkdir()
         (stars / "notes").mkdir()
         (stars / "notes" / "other.obj").write_text("no problem by itself")
@@ -102,7 +102,7 @@ class TestFinding:
         assert names(stars / "list.txt") == ["b/c", "b/d/e"]
 
     @pytest.mark.skipif(os.name != "posix", reason="makes links")
-    def test_links_that_lead_in_circles_hold_nobody_up(self, stars):
+    def test_cyclic_links_delay_nothing(self, stars):
         (stars / "one").symlink_to("two")
         (stars / "two").symlink_to("one")
         (stars / "b" / "self").symlink_to("self")
@@ -127,13 +127,13 @@ class TestFinding:
         with pytest.raises(ValueError, match="there is no folder, list or mesh"):
             names(stars / "none")
 
-    def test_output_is_no_input(self, stars):
+    def test_output_is_not_used_as_input(self, stars):
         batch.run(stars, stars / "out", jobs=1)
         assert names(stars) == ["a", "b/c", "b/d/e", "z"]
         assert len(names(stars, plain=True)) == 4
 
     @pytest.mark.skipif(os.name != "posix", reason="makes links")
-    def test_links_are_followed_and_circles_are_not(self, stars):
+    def test_links_are_followed_except_cycles(self, stars):
         (stars / "linked").symlink_to(stars / "b")
         (stars / "b" / "back").symlink_to(stars)
         assert names(stars) == ["a", "b/c", "b/d/e", "linked/c", "linked/d/e", "z"]
@@ -159,7 +159,7 @@ class TestRun:
             assert record["certified"]
             assert (record["vertices"], record["triangles"]) == (len(mesh.V), len(mesh.F))
             assert record["flips_after"] == 0
-            assert record["iterations"] == sum(stage["iterations"] for stage in json.loads(record["stages"]))
+            assert record["iterations"] == sum(stage["n_iterations"] for stage in json.loads(record["stages"]))
             parts = [v for k, v in record.items() if k.startswith("seconds_")]
             assert 0 < sum(parts) <= record["seconds"]
             assert record["mips"] > 0
@@ -192,7 +192,7 @@ class TestRun:
         assert record["seconds_polish"] > 0
         assert record["status"] == "polished"
 
-    def test_a_rerun_does_what_is_new_and_nothing_else(self, stars, tmp_path):
+    def test_a_rerun_solves_new_problems_only(self, stars, tmp_path):
         out = tmp_path / "out"
         batch.run(stars, out, jobs=1)
         stamps = {path: path.stat().st_mtime_ns for path in out.rglob("map.obj")}
@@ -208,7 +208,7 @@ class TestRun:
         assert batch.run(stars, out, jobs=1).resumed == 4
         assert batch.run(stars, out, batch.Settings(strategy="paper"), jobs=1).resumed == 0
 
-    def test_what_another_state_of_the_code_has_done_is_done_anew(self, stars, tmp_path, monkeypatch):
+    def test_problems_of_another_version_are_solved_again(self, stars, tmp_path, monkeypatch):
         assert batch.run(stars / "a", tmp_path / "out").resumed == 0
         assert batch.run(stars / "a", tmp_path / "out").resumed == 1
         package = tmp_path / "package"
@@ -241,7 +241,7 @@ class TestRun:
         assert refused[-1] == 4
         assert batch.run(stars, out).resumed == 4
 
-    def test_nothing_that_is_not_of_a_run_is_written_over(self, stars, tmp_path):
+    def test_files_of_other_origin_are_not_overwritten(self, stars, tmp_path):
         for out in (stars, stars / "b", stars / "a"):
             with pytest.raises(ValueError, match=r"contains a problem, .*input.obj: choose another folder"):
                 batch.run(stars, out)
@@ -255,12 +255,12 @@ class TestRun:
         (tmp_path / "records.csv").unlink()
         assert batch.run(stars / "b", stars).solved == batch.run(stars / "b", stars).resumed == 2
 
-    def test_nothing_is_started_when_all_is_done(self, stars, tmp_path, monkeypatch):
+    def test_no_process_starts_if_everything_is_done(self, stars, tmp_path, monkeypatch):
         batch.run(stars, tmp_path / "out", jobs=1)
         monkeypatch.setattr(supervisor, "COMMAND", ["/nonexistent"])
         assert batch.run(stars, tmp_path / "out").resumed == 4
 
-    def test_plain_meshes_onto_an_outline(self, stars, tmp_path):
+    def test_plain_meshes_mapped_to_an_outline(self, stars, tmp_path):
         io.write_off(stars / "ring.off", io.MeshData(*annulus(6)))
         settings = batch.Settings(to="letter:O")
         progress = batch.run(stars, tmp_path / "out", settings, jobs=1)
@@ -279,14 +279,39 @@ class TestRun:
             assert batch.run(stars / "a", tmp_path / f"{slide}", settings, jobs=1).outcomes == {"injective": 1}
             written = io.read_mesh(tmp_path / f"{slide}" / "results" / "input.obj" / "map.obj")
             uv = io.map_of(written)
-            energies.append(distortion(written.V, written.F, uv).summary("symmetric_dirichlet").mean)
+            energies.append(distortion(written.V, written.F, uv).statistics("symmetric_dirichlet").mean)
         assert energies[1] < 0.95 * energies[0]
         (loop,) = boundary_loops(written.F, len(uv))
         # Distances from the font's curves, not from chords of them.
         away = np.min([curve.nearest(uv[loop])[1] for curve in outline_curves("letter:O")], axis=0)
         assert away.max() < 1e-14
 
-    def test_boundaries_slide_along_what_they_are(self, stars, tmp_path):
+    def test_pieces_and_the_corner_angle_are_those_of_the_map_command(self, tmp_path):
+        """A vertex that is assigned to a side slides on it; every point is a corner with an angle of 0."""
+        (tmp_path / "set").mkdir()
+        V, F = grid(6, 6)
+        io.write_obj(tmp_path / "set" / "a.obj", io.MeshData(V, F))
+        corners, sides = "near:0,0,0,near:1,0,0,near:1,1,0,near:0,1,0", tmp_path / "pieces.txt"
+        sides.write_text("3 0\n")
+        given = {"to": "rect:2x1", "corners": corners, "polish": "symmetric-dirichlet", "slide": True}
+        settings = batch.Settings(**given, pieces=str(sides))
+        assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).outcomes == {"injective": 1}
+        map_file = tmp_path / "map.obj"
+        options = ["--to", "rect:2x1", "--corners", corners, "--slide", "--polish", "symmetric-dirichlet"]
+        assert (
+            main(["map", str(tmp_path / "set" / "a.obj"), "-o", str(map_file), *options, "--pieces", str(sides)]) == 0
+        )
+        again = io.map_of(io.read_mesh(tmp_path / "out" / "results" / "a.obj" / "map.obj"))
+        np.testing.assert_allclose(again, io.map_of(io.read_mesh(map_file)), atol=1e-9)
+        sides.write_text("3 9\n")
+        assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).outcomes == {"invalid": 1}
+        assert "sides 0 … 3" in record_of(tmp_path / "out", "a.obj")["error"]
+        with pytest.raises(ValueError, match="set slide as well"):
+            batch.run(tmp_path / "set", tmp_path / "b", batch.Settings(to="rect:2x1", pieces=str(sides)))
+        with pytest.raises(ValueError, match="font applies only to"):
+            batch.run(tmp_path / "set", tmp_path / "b", batch.Settings(font="x.ttf"))
+
+    def test_boundaries_slide_on_their_exact_curves(self, stars, tmp_path):
         settings = batch.Settings(polish="symmetric-dirichlet", slide=True)
         assert batch.run(stars / "a", tmp_path / "out", settings, jobs=1).outcomes == {"injective": 1}
         written = io.read_mesh(tmp_path / "out" / "results" / "a" / "map.obj")
@@ -351,7 +376,7 @@ class TestRun:
         assert "1 corner vertex for a contour with 4 corners" in record_of(tmp_path / "out", "a.obj")["error"]
 
     @pytest.mark.parametrize("options", [{"to": "letter:H", "refine": True}, {"flatten": True}])
-    def test_what_does_not_lie_flat_is_cut(self, tmp_path, options):
+    def test_surfaces_that_cannot_be_flattened_are_cut(self, tmp_path, options):
         """Cuts are seams: vertices and faces are unchanged. With an outline, a disk is not cut."""
         source = tmp_path / "set"
         source.mkdir()
@@ -383,7 +408,7 @@ class TestRun:
         if wanted == "injective":
             assert record_of(tmp_path / "out", "disk.obj")["cut_edges"] == 0
 
-    def test_edges_without_room_are_split(self, tmp_path):
+    def test_edges_without_space_are_split(self, tmp_path):
         V, F = disk(2)
         ring = np.arange(len(V) - 12, len(V))
         tips = 1.2 * (V[ring] + V[np.roll(ring, -1)]) / 2
@@ -446,7 +471,7 @@ class TestRun:
             ({"flatten": True, "energy": "arap"}, "energy must be one of .*arap-barrier, distances, not 'arap'"),
         ],
     )
-    def test_what_free_boundaries_do_not_go_with(self, stars, tmp_path, options, message):
+    def test_options_incompatible_with_free_boundaries(self, stars, tmp_path, options, message):
         with pytest.raises(ValueError, match=message):
             batch.run(stars, tmp_path / "out", batch.Settings(**options))
         assert not (tmp_path / "out").exists()
@@ -473,7 +498,7 @@ class TestRun:
         assert [*batch.read_table(tmp_path / "out" / "records.csv")] == table
         assert not (tmp_path / "out" / "records.parquet").exists()
 
-    def test_refused_calls(self, stars, tmp_path):
+    def test_rejected_calls(self, stars, tmp_path):
         (tmp_path / "empty").mkdir()
         with pytest.raises(ValueError, match=r"no problems in .*empty"):
             batch.run(tmp_path / "empty", tmp_path / "out")
@@ -535,7 +560,7 @@ class TestRun:
         # A list of the problems would take half a megabyte.
         assert sizes[1000] < sizes[100] + 50_000
 
-    def test_an_interrupt_stops_at_once_and_keeps_what_is_done(self, stars, tmp_path, troubled):
+    def test_an_interrupt_stops_at_once_and_keeps_finished_results(self, stars, tmp_path, failing_worker):
         write_stars(stars, ["y_sleep"])
 
         def interrupt(progress):
@@ -552,7 +577,7 @@ class TestRun:
 
 class TestTables:
     @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-    def test_what_is_written_is_read(self, tmp_path, suffix):
+    def test_written_tables_are_read_back(self, tmp_path, suffix):
         if suffix == ".parquet":
             pytest.importorskip("pyarrow")
         row = {"problem": 'caf\u00e9, "x"\n', "certified": True, "mips": 0.1 + 0.2}
@@ -563,7 +588,7 @@ class TestTables:
         assert [row["vertices"] for row in read] == list(range(2500))
         assert {k: v for k, v in read[0].items() if v is not None} == {**row, "vertices": 0}
 
-    def test_names_that_are_no_unicode(self, tmp_path):
+    def test_names_that_are_not_unicode(self, tmp_path):
         records.write_table(tmp_path / "t.csv", [{"problem": "bad\udcff"}])
         assert next(records.read_table(tmp_path / "t.csv"))["problem"] == r"bad\udcff"
 
@@ -587,7 +612,7 @@ class TestTables:
         with pytest.raises(ValueError, match=r"csv or .parquet"):
             list(records.read_table(tmp_path / "t.xls"))
 
-    def test_a_map_that_is_gone_is_made_again(self, stars, tmp_path):
+    def test_a_missing_map_is_made_again(self, stars, tmp_path):
         out = tmp_path / "out"
         batch.run(stars / "a", out)
         (record,) = (out / "results").rglob("record.json")
@@ -600,7 +625,7 @@ class TestTables:
             assert batch.run(stars / "a", out).resumed == 0
             assert [path.read_bytes() for path in maps] == whole
 
-    def test_tables_that_are_none(self, tmp_path):
+    def test_invalid_tables(self, tmp_path):
         pytest.importorskip("pyarrow")
         table = tmp_path / "records.parquet"
         for text in (b"", b"PAR1 and nothing else"):
@@ -608,7 +633,7 @@ class TestTables:
             with pytest.raises(ValueError, match=r"records\.parquet: cannot be read as a table"):
                 list(batch.read_table(table))
 
-    def test_a_limit_of_memory_where_it_cannot_be_told(self, stars, tmp_path, monkeypatch):
+    def test_a_memory_limit_on_systems_without_support(self, stars, tmp_path, monkeypatch):
         monkeypatch.setattr(driver, "resident", lambda pid: None)
         with pytest.raises(ValueError, match=r"needs psutil on this system: pip install 'quasiharmonic\[batch\]'"):
             batch.run(stars, tmp_path / "out", memory_limit=1 << 30)
@@ -621,7 +646,7 @@ class TestTables:
 
 
 class TestCommand:
-    def test_statuses(self, stars, tmp_path, capsys):
+    def test_exit_statuses(self, stars, tmp_path, capsys):
         out = str(tmp_path / "out")
         assert main(["batch", str(stars), "-o", out, "-j", "1", "--memory-limit", "2G"]) == 0
         said = capsys.readouterr()
@@ -639,7 +664,7 @@ class TestCommand:
         assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
         assert "there is no folder" in capsys.readouterr().err
 
-    def test_full_disk(self, tmp_path, capsys, troubled):
+    def test_full_disk(self, tmp_path, capsys, failing_worker):
         write_stars(tmp_path / "set", ["full"])
         assert main(["batch", str(tmp_path / "set"), "-o", str(tmp_path / "out")]) == 2
         assert "o space left" in capsys.readouterr().err
@@ -659,7 +684,7 @@ class TestCommand:
         assert asked == [value]
 
     @pytest.mark.parametrize("text", ["", "4X", "-1G", "0", "1.2.3G", "."])
-    def test_what_is_no_size(self, text, capsys):
+    def test_invalid_sizes(self, text, capsys):
         with pytest.raises(SystemExit) as stop:
             main(["batch", "set", "-o", "out", f"--memory-limit={text}"])
         assert stop.value.code == 2

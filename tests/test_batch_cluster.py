@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 pytest.importorskip("distributed")
 
-PRELOAD = Path(__file__).with_name("shared") / "troubled_cluster.py"
+PRELOAD = Path(__file__).with_name("shared") / "failing_cluster.py"
 
 
 @contextmanager
@@ -52,7 +52,7 @@ def cluster(folder, workers, **environment):
         yield address, scheduler, running
 
 
-def test_a_worker_killed_in_the_middle(tmp_path):
+def test_a_worker_killed_during_a_problem(tmp_path):
     source = write_stars(tmp_path / "set", [f"{i:02d}" for i in range(16)], rings=14)
     killed = []
     with cluster(tmp_path, 3) as (address, _, workers):
@@ -76,7 +76,7 @@ def test_a_worker_killed_in_the_middle(tmp_path):
         assert lasting(record_of(tmp_path / "out", name)) == lasting(record_of(tmp_path / "local", name))
 
 
-def test_what_kills_workers_is_found_out_and_takes_no_other_along(tmp_path):
+def test_problems_that_kill_workers_are_identified_and_affect_no_other(tmp_path):
     source = write_stars(tmp_path / "set", ["a", "b", "c", "poison", "x", "y", "z"])
     with cluster(tmp_path, 4, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0") as (address, _, workers):
         progress = batch.run(source, tmp_path / "out", scheduler=address)
@@ -86,7 +86,7 @@ def test_what_kills_workers_is_found_out_and_takes_no_other_along(tmp_path):
     assert batch.run(source, tmp_path / "out").resumed == 7
 
 
-def test_what_ends_the_run(tmp_path):
+def test_errors_that_end_the_run(tmp_path):
     """A full disk, an internal error, and folders that a worker cannot see end the run."""
     source = write_stars(tmp_path / "set", ["a", "full", "mistake"])
     with cluster(tmp_path, 1) as (address, _, _):
@@ -131,7 +131,7 @@ def test_no_scheduler(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("address", ["nonsense", "tcp://host", "http://host:1", "tcp://host:port"])
-def test_wrong_addresses_are_refused_at_once(tmp_path, capfd, address):
+def test_invalid_addresses_are_rejected_at_once(tmp_path, capfd, address):
     source = write_stars(tmp_path / "set", ["a"])
     began = time.monotonic()
     assert main(["batch", str(source), "-o", str(tmp_path / "out"), "--scheduler", address]) == 2

@@ -15,7 +15,8 @@ import pytest
 from quasiharmonic import batch, io
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.cli import main
-from quasiharmonic.ui.report import figures, numbers, page, write_report
+from quasiharmonic.ui.report import charts, page, statistics, write_report
+from quasiharmonic.ui.report.style import STYLE
 from shared.datasets import star_of, write_problem, write_stars
 
 pytestmark = pytest.mark.slow
@@ -88,7 +89,7 @@ class TestPage:
         listed = re.findall(r"(?:simple|letters)/\d+", text[text.index("Slowest") : text.index("Failed")])
         assert listed == [row["problem"] for row in slowest]
 
-    def test_the_worst_comes_first(self, tmp_path):
+    def test_the_worst_problems_come_first(self, tmp_path):
         rows = made(tmp_path)
         for row in rows:
             row["isometric"] = None if row["mips"] is None else 2 + row["mips"]
@@ -104,18 +105,18 @@ class TestPage:
             rf"{page.number(max(mips))} +worst MIPS[^;]*; median {page.number(float(np.median(mips)))}", head
         )
         assert head.index("worst stretch") < head.index("median time")
-        lists = [text.index(words) for words in ("Most stretched", "Most distorted", "Slowest")]
+        lists = [text.index(words) for words in ("Highest stretch", "Highest MIPS", "Slowest")]
         assert lists == sorted(lists)
         assert re.findall(r"(?:simple|letters)/\d+", text[lists[0] :])[0] == rows[7]["problem"]
         name = rows[7]["problem"].partition("/")[0]
         assert re.search(rf"{name} +100 +\d+ [^a-z]*1.7·10¹⁰", text)
 
-    def test_of_a_real_run_with_pictures(self, tmp_path):
+    def test_a_real_run_with_pictures(self, tmp_path):
         source = write_stars(tmp_path / "set", ["easy/a", "easy/b", "hard/c"])
         (source / "bad").mkdir()
         (source / "bad" / "input.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
         batch.run(source, tmp_path / "out", jobs=1)
-        assert main(["report", str(tmp_path / "out")]) == 0
+        assert main(["batch", "-o", str(tmp_path / "out"), "--report"]) == 0
         read = Reader((tmp_path / "out" / "report.html").read_text())
         pictures = [attributes["src"] for tag, attributes in read.tags if tag == "img"]
         # Three maps in three lists, and a surface without a map.
@@ -129,7 +130,7 @@ class TestPage:
         assert "input cannot be used" in read.text
         assert str(source) in read.text
 
-    def test_of_free_boundaries(self, tmp_path):
+    def test_free_boundaries(self, tmp_path):
         for k in range(2):
             V, F, _, _ = star_of(3)
             (tmp_path / "set").mkdir(exist_ok=True)
@@ -144,14 +145,14 @@ class TestPage:
         # The table alone gives the same count.
         assert "2 of 3 certified bijective" in Reader(written(tmp_path, tmp_path / "out" / "records.csv")).text
 
-    def test_of_a_run_that_is_going_on(self, tmp_path):
+    def test_an_unfinished_run(self, tmp_path):
         source = write_stars(tmp_path / "set", ["a", "b", "c"])
         batch.run(source, tmp_path / "out", jobs=1)
         (tmp_path / "out" / "records.csv").unlink()
         (tmp_path / "out" / "results" / "c" / "record.json").unlink()
         assert "2 of 2 certified" in Reader(written(tmp_path, tmp_path / "out")).text
 
-    def test_spoilt_files_are_passed_over(self, tmp_path):
+    def test_damaged_files_are_skipped(self, tmp_path):
         out = tmp_path / "out"
         batch.run(write_stars(tmp_path / "set", list("abcdefg")), out, jobs=1)
         (out / "records.csv").unlink()
@@ -169,17 +170,17 @@ class TestPage:
             assert "2 of 2 certified" in Reader(written(tmp_path, out)).text
         assert batch.run(tmp_path / "set", out, jobs=1).resumed == 1
 
-    def test_problems_proven_impossible_are_told_apart(self, tmp_path):
+    def test_impossible_problems_are_counted_separately(self, tmp_path):
         V, F, fixed, target = star_of(4)
         write_problem(tmp_path / "set" / "mirrored", V, F, fixed, target * [1, -1])
         write_stars(tmp_path / "set", ["a"])
         batch.run(tmp_path / "set", tmp_path / "out", jobs=1)
         text = Reader(written(tmp_path, tmp_path / "out")).text
-        assert "1 no injective map found; it is proven of 1 that they have no such map" in text
+        assert "1 no injective map found; 1 proven to have no such map" in text
         assert "The target has the opposite orientation to the mesh" in text
 
     @pytest.mark.parametrize("column", ["problem", "error", "outcome", "source", "versions"])
-    def test_whatever_things_are_called(self, tmp_path, column):
+    def test_any_names(self, tmp_path, column):
         made(tmp_path, 30, **{column: VILE, "certified": False})
         made(tmp_path, 30, name="x.csv")
         (tmp_path / "x.csv").rename(tmp_path / "<b>o&.csv")
@@ -193,7 +194,7 @@ class TestPage:
             assert r"\u202e" in read.text
             assert "\u202e" not in read.text
 
-    def test_refers_to_nothing_outside(self, tmp_path):
+    def test_the_page_has_no_external_references(self, tmp_path):
         made(tmp_path)
         text = written(tmp_path, tmp_path / "t.csv")
         assert not re.search(r"https?:|//[a-z]|@import|url\(", text)
@@ -212,23 +213,31 @@ class TestPage:
         parquet.write_table(pyarrow.table({"problem": [0, 1], "seconds": [0.5, None]}), tmp_path / "t.parquet")
         assert "0 of 2 certified" in Reader(written(tmp_path, tmp_path / "t.parquet")).text
 
-    def test_many_failures_and_many_dots_stay_bounded(self, tmp_path):
+    def test_many_failures_and_many_dots_are_limited(self, tmp_path):
         made(tmp_path, 20_000, name="many.csv")
         text = written(tmp_path, tmp_path / "many.csv", tmp_path / "many.csv")
         assert len(text) < 2_000_000
         assert "And 500 more" in text
 
-    def test_refused(self, tmp_path, capsys):
+    def test_errors(self, tmp_path, capsys):
         (tmp_path / "t.csv").write_text("problem,seconds\n")
-        assert main(["report", str(tmp_path / "t.csv")]) == 2
+        assert main(["batch", "-o", str(tmp_path / "t.csv"), "--report"]) == 2
         assert "no records" in capsys.readouterr().err
         for name in ("none.csv", "none"):
-            assert main(["report", str(tmp_path / name)]) == 2
-            assert "there is no folder and no table" in capsys.readouterr().err
-        assert main(["report", str(tmp_path)]) == 2
-        made(tmp_path)
-        assert main(["report", str(tmp_path / "t.csv"), "-o", str(tmp_path / "no" / "r.html")]) == 2
+            assert main(["batch", "-o", str(tmp_path / name), "--report"]) == 2
+            assert "no such folder or table of records" in capsys.readouterr().err
+        assert main(["batch", "-o", str(tmp_path), "--report"]) == 2
         assert not (tmp_path / "report.html").exists()
+        assert main(["batch", "-o", str(tmp_path)]) == 2
+        assert "name a folder or a list of problems" in capsys.readouterr().err
+        assert main(["batch", str(tmp_path), "-o", str(tmp_path / "o"), "--against", str(tmp_path / "t.csv")]) == 2
+        assert "--against needs --report" in capsys.readouterr().err
+
+    def test_a_run_writes_its_report(self, tmp_path, capsys):
+        source = write_stars(tmp_path / "set", ["a"])
+        assert main(["batch", str(source), "-o", str(tmp_path / "out"), "-j", "1", "--report"]) == 0
+        assert "100 %" in Reader((tmp_path / "out" / "report.html").read_text()).text
+        assert f"wrote {tmp_path / 'out' / 'report.html'}" in capsys.readouterr().out
 
 
 class TestAgainst:
@@ -239,7 +248,7 @@ class TestAgainst:
             file.writelines(f"{row['problem']},{row['seconds'] * 20},3\n" for row in ours[:60])
             file.write("elsewhere/1,5,1\n")
         text = Reader(written(tmp_path, tmp_path / "t.csv", tmp_path / "tlc.csv")).text
-        assert "60 problems that both have; median 20 times faster" in text
+        assert "60 problems in both runs; median 20 times faster" in text
         assert "against 3" in text
 
     def test_nothing_in_common(self, tmp_path):
@@ -249,61 +258,89 @@ class TestAgainst:
 
 
 class TestFigures:
-    def heights(self, svg):
-        """The shares of the bars, measured in the drawing by its own labels."""
+    def ticks(self, tree, anchor):
+        """Positions (x, y) of the labels of an axis: "middle" for the horizontal one, "end" for the vertical one."""
+        labels = [text for text in tree.iter("text") if f"text-anchor: {anchor}" in text.get("style")]
+        return {text.text: (float(text.get("x")), float(text.get("y"))) for text in labels}
+
+    def grid(self, tree):
+        """The positions of the vertical and of the horizontal lines of the grid."""
+        lines = [path.get("d") for path in tree.iter("path") if "var(--line)" in path.get("style")]
+        ends = [np.array(re.findall(r"[ML] ([\d.]+) ([\d.]+)", line), dtype=float) for line in lines]
+        return [sorted({a[k] for a, b in ends if a[k] == b[k]}) for k in (0, 1)]
+
+    def bars(self, svg):
+        """The left ends and the heights of the bars, heights in units of the grid."""
         tree = ET.fromstring(svg)
-        labels = [(float(t.text[:-2]) / 100, float(t.get("y")) - 4) for t in tree.iter("text") if "%" in t.text]
-        (s0, y0), (s1, y1) = labels[0], labels[-1]
-        path = next(p.get("d") for p in tree.iter("path") if "fill" in p.get("class"))
-        bars = re.findall(r"M([\d.]+) \d+V([\d.]+)H([\d.]+)", path)
-        return [(float(a), s0 + (float(y) - y0) * (s1 - s0) / (y1 - y0)) for a, y, _ in bars]
+        shares = sorted(float(label[:-2]) / 100 for label in self.ticks(tree, "end"))
+        rows = self.grid(tree)[1][::-1]
+        assert len(rows) == len(shares)
+        bars = []
+        for path in tree.iter("path"):
+            if "fill: var(--ours)" in path.get("style"):
+                corners = np.array(re.findall(r"[ML] ([\d.]+) ([\d.]+)", path.get("d")), dtype=float)
+                height = shares[-1] * (rows[0] - corners[:, 1].min()) / (rows[0] - rows[-1])
+                bars.append((corners[:, 0].min(), height))
+        return bars
 
     def test_histogram_counts(self):
         values = 10 ** np.random.default_rng(1).uniform(-2, 2, 5000)
-        bars = self.heights(figures.histogram([("ours", values)], "x"))
+        bars = self.bars(charts.histogram([("ours", values)], "x"))
         counts = np.histogram(np.log10(values), np.linspace(-2, 2, 25))[0] / 5000
         assert len(bars) == 24
         np.testing.assert_allclose([share for _, share in bars], counts, atol=2e-4)
         assert sum(share for _, share in bars) == pytest.approx(1, abs=2e-3)
 
-    def test_what_has_no_logarithm(self):
-        bars = self.heights(figures.histogram([("ours", np.array([0.0, 0.0, 1.0, np.nan, np.inf]))], "x"))
-        assert [round(share, 2) for _, share in bars] == [0.67, 0.33]
+    def test_values_without_a_logarithm(self):
+        bars = self.bars(charts.histogram([("ours", np.array([0.0, 0.0, 1.0, np.nan, np.inf]))], "x"))
+        assert [round(share, 2) for _, share in bars if share > 0] == [0.67, 0.33]
         for nothing in ([], [np.nan], [1.0]):
-            ET.fromstring(figures.histogram([("ours", np.array(nothing))], "x"))
-            ET.fromstring(figures.scatter([("ours", np.array(nothing), np.array(nothing))], "x", "y", same=True))
+            ET.fromstring(charts.histogram([("ours", np.array(nothing))], "x"))
+            ET.fromstring(charts.scatter([("ours", np.array(nothing), np.array(nothing))], "x", "y", same=True))
 
-    def test_dots_are_where_the_ticks_say(self):
-        svg = figures.scatter([("ours", np.array([10.0, 1000.0, -1.0]), np.array([1.0, 0.01, 1.0]))], "x", "y")
+    def test_dots_are_at_the_positions_of_the_ticks(self):
+        svg = charts.scatter([("ours", np.array([10.0, 1000.0, -1.0]), np.array([1.0, 0.01, 1.0]))], "x", "y")
         tree = ET.fromstring(svg)
-        ticks = {(t.text, t.get("text-anchor")): t for t in tree.iter("text")}
-        x = {word: float(ticks[word, "middle"].get("x")) for word in ("10", "1000")}
-        y = {word: float(ticks[word, "end"].get("y")) - 4 for word in ("1", "0.01")}
-        path = next(p.get("d") for p in tree.iter("path") if "dots" in p.get("class"))
-        dots = sorted((float(a), float(b)) for a, b in re.findall(r"M(\d+) (\d+)h0", path))
+        columns, rows = self.grid(tree)
+        x = dict(zip(["10", "100", "1000"], columns, strict=True))
+        y = dict(zip(["1", "0.1", "0.01"], rows, strict=True))
+        for word, place in x.items():
+            assert self.ticks(tree, "middle")[word][0] == pytest.approx(place)
+        for word, place in y.items():
+            assert self.ticks(tree, "end")[word][1] == pytest.approx(place, abs=6)
+        path = next(p.get("d") for p in tree.iter("path") if "stroke: var(--ours)" in p.get("style"))
+        dots = sorted((float(a), float(b)) for a, b in re.findall(r"M ([\d.]+) ([\d.]+)", path))
         np.testing.assert_allclose(dots, [(x["10"], y["1"]), (x["1000"], y["0.01"])], atol=0.6)
+
+    def test_figures_use_the_colours_of_the_page(self):
+        values = np.array([1.0, 10.0])
+        series = [("ours", values), ("theirs", values)]
+        for svg in (charts.histogram(series, "x"), charts.scatter([("failed", values, values)], "x", "y", same=True)):
+            assert not re.search(r"#[0-9a-f]{6}", svg)
+            assert not re.search(r" id=|url|href|xmlns", svg)
+            assert {f"--{name}" for name in re.findall(r"var\(--(\w+)\)", svg)} <= set(re.findall(r"--\w+", STYLE))
 
     @pytest.mark.parametrize(
         ("value", "text"),
         [(0, "0"), (0.0123, "0.0123"), (1234.5, "1,234"), (3.07e6, "3.07·10⁶"), (1e-7, "1·10⁻⁷"), (np.nan, "–")],
     )
-    def test_numbers_as_people_write_them(self, value, text):
+    def test_numbers_are_formatted_for_reading(self, value, text):
         assert page.number(value) == text
 
-    def test_percent_is_not_rounded_to_all(self):
+    def test_percentages_below_all_are_not_rounded_to_100(self):
         assert page.percent(99_999, 100_000) == "99.99 %"
         assert page.percent(100, 100) == "100 %"
 
-    def test_quantile_ignores_what_is_not_there(self):
-        assert numbers.quantile(np.array([1.0, np.nan, 3.0, np.inf]), 0.5) == 2.0
-        assert np.isnan(numbers.quantile(np.array([np.nan]), 0.5))
+    def test_quantiles_ignore_missing_values(self):
+        assert statistics.quantile(np.array([1.0, np.nan, 3.0, np.inf]), 0.5) == 2.0
+        assert np.isnan(statistics.quantile(np.array([np.nan]), 0.5))
 
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium here")
-def test_in_a_browser_by_day_and_by_night(tmp_path):
+def test_in_a_browser_in_light_and_dark_mode(tmp_path):
     from matplotlib.image import imread
 
     made(tmp_path, 60)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from itertools import islice
 from pathlib import Path
 
@@ -10,9 +11,9 @@ import pytest
 
 import campaign
 import compiled_loops
-import letters_alone
-import many
+import lbfgs_only
 import problems
+import small_problems
 import speed
 from quasiharmonic import Problem, boundary_loops, certify, solve
 from quasiharmonic.solver.search.strategy import stages_of
@@ -25,7 +26,7 @@ FEASIBLE = ["noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb",
 
 @pytest.mark.parametrize("family", problems.FAMILIES)
 @pytest.mark.parametrize("difficulty", [0.0, 0.55, 1.0])
-def test_a_problem_is_well_formed_and_has_the_solution_it_was_made_from(family, difficulty):
+def test_a_problem_is_well_formed_and_has_its_known_solution(family, difficulty):
     case = problems.make(family, 3, difficulty, triangles=150)
     problem = Problem(case.V, case.F, case.fixed, case.target)
     assert 20 <= len(case.F) <= 700
@@ -41,7 +42,7 @@ def test_a_problem_is_well_formed_and_has_the_solution_it_was_made_from(family, 
 
 
 @pytest.mark.parametrize("family", problems.FAMILIES)
-def test_a_name_is_all_that_goes_into_a_problem(family):
+def test_the_name_determines_a_problem(family):
     first = problems.make(family, 5, 0.7, triangles=100)
     again = problems.make(*problems.parse(first.name), triangles=100)
     for one, other in zip(first[:4], again[:4], strict=True):
@@ -49,12 +50,12 @@ def test_a_name_is_all_that_goes_into_a_problem(family):
     assert not np.array_equal(first.target, problems.make(family, 6, 0.7, triangles=100).target)
 
 
-def test_pins_lie_inside():
+def test_pins_are_interior_vertices():
     case = problems.make("pins", 1, 0.5, triangles=200)
     assert Problem(case.V, case.F, case.fixed, case.target).domain.pins.size > 0
 
 
-def test_rest_meshes_come_with_slivers_and_wild_areas():
+def test_rest_meshes_have_slivers_and_extreme_areas():
     ratios, angles = [], []
     for seed in range(30):
         case = problems.make("flow", seed, 1.0, triangles=60)
@@ -68,7 +69,7 @@ def test_rest_meshes_come_with_slivers_and_wild_areas():
     assert min(angles) < 1e-5
 
 
-def test_unknown_families_are_refused():
+def test_unknown_families_are_rejected():
     with pytest.raises(ValueError, match="no family 'mace'"):
         problems.parse("mace:1:0.5")
 
@@ -129,14 +130,14 @@ def test_a_hang_is_a_result_and_the_next_problem_is_solved(tmp_path, monkeypatch
     ("trouble", "outcome"),
     [("raise KeyError('lost')", "exception"), ("__import__('warnings').warn('hm')", "warning")],
 )
-def test_what_goes_wrong_is_recorded(monkeypatch, trouble, outcome):
+def test_errors_are_recorded(monkeypatch, trouble, outcome):
     solve = campaign.solve
 
-    def troubled(*args, **options):
+    def solve_or_fail(*args, **options):
         exec(trouble)
         return solve(*args, **options)
 
-    monkeypatch.setattr(campaign, "solve", troubled)
+    monkeypatch.setattr(campaign, "solve", solve_or_fail)
     record = campaign.run("swirl:0:0.1")
     assert record["outcome"] == outcome
     assert campaign.failed(record)
@@ -144,7 +145,7 @@ def test_what_goes_wrong_is_recorded(monkeypatch, trouble, outcome):
     json.dumps(record, allow_nan=False)
 
 
-def test_a_generator_that_fails_is_a_failure_with_a_summary(monkeypatch):
+def test_an_error_of_a_generator_is_a_failure_with_a_summary(monkeypatch):
     def broken(rng, difficulty, size):
         raise AssertionError("no solution")
 
@@ -154,13 +155,13 @@ def test_a_generator_that_fails_is_a_failure_with_a_summary(monkeypatch):
     assert "exception: AssertionError('no solution')" in campaign.summary([record])
 
 
-def test_without_a_known_solution_no_map_is_no_failure():
+def test_no_map_is_no_failure_without_a_known_solution():
     assert not campaign.failed({"outcome": "not injective", "feasible": False})
     assert campaign.failed({"outcome": "not injective", "feasible": True})
 
 
 @pytest.mark.parametrize("name", ["jam:15:0.771", "jam:20:0.861", "spiral:83:0.797", "jam:84:0.415"])
-def test_fallbacks_solve_what_the_search_over_tensors_leaves(name):
+def test_fallbacks_solve_problems_that_the_search_over_tensors_does_not(name):
     """Problems whose last triangles have almost no space, or whose target overlaps itself."""
     case = problems.make(*problems.parse(name))
     problem = Problem(case.V, case.F, case.fixed, case.target)
@@ -188,7 +189,7 @@ def test_loops_drift_as_rigid_bodies():
     assert max(carried) > 1e-3
 
 
-def test_a_timeout_is_no_success_of_the_feasible_families():
+def test_a_timeout_is_a_failure_of_a_feasible_family():
     solved = {"name": "jam:0:0.5", "strategy": "speed", "family": "jam", "difficulty": 0.5, "feasible": True,
               "simple": True, "outcome": "injective", "stages": [("vector-adam, tanh", 1, 5, 0, 0.1)],
               "iterations": 3, "seconds": 0.1}  # fmt: skip
@@ -209,7 +210,7 @@ def test_a_timeout_is_no_success_of_the_feasible_families():
         (["--families", "maze,bogus"], "no family bogus"),
     ],
 )
-def test_wrong_calls_of_a_campaign_are_refused(arguments, message, tmp_path, monkeypatch, capsys):
+def test_invalid_calls_of_a_campaign_are_rejected(arguments, message, tmp_path, monkeypatch, capsys):
     """Invalid calls fail before any problem runs."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
@@ -219,7 +220,7 @@ def test_wrong_calls_of_a_campaign_are_refused(arguments, message, tmp_path, mon
     assert not list(tmp_path.iterdir())
 
 
-def test_summary_counts_what_each_fallback_adds():
+def test_the_summary_counts_the_problems_that_each_fallback_adds():
     def record(name, outcome, *stages):
         listed = [(stage, 1, 5, 0, 0.1) for stage in stages]
         return {"name": name, "strategy": "speed", "family": "jam", "difficulty": 0.5, "feasible": True, "simple": True,
@@ -249,7 +250,7 @@ def test_summary_counts_what_each_fallback_adds():
         (["--join", "other.csv"], "other.csv holds no records"),
     ],
 )
-def test_wrong_calls_of_the_speed_benchmark_are_refused(arguments, message, tmp_path, monkeypatch, capsys):
+def test_invalid_calls_of_the_speed_benchmark_are_rejected(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("other.csv").write_text("name,value\na,1\n", encoding="utf-8")
     with pytest.raises(SystemExit) as ended:
@@ -271,7 +272,7 @@ def test_compiled_loops_are_compared_with_numpy(tmp_path, monkeypatch):
     assert [line.split("|")[1].strip() for line in lines[4:]] == ["cat on C", "cat on R", "cat on S", "geometric mean"]
 
 
-def test_speed_is_measured_joined_and_limited(tmp_path, capsys):
+def test_speed_is_measured_merged_and_limited(tmp_path, capsys):
     """A tool that exceeds the limit gets no larger problem, including this project's own."""
     once = ["--peers", "-r", "1", "--letters", "C", "-o", str(tmp_path)]
     speed.main([*once, "--triangles", "100", "300", "--limit", "1e-9"])
@@ -279,34 +280,35 @@ def test_speed_is_measured_joined_and_limited(tmp_path, capsys):
     (first,) = speed.read_csv(tmp_path / "speed.csv")
     assert first.injective
     assert 0.5 * first.median < sum(first.phases[0].values()) <= first.median
-    assert "cat on C | 96 |" in (tmp_path / "speed.md").read_text()
+    assert "| 96 | " in (tmp_path / "speed.md").read_text()
     other = speed.Record("cat on C", 294, speed.YARDSTICK, [0.5], injective=False)
     speed.write_csv([first, other], tmp_path / "both.csv")
     speed.main([*once, "--triangles", "--join", str(tmp_path / "both.csv")])
     text = (tmp_path / "speed.md").read_text()
-    assert "| cat on C | 294 |  | 0.5 × |  |" in text
+    assert "| triangles | quasiharmonic, s | igl.harmonic, s |" in text
+    assert re.search(r"^\| 96 – 294 \| [\d.e-]+ \| 0.5 \|$", text, re.MULTILINE)
     assert (tmp_path / "speed.png").stat().st_size > 0
 
 
-def test_letters_alone(tmp_path):
+def test_lbfgs_only(tmp_path):
     """A row is read back as written, and the recorded runs are complete."""
-    (V, F) = next((V, F) for name, V, F in letters_alone.made(24) if name == "hand")
-    run = letters_alone.measure("hand", V, F, "A", "V₃ tanh", 100)
+    (V, F) = next((V, F) for name, V, F in lbfgs_only.made(24) if name == "hand")
+    run = lbfgs_only.measure("hand", V, F, "A", "V₃ tanh", 100)
     assert run.flips == 0
     table = tmp_path / "table.csv"
     table.write_text(",".join(run._fields) + "\n" + ",".join(map(str, run)) + "\n", encoding="utf-8")
-    assert letters_alone.read(table) == [run]
-    assert letters_alone.read(tmp_path / "none.csv") == []
-    recorded = letters_alone.read(letters_alone.RECORDS)
+    assert lbfgs_only.read(table) == [run]
+    assert lbfgs_only.read(tmp_path / "none.csv") == []
+    recorded = lbfgs_only.read(lbfgs_only.RECORDS)
     assert len({(run.surface, run.triangles, run.letter, run.column) for run in recorded}) == len(recorded)
-    assert {row["of"] for row in letters_alone.by_kind(recorded)["gallery"].values()} == {30}
+    assert {row["of"] for row in lbfgs_only.by_kind(recorded)["gallery"].values()} == {30}
 
 
-@pytest.mark.parametrize("name", many.SETS)
+@pytest.mark.parametrize("name", small_problems.SETS)
 def test_sets_of_small_problems(name):
-    some = list(islice(many.SETS[name](200), 4))
+    some = list(islice(small_problems.SETS[name](200), 4))
     assert all(120 <= len(F) <= 280 for _, F, _, _ in some)
     assert len({target.tobytes() for _, _, _, target in some}) == 4
-    assert many.together(some, 1) == many.one_by_one(some)
+    assert small_problems.together(some, 1) == small_problems.one_by_one(some)
     shared = all(np.array_equal(some[0][0], V) for V, _, _, _ in some)
     assert shared == (name == "one mesh")

@@ -20,7 +20,7 @@ from quasiharmonic import (
     solve,
 )
 from quasiharmonic.apps.flattening import piece
-from quasiharmonic.solver.search import stages
+from quasiharmonic.solver.search import search
 from quasiharmonic.surfaces import disk
 
 V, F = disk(3)
@@ -44,11 +44,11 @@ TAKERS = {
 
 
 @pytest.mark.parametrize("take", TAKERS.values(), ids=TAKERS)
-def test_what_cannot_be_called_is_refused_before_anything_is_computed(take, monkeypatch):
+def test_objects_that_are_not_callable_are_rejected_first(take, monkeypatch):
     def computed(*arguments, **options):
         raise AssertionError("the search has begun")
 
-    monkeypatch.setattr(stages.Search, "run", computed, raising=False)
+    monkeypatch.setattr(search.Search, "run", computed, raising=False)
     monkeypatch.setattr(piece.Flattening, "run", computed)
     with pytest.raises(ValueError, match="callback must be callable, or None, not 3"):
         take(3)

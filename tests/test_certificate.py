@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic.geometry.exact.certificate import Obstacle, certify, inverted_triangles, is_injective
+from quasiharmonic.geometry.exact.certificate import Obstacle
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.solver.refine.mapping import injective_map
+from quasiharmonic.problem.certification import certify, inverted_triangles, is_injective
+from quasiharmonic.solver.mapping import injective_map
 from quasiharmonic.surfaces import annulus
 from shared.exact import exact_orientation, exact_relation
 
@@ -185,7 +186,7 @@ def test_dtypes_layouts_and_untouched_input():
     assert certify(F.tolist(), uv.tolist()).bijective
 
 
-def test_vertices_of_no_triangle_are_not_looked_at():
+def test_vertices_of_no_triangle_are_ignored():
     uv = np.vstack([CORNERS, [[np.nan, np.inf], [0.5, 0.5]]])
     assert certify(SQUARE, uv).bijective
 
@@ -215,7 +216,7 @@ def test_malformed_input_is_named(F, uv, said):
             function(F, uv)
 
 
-def test_nothing_is_not_injective():
+def test_an_empty_mesh_is_not_injective():
     c = certify(np.empty((0, 3), int), np.empty((0, 2)))
     assert not c.injective
     assert c.bijective is False
@@ -226,7 +227,7 @@ def test_nothing_is_not_injective():
 # --- the whole map ---
 
 
-def test_disks_and_rings_that_are_bijective():
+def test_bijective_disks_and_rings():
     assert certify(SQUARE, CORNERS).bijective
     assert certify(*spiral(turns=4, pitch=1.1)).bijective
     assert certify(*ring()).bijective
@@ -243,7 +244,7 @@ def test_a_ring_turned_inside_out_is_bijective():
     assert certify(F, uv).bijective
 
 
-def test_a_band_that_overlaps_itself_is_injective_only():
+def test_a_band_that_overlaps_itself_is_injective_but_not_bijective():
     c = certify(*spiral(turns=1.5, pitch=0.5))
     assert c.injective
     assert c.bijective is False
@@ -254,7 +255,7 @@ def test_a_band_that_overlaps_itself_is_injective_only():
     )
 
 
-def test_crossings_are_the_edges_that_cross():
+def test_crossings_list_the_crossing_edges():
     F, uv = fan([[0, 0], [2, 2], [2, 0], [0, 2]], centre=(1, 1.5))
     c = certify(F, uv)
     np.testing.assert_array_equal(c.crossings, [[1, 2, 3, 4]])
@@ -311,14 +312,14 @@ def test_a_fan_wound_twice():
         assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.MULTIPLY_WOUND}
 
 
-def test_a_fan_wound_once_is_not_overwound(rng):
+def test_a_fan_wound_once_is_not_multiply_wound(rng):
     for _ in range(20):
         t = np.sort(rng.random(9)) if rng.random() < 0.5 else (np.arange(8) / 8)
         uv = polar(rng.uniform(1, 2, len(t)), t)
         assert not certify(*fan(np.round(uv, 1))).multiply_wound.size
 
 
-def test_only_vertices_with_positive_triangles_are_overwound():
+def test_only_vertices_with_positive_triangles_are_multiply_wound():
     F, uv = fan(polar(np.linspace(1, 2, 12), np.arange(12) / 5))
     c = certify(F[:-1], uv)  # vertex 0 is on the boundary now
     assert c.injective
@@ -371,7 +372,7 @@ def open_fan(rng, triangles):
     return np.stack([np.zeros_like(rim), rim, rim + 1], axis=1), np.vstack([[0, 0], points]).astype(float)
 
 
-def test_boundary_vertices_around_which_triangles_wind_more_than_once(rng):
+def test_boundary_vertices_with_multiply_wound_triangles(rng):
     counted = {True: 0, False: 0}
     for _ in range(150):
         F, uv = open_fan(rng, int(rng.integers(2, 9)))
@@ -386,7 +387,7 @@ def test_boundary_vertices_around_which_triangles_wind_more_than_once(rng):
     assert counted[False] > 20
 
 
-def test_maps_of_annuli_overwound_or_not(rng):
+def test_maps_of_annuli_that_are_multiply_wound_or_not(rng):
     """Rings with integer coordinates, some torn, some with a loop reflected; a third have inverted triangles."""
     seen = 0
     for _ in range(120):
@@ -419,7 +420,7 @@ def test_an_annulus_with_its_inner_loop_reflected():
     assert c.to_dict()["multiply_wound"] == [21, 38]
 
 
-def test_a_slit_that_is_closed_is_not_overwound():
+def test_a_closed_slit_is_not_multiply_wound():
     """The angles at its end sum to exactly 2π. Its sides coincide, which is a crossing."""
     t = np.arange(9) / 8
     F, uv = fan(np.round(polar(1 + 0 * t, t) * 4))
@@ -437,7 +438,7 @@ def test_a_slit_that_is_closed_is_not_overwound():
         assert not certify(F[:-1], turned).multiply_wound.size
 
 
-def test_branched_sheets_with_simple_loops_apart():
+def test_branched_sheets_with_simple_and_disjoint_loops():
     F, uv, branches = crossed_sheets()
     c = certify(F, uv)
     assert c.injective
@@ -474,7 +475,7 @@ def test_islands_that_overlap_or_touch(parts, kind):
         ([[0, 1, 2], [2, 3, 4]], "passes more than once through vertex 2"),
     ],
 )
-def test_meshes_that_are_no_surface(F, said):
+def test_meshes_that_are_not_surfaces(F, said):
     uv = np.array([[0.0, 0], [4, 0], [2, 1], [3, 2], [1, 2]])
     c = certify(F, uv)
     assert c.bijective is False
@@ -498,7 +499,7 @@ def test_boundary_that_is_not_finite():
     assert kinds(c) == {Obstacle.NOT_INJECTIVE}
 
 
-def test_a_collapsed_map_is_answered_quickly():
+def test_a_collapsed_map_is_certified_quickly():
     F, uv = ring(columns=20_000)
     c = certify(F, np.zeros_like(uv))
     assert c.degenerate.size == len(F)
@@ -513,7 +514,7 @@ def test_many_loops_and_long_loops():
     assert certify(*ring(columns=30_000)).bijective
 
 
-def test_certificate_is_frozen_and_fit_for_json():
+def test_certificate_is_frozen_and_serialisable():
     F, uv, _ = crossed_sheets()
     for c in (certify(F, uv), certify(F, uv * [-1, 1]), certify(SQUARE, CORNERS, boundary=False), certify(*ring())):
         told = json.loads(json.dumps(c.to_dict()))
@@ -529,12 +530,12 @@ def test_certificate_is_frozen_and_fit_for_json():
         c.triangles = 3
 
 
-# --- against slower ways of deciding the same ---
+# --- against slower methods
 
 
 @given(st.data())
 @settings(max_examples=60, deadline=None)
-def test_bijective_means_that_no_triangles_share_more_than_their_vertices(data):
+def test_bijective_if_no_triangles_share_more_than_their_vertices(data):
     base = data.draw(st.sampled_from(["band", "ring", "fan", "islands"]))
     if base == "band":
         turns = data.draw(st.sampled_from([0.5, 0.9, 1.0, 1.2]))
@@ -561,7 +562,7 @@ def test_bijective_means_that_no_triangles_share_more_than_their_vertices(data):
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=8))
 @settings(deadline=None)
-def test_polygons_are_judged_as_by_all_pairs_of_edges(polygon):
+def test_polygons_agree_with_all_pairs_of_edges(polygon):
     k = len(polygon)
     places = np.array(polygon, dtype=float)
     relation = {
@@ -579,7 +580,7 @@ def test_polygons_are_judged_as_by_all_pairs_of_edges(polygon):
         assert (Obstacle.WINDING in found) == (np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0)
 
 
-def test_every_triangle_is_judged_as_in_rational_arithmetic(rng):
+def test_every_triangle_agrees_with_rational_arithmetic(rng):
     F = strip(9, rows=9)
     flat = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0), indexing="ij"), axis=-1).reshape(-1, 2)
     for scale, offset, noise in itertools.product([5e-324, 1e-300, 1e-150, 1, 1e150, 1e307], [0, 1e8], [0, 1e-16, 0.3]):

@@ -1,8 +1,7 @@
-"""The command, as a user calls it: exit statuses, files, reports, messages."""
+"""The command ``qhm``: exit statuses, files, reports and messages."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -24,8 +23,8 @@ from quasiharmonic.surfaces import random_delaunay
 from quasiharmonic.ui import cli
 from shared.commands import run
 from shared.meshes import boundary_of, lift, signed_areas
-from shared.solvable import star_problem, turned_ring
-from shared.written import written
+from shared.obj_reader import written
+from shared.solvable_problems import star_problem, turned_ring
 
 
 def write_problem(folder, V, F, fixed, target, handles=True):
@@ -56,10 +55,10 @@ class TestMap:
         facts = json.loads(report.read_text())
         assert facts["injective"] is True
         assert facts["inverted"] == facts["degenerate"] == []
-        assert facts["iterations"] > 0
+        assert facts["n_iterations"] > 0
         assert facts["seconds"] > 0
         assert facts["linear_solver"]
-        assert sum(stage["iterations"] for stage in facts["stages"]) == facts["iterations"]
+        assert sum(stage["n_iterations"] for stage in facts["stages"]) == facts["n_iterations"]
         assert facts["triangles"] == len(F)
         assert picture.read_bytes().startswith(b"\x89PNG")
         said = capsys.readouterr()
@@ -74,12 +73,12 @@ class TestMap:
         assert run("map", tmp_path, "-o", tmp_path / "out.obj") == 0
         np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "out.obj"))[fixed], target)
 
-    def test_json_alone_on_standard_output(self, star, tmp_path, capsys):
+    def test_only_json_goes_to_standard_output(self, star, tmp_path, capsys):
         assert run("map", star, "-o", tmp_path / "out.off", "--json", "-") == 0
         assert json.loads(capsys.readouterr().out)["injective"] is True
         assert run("check", tmp_path / "out.off") == 0
 
-    def test_a_map_that_is_not_injective_is_written_and_said_to_be_so(self, tmp_path, capsys):
+    def test_a_map_that_is_not_injective_is_written_and_reported(self, tmp_path, capsys):
         problem = write_problem(tmp_path, *turned_ring(180))
         out = tmp_path / "out.obj"
         assert run("map", problem, "-o", out, "--max-iterations", 2, "--json", tmp_path / "r.json") == 1
@@ -111,7 +110,7 @@ class TestMap:
 
 
 def bad_meshes():
-    """(name, V, F, words) of meshes that `qhm map` must refuse."""
+    """Return (name, V, F, words) of meshes that `qhm map` must reject."""
     V, F = random_delaunay(60, seed=2)
     V = lift(V)
     inner = next(t for t in range(len(F)) if not np.isin(F[t], boundary_of(F)).any())
@@ -129,7 +128,7 @@ def bad_meshes():
     ]
 
 
-class TestRefuses:
+class TestRejects:
     @pytest.mark.parametrize(("name", "V", "F", "words"), bad_meshes(), ids=[m[0] for m in bad_meshes()])
     def test_bad_meshes(self, tmp_path, capsys, name, V, F, words):
         problem = write_problem(tmp_path, V, F, np.arange(3), np.zeros((3, 2)), handles=False)
@@ -157,7 +156,7 @@ class TestRefuses:
         assert re.search(words, capsys.readouterr().err)
         assert not (tmp_path / "out.obj").exists()
 
-    def test_fixed_that_misses_part_of_the_boundary(self, star, tmp_path, capsys):
+    def test_fixed_vertices_that_miss_part_of_the_boundary(self, star, tmp_path, capsys):
         lines = (tmp_path / "handles.txt").read_text().split()
         (tmp_path / "some.txt").write_text("\n".join(lines[3:]))
         assert run("map", star, "-o", tmp_path / "out.obj", "--fixed", tmp_path / "some.txt") == 2
@@ -171,13 +170,13 @@ class TestRefuses:
         assert run("map", star, "-o", tmp_path / "out.xyz") == 2
         assert ".obj, .off" in capsys.readouterr().err
 
-    def test_wrong_call(self, star, capsys):
+    def test_invalid_call(self, star, capsys):
         with pytest.raises(SystemExit) as stop:
             run("map", star)
         assert stop.value.code == 2
         assert "-o" in capsys.readouterr().err
 
-    def test_outputs_that_would_destroy_something(self, star, tmp_path, capsys):
+    def test_outputs_that_would_overwrite_inputs(self, star, tmp_path, capsys):
         before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
         out = tmp_path / "out.obj"
         for extra in (
@@ -194,7 +193,7 @@ class TestRefuses:
         assert run("check", star, "--json", star) == 2
         assert run("map", star, "-o", star) == 0
 
-    def test_messages_name_the_file_and_how_it_counts(self, tmp_path, capsys):
+    def test_messages_name_the_file_and_its_numbering(self, tmp_path, capsys):
         _, V, F, _ = bad_meshes()[0]
         problem = write_problem(tmp_path, V, F, np.arange(3), np.zeros((3, 2)), handles=False)
         assert run("map", problem, "-o", tmp_path / "out.obj") == 2
@@ -203,8 +202,8 @@ class TestRefuses:
         assert run("map", problem, "-o", tmp_path / "out.obj", "--reference", "equilateral") in (0, 1)
 
 
-class TestReportFails:
-    """What goes wrong once the map is written must not claim that nothing was."""
+class TestReportFailures:
+    """After a map is written, an error message must not claim that nothing was written."""
 
     def test_full_standard_output(self, star, tmp_path):
         if not Path("/dev/full").exists():
@@ -246,7 +245,7 @@ class TestReportFails:
         assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 3
         assert "o.obj is written; interrupted" in capsys.readouterr().err
 
-    def test_interrupt_while_what_was_written_is_judged(self, star, tmp_path, capsys, monkeypatch):
+    def test_interrupt_while_the_written_map_is_certified(self, star, tmp_path, capsys, monkeypatch):
         def interrupt(mesh):
             raise KeyboardInterrupt
 
@@ -280,9 +279,9 @@ class TestReportFails:
         from matplotlib.image import imread
 
         out, picture = tmp_path / "o.obj", tmp_path / "p.png"
-        assert run("map", star, "-o", out, "--plot", picture, "--plot-kind", "distortion") == 0
+        assert run("map", star, "-o", out, "--plot", picture, "--kind", "distortion") == 0
         assert run("plot", out, "-o", tmp_path / "again.png", "--kind", "distortion") == 0
-        # The same picture as that of the written file.
+        # The picture is the same as that of the written file.
         np.testing.assert_array_equal(imread(picture), imread(tmp_path / "again.png"))
 
     def test_no_first_map_to_draw(self, star, tmp_path, monkeypatch):
@@ -291,22 +290,23 @@ class TestReportFails:
         def fail(*arguments, **more):
             raise NotPositiveDefinite("as asked")
 
-        monkeypatch.setattr("quasiharmonic.solver.search.solving.quasi_harmonic_map", fail)
+        monkeypatch.setattr("quasiharmonic.solver.mapping.quasi_harmonic_map", fail)
         assert run("map", star, "-o", tmp_path / "o.obj", "--plot", tmp_path / "p.png") == 0
         assert (tmp_path / "p.png").exists()
 
 
-class TestDiagnose:
+class TestObstructions:
     def test_nothing_found(self, star, capsys):
-        assert run("diagnose", star) == 0
-        assert str(star) in capsys.readouterr().out
+        run("check", star, "--json", "-")
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["injective"] or not facts["diagnosis"]["obstructions"]
 
-    def test_names_what_forbids_a_map(self, tmp_path, capsys):
+    def test_names_the_obstacle_to_a_map(self, tmp_path, capsys):
         V, F, fixed, target = star_problem(n=80)
         problem = write_problem(tmp_path, V, F, fixed, target * [1, -1])
-        assert run("diagnose", problem, "--json", "-") == 1
+        assert run("check", problem, "--json", "-") == 1
         facts = json.loads(capsys.readouterr().out)
-        assert facts["obstructions"]
+        assert facts["diagnosis"]["obstructions"]
         assert run("map", problem, "-o", tmp_path / "o.obj", "--json", tmp_path / "r.json") == 1
         said = capsys.readouterr().out
         assert "No injective map exists" in said
@@ -316,7 +316,7 @@ class TestDiagnose:
 
 
 class TestPolish:
-    def test_a_little_unasked(self, star, tmp_path, monkeypatch):
+    def test_a_few_steps_by_default(self, star, tmp_path, monkeypatch):
         facts, maps = {}, {}
         for name, options in {"unasked": [], "none": ["--no-polish"], "asked": ["--polish", "blend"]}.items():
             out, report = tmp_path / f"{name}.obj", tmp_path / f"{name}.json"
@@ -327,14 +327,14 @@ class TestPolish:
         assert facts["none"]["status"] == facts["unasked"]["status"] == "injective"
         assert facts["asked"]["status"] == "polished"
         V, F, _, _ = star_problem()
-        worst = {name: distortion(V, F, uv).summary("isometric").maximum for name, uv in maps.items()}
+        worst = {name: distortion(V, F, uv).statistics("isometric").maximum for name, uv in maps.items()}
         assert worst["unasked"] < 0.9 * worst["none"]
-        # On large meshes the first map is what one gets.
-        monkeypatch.setattr("quasiharmonic.energies.smoothing.LARGEST", 100)
+        # Maps of large meshes are not polished by default.
+        monkeypatch.setattr("quasiharmonic.energies.polishing.LARGEST_SMOOTHED", 100)
         assert run("map", star, "-o", tmp_path / "large.obj") == 0
         np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "large.obj")), maps["none"])
 
-    def test_not_unasked_where_distortion_is_undefined(self, tmp_path):
+    def test_not_by_default_where_distortion_is_undefined(self, tmp_path):
         V, F, fixed, target = star_problem(n=120)
         V = np.asarray(V, dtype=float).copy()
         inner = next(t for t in range(len(F)) if not np.isin(F[t], fixed).any())
@@ -344,7 +344,7 @@ class TestPolish:
         assert run("map", problem, "-o", tmp_path / "o.obj", *arguments) == 0
         assert "polish" not in json.loads((tmp_path / "r.json").read_text())["stages"][-1]["name"]
 
-    def test_not_both_ways(self, star, tmp_path, capsys):
+    def test_not_with_and_without_polish(self, star, tmp_path, capsys):
         with pytest.raises(SystemExit):
             run("map", star, "-o", tmp_path / "o.obj", "--polish", "mips", "--no-polish")
         assert "not allowed" in capsys.readouterr().err
@@ -362,12 +362,12 @@ class TestPolish:
         assert run("map", star, "-o", both, "--polish", "mips") == 0
         np.testing.assert_array_equal(io.map_of(io.read_mesh(both)), io.map_of(io.read_mesh(polished)))
 
-    def test_refuses_a_map_with_flips(self, star, tmp_path, capsys):
+    def test_rejects_a_map_with_inverted_triangles(self, star, tmp_path, capsys):
         assert run("polish", star, "-o", tmp_path / "o.obj") == 2
         assert "injective" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
 
-    def test_names_are_those_of_the_library(self):
+    def test_energy_names_are_those_of_the_library(self):
         from quasiharmonic import linsolve
         from quasiharmonic.energies.polishing import ENERGIES
         from quasiharmonic.solver.search import harmonising, strategy
@@ -392,21 +392,21 @@ class TestHarmonise:
         _, _, fixed, target = star_problem()
         np.testing.assert_array_equal(io.map_of(io.read_mesh(out))[fixed], target)
 
-    def test_options_reach_it(self, star, tmp_path):
+    def test_options_reach_the_solver(self, star, tmp_path):
         first, report = tmp_path / "first.obj", tmp_path / "r.json"
         assert run("map", star, "-o", first) == 0
         arguments = "--eta", 0.5, 0.25, "--max-iterations", 6, "--linear-solver", "superlu", "--json", report
         assert run("harmonise", first, "-o", tmp_path / "o.obj", "--energy", "springs", *arguments) == 0
         facts = json.loads(report.read_text())
         assert [s["name"] for s in facts["stages"][:2]] == [f"harmonise, springs, η = {eta}" for eta in (0.5, 0.25)]
-        assert all(s["iterations"] <= 6 for s in facts["stages"][:2])
+        assert all(s["n_iterations"] <= 6 for s in facts["stages"][:2])
         assert facts["linear_solver"] == "superlu"
-        # The map is not of the size of its surface.
+        # The map does not have the size of its surface.
         assert run("harmonise", first, "-o", tmp_path / "o.obj", "--energy", "springs", "--unscaled", *arguments) == 0
         unscaled = json.loads(report.read_text())
         assert unscaled["stages"][0]["energy"] != facts["stages"][0]["energy"]
 
-    def test_refuses_what_it_cannot_begin_with(self, star, tmp_path, capsys):
+    def test_rejects_maps_it_cannot_start_from(self, star, tmp_path, capsys):
         assert run("harmonise", star, "-o", tmp_path / "o.obj", "--energy", "mips") == 2
         assert "injective" in capsys.readouterr().err
         assert run("harmonise", star, "-o", tmp_path / "o.obj", "--eta", "-1") == 2
@@ -414,8 +414,8 @@ class TestHarmonise:
         assert not (tmp_path / "o.obj").exists()
 
     @pytest.mark.parametrize("command", ["polish", "harmonise"])
-    def test_refuses_flat_rest_triangles(self, star, tmp_path, capsys, command):
-        """Without advice that the command has no option for."""
+    def test_rejects_flat_rest_triangles(self, star, tmp_path, capsys, command):
+        """The message does not advise options that the command does not have."""
         first = tmp_path / "first.obj"
         assert run("map", star, "-o", first) == 0
         mesh = io.read_mesh(first)
@@ -429,7 +429,7 @@ class TestHarmonise:
 
 
 class TestCheck:
-    def test_statuses(self, star, tmp_path, capsys):
+    def test_exit_statuses(self, star, tmp_path, capsys):
         assert run("check", star) == 1
         assert "Not injective" in capsys.readouterr().out
         run("map", star, "-o", tmp_path / "out.obj")
@@ -438,7 +438,7 @@ class TestCheck:
         assert run("check", tmp_path / "none.obj") == 2
 
     def test_as_float32(self, tmp_path, capsys):
-        """A triangle that exists in doubles only."""
+        """A triangle that is positive in double precision only."""
         uv = np.array([[0, 0], [1, 0], [0.5, 1e-50]])
         io.write_obj(tmp_path / "thin.obj", io.MeshData(np.eye(3), np.array([[0, 1, 2]])).with_map(uv))
         assert run("check", tmp_path / "thin.obj") == 0
@@ -447,12 +447,12 @@ class TestCheck:
 
 
 class TestDemo:
-    def test_a_folder_that_cannot_be_made(self, tmp_path, capsys):
+    def test_a_folder_that_cannot_be_created(self, tmp_path, capsys):
         (tmp_path / "file").touch()
         assert run("demo", "-o", tmp_path / "file" / "demo") == 2
         assert f"cannot create the folder {tmp_path / 'file' / 'demo'}" in capsys.readouterr().err
 
-    def test_writes_its_three_files(self, tmp_path, capsys):
+    def test_writes_three_files(self, tmp_path, capsys):
         assert run("demo", "-o", tmp_path / "d") == 0
         assert sorted(p.name for p in (tmp_path / "d").iterdir()) == ["demo.json", "demo.obj", "demo.png"]
         facts = json.loads((tmp_path / "d" / "demo.json").read_text())
@@ -463,7 +463,7 @@ class TestDemo:
 
 
 def test_help_imports_no_numerics():
-    """`qhm --help` must not pay for NumPy."""
+    """`qhm --help` must not import NumPy."""
     code = (
         "import sys; from quasiharmonic.ui.cli import main\n"
         "try: main(['map', '--help'])\n"
@@ -474,15 +474,16 @@ def test_help_imports_no_numerics():
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
-def test_every_subcommand_explains_itself(command):
-    """Its page in the documentation is made from this and nothing else."""
-    parser = argparse.ArgumentParser()
+def test_every_subcommand_has_help(command):
+    """The command's page in the documentation is made from the help texts alone."""
+    parser = cli.CommandParser()
     commands = parser.add_subparsers()
     import_module(f"quasiharmonic.ui.cli.commands.{command}").add_parser(commands)
     ((name, subparser),) = commands.choices.items()
     assert name == command
-    assert re.search(rf"^ +{name} +\w+", parser.format_help(), re.MULTILINE)
-    # An option without a help text stands alone on its line, and so does nothing else.
+    assert re.search(rf"^  {name} +\w+", cli.parser_of([]).format_help(), re.MULTILINE)
+    assert re.search(rf"^examples:\n(  qhm {name}\b.*\n)+\Z", subparser.format_help(), re.MULTILINE)
+    # An option without help text would stand alone on its line.
     assert not re.findall(r"^  -[^ ]+(?:, --[\w-]+)?(?: [A-Z]+)?$(?!\n {10})", subparser.format_help(), re.MULTILINE)
 
 
@@ -492,7 +493,7 @@ def test_module_runs_as_the_command():
 
 
 @pytest.mark.parametrize("pure", ["", "1"])
-def test_the_version_says_what_it_runs_on(pure):
+def test_version_names_the_environment(pure):
     command = [sys.executable, "-m", "quasiharmonic", "--version"]
     done = subprocess.run(command, env=os.environ | {"QUASIHARMONIC_PURE": pure}, capture_output=True, text=True)
     first, python, packages, loops, solvers = done.stdout.splitlines()
@@ -501,14 +502,14 @@ def test_the_version_says_what_it_runs_on(pure):
     assert f"numpy {np.__version__}" in packages
     assert solvers == f"linear solvers: {', '.join(available())}"
     if pure:
-        assert loops == "loops: in NumPy, as QUASIHARMONIC_PURE has it"
+        assert loops == "loops: in NumPy, because QUASIHARMONIC_PURE is set"
     else:
         built = find_spec("quasiharmonic.util.kernels._compiled") is not None
         assert loops.startswith("loops: compiled" if built else "loops: in NumPy: ")
 
 
 def test_progress_on_a_terminal_only(star, tmp_path):
-    """On a pseudo-terminal a line is written over; nothing of it stays."""
+    """On a pseudo-terminal, progress lines are overwritten, and nothing remains."""
     pty = pytest.importorskip("pty")
     leader, follower = pty.openpty()
     command = [sys.executable, "-m", "quasiharmonic", "map", str(star), "-o", str(tmp_path / "out.obj")]
@@ -522,13 +523,13 @@ def test_progress_on_a_terminal_only(star, tmp_path):
     assert shown.endswith("\r\x1b[K")
 
 
-# Of every family that has maps by construction one that Tutte's embedding does not map.
+# One problem of every family that is feasible by construction and that Tutte's embedding does not solve.
 MADE = ["noise:1:0.6", "flow:2:0.6", "swirl:3:0.5", "pins:4:0.5", "spiral:5:0.5", "comb:6:0.5", "maze:7:0.5"]
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_made_problems(name, tmp_path):
-    """Every one is solved, and whoever reads the written file as text agrees."""
+def test_generated_problems(name, tmp_path):
+    """Every problem is solved, and the written text file contains the same injective map."""
     V, F, fixed, target, *_ = problems.make(*problems.parse(name))
     out = tmp_path / "out.obj"
     source = write_problem(tmp_path, V, F, fixed, target)

@@ -31,7 +31,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def full_disk(monkeypatch):
-    """Writing fails after a given number of files."""
+    """Make writing fail after a given number of files."""
 
     def set_full(after=0):
         left = iter(range(after))
@@ -64,7 +64,7 @@ def left(folder):
         ("demo -o new/D", 0),
         ("animate m.obj frames.npy -o new/D", 0),
         ("batch . --to disk -o new/D", 0),
-        *(("map m.obj -o o.obj --material", k) for k in range(3)),
+        *(("map m.obj -o o.obj --texture checkerboard", k) for k in range(3)),
         *(("refine m.obj -o o.obj", k) for k in range(3)),
     ],
 )
@@ -77,14 +77,14 @@ def test_a_full_disk_leaves_nothing_behind(folder, full_disk, capsys, call, afte
     assert left(folder) == before
 
 
-def test_a_folder_that_was_there_stays(folder, full_disk, capsys):
+def test_an_existing_folder_is_not_removed(folder, full_disk, capsys):
     (folder / "D").mkdir()
     full_disk()
     assert run("demo", "-o", "D") == 2
     assert left(folder) == ["D", "m.obj"]
 
 
-def test_frames_that_are_written_are_told(folder, full_disk, capsys):
+def test_written_frames_are_reported(folder, full_disk, capsys):
     frames(folder, 3)
     full_disk(2)
     assert run("animate", "m.obj", "frames.npy", "-o", "D") == 3
@@ -92,7 +92,7 @@ def test_frames_that_are_written_are_told(folder, full_disk, capsys):
     assert left(folder / "D") == ["0000.obj", "0001.obj"]
 
 
-def test_a_folder_that_cannot_be_made(folder, capsys):
+def test_a_folder_that_cannot_be_created(folder, capsys):
     (folder / "file").write_text("")
     for call in ("demo -o file/D", "demo -o file"):
         assert run(*call.split()) == 2
@@ -105,7 +105,7 @@ def test_a_folder_that_cannot_be_made(folder, capsys):
 REPRESENTATIONS = "Path(", "Error(", "errno", "Errno", "object at 0x", "np.float64(", "<class"
 
 
-def test_outputs_that_cannot_be_named(folder, capsys):
+def test_outputs_with_unusable_names(folder, capsys):
     os.symlink("loop.obj", folder / "loop.obj")
     for name in ("loop.obj", "a\0b.obj"):
         with pytest.raises(OutputError) as raised:
@@ -115,7 +115,7 @@ def test_outputs_that_cannot_be_named(folder, capsys):
         assert said.isprintable()
 
 
-def test_inputs_that_cannot_be_named(folder):
+def test_inputs_with_unusable_names(folder):
     for name in ("a\0b.obj", "a\udcffb.obj", "a\nb.obj"):
         with pytest.raises(MeshFileError) as raised:
             io.read_mesh(folder / name)
@@ -167,7 +167,7 @@ def test_damaged_gltf_is_described_in_words(folder, make, said):
     assert not any(word in str(raised.value) for word in REPRESENTATIONS)
 
 
-def test_a_missing_file_is_named_without_the_number_of_the_error(folder, capsys):
+def test_message_for_a_missing_file_has_no_error_number(folder, capsys):
     for call in ("field none.npy -o o.npy", "animate m.obj none.npy -o D", "flatten none.obj -o o.obj"):
         assert run(*call.split()) == 2
         said = capsys.readouterr().err
@@ -176,7 +176,7 @@ def test_a_missing_file_is_named_without_the_number_of_the_error(folder, capsys)
 
 
 @pytest.mark.parametrize("value", [object(), np.float64(-1.5), {}])
-def test_arguments_of_another_kind_are_named_shortly(value, folder):
+def test_wrong_arguments_are_named_briefly(value, folder):
     V, F = disk(3)
     (rim,) = boundary_loops(F, len(V))
     for call in (
@@ -196,8 +196,8 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
 @pytest.mark.parametrize(
     ("call", "needs"),
     [
-        ("map m.obj -o o.obj --plot-kind map", "--plot"),
-        ("map m.obj -o o.obj --margin 0.1", "--pack"),
+        ("map m.obj -o o.obj --kind map", "--plot"),
+        ("map m.obj -o o.obj --padding 8", "--pack"),
         ("map m.obj -o o.obj --font x", "--to"),
         ("map m.obj -o o.obj --to disk --font x", "only letter: and word:"),
         ("map m.obj -o o.obj --corner-angle 9", "--to"),
@@ -207,15 +207,15 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         ("flatten m.obj -o o.obj --rings 3", "--energy distances"),
         ("flatten m.obj -o o.obj --unit cm", "--pattern"),
         ("flatten m.obj -o o.obj --allowance 1", "--pattern"),
-        ("polish m.obj -o o.obj --margin 0.1", "--pack"),
+        ("polish m.obj -o o.obj --padding 8", "--pack"),
         ("polish m.obj -o o.obj --to disk", "--slide"),
-        ("harmonise m.obj -o o.obj --margin 0.1", "--pack"),
+        ("harmonise m.obj -o o.obj --padding 8", "--pack"),
         ("animate m.obj m.obj -o o --max-motion-ratio 2", "--polish"),
         ("animate m.obj m.obj -o o --frames-per-second 2", "--frames-per-second needs a moving picture"),
         ("measure m.obj --rings 3", "--distances"),
         ("plot m.obj -o o.png --measure mips", "--kind distortion"),
         ("plot m.obj -o o.png --kind texture --measure isometric", "--kind distortion"),
-        ("plot m.obj -o o.png --kind map --picture p.png", "--kind map"),
+        ("plot m.obj -o o.png --kind map --texture p.png", "--kind map"),
         ("check m.obj --plot o.png", "--boundary"),
         ("check m.obj --boundary --as float64", "--as"),
         ("check m.obj --boundary --any-triangulation", "--any-triangulation"),
@@ -225,7 +225,7 @@ def test_arguments_of_another_kind_are_named_shortly(value, folder):
         ("batch . -o o --corners auto", "give the outline by to"),
     ],
 )
-def test_an_option_without_effect_is_refused(folder, capsys, call, needs):
+def test_an_option_without_effect_is_rejected(folder, capsys, call, needs):
     assert run(*call.split()) == 2
     assert needs in capsys.readouterr().err
     assert left(folder) == ["m.obj"]
@@ -235,7 +235,7 @@ def test_an_option_without_effect_is_refused(folder, capsys, call, needs):
 
 
 def shell(call, streams, *, unbuffered=False):
-    """Exit status and standard error of a command with its own streams."""
+    """Return the exit status and standard error of a command with the given streams."""
     command = f"set -o pipefail; {sys.executable} -m quasiharmonic {call} {streams}"
     environment = {**os.environ, "PYTHONUNBUFFERED": "1" if unbuffered else ""}
     done = subprocess.run(["bash", "-c", command], capture_output=True, env=environment)
@@ -245,7 +245,7 @@ def shell(call, streams, *, unbuffered=False):
 @posix
 @pytest.mark.parametrize("unbuffered", [False, True])
 @pytest.mark.parametrize("call", ["--version", "--help", "map --help", "check m.obj", "measure m.obj"])
-def test_without_a_reader_the_command_ends_in_silence(folder, call, unbuffered):
+def test_without_a_reader_the_command_ends_without_a_message(folder, call, unbuffered):
     status, said = shell(call, "| true", unbuffered=unbuffered)
     assert status == 141
     assert said == ""
@@ -259,7 +259,7 @@ def test_a_command_that_writes_no_file_ends_with_141_when_standard_output_is_clo
 
 @posix
 @pytest.mark.parametrize("call", ["check m.obj --json out.json", "measure m.obj --export out.csv", "--help"])
-def test_a_closed_standard_output_is_no_failure_when_the_report_goes_elsewhere(folder, call):
+def test_closed_standard_output_is_no_failure_if_the_report_goes_elsewhere(folder, call):
     status, said = shell(call, ">&-")
     assert status == 0
     assert ("usage" in said) == (call == "--help")
@@ -268,14 +268,14 @@ def test_a_closed_standard_output_is_no_failure_when_the_report_goes_elsewhere(f
 @posix
 @pytest.mark.parametrize("streams", ["2>&-", ">&- 2>&-", "2>&1 | true"])
 @pytest.mark.parametrize(("call", "status"), [("--version", (0, 141)), ("check m.obj", (0, 141)), ("check none", (2,))])
-def test_without_a_standard_error_the_command_ends_in_silence(folder, call, status, streams):
+def test_without_standard_error_the_command_ends_without_a_message(folder, call, status, streams):
     found, said = shell(call, streams)
     assert found in status
     assert said == ""
 
 
 @posix
-def test_a_report_in_json_stays_alone_without_a_standard_error(folder):
+def test_json_output_stays_valid_without_standard_error(folder):
     command = f"{sys.executable} -m quasiharmonic check m.obj --json - 2>&-"
     done = subprocess.run(["bash", "-c", command], stdout=subprocess.PIPE)
     assert done.returncode == 0
@@ -285,7 +285,7 @@ def test_a_report_in_json_stays_alone_without_a_standard_error(folder):
 @posix
 @pytest.mark.parametrize("unbuffered", [False, True])
 @pytest.mark.parametrize("call", ["--version", "--help", "map --help", "check m.obj"])
-def test_a_full_standard_output_is_said(folder, call, unbuffered):
+def test_a_full_standard_output_is_reported(folder, call, unbuffered):
     if not os.path.exists("/dev/full"):
         pytest.skip("no /dev/full on this system")
     status, said = shell(call, "> /dev/full", unbuffered=unbuffered)

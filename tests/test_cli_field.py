@@ -26,7 +26,7 @@ def test_a_field_and_its_inverse(tmp_path, field, capsys):
         "--spacing",
         "0.5",
         "2",
-        "--hold-border",
+        "--fix-border",
         "--min-jacobian",
         "0.02",
         "--json",
@@ -47,7 +47,7 @@ def test_a_field_and_its_inverse(tmp_path, field, capsys):
 
 
 def test_a_field_without_an_inverse(tmp_path, capsys):
-    """The border of the field overlaps itself, but no cell is inverted."""
+    """The boundary of the field overlaps itself, but no cell is inverted."""
     t, r = np.meshgrid(np.linspace(0, 7, 80), np.linspace(20, 30, 6))
     ring = np.stack([r * np.sin(t), r * np.cos(t)], axis=-1)[:, ::-1]
     x, y = np.meshgrid(np.arange(80), np.arange(6))
@@ -69,11 +69,11 @@ def test_a_field_without_an_inverse(tmp_path, capsys):
         (["lost.npy", "-o", "a.npy"], r"lost.npy: field is not finite at pixel (2, 3), row and column"),
         (["words.npy", "-o", "a.npy"], "words.npy: not an array of numbers in NumPy's format .npy"),
         (["none.npy", "-o", "a.npy"], "none.npy"),
-        (["row.npy", "-o", "a.npy", "--hold-border"], "row.npy: field must have shape (height, width, 2)"),
+        (["row.npy", "-o", "a.npy", "--fix-border"], "row.npy: field must have shape (height, width, 2)"),
         (["several.npz", "-o", "a.npy"], "several.npz: not an array of numbers in NumPy's format .npy"),
     ],
 )
-def test_wrong_calls(tmp_path, monkeypatch, field, capsys, arguments, message):
+def test_invalid_calls(tmp_path, monkeypatch, field, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     field[2, 3, 0] = np.nan
     np.save("lost.npy", field)

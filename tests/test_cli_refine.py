@@ -1,4 +1,4 @@
-"""`qhm refine`: a problem without a map in, one with a map out, and nothing else touched."""
+"""``qhm refine``: it turns a problem without a map into one with a map and changes nothing else."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import pytest
 
 from quasiharmonic import io
 from shared.commands import run
+from shared.infeasible_problems import OBSTRUCTED
 from shared.meshes import lift, signed_areas
-from shared.obstructed import OBSTRUCTED
 
 
 def write(folder, name, **more):
-    """A problem as files; the free vertices get no place."""
+    """Write a problem as files; free vertices get no target positions."""
     problem, _ = OBSTRUCTED[name]
     uv = np.full((problem.n, 2), 0.25)
     uv[problem.fixed] = problem.target
@@ -33,12 +33,15 @@ def test_after_refining_there_is_a_map(tmp_path, capsys, name):
     out, handles = tmp_path / "finer.obj", tmp_path / "finer.handles"
     assert run("map", tmp_path, "-o", tmp_path / "none.obj") == 1
     assert "qhm refine" in capsys.readouterr().out
-    assert run("diagnose", tmp_path) == 1
+    assert run("check", tmp_path) == 1
     assert "qhm refine" in capsys.readouterr().out
 
     assert run("refine", tmp_path, "-o", out, "--json", tmp_path / "report.json") == 0
     assert f"qhm map {out} --fixed {handles}" in capsys.readouterr().out
-    assert run("diagnose", out, "--fixed", handles) == 0
+    capsys.readouterr()
+    run("check", out, "--fixed", handles, "--json", "-")
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["injective"] or not facts["diagnosis"]["forbids_injective"]
     assert run("map", out, "--fixed", handles, "-o", tmp_path / "map.obj") == 0
 
     mesh, facts = io.read_mesh(out), json.loads((tmp_path / "report.json").read_text())
@@ -91,7 +94,7 @@ def test_groups_and_normals_stay_with_their_triangles(tmp_path):
     assert np.isfinite(new.extra).all()
 
 
-def test_what_no_refinement_cures(tmp_path, capsys):
+def test_problems_that_refinement_cannot_solve(tmp_path, capsys):
     problem = write(tmp_path, "mirrored")
     assert run("refine", tmp_path, "-o", tmp_path / "same.obj") == 1
     said = capsys.readouterr().out
@@ -101,7 +104,7 @@ def test_what_no_refinement_cures(tmp_path, capsys):
     np.testing.assert_array_equal(io.read_mesh(tmp_path / "same.obj").F, problem.F)
 
 
-def test_where_nothing_is_in_the_way_nothing_changes(tmp_path):
+def test_a_problem_without_obstacles_is_not_changed(tmp_path):
     problem = write(tmp_path, "slit")
     assert run("refine", tmp_path, "-o", tmp_path / "same.obj") == 0
     assert (tmp_path / "same.obj").read_bytes() == (tmp_path / "input.obj").read_bytes()
@@ -109,7 +112,7 @@ def test_where_nothing_is_in_the_way_nothing_changes(tmp_path):
     assert len(io.read_handles(tmp_path / "same.handles", problem.n)) == len(problem.fixed)
 
 
-def test_vertices_without_a_place_get_one(tmp_path):
+def test_vertices_without_a_target_position_get_one(tmp_path):
     problem = write(tmp_path, "no kernel")
     text = (tmp_path / "input.obj").read_text()
     bare = text.replace("9/9", "9")  # the hub
@@ -121,8 +124,8 @@ def test_vertices_without_a_place_get_one(tmp_path):
     np.testing.assert_array_equal(uv[8], (problem.target.min(axis=0) + problem.target.max(axis=0)) / 2)
 
 
-class TestRefuses:
-    def test_to_overwrite_anything(self, tmp_path, capsys):
+class TestRejects:
+    def test_overwriting_an_existing_file(self, tmp_path, capsys):
         write(tmp_path, "no kernel")
         source, handles = tmp_path / "input.obj", tmp_path / "handles.txt"
         (tmp_path / "link.obj").symlink_to(source)
@@ -146,7 +149,7 @@ class TestRefuses:
             assert said.out == ""
             assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
-    @pytest.mark.parametrize("command", ["map", "check", "diagnose"])
+    @pytest.mark.parametrize("command", ["map", "check"])
     def test_a_report_in_place_of_a_hard_link_to_the_input(self, tmp_path, capsys, command):
         write(tmp_path, "slit")
         source, link = tmp_path / "input.obj", tmp_path / "link.json"
@@ -157,12 +160,12 @@ class TestRefuses:
         assert link.samefile(source)
 
     @pytest.mark.parametrize("output", ["finer.off", "finer", "nowhere/finer.obj"])
-    def test_places_where_it_cannot_be_written(self, tmp_path, capsys, output):
+    def test_outputs_that_cannot_be_written(self, tmp_path, capsys, output):
         write(tmp_path, "no kernel")
         assert run("refine", tmp_path, "-o", tmp_path / output) == 2
         assert str(tmp_path / output) in capsys.readouterr().err
 
-    def test_wrong_input(self, tmp_path, capsys):
+    def test_invalid_input(self, tmp_path, capsys):
         write(tmp_path, "no kernel")
         (tmp_path / "handles.txt").write_text("0\n1\n")
         assert run("refine", tmp_path, "-o", tmp_path / "finer.obj") == 2
@@ -172,7 +175,7 @@ class TestRefuses:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills outright")
-def test_kill_9_leaves_each_file_old_or_new(tmp_path):
+def test_kill_9_leaves_each_file_complete_old_or_new(tmp_path):
     write(tmp_path, "nothing sees all")
     out = tmp_path / "finer.obj"
     command = [sys.executable, "-m", "quasiharmonic", "refine", str(tmp_path), "-o", str(out)]
@@ -188,15 +191,15 @@ def test_kill_9_leaves_each_file_old_or_new(tmp_path):
         for path, text in zip(files, old, strict=True):
             path.write_bytes(text)
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-            # Most of the time goes by before anything is written.
+            # Most of the time passes before the command writes.
             time.sleep(took * rng.uniform(0.6, 1.1))
             process.kill()
-        if process.returncode == 0:  # the machine is less busy than it was
+        if process.returncode == 0:  # use less time if the machine is faster now
             took *= 0.9
         killed += process.returncode != 0
         now = [path.read_bytes() for path in files]
         assert all(text in pair for text, *pair in zip(now, old, new, strict=True))
-        # The mesh comes last.
+        # The mesh is written last.
         assert now[0] == old[0] or now == new
         if killed == 3:
             break

@@ -1,4 +1,4 @@
-"""Coarse meshes, the way back from them, and the search that takes it."""
+"""Coarse meshes, prolongation from them, and the search that uses them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, distortion, inverted_triangles, is_injective, solve
-from quasiharmonic.geometry.coarsening.levels import coarsen, touching
-from quasiharmonic.geometry.coarsening.prolongation import places, prolong, smooth
-from quasiharmonic.geometry.coarsening.removal import by_degree, remove_vertices, room_for_round
+from quasiharmonic.geometry.coarsening.levels import coarsen, has_marked_corner
+from quasiharmonic.geometry.coarsening.prolongation import prolong, reinsertion_positions, smooth
+from quasiharmonic.geometry.coarsening.removal import allocate_round, remove_vertices, split_by_degree
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain
 from quasiharmonic.solver.methods import VectorAdam
-from quasiharmonic.solver.search import stages
+from quasiharmonic.solver.search import search
 from quasiharmonic.solver.search.coarse import CoarseMesh, coarse_mesh
 from quasiharmonic.solver.search.stages import CoarseToFine
 from quasiharmonic.solver.search.strategy import speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
+from shared.distinct_steps import DistinctSteps
 from shared.meshes import boundary_of, lift, random_annulus, signed_areas, tangled
-from shared.told import Told
 
 
 def meshes():
@@ -45,7 +45,7 @@ def coarsened(V, F, pins=(), goal=0):
 
 
 def turned(F):
-    """Triangles as a set: each from its smallest vertex on."""
+    """Return the triangles as a set; each starts at its smallest vertex."""
     first = F.argmin(axis=1)[:, None] + np.arange(3)
     return set(map(tuple, np.take_along_axis(F, first % 3, axis=1).tolist()))
 
@@ -59,15 +59,15 @@ class TestCoarsen:
         assert not found.inconsistent.size
         assert set(map(tuple, found.boundary.tolist())) == set(map(tuple, fine.boundary.tolist()))
         assert np.isin(np.flatnonzero(held), coarse.F).all()
-        # Euler's characteristic: no handle and no hole has come or gone.
+        # The Euler characteristic does not change: no handle and no hole.
         euler = [
             np.unique(T).size - len(e.interior) - len(e.boundary) + len(T) for T, e in ((coarse.F, found), (F, fine))
         ]
         assert euler[0] == euler[1]
         assert np.unique(coarse.F).size < 0.45 * len(V)
 
-    def test_leads_back_to_the_mesh(self, name, V, F, pins):
-        """Round by round: rings hold the vertices that were there, and fans fill them."""
+    def test_prolongs_to_the_original_mesh(self, name, V, F, pins):
+        """In each round, rings contain the vertices that existed before, and fans fill them."""
         _, coarse = coarsened(V, F, pins)
         triangles = turned(coarse.F)
         for number in reversed(range(len(coarse.rounds))):
@@ -83,7 +83,7 @@ class TestCoarsen:
         assert triangles == turned(F)
         assert 0 in coarse.levels
 
-    def test_gives_held_vertices_no_new_neighbours(self, name, V, F, pins):
+    def test_fixed_vertices_get_no_new_neighbours(self, name, V, F, pins):
         held, coarse = coarsened(V, F, pins)
         n = len(V)
 
@@ -94,17 +94,17 @@ class TestCoarsen:
 
         assert at_held(coarse.F) <= at_held(F)
 
-    def test_stops_at_its_goal_and_repeats_itself(self, name, V, F, pins):
+    def test_stops_at_its_goal_and_is_deterministic(self, name, V, F, pins):
         goal = int(0.7 * len(V))
         _, coarse = coarsened(V, F, pins, goal)
         _, again = coarsened(V, F, pins, goal)
-        # A round takes out a quarter at most.
+        # A round removes at most a quarter of the vertices.
         assert 0.7 * goal < np.unique(coarse.F).size <= goal
         np.testing.assert_array_equal(coarse.F, again.F)
 
 
 def removed_by_hand(T, free, dice):
-    """Vertices that a round takes out, with their rings, and what kept others in; vertex by vertex."""
+    """Return the vertices that a round removes, with their rings, and the reasons why others stay, vertex by vertex."""
     triangles = T.T.tolist()
     following = {v: {} for v in range(free.size)}
     for t in triangles:
@@ -136,16 +136,16 @@ def removed_by_hand(T, free, dice):
     return rings, why
 
 
-def test_rounds_take_out_what_they_should():
-    """And the meshes are such that every reason to stay occurs."""
+def test_rounds_remove_the_expected_vertices():
+    """The meshes are such that every reason to keep a vertex occurs."""
     whys = Counter()
     for seed in range(25):
         rng = np.random.default_rng(seed)
         T, free = tangled(rng, 150)
-        dice = 12 * rng.random(free.size)  # so that few neighbours hardly count
-        vertices, rings, of_degree = room_for_round(T)
+        dice = 12 * rng.random(free.size)  # so that neighbours count little
+        vertices, rings, of_degree = allocate_round(T)
         remove_vertices(T, free, dice, vertices, rings, of_degree)
-        found = [ring for some in by_degree(rings, of_degree) for ring in some.tolist()]
+        found = [ring for some in split_by_degree(rings, of_degree) for ring in some.tolist()]
         expected, why = removed_by_hand(T, free, dice)
         assert dict(zip(vertices.tolist(), found, strict=False)) == expected
         assert vertices[: len(found)].tolist() == list(expected)
@@ -155,21 +155,21 @@ def test_rounds_take_out_what_they_should():
     assert whys["claimed"] > 2
 
 
-def test_touching():
+def test_vertices_that_touch():
     F = np.array([[0, 1, 2], [2, 1, 3], [3, 4, 5]])
     np.testing.assert_array_equal(
-        touching(F, np.array([True, False, False, False, True, False])),
+        has_marked_corner(F, np.array([True, False, False, False, True, False])),
         [True, False, True],
     )
 
 
-class TestPlaces:
+class TestKernelPoints:
     @pytest.mark.parametrize("d", range(3, 9))
     @pytest.mark.parametrize("thin", [1.0, 1e-3, 1e-9])
-    def test_are_seen_from_all_of_the_ring(self, d, thin, rng):
-        """Rings that are seen from their apexes and from little else."""
+    def test_see_the_whole_ring(self, d, thin, rng):
+        """Rings that are visible from their apexes and from few other points."""
         rows = 300
-        # Angles of the fan's sectors: any, with a sum below a full turn; the ring may be reflex at its apex.
+        # The fan's sectors have any angles whose sum is below a full turn; the ring may be reflex at its apex.
         sectors = rng.random((rows, d - 2)) + 1e-2
         sectors *= (rng.uniform(0.2, 1.95 * np.pi, rows) / sectors.sum(axis=1))[:, None]
         sectors = np.minimum(sectors, 0.95 * np.pi)
@@ -177,22 +177,22 @@ class TestPlaces:
         arm = thin ** rng.random((rows, d - 1)) * np.exp(1j * angle)
         ring = np.concatenate([np.zeros((rows, 1)), arm], axis=1) * np.exp(2j * np.pi * rng.random((rows, 1)))
         ring += rng.standard_normal((rows, 1))
-        place = places(ring)
+        place = reinsertion_positions(ring)
         spokes = ring - place[:, None]
         area = (spokes.conj() * np.roll(spokes, -1, axis=1)).imag
         if thin > 1e-6:
             assert area.min() > 0
         else:
-            # Where arms differ by nine orders of magnitude, a few places are lost to rounding.
+            # If arms differ by nine orders of magnitude, rounding loses a few points.
             assert np.mean(area.min(axis=1) > 0) > 0.97
 
-    def test_are_the_middle_of_a_regular_ring(self):
+    def test_are_the_centre_of_a_regular_ring(self):
         ring = 3 + 2 * np.exp(2j * np.pi * np.arange(6) / 6)[None]
-        assert places(ring)[0] == pytest.approx(3)
+        assert reinsertion_positions(ring)[0] == pytest.approx(3)
 
 
 class TestSmoothing:
-    def test_takes_vertices_to_the_middle_of_their_neighbours(self, rng):
+    def test_moves_vertices_to_the_mean_of_their_neighbours(self, rng):
         V, F = disk(6)
         held = np.zeros(len(V), dtype=bool)
         held[[*boundary_of(F), 7]] = True
@@ -204,7 +204,7 @@ class TestSmoothing:
         np.testing.assert_allclose(w, expected, atol=1e-15)
 
     def test_inverts_nothing(self):
-        """A spiral, through whose arms the middles of neighbours go."""
+        """A spiral whose arms are crossed by the means of neighbours."""
         V, F = disk(30)
         held = np.zeros(len(V), dtype=bool)
         held[boundary_of(F)] = True
@@ -219,7 +219,7 @@ class TestSmoothing:
 
 @pytest.mark.parametrize(("name", "V", "F", "pins"), meshes(), ids=lambda x: x if isinstance(x, str) else "")
 def test_injective_maps_stay_injective(name, V, F, pins, rng):
-    """From positions of the coarse vertices alone, also where these are far from even."""
+    """Only the positions of the coarse vertices are given, and they may be far from even."""
     held, coarse = coarsened(V, F, pins)
     used, local = np.unique(coarse.F, return_inverse=True)
     local = local.reshape(-1, 3).astype(np.int64)
@@ -228,7 +228,7 @@ def test_injective_maps_stay_injective(name, V, F, pins, rng):
     assert found.injective
     uv = found.uv
     for _ in range(100):
-        # Vertices at random towards one of their neighbours, as long as triangles stay positive.
+        # Move vertices at random towards one of their neighbours while triangles stay positive.
         some = local[rng.choice(len(local), 3)]
         free = some[~np.isin(some[:, 0], fixed)]
         moved = uv.copy()
@@ -255,7 +255,7 @@ def posed():
 
 
 class TestSearch:
-    def test_large_meshes_are_solved_without_being_factored(self, posed, monkeypatch):
+    def test_large_meshes_are_solved_without_factoring_them(self, posed, monkeypatch):
         factor, sizes = Laplacian.factor, set()
 
         def recorded(laplacian, *arguments):
@@ -264,7 +264,7 @@ class TestSearch:
 
         monkeypatch.setattr(Laplacian, "factor", recorded)
         problem = posed.with_target(posed.target)
-        steps = Told()
+        steps = DistinctSteps()
         result = solve(problem, callback=steps.append)
         assert result.injective
         assert [s.name.split(",")[0] for s in result.stages] == ["coarse-to-fine"]
@@ -272,7 +272,7 @@ class TestSearch:
         np.testing.assert_array_equal(result.uv[problem.fixed], problem.target)
         assert steps == result.history
         assert [s.iteration for s in steps] == list(range(len(steps)))
-        assert result.iterations == len(steps) - 1
+        assert result.n_iterations == len(steps) - 1
         assert (steps[-1].inverted, steps[-1].energy) == (0, 0.0)
         assert result.mu.shape == (len(problem.F),)
         assert np.all(np.abs(result.mu) < 1)
@@ -285,7 +285,7 @@ class TestSearch:
         direct = solve(posed, strategy=[s for s in speed(posed) if not isinstance(s, CoarseToFine)])
         assert mean(solve(posed).uv) < 2 * mean(direct.uv)
 
-    def test_is_repeated_for_a_moved_target(self, posed):
+    def test_repeats_for_a_moved_target(self, posed):
         shifted = posed.with_target(2 * posed.target + 1)
         strategy = [CoarseToFine(VectorAdam())]
         first, second = solve(posed, strategy=strategy), solve(shifted, strategy=strategy)
@@ -294,7 +294,7 @@ class TestSearch:
         assert coarse is not None
         assert coarse_mesh(shifted) is coarse
 
-    def test_serves_pins_and_holes(self):
+    def test_handles_pins_and_holes(self):
         V, F = random_annulus(4000, seed=3)
         fixed = np.append(boundary_of(F), [int(np.argmin(np.abs(V - (0, 0.7)).sum(axis=1)))])
         target = V[fixed] @ [[1, 0.4], [0, 1]]
@@ -304,17 +304,17 @@ class TestSearch:
         assert result.injective
         assert result.stages[0].name.startswith("coarse-to-fine, vector-adam, si-log")
 
-    def test_goes_on_where_the_coarse_problem_fails(self, posed, monkeypatch):
+    def test_continues_if_the_coarse_problem_fails(self, posed, monkeypatch):
         found = solve(posed)
 
         def mirrored(problem):
-            """The coarse mesh with its triangles turned over, which admits no map."""
+            """The coarse mesh with reversed triangles, which admits no map."""
             coarse = copy(coarse_mesh(problem))
             turned = coarse.domain.F[:, ::-1]
             coarse.domain = Domain(coarse.domain.V, turned, coarse.domain.fixed)
             return coarse
 
-        monkeypatch.setattr(stages, "coarse_mesh", mirrored)
+        monkeypatch.setattr(search, "coarse_mesh", mirrored)
         result = solve(posed)
         assert result.injective
         assert [s.name.split(",")[0] for s in result.stages] == [
@@ -322,13 +322,13 @@ class TestSearch:
             "composite",
         ]
         assert not result.stages[0].kept
-        assert result.iterations == len(result.history) - 1
+        assert result.n_iterations == len(result.history) - 1
         assert not np.array_equal(result.uv, found.uv)
 
     @pytest.mark.parametrize("repaired", [True, False])
-    def test_what_a_coarse_search_leaves_inverted_is_repaired_on_the_mesh(self, posed, monkeypatch, repaired):
-        """A search of the whole mesh for a triangle or two took many times as long."""
-        solved = stages.search_coarse
+    def test_triangles_that_the_coarse_search_leaves_inverted_are_repaired(self, posed, monkeypatch, repaired):
+        """A search on the whole mesh for one or two triangles took many times as long."""
+        solved = search.search_coarse
 
         def nearly(coarse, *further):
             _, uv, _, solver = solved(coarse, *further)
@@ -342,9 +342,9 @@ class TestSearch:
 
         prolonged = CoarseMesh.prolong
         monkeypatch.setattr(CoarseMesh, "prolong", displaced)
-        monkeypatch.setattr(stages, "search_coarse", nearly)
+        monkeypatch.setattr(search, "search_coarse", nearly)
         if not repaired:
-            monkeypatch.setattr(stages, "LOCAL_REPAIRS", ())
+            monkeypatch.setattr(search, "LOCAL_REPAIRS", ())
         result = solve(posed, strategy=[CoarseToFine(VectorAdam()), VectorAdam(iterations=1)])
         first, *others = [s.name.split(",")[0] for s in result.stages]
         left = result.stages[0].inverted[1]
@@ -352,13 +352,13 @@ class TestSearch:
         assert 0 < left <= 50
         assert result.injective is repaired
         if repaired:
-            assert set(others) <= {"combing", "patches"}
+            assert set(others) <= {"line shift", "local repair"}
         else:
-            # It begins anew, and what it comes to is worse than what was put aside.
+            # It starts again, and its result is worse than the stored one.
             assert others == ["vector-adam"]
             assert result.stages[1].inverted[1] > left == len(result.certificate.inverted)
 
-    def test_is_left_out_where_it_does_not_serve(self, posed):
+    def test_is_skipped_where_it_does_not_help(self, posed):
         small = Problem(*on_letter("C", rings=12))
         assert coarse_mesh(small) is None
         names = [s.name.split(",")[0] for s in speed(small)]
@@ -375,12 +375,12 @@ class TestSearch:
         result = solve(posed, callback=stop)
         assert result.status is Status.INTERRUPTED
         assert result.certificate.inverted.size > 0
-        # Not the middle of the target, but the coarse map carried here.
+        # The result is the prolonged coarse map, not the centre of the target.
         assert np.count_nonzero(signed_areas(posed.F, result.uv) > 0) > len(posed.F) // 2
 
     @pytest.mark.parametrize("bend", [0.0, 1e-9], ids=["in a plane", "all but in a plane"])
-    def test_flat_coarse_triangles_have_shapes(self, bend, rng):
-        """On a grid there are coarse triangles whose corners lie on a line, or all but."""
+    def test_flat_coarse_triangles_get_shapes(self, bend, rng):
+        """On a grid, some coarse triangles have corners on a line, or almost."""
         V, F = grid(120, 120)
         V = np.column_stack([V, bend * rng.standard_normal(len(V))])
         problem = Problem(V, F, boundary_of(F), V[boundary_of(F), :2] @ [[1, 0.3], [0, 1]])

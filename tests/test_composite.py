@@ -1,4 +1,4 @@
-"""The composite of two maps through a disk: against what is known of it, and what it saves."""
+"""The composite of two maps through a disk: known properties, and the steps that it saves."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import Composite, VectorAdam
 from quasiharmonic.solver.methods.composite import composite_map, polygon_triangles
 from quasiharmonic.surfaces import annulus, disk
-from shared.solvable import star_problem
+from shared.solvable_problems import star_problem
 
 
 def onto(outline, rings=10):
-    """A disk and an outline, from an angle to a place, for its boundary."""
+    """Return a disk and target positions of its boundary on an outline, given by a function of the angle."""
     V, F = disk(rings)
     (loop,) = boundary_loops(F, len(V))
     place = outline(np.arctan2(V[loop, 1], V[loop, 0]))
@@ -24,13 +24,13 @@ def onto(outline, rings=10):
 
 
 def comma(angle):
-    """A disk bent around by three quarters of a turn, thin at one end."""
+    """Return a disk bent by three quarters of a turn, with one thin end."""
     x, y = np.cos(angle), np.sin(angle)
     return (2 - (0.5 - 0.4 * x) * y) * np.exp(2.4j * x)
 
 
 @pytest.mark.parametrize("corners", [3, 4, 17, 200])
-def test_a_polygon_is_covered_once_without_further_corners(rng, corners):
+def test_a_polygon_is_covered_once_without_extra_corners(rng, corners):
     angle = np.sort(rng.uniform(0, 2 * np.pi, corners)) if corners > 4 else np.arange(corners) * 2 * np.pi / corners
     outline = rng.uniform(0.2, 1, corners) * np.exp(1j * angle)
     F = polygon_triangles(outline)
@@ -41,8 +41,8 @@ def test_a_polygon_is_covered_once_without_further_corners(rng, corners):
 
 
 @pytest.mark.parametrize("corners", [101, 200])
-def test_few_corners_are_triangulated_as_many_are(rng, corners):
-    """By a sweep and flips, and by Qhull and flips within a box: the Delaunay triangulation is one."""
+def test_small_and_large_polygons_have_the_same_triangulation(rng, corners):
+    """A sweep with flips, and Qhull with flips in a box, must agree, because the Delaunay triangulation is unique."""
     outline = rng.uniform(0.2, 1, corners) * np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, corners)))
     swept = delaunay_of_polygon(np.stack([outline.real, outline.imag], axis=1))
     assert {tuple(np.roll(t, -t.argmin())) for t in swept} == {
@@ -50,19 +50,19 @@ def test_few_corners_are_triangulated_as_many_are(rng, corners):
     }
 
 
-def test_what_meets_itself_or_runs_clockwise_has_no_triangles():
+def test_crossing_or_clockwise_polygons_have_no_triangles():
     assert polygon_triangles(np.array([0, 1 + 1j, 1, 1j])) is None
     assert polygon_triangles(np.exp(-2j * np.pi * np.arange(5) / 5)) is None
 
 
-def test_onto_a_regular_polygon_it_is_tuttes_embedding():
+def test_on_a_regular_polygon_it_is_tuttes_embedding():
     problem = onto(lambda angle: 3 * np.exp(1j * angle) + 2)
     objective = Objective(problem)
     tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex)).w
     np.testing.assert_allclose(composite_map(objective), tutte, atol=1e-12)
 
 
-def test_fixed_vertices_are_in_their_places_and_few_triangles_inverted():
+def test_fixed_vertices_are_at_their_targets_and_few_triangles_are_inverted():
     problem = onto(comma)
     objective = Objective(problem)
     w = composite_map(objective)
@@ -71,7 +71,7 @@ def test_fixed_vertices_are_in_their_places_and_few_triangles_inverted():
     assert objective.near_map(w).inverted < 0.2 * tutte.inverted
 
 
-def test_there_is_none_for_two_loops_or_pins_or_a_target_that_crosses_itself():
+def test_not_defined_for_two_loops_pins_or_a_crossing_target():
     V, F = annulus()
     fixed = np.concatenate(boundary_loops(F, len(V)))
     assert composite_map(Objective(Problem(V, F, fixed, V[fixed]))) is None
@@ -81,7 +81,7 @@ def test_there_is_none_for_two_loops_or_pins_or_a_target_that_crosses_itself():
     assert composite_map(Objective(onto(lambda angle: np.cos(angle) + 1j * np.sin(2 * angle) + 0.1j))) is None
 
 
-def test_without_a_composite_it_is_vector_adam(rng):
+def test_without_a_composite_the_method_is_vector_adam(rng):
     V, F = annulus()
     outer, inner = sorted(boundary_loops(F, len(V)), key=len, reverse=True)
     target = np.concatenate([V[outer], V[inner] @ [[0, 1], [-1, 0]]])
@@ -93,7 +93,7 @@ def test_without_a_composite_it_is_vector_adam(rng):
         assert np.array_equal(here.w, there.w)
 
 
-def test_it_takes_no_more_steps_than_asked_for():
+def test_it_takes_no_more_steps_than_requested():
     problem = onto(comma)
     objective = Objective(problem)
     start = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
@@ -101,9 +101,9 @@ def test_it_takes_no_more_steps_than_asked_for():
         assert len(list(Composite(iterations=count).iterates(objective, start))) == count
 
 
-def test_it_solves_what_takes_long_from_tuttes_embedding():
+def test_it_solves_problems_that_are_slow_from_tuttes_embedding():
     problem = Problem(*star_problem(depth=0.1, points=7, n=1000))
     few = solve(problem, strategy=[Composite(iterations=100)])
     assert few.injective
-    assert few.iterations <= 10
+    assert few.n_iterations <= 10
     assert not solve(problem, strategy=[VectorAdam(iterations=100)]).injective

@@ -1,8 +1,9 @@
-"""A map onto every simple target: the construction by itself, what it is made of, and where doubles have no room."""
+"""The construction of a map to every simple target: its parts, the whole, and the limits of double precision."""
 
 from __future__ import annotations
 
 from fractions import Fraction
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -12,32 +13,38 @@ from hypothesis import strategies as st
 from quasiharmonic import Problem, certify
 from quasiharmonic.geometry.mesh.refinement import split_edges
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
-from quasiharmonic.solver.construction.constructing import construct
+from quasiharmonic.solver.construction.constructing import construct_and_thin
 from quasiharmonic.solver.construction.cutting import Cutting
 from quasiharmonic.solver.construction.halfedges import HalfEdges
-from quasiharmonic.solver.construction.opening import thinned
+from quasiharmonic.solver.construction.opening import thin_refinement
 from quasiharmonic.solver.construction.regions import Regions
 from quasiharmonic.solver.construction.sheet import Sheet
 from quasiharmonic.solver.construction.simplicity import is_simple
-from quasiharmonic.solver.construction.thinning import best_triangles, shape
+from quasiharmonic.solver.construction.thinning import quality, triangulate_best
 from quasiharmonic.solver.construction.walks import walk
 from quasiharmonic.solver.field.objective import Objective
-from quasiharmonic.solver.methods.local_repair import remapped
-from quasiharmonic.solver.methods.untangling import untangled
+from quasiharmonic.solver.methods.local_repair import remap_patches
+from quasiharmonic.solver.methods.untangling import untangle
 from quasiharmonic.surfaces import disk, grid
 from quasiharmonic.targets.boundary.chords import flattened_edges
-from shared.outlined import onto_polygon, polygon, turned_ring, with_holes, without_inner_vertices
 from shared.polygons import circle, random_polygon, spread
+from shared.simple_targets import onto_polygon, polygon, turned_ring, with_holes, without_inner_vertices
 from shared.small_meshes import handle, wheel
 
 KINDS = ["burst", "spiral", "comb", "grid", "flat"]
 
 
+def construct(problem, guide=None, *, thin=True):
+    """Return the constructed map, thinned unless ``thin`` is False."""
+    *_, made = islice(construct_and_thin(problem, guide), None if thin else 1)
+    return made
+
+
 def check(problem, made):
-    """Certified, and a refinement of the problem's mesh that leaves alone all that is held."""
+    """Check that the map is certified and that its mesh refines the problem's mesh without splitting fixed edges."""
     refined, n = made.refined, problem.n
     assert made.certificate.bijective
-    # Not as the construction has it judged: from arrays, its loops found anew.
+    # Certify from arrays, which finds the loops independently of the construction.
     assert certify(refined.F, made.uv).bijective
     assert np.array_equal(made.uv[problem.fixed], problem.target)
     assert np.array_equal(refined.V[:n], problem.V)
@@ -47,7 +54,7 @@ def check(problem, made):
     )
     assert np.array_equal(np.unique(refined.parent), np.arange(len(problem.F)))
     assert np.allclose(refined.weights.sum(axis=1), 1)
-    # The parts of a triangle lie in it, wound as it is, and cover it: in its own coordinates, exactly.
+    # The parts of a triangle lie in it, have its orientation, and cover it, by exact arithmetic in its own coordinates.
     covered = [Fraction(0)] * len(problem.F)
     where = [{v: Fraction(1)} for v in range(n)]
     for between, weights in zip(refined.parents.tolist(), refined.weights.tolist(), strict=True):
@@ -83,7 +90,7 @@ def test_any_polygon(seed, kind):
 @pytest.mark.parametrize(
     ("holes", "pins"), [(1, 0), (0, 1), (0, 5), (3, 0), (2, 3), pytest.param(6, 6, marks=pytest.mark.slow)]
 )
-def test_holes_and_pins_in_any_place(holes, pins):
+def test_holes_and_pins_at_any_position(holes, pins):
     problem = with_holes(np.random.default_rng(holes), holes, pins)
     assert is_simple(problem)
     assert len(problem.domain.loops) == 1 + holes
@@ -98,16 +105,16 @@ def test_a_ring(quarters):
 
 
 def test_a_ring_turned_inside_out():
-    """Which loop is the outer one in the target does not matter."""
+    """Any loop may be the outer one in the target."""
     problem = turned_ring(0)
     away = problem.target / np.sum(problem.target**2, axis=1)[:, None]
-    # An inversion reverses the sense of loops: reflected, they are wound as the mesh's.
+    # An inversion reverses the orientation of loops; a reflection restores it.
     problem = problem.with_target(away * [1, -1])
     assert is_simple(problem)
     check(problem, construct(problem))
 
 
-def test_a_guide_need_not_be_injective():
+def test_a_guide_may_have_inverted_triangles():
     problem = onto_polygon(4, "grid")
     guide = np.zeros((problem.n, 2))
     guide[problem.fixed] = problem.target
@@ -124,7 +131,7 @@ def test_any_scale(exponent):
 
 
 def pinned_near_each_other(size, apart):
-    """A disk onto itself, three of its inner vertices pinned near the origin."""
+    """A disk mapped to itself, with three inner vertices pinned near the origin."""
     V, F = disk(4)
     (loop,) = boundary_loops(F, len(V))
     pins = np.setdiff1d(np.arange(len(V)), loop)[:3]
@@ -137,8 +144,8 @@ def test_cuts_of_any_length(apart):
     problem = pinned_near_each_other(1, apart)
     assert is_simple(problem)
     cutting = Cutting(problem)
-    # Three of the cuts connect a pin, each of the others makes a piece.
-    assert len(cutting.sheet.loops()) == len(cutting.regions.kept) // 2 - 3 + 1
+    # Three of the cuts connect a pin; each of the others makes a piece.
+    assert len(cutting.sheet.loops()) == len(cutting.regions.cuts) // 2 - 3 + 1
 
 
 @pytest.mark.parametrize("scale", [1e-130, 1e-160, 1e-300])
@@ -147,18 +154,22 @@ def test_patches_whose_areas_underflow_are_left_alone(scale):
     (loop,) = boundary_loops(F, len(V))
     w = V @ np.array([1, 1j]) * scale
     w[np.setdiff1d(np.arange(len(V)), loop)] *= 9
-    steps = list(untangled(F, w, loop, grading=0.0))
+    steps = list(untangle(F, w, loop, grading=0.0))
     assert bool(steps) == (scale > 1e-140)
 
 
 def test_other_maps_of_patches_have_a_limit():
     problem = pinned_near_each_other(1, 1e-3)
     objective, tried = Objective(problem), []
-    list(remapped(objective, np.zeros(problem.n) + 0j, np.arange(9), lambda *_: tried.append(0), patience=50, tries=3))
+    list(
+        remap_patches(
+            objective, np.zeros(problem.n) + 0j, np.arange(9), lambda *_: tried.append(0), patience=50, tries=3
+        )
+    )
     assert len(tried) == 3
 
 
-def test_what_no_scale_bears_is_told():
+def test_targets_beyond_the_precision_limit_are_reported():
     problem = pinned_near_each_other(1e300, 1e-25)
     assert is_simple(problem)
     made = construct(problem)
@@ -167,7 +178,7 @@ def test_what_no_scale_bears_is_told():
     assert made.crowded.size
 
 
-def test_thinning_leaves_alone_what_it_would_round():
+def test_thinning_keeps_vertices_near_the_precision_limit():
     V, F = disk(2)
     (loop,) = boundary_loops(F, len(V))
     problem = Problem(V, F, loop, V[loop] * 1e300)
@@ -175,7 +186,7 @@ def test_thinning_leaves_alone_what_it_would_round():
     uv = refined.V * 1e300
     uv[np.hypot(*V.T).argmin()] = 1e-25, 0
     assert certify(refined.F, uv).bijective
-    same, places = thinned(problem, refined, uv)
+    same, places = thin_refinement(problem, refined, uv)
     assert same is refined
     assert np.array_equal(places, uv)
 
@@ -197,7 +208,7 @@ def test_far_from_the_origin():
     check(far, construct(far))
 
 
-def test_what_fits_gains_nothing():
+def test_a_mesh_that_fits_needs_no_new_vertices():
     V, F = disk(5)
     (loop,) = boundary_loops(F, len(V))
     problem = Problem(V, F, loop, V[loop])
@@ -207,8 +218,8 @@ def test_what_fits_gains_nothing():
     assert np.array_equal(made.refined.F, F)
 
 
-def test_thinning_leaves_what_is_needed():
-    """A chord that the target does not contain takes one vertex, and one that it does contain none."""
+def test_thinning_keeps_the_needed_vertices():
+    """A chord outside the target needs one vertex; a chord inside needs none."""
     V, F = [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]]
     chevron = Problem(V, F, [0, 1, 2, 3], [[-1, -1], [0, 0], [1, -1], [0, 2]])
     made = construct(chevron)
@@ -220,9 +231,9 @@ def test_thinning_leaves_what_is_needed():
     assert not len(made.refined.parents)
 
 
-class TestNoRoom:
+class TestPrecisionLimit:
     def test_a_triangle_of_adjacent_doubles(self):
-        """It contains no further point whose coordinates are doubles."""
+        """The triangle contains no other point with double-precision coordinates."""
         V, F = wheel(3)
         step = 2.0**-52
         problem = Problem(V, F, [0, 1, 2], [[1, 1], [1 + step, 1], [1, 1 + step]])
@@ -232,8 +243,8 @@ class TestNoRoom:
         assert set(made.crowded.tolist()) <= {0, 1, 2}
         assert made.crowded.size
 
-    def test_one_place_in_between(self):
-        """Of a lattice with a single point inside the construction finds that point."""
+    def test_one_point_in_between(self):
+        """The construction finds the only lattice point inside."""
         V, F = wheel(3)
         step = 2.0**-52
         problem = Problem(V, F, [0, 1, 2], 1 + step * np.array([[0, 0], [3, 0], [0, 3]]))
@@ -264,7 +275,7 @@ class TestWhichProblems:
         (loop,) = boundary_loops(F, len(V))
         assert is_simple(Problem(V, F, [*loop, 12], [*V[loop], place])) is simple
 
-    def test_pins_in_one_place(self):
+    def test_pins_at_one_position(self):
         V, F = grid(4, 4)
         (loop,) = boundary_loops(F, len(V))
         assert not is_simple(Problem(V, F, [*loop, 11, 12], [*V[loop], [0.5, 0.5], [0.5, 0.5]]))
@@ -279,7 +290,7 @@ class TestWhichProblems:
 
     @pytest.mark.parametrize("seed", range(5))
     def test_pins_level_with_corners(self, seed):
-        """On a lattice rays pass through corners and along sides; a rational ray decides as well."""
+        """On a lattice, rays pass through corners and along sides; a rational ray also decides these cases."""
         rng = np.random.default_rng(seed)
         corners = random_polygon(rng, 10, 6)
         V, F = disk(3)
@@ -291,7 +302,7 @@ class TestWhichProblems:
 
 
 def strictly_inside(point, corners):
-    """Whether a point is inside a polygon and not on it, by a ray of no rational slope's likelihood, in fractions."""
+    """Test whether a point is strictly inside a polygon, by a generic ray and fractions."""
     x, y = (Fraction(c) for c in point)
     slope, inside = Fraction(1234567, 7654321), False
     for p, q in zip(corners.tolist(), np.roll(corners, -1, axis=0).tolist(), strict=True):
@@ -301,7 +312,7 @@ def strictly_inside(point, corners):
             return False
         one, other = (py - y) - slope * (px - x), (qy - y) - slope * (qx - x)
         if (one > 0) != (other > 0):
-            # Where the side meets the line through the point: ahead of it or behind.
+            # The side meets the line through the point either ahead of it or behind it.
             share = one / (one - other)
             inside ^= px + share * (qx - px) > x
     return inside
@@ -314,16 +325,16 @@ def twice_area(corners):
 
 class TestRegions:
     @pytest.mark.parametrize("kind", KINDS)
-    def test_convex_and_all_there(self, kind):
+    def test_regions_are_convex_and_complete(self, kind):
         points = polygon(np.random.default_rng(1), kind, 30)
         points = points / np.abs(points).max()
         n = len(points)
         regions = Regions(points, [np.arange(n)], np.empty(0, dtype=np.int64))
         cuts = regions.diagonals([])
         assert regions.bridges() == []
-        assert {frozenset(cut) for cut in cuts} == {frozenset(cut) for cut in regions.kept}
-        # Around every region, along cuts and the outline, no turn to the right.
-        rim = {(k, (k + 1) % n) for k in range(n)} | regions.kept
+        assert {frozenset(cut) for cut in cuts} == {frozenset(cut) for cut in regions.cuts}
+        # No region turns right along its boundary.
+        rim = {(k, (k + 1) % n) for k in range(n)} | regions.cuts
         area, seen = 0.0, set()
         for start in sorted(rim):
             here, loop = start, []
@@ -356,7 +367,7 @@ class TestRegions:
 class TestSheet:
     @pytest.mark.parametrize("seed", range(5))
     def test_cuts_make_disks(self, seed):
-        """Cut from boundary vertex to boundary vertex at random: always one piece more, all of them disks."""
+        """Random cuts between boundary vertices: each adds one piece, and all pieces are disks."""
         rng = np.random.default_rng(seed)
         V, F = without_inner_vertices(rng, 20) if seed % 2 else disk(3)
         sheet = Sheet(F, len(V))
@@ -368,7 +379,7 @@ class TestSheet:
                 continue
             before = len(sheet.loops())
             way = walk(sheet, place, loop[i], loop[j])
-            assert not any(sheet.is_held(copy) for copy in way[1:-1])
+            assert not any(sheet.is_fixed(copy) for copy in way[1:-1])
             right = sheet.cut(way)
             place += [place[copy] for copy in way]
             assert len(place) == len(sheet.vertex)
@@ -390,21 +401,21 @@ class TestSheet:
             assert around == sorted(tuple(sorted(row)) for row in F.tolist() if vertex in row)
 
 
-def test_the_best_triangulation_is_the_best():
-    """Against all triangulations of a polygon of seven corners."""
+def test_the_optimal_triangulation_is_optimal():
+    """Compare with all triangulations of a polygon with seven corners."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         points = random_polygon(rng, 7, 9) @ [1, 1j]
 
         def worth(a, b, c, points=points):
-            return shape(points[a], points[b], points[c])
+            return quality(points[a], points[b], points[c])
 
-        best = best_triangles(list(range(7)), worth)
+        best = triangulate_best(list(range(7)), worth)
         assert min(worth(*t) for t in best) == max(min(worth(*t) for t in cut) for cut in cuts(0, 6))
 
 
 def cuts(i, j):
-    """All triangulations of the polygon of corners i … j."""
+    """Yield all triangulations of the polygon of corners i … j."""
     if j - i < 2:
         return [[]]
     return [[*a, (i, k, j), *b] for k in range(i + 1, j) for a in cuts(i, k) for b in cuts(k, j)]
@@ -414,5 +425,5 @@ def test_shapes_have_the_exact_sign():
     step = 2.0**-52
     p, q = complex(1, 1), complex(1 + 1e3 * step, 1 + 1e3 * step)
     middle = complex(1 + 500 * step, 1 + 500 * step)
-    assert shape(p, q, middle) == 0
-    assert shape(p, q, middle + 1j * step) > 0 > shape(p, q, middle - 1j * step)
+    assert quality(p, q, middle) == 0
+    assert quality(p, q, middle + 1j * step) > 0 > quality(p, q, middle - 1j * step)

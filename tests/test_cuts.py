@@ -1,25 +1,27 @@
-"""Cuts: what they leave are disks, they are short, and they go where they do good."""
+"""Cuts: they leave disks, they are short, and they reduce distortion."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from quasiharmonic import flatten, surfaces
-from quasiharmonic.geometry.mesh.opening import opened_along
+from quasiharmonic import crease_costs, flatten, surfaces
+from quasiharmonic.geometry.coarsening.levels import coarsen
+from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edge_keys, edges
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.targets.cuts.graph import edge_graph
-from quasiharmonic.targets.cuts.shortening import shortened, stretches
+from quasiharmonic.targets.cuts.levels import insert_vertices
+from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches
 from quasiharmonic.targets.cuts.shrinking import Shrinking
 from quasiharmonic.targets.cuts.topological import opening_cuts, without_loose_ends
-from shared.closed import TETRAHEDRON, blocks, double_torus, torus
+from shared.closed_surfaces import TETRAHEDRON, blocks, double_torus, torus
 from shared.meshes import lift
 
 
 def parts(V, F, cut):
-    """Euler's number and the number of loops of every part, by a mesh of its own."""
-    FT, origin = opened_along(F, cut, len(V))
+    """Return the Euler number and the number of loops of every part, computed independently."""
+    FT, origin = open_along(F, cut, len(V))
     assert np.array_equal(origin[FT], F)
     label = components(FT, len(origin))[FT[:, 0]]
     found = []
@@ -39,13 +41,13 @@ def length_of(V, cut):
 
 
 def energy_of(V, F, cut):
-    """The mean symmetric Dirichlet energy of the map."""
-    FT, origin = opened_along(F, cut, len(V))
+    """Return the mean symmetric Dirichlet energy of the map."""
+    FT, origin = open_along(F, cut, len(V))
     return flatten(V[origin], FT).history[-1].energy
 
 
 def jittered(V, seed=0, size=2e-3):
-    """No two lengths alike, so that nothing depends on rounding."""
+    """Perturb vertices so that no two lengths are equal and rounding does not matter."""
     return V + size * np.random.default_rng(seed).standard_normal(V.shape)
 
 
@@ -75,7 +77,7 @@ SURFACES = {
 class TestDisks:
     @pytest.mark.parametrize("gain", [0.02, 0.1, np.inf])
     @pytest.mark.parametrize("name", SURFACES)
-    def test_of_every_surface(self, name, gain):
+    def test_every_surface(self, name, gain):
         V, F = SURFACES[name]
         before = V.copy(), F.copy()
         cut = find_cuts(V, F, min_gain=gain)
@@ -87,7 +89,7 @@ class TestDisks:
         assert np.array_equal(V, before[0])
         assert np.array_equal(F, before[1])
 
-    def test_of_several_surfaces_as_of_each(self):
+    def test_several_surfaces_are_cut_like_each_alone(self):
         (V, F), (W, G) = surfaces.starfish(3, 12), torus(12, 8)
         V = jittered(V)
         both = np.concatenate([V, [[9, 9, 9]], 100 * W]), np.concatenate([F, G + len(V) + 1])
@@ -96,17 +98,17 @@ class TestDisks:
         own = find_cuts(V, F)
         assert np.array_equal(found[found[:, 0] < len(V)], own)
 
-    def test_where_two_surfaces_touch_each_is_its_own(self):
+    def test_touching_surfaces_are_cut_separately(self):
         V, F = TETRAHEDRON
         V, F = np.concatenate([V, -V[1:]]), np.concatenate([F, np.where(F, F + 3, 0)[:, ::-1]])
         assert parts(V, F, find_cuts(V, F)) == [(1, 1), (1, 1)]
 
     @pytest.mark.parametrize("scale", [0, 1e-310, 1e-200, 1e200, 1e300])
-    def test_at_any_size(self, scale):
+    def test_any_size(self, scale):
         V, F = torus(12, 8)
         assert parts(V, F, find_cuts(scale * V, F)) == [(1, 1)]
 
-    def test_with_slivers_and_triangles_without_area(self):
+    def test_slivers_and_triangles_without_area(self):
         V, F = surfaces.starfish(3, 12)
         V = V * (1, 1e-5, 1)
         V[F[100, 1]] = V[F[100, 0]]
@@ -114,8 +116,8 @@ class TestDisks:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("seed", range(60))
-    def test_of_whatever_comes(self, seed):
-        """Any number of handles, holes and components that touch, edges given at random, any proportions."""
+    def test_random_surfaces(self, seed):
+        """Any number of handles, holes and touching components, random edges, and any proportions."""
         rng = np.random.default_rng(seed)
         V, F = blocks(rng.random(rng.integers(1, 5, 3)) < rng.choice([0.5, 0.75, 0.95]), rounds=rng.integers(0, 3))
         F = F[rng.random(len(F)) >= rng.choice([0, 0.05, 0.3])]
@@ -146,33 +148,33 @@ class TestShortest:
         shortest = sum(np.linalg.norm(V[loop] - V[np.roll(loop, 1)], axis=1).sum() for loop in (ring, equator))
         assert length_of(V, find_cuts(V, F, min_gain=np.inf)) == pytest.approx(shortest, rel=1e-3)
 
-    def test_no_cut_where_nothing_is_gained(self):
+    def test_no_cut_without_a_gain(self):
         assert find_cuts(*surfaces.disk(8)).shape == (0, 2)
         assert find_cuts(*surfaces.grid(30, 3)).shape == (0, 2)
 
     @pytest.mark.parametrize("seed", range(6))
     @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
-    def test_a_random_cut_gets_shorter_and_stays_one(self, name, seed):
+    def test_a_random_cut_gets_shorter_and_stays_a_cut(self, name, seed):
         V, F = SURFACES[name]
         graph = edge_graph(V, F)
         cut = random_cut(graph, seed)
         assert parts(V, F, graph.ends[cut]) == [(1, 1)]
-        better = shortened(graph, cut)
+        better = shorten_cuts(graph, cut)
         assert parts(V, F, graph.ends[better]) == [(1, 1)]
         assert graph.cost[better].sum() < 0.9 * graph.cost[cut].sum()
         assert sum(way.size for way in stretches(graph, better)) == better.sum()
-        # No worse than twice the cut that topology begins with.
+        # At most twice the length of the topological cut.
         if name != "starfish":
-            assert graph.cost[better].sum() < 2 * graph.cost[shortened(graph, opening_cuts(graph))].sum()
+            assert graph.cost[better].sum() < 2 * graph.cost[shorten_cuts(graph, opening_cuts(graph))].sum()
 
     def test_creases_are_preferred(self):
-        """The way around a bar is as long along its edges as beside them."""
+        """The path around a bar has the same length on its edges and beside them."""
         V, F = blocks(np.ones((12, 4, 4)), rounds=0)
         graph = edge_graph(V, F)
         corner = np.isin(V[graph.ends][..., 1:], (1, 5)).all(axis=(1, 2))
         assert corner.any()
         assert np.allclose(graph.cost[corner], 0.75 * graph.length[corner])
-        # Seen from within the bar's edges are folded inwards.
+        # Seen from inside, the bar's edges are folded inwards.
         inside_out = edge_graph(V, F[:, ::-1])
         assert np.allclose(inside_out.cost[corner], 0.5 * graph.length[corner])
         flat = np.isclose(graph.cost, graph.length)
@@ -183,7 +185,7 @@ class TestShortest:
 
 
 def random_cut(graph, seed):
-    """The edges that a random tree of triangles does not cross, less loose ends but for some."""
+    """Return the edges that a random tree of triangles does not cross, without most loose ends."""
     rng = np.random.default_rng(seed)
     order, joined, root = rng.permutation(len(graph.ends)), np.arange(len(graph.F)), {}
     for t, numbers in enumerate(graph.side.T.tolist()):
@@ -205,7 +207,7 @@ def random_cut(graph, seed):
     bare = without_loose_ends(graph, cut)
     if bare.any():
         return bare
-    # A sphere has nothing but loose ends: a path and a branch of the tree are left.
+    # On a sphere all edges are loose ends; a path and a branch of the tree remain.
     for _ in range(12):
         degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
         loose = cut & (degree == 1)[graph.ends].any(axis=1)
@@ -215,9 +217,9 @@ def random_cut(graph, seed):
     return cut
 
 
-class TestWorth:
-    def test_of_a_cap_as_stereographic_projection_has_it(self):
-        """On a sphere, e⁻ʷ is (1 + cos θ₀) / (1 + cos θ), with lengths kept at θ₀."""
+class TestGain:
+    def test_cap_agrees_with_stereographic_projection(self):
+        """On a sphere, e⁻ʷ is (1 + cos θ₀) / (1 + cos θ) if lengths are unchanged at θ₀."""
         flat, F = surfaces.disk(40)
         theta = 1.3 * np.hypot(*flat.T)
         turn = np.arctan2(flat[:, 1], flat[:, 0])
@@ -226,8 +228,8 @@ class TestWorth:
         w = Shrinking(graph).of(graph.rim_vertices)
         np.testing.assert_allclose(w, np.log((1 + np.cos(theta)) / (1 + np.cos(1.3))), atol=3e-3)
 
-    def test_of_a_tube_by_its_length_and_width(self):
-        """Closed at one end: half a sphere's curvature flows out along the tube, w grows by 1 for each radius."""
+    def test_tube_depends_on_length_over_width(self):
+        """A tube closed at one end contains half a sphere's curvature; w grows by 1 per radius along the tube."""
         around, along = 48, 60
         i, j = np.divmod(np.arange(around * along), around)
         V = np.stack([np.cos(2 * np.pi * j / around), np.sin(2 * np.pi * j / around), 2 * np.pi * i / around], axis=1)
@@ -247,7 +249,7 @@ class TestWorth:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("gain", [0.1, np.inf])
-    def test_the_energy_is_about_that_of_the_map(self, gain):
+    def test_predicted_energy_is_close_to_that_of_the_map(self, gain):
         for V, F in (surfaces.starfish(5, 24), surfaces.starfish(3, 24), double_torus()):
             cut = find_cuts(V, F, min_gain=gain)
             graph, shrinking = edge_graph(V, F), Shrinking(edge_graph(V, F))
@@ -257,26 +259,26 @@ class TestWorth:
             assert 0.4 * true < told < 2.5 * true + 0.2
 
     @pytest.mark.slow
-    def test_arms_are_reached(self):
+    def test_cuts_reach_arms(self):
         V, F = surfaces.starfish(5, 24)
         cut = find_cuts(V, F)
         V = V / V[:, 0].max()
         for turn in 2 * np.pi * np.arange(5) / 5:
             tip = np.array([np.cos(turn), np.sin(turn), 0])
             assert np.linalg.norm(V[np.unique(cut)] - tip, axis=1).min() < 0.15
-        # Little more than arms and the middle are long.
+        # The cut is little longer than the arms and the centre.
         assert length_of(V, cut) < 5 * 1.3
         assert energy_of(V, F, cut) < 0.1 * energy_of(V, F, find_cuts(V, F, min_gain=np.inf))
 
     @pytest.mark.slow
-    def test_more_gain_asked_for_makes_cuts_shorter(self):
+    def test_a_larger_required_gain_makes_cuts_shorter(self):
         V, F = surfaces.starfish(5, 24)
         lengths = [length_of(V, find_cuts(V, F, min_gain=gain)) for gain in (0.02, 0.2, 2, np.inf)]
         assert lengths == sorted(lengths, reverse=True)
         assert lengths[0] > 1.5 * lengths[-1]
 
     @pytest.mark.slow
-    def test_the_same_whatever_the_unit_the_place_and_the_view(self):
+    def test_unit_position_and_orientation_do_not_matter(self):
         V, F = surfaces.starfish(4, 16)
         V = jittered(V)
         cut = find_cuts(V, F)
@@ -285,6 +287,111 @@ class TestWorth:
         rotation = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
         rotation *= np.linalg.det(rotation)
         assert np.array_equal(cut, find_cuts(1000.3 * V @ rotation.T + (5, -700, 30), F))
+
+
+class TestLevels:
+    """Large surfaces are cut on a coarse mesh; the cuts are carried to the fine one."""
+
+    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
+    def test_cuts_keep_their_topology_when_vertices_are_inserted(self, name, seed):
+        V, F = SURFACES[name]
+        FT, origin = open_along(F, np.zeros((0, 2), dtype=np.int64), len(V))
+        V, F = V[origin], FT
+        fixed = np.zeros(len(V), dtype=bool)
+        fixed[edges(F, len(V)).boundary] = True
+        coarsening = coarsen(F, len(V), fixed, 60)
+        vertices, coarse = np.unique(coarsening.F, return_inverse=True)
+        graph = edge_graph(V[vertices], coarse.reshape(-1, 3))
+        cut = vertices[graph.ends[random_cut(graph, seed)]]
+        ends = (np.bincount(cut.ravel()) == 1).sum()
+        assert len(coarsening.rounds) > 1
+        for k in reversed(range(len(coarsening.rounds))):
+            cut = insert_vertices(cut, coarsening.rounds[k], len(V))
+            assert np.array_equal(cut, np.sort(cut, axis=1))
+            assert (np.bincount(cut.ravel()) == 1).sum() == ends
+            if k in coarsening.levels:
+                assert parts(V, coarsening.levels[k], cut) == [(1, 1)]
+        assert parts(V, F, cut) == [(1, 1)]
+
+    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
+    def test_shortening_close_to_cuts(self, name, seed):
+        V, F = SURFACES[name]
+        graph = edge_graph(V, F)
+        cut = random_cut(graph, seed)
+        better = shorten_cuts(graph, cut, rings=3)
+        assert parts(V, F, graph.ends[better]) == [(1, 1)]
+        assert graph.cost[better].sum() < 0.9 * graph.cost[cut].sum()
+
+    def test_a_part_of_a_graph_has_the_same_edges(self):
+        V, F = SURFACES["torus with holes"]
+        graph = edge_graph(V, F)
+        part, own = graph.part_near(np.array([3]), 2)
+        ring = np.unique(F[(F == 3).any(axis=1)])
+        near = np.isin(F, ring).any(axis=1)
+        assert np.array_equal(np.sort(part.V[part.F], axis=1), np.sort(graph.V[F[near]], axis=1))
+        assert np.array_equal(part.V[part.ends], graph.V[graph.ends[own]])
+        assert np.array_equal(
+            part.ends[part.side], np.sort(np.stack([part.F, np.roll(part.F, -1, 1)], 2), 2).swapaxes(0, 1)
+        )
+        assert np.array_equal(part.rim, graph.rim[own])
+        # Costs are infinite exactly at vertices outside the first ring.
+        outer = ~np.isin(graph.ends[own], ring).all(axis=1)
+        assert np.array_equal(np.isinf(part.cost), outer)
+
+    def test_a_large_torus(self):
+        """The inner equator and a ring are nearly the shortest cuts."""
+        V, F = torus(240, 80, radius=3)
+        cut = find_cuts(V, F, min_gain=np.inf)
+        assert parts(V, F, cut) == [(1, 1)]
+        assert length_of(V, cut) < 1.03 * 2 * np.pi * (1 + 2)
+        assert np.array_equal(cut, find_cuts(V, F, min_gain=np.inf))
+
+    def test_a_large_surface_avoids_diagonals(self):
+        V, F = torus(240, 80, radius=3)
+        diagonals = F[: len(F) // 2, [0, 2]]
+        cut = find_cuts(V, F, forbidden_edges=diagonals, min_gain=np.inf)
+        assert parts(V, F, cut) == [(1, 1)]
+        assert not np.isin(edge_keys(*cut.T, len(V)), edge_keys(*diagonals.T, len(V))).any()
+
+    @pytest.mark.slow
+    def test_large_arms(self):
+        """On a fine mesh, cuts are about as long as on a coarse one, which reach all arms."""
+        V, F = surfaces.starfish(5, 24)
+        few = find_cuts(V, F)
+        V, F = surfaces.starfish(5, 64)
+        cut = find_cuts(V, F)
+        assert parts(V, F, cut) == [(1, 1)]
+        assert length_of(V, cut) < 1.2 * length_of(*surfaces.starfish(5, 24)[:1], few)
+
+
+class TestCosts:
+    def test_costs_of_one_change_nothing(self):
+        V, F = SURFACES["starfish"]
+        assert np.array_equal(find_cuts(V, F), find_cuts(V, F, edge_costs=np.ones(F.shape)))
+
+    @pytest.mark.parametrize("shape", [(36, 14), (240, 80)], ids=["small", "large"])
+    def test_cuts_leave_costly_parts(self, shape):
+        """A cut around a torus may be anywhere: it moves to the half where it is cheap."""
+        V, F = torus(*shape)
+        for side in (-1, 1):
+            costly = np.where(side * V[:, 0] > 0, 10.0, 1.0)
+            costs = (costly[F] + costly[np.roll(F, -1, axis=1)]) / 2
+            cut = find_cuts(V, F, edge_costs=costs, min_gain=np.inf)
+            assert parts(V, F, cut) == [(1, 1)]
+            # Only the cut along the torus crosses the costly half; the cut around the tube is in the other one.
+            assert length_of(V, cut[(side * V[cut][..., 0] > 0).all(axis=1)]) < 1.1 * np.pi
+
+    def test_creases_cost_less_if_concave(self):
+        V, F = blocks(np.ones((12, 4, 4)), rounds=0)
+        assert np.array_equal(crease_costs(V, F), np.ones(F.shape))
+        costs = crease_costs(V, F[:, ::-1])
+        ends = np.stack([F[:, ::-1], np.roll(F[:, ::-1], -1, axis=1)], axis=2)
+        corner = np.isin(V[ends][..., 1:], (1, 5)).all(axis=(2, 3))
+        assert corner.any()
+        assert np.allclose(costs[corner], 0.25)
+        assert set(np.unique(np.round(costs, 12))) == {0.25, 1.0}
 
 
 class TestGiven:
@@ -303,12 +410,12 @@ class TestGiven:
         assert parts(V, F, cut) == [(1, 1), (1, 1)]
         assert length_of(V, cut) < length_of(V, self.RING) * 2 + 2 * np.pi
 
-    def test_enough_is_enough(self):
+    def test_sufficient_cuts_are_not_extended(self):
         V, F = TORUS
         enough = find_cuts(V, F, min_gain=np.inf)
         assert np.array_equal(find_cuts(V, F, edges=enough[::-1, ::-1], min_gain=np.inf), enough)
 
-    def test_one_edge_inside_opens_nothing(self):
+    def test_one_interior_edge_opens_nothing(self):
         V, F = TORUS
         lone = np.setdiff1d(np.arange(len(V)), find_cuts(V, F))[0]
         end = F[(lone == F).any(axis=1)][0]
@@ -316,12 +423,12 @@ class TestGiven:
         assert np.array_equal(find_cuts(V, F, edges=[edge]), find_cuts(V, F))
         assert parts(*TETRAHEDRON, find_cuts(*TETRAHEDRON, edges=[[0, 1]])) == [(1, 1)]
 
-    def test_the_boundary_is_open_already(self):
+    def test_boundary_edges_are_no_cuts(self):
         V, F = surfaces.disk(4)
         (loop,) = boundary_loops(F, len(V))
         assert find_cuts(V, F, edges=np.stack([loop, np.roll(loop, 1)], axis=1)).shape == (0, 2)
 
-    def test_diagonals_are_spared(self):
+    def test_diagonals_are_avoided(self):
         V, F = TORUS
         half = len(F) // 2
         diagonals = F[:half, [0, 2]]
@@ -345,12 +452,15 @@ class TestGiven:
         ({"edges": [[0, 7]]}, "refers to vertex 7"),
         ({"edges": [[0.5, 1]]}, "edges must contain integer indices"),
         ({"forbidden_edges": [[0, 7]]}, "forbidden_edges refers to vertex 7"),
+        ({"edge_costs": np.ones(4)}, r"edge_costs must have shape \(4, 3\), not \(4,\)"),
+        ({"edge_costs": np.eye(4)[:, 1:]}, "edge_costs must be positive and finite: triangles 0, 1"),
+        ({"edge_costs": np.full((4, 3), np.inf)}, "edge_costs must be positive and finite"),
         ({"min_gain": 0}, "min_gain must be a positive number, not 0"),
         ({"min_gain": np.nan}, "min_gain must be a positive number, not nan"),
         ({"min_gain": "much"}, "min_gain must be a positive number, not 'much'"),
     ],
 )
-def test_wrong_calls_are_refused(change, message):
+def test_invalid_calls_are_rejected(change, message):
     V, F = TETRAHEDRON
     arguments = {"V": np.vstack([V, [2, 2, 2]]), "F": F} | change
     with pytest.raises(ValueError, match=message):
@@ -358,16 +468,16 @@ def test_wrong_calls_are_refused(change, message):
 
 
 class TestOpening:
-    def test_copies_come_last_and_the_rest_keeps_its_number(self):
+    def test_copies_come_last_and_other_vertices_keep_their_numbers(self):
         V, F = surfaces.disk(3)
-        FT, origin = opened_along(F, np.array([[0, 1], [1, 7], [7, 19]]), len(V))
+        FT, origin = open_along(F, np.array([[0, 1], [1, 7], [7, 19]]), len(V))
         assert np.array_equal(origin, [*range(len(V)), 1, 7, 19])
         assert np.array_equal(origin[FT], F)
         assert set(F[FT != F]) == {1, 7, 19}
         assert parts(V, F, np.array([[0, 1], [1, 7], [7, 19]])) == [(1, 1)]
 
-    def test_nothing_cut_is_nothing_changed(self):
+    def test_no_cut_changes_nothing(self):
         V, F = surfaces.annulus(6)
-        FT, origin = opened_along(F, np.zeros((0, 2), dtype=np.int64), len(V))
+        FT, origin = open_along(F, np.zeros((0, 2), dtype=np.int64), len(V))
         assert np.array_equal(FT, F)
         assert np.array_equal(origin, np.arange(len(V)))

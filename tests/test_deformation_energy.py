@@ -57,19 +57,19 @@ def test_gradient_of_springs():
 
 
 @pytest.mark.parametrize(("name", "V", "F"), surfaces())
-def test_the_mean_is_that_of_the_measures(name, V, F):
+def test_the_mean_equals_that_of_the_measures(name, V, F):
     uv = bend(V[:, :2])
     found = distortion(V, F, uv)
     w = as_complex(uv)
     area = float(signed_areas(F, w).sum())
     for energy, measure in ((MIPS(), "mips"), (SymmetricDirichlet(), "symmetric_dirichlet"), (ARAP(), "arap")):
         assert DeformationEnergy(V, F, energy, area=area).value(w) == pytest.approx(
-            found.summary(measure).mean, rel=1e-12
+            found.statistics(measure).mean, rel=1e-12
         )
 
 
 class Restated(Isotropic):
-    """Another energy, told by its methods alone, so that nobody knows what it is a sum of."""
+    """The same energy, defined by its methods alone, so that its terms are not known."""
 
     barrier = True
 
@@ -87,7 +87,7 @@ class Restated(Isotropic):
 
 
 @pytest.mark.parametrize("energy", [*ENERGIES.values(), Combination((2.0, conformal_area_blend()), (0.5, MIPS()))])
-def test_energies_of_the_package_are_what_their_methods_say(energy, rng):
+def test_the_package_s_energies_agree_with_their_methods(energy, rng):
     V, F, w = bowl(300)
     weights = rng.uniform(0, 2, len(F))
     one, other = (DeformationEnergy(V, F, each, area=2.0, weights=weights) for each in (energy, Restated(energy)))
@@ -99,8 +99,8 @@ def test_energies_of_the_package_are_what_their_methods_say(energy, rng):
         np.testing.assert_allclose(*forms, rtol=1e-10, atol=1e-12)
 
 
-def test_an_energy_that_changes_a_part_of_another_is_asked_for_it():
-    """What it has left as it was is the other's, and what it has changed is its own."""
+def test_a_subclass_that_overrides_a_part_of_an_energy_is_used():
+    """Unchanged methods are those of the base class, and changed ones those of the subclass."""
 
     class Doubled(SymmetricDirichlet):
         def density(self, d):
@@ -123,7 +123,7 @@ def test_an_energy_that_changes_a_part_of_another_is_asked_for_it():
     assert (bent.curvature_of(d, negative=1.0).pp > 1.1 * plain.curvature_of(d, negative=1.0).pp).mean() > 0.5
 
 
-def test_a_derivative_that_is_one_number():
+def test_a_constant_derivative():
     class Stretch(Energy):
         def density(self, d):
             return d.a + d.q.real
@@ -136,7 +136,7 @@ def test_a_derivative_that_is_one_number():
     assert derivative_error(E.value, lambda w, d: np.sum(np.conj(E.gradient(w)) * d).real, w) < 1e-6
 
 
-def test_scale_of_map_and_surface_do_not_matter_when_normalised():
+def test_scale_does_not_matter_with_normalisation():
     V, F, w = bowl()
     area = float(signed_areas(F, w).sum())
     values = [
@@ -146,7 +146,7 @@ def test_scale_of_map_and_surface_do_not_matter_when_normalised():
     assert values == pytest.approx([values[0]] * 5, rel=1e-12)
 
 
-def test_without_an_area_maps_are_measured_as_they_are():
+def test_without_an_area_the_energy_is_not_normalised():
     V, F = grid(3, 3)
     w = as_complex(V)
     E = DeformationEnergy(100 * V, F, AreaPreserving())
@@ -169,8 +169,8 @@ def test_a_clockwise_planar_mesh_is_a_surface_seen_from_behind():
     assert DeformationEnergy(mirrored, F, ARAP()).value(as_complex(V)) == pytest.approx(0, abs=1e-20)
 
 
-def test_unsigned_arap_is_that_of_the_singular_values(rng):
-    """§11.1.1 by NumPy's singular values, inverted triangles included; there `ARAP` is dearer, elsewhere the same."""
+def test_unsigned_arap_agrees_with_singular_values(rng):
+    """§11.1.1 by NumPy's singular values. For inverted triangles `ARAP` is larger; otherwise both are equal."""
     V, F = random_delaunay(60, seed=5)
     w = as_complex(V) + 0.15 * (rng.standard_normal((len(V), 2)) @ (1, 1j))
     uv = np.stack([w.real, w.imag], axis=1)
@@ -216,7 +216,7 @@ def test_malformed_input():
 def test_steps_to_collapse_are_the_first_zeros_of_the_areas(rng):
     V, F, w = bowl(200)
     E = DeformationEnergy(V, F, MIPS())
-    # Steps of very different sizes, so that all branches of the formula occur.
+    # Steps have very different sizes, so that all branches of the formula occur.
     step = (rng.standard_normal(w.size) + 1j * rng.standard_normal(w.size)) * 10.0 ** rng.integers(-9, 2, w.size)
     found = E.steps_to_collapse(w, step)
     for t, face in zip(found, F, strict=True):
@@ -230,7 +230,7 @@ def test_steps_to_collapse_are_the_first_zeros_of_the_areas(rng):
     assert np.isfinite(found).any()
 
 
-def test_collapse_of_shapes_that_only_grow_or_stand_still():
+def test_collapse_of_shapes_that_grow_or_do_not_change():
     V, F = grid(2, 2)
     w = as_complex(V)
     E = DeformationEnergy(V, F, MIPS())
@@ -240,7 +240,7 @@ def test_collapse_of_shapes_that_only_grow_or_stand_still():
 
 
 @pytest.mark.parametrize("energy", [MIPS(), SymmetricDirichlet(), ARAP(), UnsignedARAP()], ids=name_of)
-def test_the_system_is_the_second_derivative(energy):
+def test_the_system_matrix_is_the_second_derivative(energy):
     V, F, w = bowl()
     fixed = boundary_of(F)
     E = DeformationEnergy(V, F, energy, area=2.0)
@@ -255,7 +255,7 @@ def test_the_system_is_the_second_derivative(energy):
         moved[system.free] += x.view(np.complex128)
         return E.gradient(moved)[system.free].view(np.float64)
 
-    # Differences relative to the size of the mesh, not of the displacement, which is zero.
+    # Differences are relative to the size of the mesh, since the displacement is zero.
     h = 1e-6
     differences = np.array([(gradient(h * e) - gradient(-h * e)) / (2 * h) for e in np.eye(2 * system.free.size)])
     assert np.abs(differences - H).max() < 1e-6 * np.abs(H).max()
@@ -283,7 +283,7 @@ def test_indefinite_and_empty_systems():
     system = NewtonSystem(F, E.g, len(V), boundary_of(F))
     form = E.curvature_of(E.deform(w)).scaled(np.full(len(F), -1.0))
     system.assemble(form)
-    # Diagonal entries that are not positive are taken for vertices without curvature.
+    # Vertices whose diagonal entry is not positive count as vertices without curvature.
     with pytest.raises(NotPositiveDefinite):
         system.factor()
     nothing = np.zeros(len(F))

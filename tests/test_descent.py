@@ -1,4 +1,4 @@
-"""The descents: what each of them must do, against brute force and differences."""
+"""The descent methods, compared with brute force and differences."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from quasiharmonic.solver.methods import (
     reweighting,
 )
 from quasiharmonic.solver.methods.base import FunctionalDescent, SearchStage, SearchState, Steps
-from quasiharmonic.solver.methods.local_repair import Patch, last_untangled
+from quasiharmonic.solver.methods.local_repair import Patch, untangle_fully
 from quasiharmonic.solver.methods.newton import SecondOrderModel
 from quasiharmonic.solver.methods.random_restarts import left_of, nearest
-from quasiharmonic.solver.methods.reweighting import reweighted
-from quasiharmonic.solver.methods.untangling import GRADINGS, Regularised, untangled
+from quasiharmonic.solver.methods.reweighting import reweight
+from quasiharmonic.solver.methods.untangling import GRADINGS, Regularised, untangle
 from quasiharmonic.solver.search.stages import TentativeStage
 from quasiharmonic.solver.search.strategy import STRATEGIES, stages_of
 from quasiharmonic.surfaces import grid
 from shared.meshes import bend, boundary_of, lift, random_xi
-from shared.solvable import star_problem, turned_ring
+from shared.solvable_problems import star_problem, turned_ring
 
 BOTH = list(PARAMETERISATIONS)
 
 
 def path(method, objective, start=None):
-    """The maps along a descent, the start's included."""
+    """Return the maps along a descent, including the start."""
     start = start or objective.evaluate(np.zeros(len(objective.problem.F), dtype=complex))
     return [start, *method.iterates(objective, start)]
 
@@ -62,41 +62,41 @@ class TestParameterisation:
         assert np.all(np.isfinite(outside.view(float)))
         assert np.all(np.abs(outside) <= p.bound * (1 + 1e-15))
 
-    def test_bend_is_the_derivative_of_the_slope(self, name):
+    def test_second_derivative_is_the_derivative_of_the_gradient(self, name):
         p = PARAMETERISATIONS[name]
         rho, h = np.linspace(0.1, 4, 20), 1e-5
         slope = (p.radial(rho + h)[2] - p.radial(rho - h)[2]) / (2 * h)
-        np.testing.assert_allclose(p.bend(rho), slope, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(p.second_derivative(rho), slope, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [getattr(descent, name) for name in descent.__all__ if name != "Descent"])
-class TestEvery:
-    """What a search relies on, of each that the package has."""
+class TestEveryMethod:
+    """Properties of every method that a search relies on."""
 
     @staticmethod
     def posed():
         return Problem(*star_problem(depth=0.4, n=200))
 
     def begun(self, method):
-        """An objective, and where the method begins after a search has been at Tutte's embedding."""
+        """An objective, and the point where the method starts after a search tried Tutte's embedding."""
         problem = self.posed()
         objective = method.objective(problem, "auto")
         tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
         assert tutte.inverted > 0
         return objective, method.start(objective, SearchState(None, tutte.w, tutte))
 
-    def test_is_one_with_defaults_a_word_and_a_way_to_resume(self, kind):
+    def test_has_defaults_a_label_and_a_way_to_resume(self, kind):
         method = kind()
         assert issubclass(kind, Descent)
-        assert method.word in method.name
+        assert method.label in method.name
         assert replace(method, resume=True) == kind(resume=True)
         assert replace(method, resume=True) != method
         objective, start = self.begun(kind(resume=True))
         assert start.objective.problem is objective.problem
         assert np.isfinite(start.energy)
 
-    def test_interleaved_and_abandoned(self, kind):
-        """Another run of the same on the same domain, midway or abandoned, changes no map of this one."""
+    def test_interleaved_and_abandoned_runs(self, kind):
+        """Another run on the same domain, unfinished or abandoned, changes no map of this run."""
         method = kind()
         objective, start = self.begun(method)
         alone = [at.w for at in islice(method.iterates(objective, start), 4)]
@@ -111,7 +111,7 @@ class TestEvery:
             for here, there in zip(expected, found, strict=True):
                 np.testing.assert_allclose(there, here, rtol=0, atol=1e-12)
 
-    def test_leaves_floating_point_alone(self, kind):
+    def test_does_not_change_the_floating_point_state(self, kind):
         before = np.geterr()
         method = kind()
         iterates = method.iterates(*self.begun(method))
@@ -120,13 +120,13 @@ class TestEvery:
         iterates.close()
         assert np.geterr() == before
 
-    def test_says_whether_it_is_at_rest(self, kind):
+    def test_reports_convergence(self, kind):
         method = kind()
         if "iterations" in kind.__dataclass_fields__:
             method = kind(iterations=2)
         steps = Steps(method.iterates(*self.begun(method)))
         assert len(list(steps)) <= 2 or "iterations" not in kind.__dataclass_fields__
-        assert isinstance(steps.at_rest, bool)
+        assert isinstance(steps.converged, bool)
 
     def test_a_solve_after_an_abandoned_one(self, kind):
         method = kind()
@@ -140,7 +140,7 @@ class TestEvery:
 
 
 class TestAlternating:
-    def test_own_tensor_is_the_best_one(self, rng):
+    def test_the_frozen_tensor_is_optimal(self, rng):
         """No other tensor has a lower energy for the map, on positive and on inverted triangles."""
         problem = Problem(*star_problem(n=80))
         mesh = problem.domain.mesh("equilateral")
@@ -191,7 +191,7 @@ class TestNewton:
         assert np.all(np.diff(values) < 0)
         assert values[-1] < 0.05 * values[0]
 
-    def test_starts_from_zero_where_polar_coordinates_do_not(self, name, reference):
+    def test_starts_from_zero_where_polar_coordinates_fail(self, name, reference):
         objective = Objective(Problem(*star_problem(n=80)), parameterisation=name, reference=reference)
         model = SecondOrderModel(objective.evaluate(np.zeros(len(objective.problem.F), dtype=complex)))
         for part in (*model.K, *model.g, *model.B[0], *model.B[1]):
@@ -199,7 +199,7 @@ class TestNewton:
 
 
 def test_newton_converges_fast_near_a_solution():
-    """Where first order methods crawl: to 1e-10 of the area within a few steps."""
+    """It converges to 1e-10 of the area within a few steps, where first-order methods are slow."""
     problem = Problem(*star_problem(depth=0.4))
     objective = Objective(problem)
     start = path(VectorAdam(iterations=40, schedule=((0, 0.2),)), objective)[-1]
@@ -221,8 +221,8 @@ def test_lbfgs_stays_within_the_bound():
         assert np.abs(iterate.xi).max() <= TANH.bound * (1 + 1e-12)
 
 
-def test_vector_adam_steps_are_of_the_schedules_length():
-    """The first step of every triangle that feels a force is exactly that long."""
+def test_vector_adam_steps_have_the_length_of_the_schedule():
+    """The first step of every triangle with a non-zero gradient has exactly that length."""
     objective = Objective(Problem(*star_problem()))
     first = path(VectorAdam(iterations=1, schedule=((0, 0.37),)), objective)[1]
     np.testing.assert_allclose(np.abs(first.xi), 0.37, rtol=1e-9)
@@ -230,7 +230,7 @@ def test_vector_adam_steps_are_of_the_schedules_length():
 
 @pytest.mark.parametrize("momenta", [(0.9, 0.999), (0.0, 0.5), (0.6, 0.9)])
 def test_vector_adam_is_adam_with_the_moduli_of_complex_numbers(momenta):
-    """By Kingma and Ba's formulas, step by step."""
+    """Compare with Kingma and Ba's formulas, step by step."""
     objective = Objective(Problem(*star_problem()))
     maps = path(VectorAdam(iterations=6, schedule=((0, 0.1),), momenta=momenta), objective)
     first, second = momenta
@@ -243,13 +243,13 @@ def test_vector_adam_is_adam_with_the_moduli_of_complex_numbers(momenta):
 
 
 class TestPatience:
-    """A stage is given up when what it descends no longer falls, whatever becomes of V₃."""
+    """A stage ends when its own functional no longer decreases, whatever V₃ does."""
 
     @dataclass(frozen=True, kw_only=True)
     class Roughening(FunctionalDescent):
-        """Tensors ever rougher: V₄ falls below zero and V₃ rises."""
+        """Tensors that become rougher: V₄ falls below zero and V₃ grows."""
 
-        word: ClassVar[str] = "roughening"
+        label: ClassVar[str] = "roughening"
         patience = 5, 1e-3
 
         def iterates(self, objective, start):
@@ -258,26 +258,26 @@ class TestPatience:
             return False
 
     @pytest.mark.parametrize(("functional", "most"), [("poisson", 40), ("dirichlet", 12)])
-    def test_is_judged_by_the_functional_that_is_descended(self, functional, most):
+    def test_patience_uses_the_descended_functional(self, functional, most):
         V, F, fixed, target = star_problem()
         result = solve(Problem(V, F, fixed, target), strategy=[self.Roughening(functional=functional, iterations=40)])
         assert not result.injective
         assert result.history[-1].energy > result.history[0].energy
-        assert (result.stages[0].iterations == 40) == (most == 40)
-        assert result.stages[0].iterations <= most
+        assert (result.stages[0].n_iterations == 40) == (most == 40)
+        assert result.stages[0].n_iterations <= most
 
 
 def test_vector_adam_ignores_the_frames():
-    """Turning triangles' corners turns their ξ and changes nothing else."""
+    """A rotation of the triangles' corners rotates ξ and changes nothing else."""
     V, F, fixed, target = star_problem()
     turned = np.where((np.arange(len(F)) % 2)[:, None], np.roll(F, -1, axis=1), F)
     a, b = (solve(Problem(V, G, fixed, target)) for G in (F, turned))
     np.testing.assert_allclose(a.uv, b.uv, atol=1e-9)
 
 
-class TestPatches:
+class TestLocalRepair:
     def displaced(self, *vertices):
-        """An injective map with some free vertices thrown across their neighbours."""
+        """An injective map with some free vertices displaced across their neighbours."""
         V, F = grid(12, 12)
         problem = Problem(V, F, boundary_of(F), bend(V[boundary_of(F)]))
         objective = Objective(problem)
@@ -298,7 +298,7 @@ class TestPatches:
         assert near.max() < 4 / 12
         assert not np.isin(moved, objective.problem.fixed).any()
 
-    def test_two_places_one_after_the_other(self):
+    def test_two_patches_one_after_the_other(self):
         objective, start = self.displaced(2 * 13 + 3, 9 * 13 + 8)
         flips = [i.inverted for i in path(LocalRepair(tries=20), objective, start)]
         assert flips[-1] == 0
@@ -306,22 +306,22 @@ class TestPatches:
         assert len(flips) > 2
 
     def test_gives_a_quasi_harmonic_map(self):
-        """Where it ends without a flip its tensors are those of the map, and V₃ is zero."""
+        """Where it ends without inverted triangles, its tensors are those of the map, and V₃ is zero."""
         objective, start = self.displaced(5 * 13 + 6)
         end = path(LocalRepair(tries=5), objective, start)[-1]
         assert end.energy < 1e-20
         np.testing.assert_allclose(objective.evaluate(end.xi).w, end.w, atol=1e-9)
 
-    def test_leaves_alone_what_is_injective(self):
+    def test_does_not_change_injective_maps(self):
         objective, start = self.displaced()
         assert path(LocalRepair(tries=5), objective, start) == [start]
 
-    def test_a_wide_patch_rights_at_once_what_takes_many_narrow_ones(self):
+    def test_one_wide_patch_repairs_what_takes_many_narrow_ones(self):
         V, F = grid(80, 80)
         problem = Problem(V, F, boundary_of(F), V[boundary_of(F)])
         objective = Objective(problem)
         w = problem.frame.inward(V)
-        # Six vertices near each other, all of them displaced by two edges' lengths.
+        # Six vertices near each other are displaced by two edge lengths.
         w[[8 * 81 + 8, 8 * 81 + 14, 8 * 81 + 20, 14 * 81 + 8, 14 * 81 + 14, 14 * 81 + 20]] += 0.05
         start = objective.of_map(w)
         assert 0 < start.inverted <= 50
@@ -333,7 +333,7 @@ class TestPatches:
 
 class TestUntangling:
     def tangled(self, seed=0):
-        """A grid whose inner vertices lie anywhere in the square."""
+        """A grid whose inner vertices lie at random positions in the square."""
         V, F = grid(8, 8)
         w = V[:, 0] + 1j * V[:, 1]
         rim = boundary_of(F)
@@ -349,7 +349,7 @@ class TestUntangling:
             assert check_energy(Regularised(epsilon), d).passed
 
     def test_energy_becomes_a_barrier(self):
-        """As ε falls it tends to (a + b + λ(D² + 1))/D where D > 0, and to infinity where D < 0."""
+        """As ε → 0 it tends to (a + b + λ(D² + 1))/D if D > 0, and to infinity if D < 0."""
         d = Deformation.of(np.array([1.0 + 0j, 0.5]), np.array([0.5 + 0j, 1.0]))
         positive, inverted = Regularised(1e-9).density(d)
         assert positive == pytest.approx((1.25 + 1e-4 * (0.75**2 + 1)) / 0.75)
@@ -357,31 +357,31 @@ class TestUntangling:
 
     @pytest.mark.parametrize("grading", GRADINGS)
     @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
-    def test_rights_what_is_thrown_together_at_random(self, grading, scale):
+    def test_untangles_random_positions(self, grading, scale):
         F, w, rim = self.tangled()
-        *_, end = untangled(F, scale * w, rim, grading=grading)
+        *_, end = untangle(F, scale * w, rim, grading=grading)
         assert signed_areas(F, w).min() < 0
         assert signed_areas(F, end).min() > 0
         np.testing.assert_array_equal(end[rim], scale * w[rim])
 
-    def test_nothing_to_do_and_nothing_to_be_done(self):
+    def test_injective_and_collapsed_maps_are_not_changed(self):
         V, F = grid(4, 4)
         w = V[:, 0] + 1j * V[:, 1]
-        assert list(untangled(F, w, boundary_of(F), grading=0.5)) == []
-        assert list(untangled(F, 0 * w, boundary_of(F), grading=0.5)) == []
+        assert list(untangle(F, w, boundary_of(F), grading=0.5)) == []
+        assert list(untangle(F, 0 * w, boundary_of(F), grading=0.5)) == []
 
-    def test_gives_up_where_no_map_exists(self):
-        """An inverted triangle all of whose vertices are held."""
+    def test_stops_where_no_map_exists(self):
+        """An inverted triangle whose vertices are all fixed."""
         F, w, rim = self.tangled()
         inner = next(t for t in F if not np.isin(t, rim).any())
         w[inner] = [0.4 + 0.4j, 0.5 + 0.6j, 0.6 + 0.4j]
-        seen = list(untangled(F, w, np.append(rim, inner), grading=0.0))
+        seen = list(untangle(F, w, np.append(rim, inner), grading=0.0))
         assert 0 < len(seen) < 1000
         assert np.all(np.isfinite(seen[-1].view(float)))
 
-    def test_leaves_numpys_errors_to_the_caller(self):
+    def test_does_not_change_numpys_error_state(self):
         F, w, rim = self.tangled()
-        for _ in untangled(F, w, rim, grading=0.0):
+        for _ in untangle(F, w, rim, grading=0.0):
             assert np.geterr()["divide"] == "warn"
 
     def test_limits_iterations(self):
@@ -404,90 +404,90 @@ class TestRandomRestarts:
         assert nearest(square, 0.9 + 0.5j) == 1 + 0.5j
 
     @pytest.mark.slow
-    def test_goes_around_a_fold(self):
+    def test_moves_a_vertex_around_a_fold(self):
         """A free vertex must lie in a wedge behind a fold of the target, and starts in front of it."""
         case = problems.make(*problems.parse("jam:80:0.943"))
         problem = Problem(case.V, case.F, case.fixed, case.target)
         objective = Objective(problem)
         tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
-        *_, w = untangled(problem.F, tutte.w, problem.fixed, grading=0.0)
+        *_, w = untangle(problem.F, tutte.w, problem.fixed, grading=0.0)
         stuck = objective.of_map(w)
         assert stuck.inverted > 0
         assert path(LocalRepair(tries=4), objective, stuck)[-1].inverted == stuck.inverted
-        end = path(RandomRestarts(in_vain=50), objective, stuck)[-1]
+        end = path(RandomRestarts(max_failures=50), objective, stuck)[-1]
         assert end.inverted == 0
         np.testing.assert_array_equal(end.w[problem.fixed], w[problem.fixed])
 
-    def test_draws_the_same_numbers_every_time(self):
-        objective, start = TestPatches().displaced(5 * 13 + 6)
-        first, again = (path(RandomRestarts(in_vain=5), objective, start)[-1] for _ in range(2))
+    def test_is_deterministic(self):
+        objective, start = TestLocalRepair().displaced(5 * 13 + 6)
+        first, again = (path(RandomRestarts(max_failures=5), objective, start)[-1] for _ in range(2))
         np.testing.assert_array_equal(first.w, again.w)
         assert first.inverted == 0
 
-    def test_untangles_first_what_is_too_much_for_local_repair(self):
+    def test_untangles_first_if_local_repair_cannot_succeed(self):
         objective = Objective(Problem(*star_problem(depth=0.2, n=1000)))
-        seen = path(RandomRestarts(in_vain=3), objective)
+        seen = path(RandomRestarts(max_failures=3), objective)
         assert seen[0].inverted > 50
         assert seen[-1].inverted < seen[0].inverted
 
 
 class TestReweighting:
     def stuck(self):
-        """A problem in which several vertices must go around a fold together, in front of it."""
+        """A problem in which several vertices, in front of a fold, must move around it together."""
         case = problems.make(*problems.parse("jam:418:0.838"))
         problem = Problem(case.V, case.F, case.fixed, case.target)
         objective = Objective(problem)
         tutte = objective.evaluate(np.zeros(len(problem.F), dtype=complex))
-        *_, w = untangled(problem.F, tutte.w, problem.fixed, grading=0.0)
-        held = np.isin(np.arange(problem.n), problem.fixed)
-        return Patch(problem.F, np.arange(problem.n), held), w
+        *_, w = untangle(problem.F, tutte.w, problem.fixed, grading=0.0)
+        fixed = np.isin(np.arange(problem.n), problem.fixed)
+        return Patch(problem.F, np.arange(problem.n), fixed), w
 
     @pytest.mark.slow
-    def test_rights_what_the_same_number_of_plain_descents_does_not(self):
+    def test_repairs_what_the_same_number_of_unweighted_descents_does_not(self):
         patch, start = self.stuck()
         assert signed_areas(patch.F, start).min() < 0
         w = start
         for grading in 5 * GRADINGS:
-            *_, w = untangled(patch.F, w, np.flatnonzero(patch.held), grading=grading)
+            *_, w = untangle(patch.F, w, np.flatnonzero(patch.fixed), grading=grading)
             assert signed_areas(patch.F, w).min() < 0
-        ends = [reweighted(np.random.default_rng(seed), patch, start, "auto") for seed in range(4)]
+        ends = [reweight(np.random.default_rng(seed), patch, start, "auto") for seed in range(4)]
         assert any(signed_areas(patch.F, end).min() > 0 for end in ends)
         for end in ends:
-            np.testing.assert_array_equal(end[patch.held], start[patch.held])
+            np.testing.assert_array_equal(end[patch.fixed], start[patch.fixed])
             assert np.sum(signed_areas(patch.F, end) <= 0) <= np.sum(signed_areas(patch.F, start) <= 0)
 
     @pytest.mark.slow
     @pytest.mark.parametrize("spoilt", [False, True])
-    def test_gives_back_what_it_cannot_better(self, spoilt, monkeypatch):
-        """The last map of its rounds that is no worse than the one it was given; that one, where all are worse."""
+    def test_returns_the_start_if_nothing_is_better(self, spoilt, monkeypatch):
+        """Return the last map of the rounds that is no worse than the given one; if all are worse, the given one."""
         patch, start = self.stuck()
         rounds = []
 
         def recorded(*arguments):
-            # Spoilt by a vertex that goes far away, each map has more inverted triangles than the first.
-            w = last_untangled(*arguments)
-            rounds.append(w + np.where(np.arange(w.size) == np.flatnonzero(~patch.held)[0], 9.0, 0) if spoilt else w)
+            # A vertex moved far away gives each map more inverted triangles than the first.
+            w = untangle_fully(*arguments)
+            rounds.append(w + np.where(np.arange(w.size) == np.flatnonzero(~patch.fixed)[0], 9.0, 0) if spoilt else w)
             return rounds[-1]
 
         def inverted(w):
             return np.sum(signed_areas(patch.F, w) <= 0)
 
-        monkeypatch.setattr(reweighting, "last_untangled", recorded)
+        monkeypatch.setattr(reweighting, "untangle_fully", recorded)
         for seed in range(2):
             rounds.clear()
-            end = reweighted(np.random.default_rng(seed), patch, start, "auto")
+            end = reweight(np.random.default_rng(seed), patch, start, "auto")
             assert len(rounds) > 1
             no_worse = [w for w in rounds if inverted(w) <= inverted(start)]
             assert bool(no_worse) is not spoilt
             np.testing.assert_array_equal(end, no_worse[-1] if no_worse else start)
 
-    def test_weights_decide_which_of_two_is_righted(self):
-        """A vertex that can be on the right side of one held edge or the other, not of both."""
+    def test_weights_decide_which_of_two_triangles_is_repaired(self):
+        """A vertex that can be on the correct side of one of two fixed edges, but not of both."""
         F = np.array([[0, 1, 4], [2, 3, 4]])
         w = np.array([0, 1, 1 + 0.2j, 0.2j, 0.5 + 0.1j]) + np.array([0.4j, 0.4j, 0, 0, 0.3j])
         for heavy in (0, 1):
             weights = np.where(np.arange(2) == heavy, 1e3, 1.0)
-            *_, end = untangled(F, w, np.arange(4), grading=0.0, weights=weights)
+            *_, end = untangle(F, w, np.arange(4), grading=0.0, weights=weights)
             areas = signed_areas(F, end)
             assert areas[heavy] > 0 > areas[1 - heavy]
 
@@ -512,7 +512,7 @@ class TestStrategy:
             ({"momenta": None}, "momenta must be two numbers"),
         ],
     )
-    def test_wrong_words(self, arguments, words):
+    def test_invalid_names(self, arguments, words):
         with pytest.raises(ValueError, match=words):
             VectorAdam(**arguments)
 
@@ -526,23 +526,23 @@ class TestStrategy:
             with pytest.raises(ValueError, match="or a list of Descent"):
                 stages_of(wrong, problem)
 
-    def test_pins_are_met_with_si_log_first(self):
+    def test_problems_with_pins_start_with_si_log(self):
         V, F, fixed, target = star_problem(n=60)
         inner = int(np.setdiff1d(np.arange(len(V)), fixed)[0])
         pinned = Problem(V, F, np.append(fixed, inner), np.vstack([target, [[0, 0]]]))
         assert stages_of("speed", pinned)[0].parameterisation == "si-log"
         assert stages_of("speed", Problem(V, F, fixed, target))[0].parameterisation == "tanh"
 
-    def test_the_papers_pipeline_is_si_log_tanh_and_then_two_methods_in_turn(self):
+    def test_the_papers_strategy_is_si_log_tanh_and_then_two_methods_in_turn(self):
         stages = stages_of("paper", Problem(*star_problem(n=60)))
         assert [stage.begins_with.parameterisation for stage in stages[:3]] == ["si-log", "tanh", "tanh"]
-        assert [stage.begins_with.word for stage in stages[:2]] == ["vector-adam"] * 2
-        assert [stage.begins_with.word for stage in stages[2:]] == ["alternating", "newton"] * 10
+        assert [stage.begins_with.label for stage in stages[:2]] == ["vector-adam"] * 2
+        assert [stage.begins_with.label for stage in stages[2:]] == ["alternating", "newton"] * 10
         assert [isinstance(stage, TentativeStage) for stage in stages[2:]] == [True, False] * 10
         assert sum(stage.begins_with.iterations for stage in stages) == 2000
 
-    def test_iterations_in_passing_are_discarded_where_they_find_no_map(self):
-        """The alternation lowers V₃ at every step; what follows begins where it began all the same."""
+    def test_iterations_of_a_tentative_stage_are_discarded_if_they_find_no_map(self):
+        """The alternation lowers V₃ at every step; nevertheless the next stage starts where the alternation started."""
         problem = Problem(*turned_ring(180))
         begun = []
 
@@ -560,7 +560,7 @@ class TestStrategy:
         assert discarded == alone
 
     def test_si_log_keeps_angles_better_on_a_smooth_surface(self):
-        """The si-log map's mean angle distortion is below tanh's, as in the paper's Figure 8."""
+        """The si-log map has a lower mean angle distortion than tanh's, as in the paper's Figure 8."""
         V, F, fixed, target = star_problem(depth=0.35, n=800)
         problem = Problem(lift(V[:, :2]), F, fixed, target)
         mesh = problem.domain.mesh("rest")

@@ -1,4 +1,4 @@
-"""Every obstruction is found where it was put, decided exactly, and gone after refining what it names."""
+"""Every obstruction is found at its location, decided exactly, and gone after the named refinement."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Forbids, Kind, diagnose
-from quasiharmonic.solver.refine.mapping import injective_map
+from quasiharmonic.solver.mapping import injective_map
 from quasiharmonic.solver.refine.refining import refine
 from quasiharmonic.surfaces import disk
-from shared.obstructed import HOUSE, OBSTRUCTED, moved, onto
+from shared.infeasible_problems import HOUSE, OBSTRUCTED, moved, onto
 from shared.polygons import circle
 from shared.small_meshes import loose_wheel, two_wheels
 
@@ -31,17 +31,17 @@ def test_obstruction_is_named(name):
         np.testing.assert_array_equal(getattr(found[0], attribute), expected)
 
 
-def test_every_kind_has_its_problem():
+def test_every_kind_has_a_problem():
     assert len(OBSTRUCTED) >= 20
     assert {kind for _, (kind, _, _) in OBSTRUCTED.values()} == {kind.name for kind in Kind}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", OBSTRUCTED)
-def test_nothing_depends_on_scale_or_on_where_things_are(name):
+def test_scale_and_location_do_not_matter(name):
     problem, _ = OBSTRUCTED[name]
     expected = [(o.kind, o.vertices.tolist(), o.split.tolist()) for o in diagnose(problem).obstructions]
-    # Powers of two round nothing off; the offset rounds, but only targets on few bits are given it.
+    # Powers of two cause no rounding; the offset does, so it applies only to targets with few bits.
     changes = [problem.target * 2.0**-900, problem.target * 2.0**900]
     if np.all(problem.target * 8 == np.round(problem.target * 8)):
         changes.append(problem.target + 2.0**40)
@@ -51,7 +51,7 @@ def test_nothing_depends_on_scale_or_on_where_things_are(name):
 
 
 @pytest.mark.parametrize("name", [name for name, (problem, _) in OBSTRUCTED.items() if len(diagnose(problem).split)])
-def test_refining_what_is_named_leaves_only_what_no_refinement_cures(name):
+def test_refining_the_named_edges_leaves_only_obstructions_that_no_refinement_removes(name):
     problem, _ = OBSTRUCTED[name]
     V, F = problem.V, problem.F
     for _ in range(6):
@@ -83,15 +83,15 @@ def test_after_refining_there_is_a_map(name):
     assert result.injective
 
 
-def test_chords_are_decided_strictly():
+def test_chords_are_decided_exactly():
     inside = [[0, 0], [1, -1], [2, -1e-300], [3, -1], *HOUSE]
     touching = [[0, 0], [1, -1], [2, 0], [3, -1], *HOUSE]
     assert Kind.CHORD not in kinds(moved(two_wheels(), inside))
     assert Kind.CHORD in kinds(moved(two_wheels(), touching))
 
 
-def test_sight_is_decided_strictly():
-    def shafts(gap):  # one down, one up from a corridor; both are seen from where they overlap
+def test_visibility_is_decided_exactly():
+    def shafts(gap):  # one corridor leads down and one up; both are visible where they overlap
         x = 4 - gap
         lower = [[0, 2], [3, 2], [3, 0], [4, 0], [4, 2], [8, 2]]
         return moved(loose_wheel(12), [*lower, [8, 4], [5, 4], [5, 6], [x, 6], [x, 4], [0, 4]])
@@ -100,7 +100,7 @@ def test_sight_is_decided_strictly():
     assert kinds(shafts(0.0)) == {Kind.HIDDEN}
 
 
-def test_a_smallest_reason_is_given():
+def test_a_minimal_reason_is_given():
     problem, _ = OBSTRUCTED["nothing sees all"]
     (found,) = diagnose(problem).obstructions
     assert found.vertices[0] == 8
@@ -109,7 +109,7 @@ def test_a_smallest_reason_is_given():
     assert found.split.tolist() == [[8, k] for k in sorted(seen)]
 
 
-def test_conditions_on_simple_targets_are_left_out_elsewhere():
+def test_conditions_for_simple_targets_are_skipped_for_other_targets():
     problem, _ = OBSTRUCTED["band over itself"]
     diagnosis = diagnose(problem)
     assert diagnosis.forbids_bijective
@@ -117,7 +117,7 @@ def test_conditions_on_simple_targets_are_left_out_elsewhere():
     assert any("visibility from vertices" in text for text in diagnosis.unchecked)
 
 
-def test_clean_problems_have_no_obstruction():
+def test_feasible_problems_have_no_obstruction():
     diagnosis = diagnose(onto(disk(3), circle(18)))
     assert diagnosis.obstructions == ()
     assert not diagnosis.forbids_injective
@@ -126,7 +126,7 @@ def test_clean_problems_have_no_obstruction():
     assert diagnosis.summary().startswith("No known obstruction")
 
 
-def test_verdicts_read_well_and_travel_as_json():
+def test_diagnoses_have_text_and_json_forms():
     for problem, (kind, _, _) in OBSTRUCTED.values():
         diagnosis = diagnose(problem)
         text = diagnosis.summary(most=2)
@@ -139,7 +139,7 @@ def test_verdicts_read_well_and_travel_as_json():
         assert {o["kind"] for o in report["obstructions"]} == {o.kind.name.lower() for o in diagnosis.obstructions}
 
 
-def test_elements_cannot_be_changed():
+def test_obstructions_are_immutable():
     problem, _ = OBSTRUCTED["flat ear"]
     found = diagnose(problem).obstructions[0]
     with pytest.raises(ValueError, match="read-only"):

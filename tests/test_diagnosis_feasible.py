@@ -1,4 +1,4 @@
-"""No obstruction is claimed where there is a map: problems made by moving a mesh and keeping its boundary."""
+"""No obstruction is reported if a map exists: problems made by moving a mesh and keeping its boundary."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Forbids, Kind, diagnose
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.infeasible_problems import OBSTRUCTED, moved, onto
 from shared.meshes import bend, boundary_of
-from shared.obstructed import OBSTRUCTED, moved, onto
 from shared.polygons import circle, spiral
 from shared.small_meshes import loose_wheel, wheel
 
@@ -22,14 +22,14 @@ def positive(F, uv):
 
 
 def pushed(F, uv, pins=()):
-    """The problem that a map solves."""
+    """Return the problem that a map solves."""
     assert positive(F, uv)
     fixed = np.concatenate([boundary_of(F), np.asarray(pins, dtype=int)])
     return Problem(uv, F, fixed, uv[fixed], reference="equilateral")
 
 
 def small_mesh(rng):
-    """A few points on a circle and in it, with chords and ears; sometimes with triangles cut out."""
+    """A few points on and in a circle, with chords and ears, and sometimes without some triangles."""
     ring = circle(int(rng.integers(3, 14)))
     V = np.concatenate([ring, 1.3 * (rng.random((int(rng.integers(1, 16)), 2)) - 0.5)])
     F = Delaunay(V).simplices.astype(np.int64)
@@ -43,7 +43,7 @@ def small_mesh(rng):
 
 
 def wander(V, F, rng, sweeps):
-    """Move one vertex after another, far, as long as its triangles stay positive."""
+    """Move one vertex after another far, while its triangles stay positive."""
     uv = V.copy()
     around = [F[(v == F).any(axis=1)] for v in range(len(V))]
     for v in np.tile(np.arange(len(V)), sweeps):
@@ -63,7 +63,7 @@ def test_wandering_vertices(seed):
     V, F = small_mesh(rng)
     uv = wander(V, F, rng, int(rng.integers(1, 12)))
     if seed % 4 == 0 and positive(F, np.round(8 * uv) / 8):
-        uv = np.round(8 * uv) / 8  # many points on lines through others
+        uv = np.round(8 * uv) / 8  # many points are collinear with others
     inner = np.setdiff1d(np.arange(len(V)), boundary_of(F))
     diagnosis = diagnose(pushed(F, uv, inner[rng.random(len(inner)) < 0.4 * (seed % 2)]))
     assert not diagnosis.forbids_injective, diagnosis.summary()
@@ -80,7 +80,7 @@ def test_smooth_maps(seed):
 
 
 @pytest.mark.parametrize("turns", [0.9, 1.3, 2.6])
-def test_bands_around_a_circle_and_over_themselves(turns):
+def test_bands_around_a_circle_and_bands_that_overlap(turns):
     V, F = grid(int(24 * turns), 3)
     t, radius = -2 * np.pi * turns * V[:, 0], 1 + V[:, 1]
     diagnosis = diagnose(pushed(F, np.stack([radius * np.cos(t), radius * np.sin(t)], axis=1)))
@@ -97,7 +97,7 @@ def test_spirals_that_fill_a_band(turns):
     assert diagnosis.obstructions == (), diagnosis.summary()
 
 
-def test_branched_covers_are_no_injective_maps_but_maps_all_the_same():
+def test_branched_covers_are_maps_that_are_not_bijective():
     V, F = disk(6)
     diagnosis = diagnose(pushed(F, (V.view(complex) ** 2).view(float)))
     assert not diagnosis.forbids_injective
@@ -105,19 +105,19 @@ def test_branched_covers_are_no_injective_maps_but_maps_all_the_same():
     assert turning.forbids is Forbids.UNBRANCHED
 
 
-def test_fine_meshes_get_through_any_corridor():
+def test_fine_meshes_pass_through_any_corridor():
     V, F = disk(24)
     assert diagnose(onto((V, F), spiral(72, 2.2))).obstructions == ()
 
 
-def test_hubs_with_a_place_are_left_alone():
-    # A star sees all its corners from the middle only.
+def test_hubs_with_a_kernel_are_not_reported():
+    # A star sees all its corners from its centre only.
     star = circle(12) * np.where(np.arange(12) % 2, 0.2, 1.0)[:, None]
     assert diagnose(moved(wheel(12), star)).obstructions == ()
     assert diagnose(moved(loose_wheel(12), star)).obstructions == ()
 
 
 @pytest.mark.parametrize("name", ["slit", "band over itself"])
-def test_what_forbids_bijective_maps_only_leaves_maps(name):
+def test_obstructions_to_bijective_maps_do_not_exclude_maps(name):
     problem, _ = OBSTRUCTED[name]
     assert not diagnose(problem).forbids_injective

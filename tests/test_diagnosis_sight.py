@@ -1,4 +1,4 @@
-"""What speeds the diagnosis up changes nothing in it: triangulation, views, places found by trial, quick sights."""
+"""The fast parts of the diagnosis agree with slow ones: triangulation, visibility, sampled points, quick tests."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from quasiharmonic.geometry.exact.loops import contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation, segment_relation
-from quasiharmonic.geometry.exact.triangulation import triangulate
+from quasiharmonic.geometry.exact.sweep import triangulate
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Kind, diagnose, examine, shortcuts
 from quasiharmonic.problem.diagnosis.clearance import clear
@@ -21,8 +21,8 @@ from quasiharmonic.problem.diagnosis.clipping import Lattice
 from quasiharmonic.problem.diagnosis.effort import Effort
 from quasiharmonic.problem.diagnosis.views import Views
 from quasiharmonic.surfaces import annulus, disk, grid
+from shared.infeasible_problems import OBSTRUCTED, onto
 from shared.meshes import boundary_of
-from shared.obstructed import OBSTRUCTED, onto
 from shared.polygons import U, circle, random_polygon, spiral
 from shared.small_meshes import loose_wheel, wheel
 
@@ -38,7 +38,7 @@ def polygons():
 
 
 def outlines(kind, n):
-    """Simple outlines of many corners."""
+    """Simple outlines with many corners."""
     t = 2 * np.pi * np.arange(n) / n
     if kind == "spiral":
         return spiral(n // 2, 8.3)
@@ -50,7 +50,7 @@ def outlines(kind, n):
 
 
 def turned_ring(n, layers, angle=np.pi):
-    """A ring of so many triangles' layers whose inner loop is turned against the outer one."""
+    """A ring with the given number of layers, whose inner loop is turned against the outer one."""
     V, F = grid(n, layers)
     here = np.arange(len(V))
     here[n :: n + 1] -= n  # the last column is the first
@@ -72,12 +72,12 @@ def test_triangles_fill_polygons(corners):
     sides = {(i, j) for t in triangles.tolist() for i, j in pairwise([*t, t[0]])}
     n = len(corners)
     assert len(sides) == 3 * (n - 2) == 3 * len(triangles)
-    # Every side of the polygon is one of a triangle, all others are shared by two.
+    # Every side of the polygon belongs to one triangle, every other edge to two.
     assert {(i, j) for i, j in sides if (j, i) not in sides} == {(k, (k + 1) % n) for k in range(n)}
 
 
 def seen(here, eye, corners):
-    """Whether points see a corner from inside, by brute force; None for those on a line with two corners."""
+    """Test by brute force whether points see a corner from inside; None for those on a line with two corners."""
     result = []
     after = np.roll(corners, -1, axis=0)
     for x in here:
@@ -95,7 +95,7 @@ def seen(here, eye, corners):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("corners", polygons()[:12])
-def test_wedges_hold_what_is_seen_and_no_more(corners, rng):
+def test_wedges_contain_exactly_the_visible_points(corners, rng):
     n = len(corners)
     k = np.arange(n)
     after, before = (k + 1) % n, (k - 1) % n
@@ -120,8 +120,8 @@ def test_wedges_hold_what_is_seen_and_no_more(corners, rng):
             assert truth is None or x == truth
 
 
-def test_directions_that_differ_by_a_rounding_are_sorted_exactly():
-    # Seen from the first corner, the others are in directions that floating point cannot tell apart.
+def test_directions_that_differ_by_rounding_are_sorted_exactly():
+    # Seen from the first corner, floating point cannot distinguish the directions of the others.
     corners = np.array([[0, 0], *([1 + 0.1 * k, 1e-30 * k] for k in range(9)), [0.5, 1.0]])
     n = len(corners)
     k = np.arange(n)
@@ -129,12 +129,12 @@ def test_directions_that_differ_by_a_rounding_are_sorted_exactly():
     sides, beside = np.stack([k, after], axis=1), np.stack([after, before], axis=1)
     views = Views(sides, corners, Lattice(corners), beside, Effort(10**9))
     wedges = views.wedges(0)
-    # Each wall but the two at the eye is seen, from right to left.
+    # Each wall except the two at the viewpoint is visible, from right to left.
     assert wedges.wall.tolist() == [[j, j + 1] for j in range(1, n - 1)]
     assert wedges.right.tolist() == list(range(1, n - 1))
 
 
-def test_clear_segments_against_all_pairs(rng):
+def test_clear_segments_agree_with_all_pairs(rng):
     points = rng.integers(0, 12, (60, 2)).astype(float)
     walls = np.stack([np.arange(0, 40, 2), np.arange(1, 40, 2)], axis=1)
     ends = np.stack([rng.integers(0, 60, 300), rng.integers(0, 60, 300)], axis=1)
@@ -150,7 +150,7 @@ def test_clear_segments_against_all_pairs(rng):
 
 
 def winding_number(x, corners):
-    """By the definition of Hormann and Agathos, one edge after another."""
+    """Return the winding number by the definition of Hormann and Agathos, edge by edge."""
     turns = 0
     for p, q in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if (p[1] <= x[1]) != (q[1] <= x[1]):
@@ -176,7 +176,7 @@ def test_winding_numbers(rng, monkeypatch, chunk):
         assert len(turns) == m
 
 
-def test_contacts_stop_at_the_most_that_is_asked_for(rng):
+def test_the_number_of_contacts_is_limited(rng):
     points = rng.random((200, 2))
     ends = np.arange(200).reshape(-1, 2)
     every = contacts(points, ends, 10**6)
@@ -187,7 +187,7 @@ def test_contacts_stop_at_the_most_that_is_asked_for(rng):
 
 
 def random_problems():
-    """Simple targets on which all kinds of obstruction come up."""
+    """Simple targets with all kinds of obstruction."""
     rng = np.random.default_rng(4)
     for n in (2, 3, 4):
         mesh = disk(n)
@@ -218,46 +218,46 @@ def found(problem):
 
 
 @pytest.mark.slow
-def test_short_cuts_of_the_diagnosis_change_nothing(monkeypatch):
+def test_fast_tests_of_the_diagnosis_agree_with_slow_ones(monkeypatch):
     problems = [*random_problems(), *(problem for problem, _ in OBSTRUCTED.values())]
     quick = [found(problem) for problem in problems]
-    monkeypatch.setattr(examine, "unplaced", lambda stars, *_: np.arange(len(stars)))
-    monkeypatch.setattr(shortcuts.Shortcuts, "within", lambda self, i, j, k: np.zeros(len(i), dtype=bool))
+    monkeypatch.setattr(examine, "find_unplaced", lambda stars, *_: np.arange(len(stars)))
+    monkeypatch.setattr(shortcuts.Shortcuts, "are_close", lambda self, i, j, k: np.zeros(len(i), dtype=bool))
     assert quick == [found(problem) for problem in problems]
     kinds = {kind for some in quick for kind, *_ in some}
     assert {Kind.HIDDEN, Kind.HALF_PLANES, Kind.LINK_DISTANCE, Kind.CHORD} <= kinds
 
 
-def test_what_takes_too_long_is_said_to_be_unchecked(monkeypatch):
+def test_checks_that_take_too_long_are_reported_as_unchecked(monkeypatch):
     problem, _ = OBSTRUCTED["nothing sees all"]
-    monkeypatch.setattr(examine, "MOST_EFFORT", 0)
+    monkeypatch.setattr(examine, "MAX_EFFORT", 0)
     diagnosis = diagnose(problem)
     assert not diagnosis.obstructions
     assert "sees all fixed neighbours of vertex 8" in diagnosis.unchecked[0]
 
 
 def crooked_wheel(n, mesh=wheel):
-    """A hub that sees all of a star whose corners are at very different distances from the middle only."""
+    """A hub that sees a whole star only from the centre; the star's corners have very different distances."""
     return onto(mesh(n), circle(n) * np.exp(2 * np.random.default_rng(0).normal(size=n))[:, None])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mesh", [wheel, loose_wheel])
-def test_hubs_of_thousands_of_neighbours_are_placed(mesh):
+def test_hubs_with_thousands_of_neighbours_are_placed(mesh):
     problem = crooked_wheel(2_000, mesh)
     began = time.process_time()
     diagnosis = diagnose(problem)
-    # A second or less where nothing else runs.
+    # It takes a second or less on an idle machine.
     assert time.process_time() - began < 10
     assert diagnosis.obstructions == ()
     assert not any("sees" in words for words in diagnosis.unchecked)
 
 
 @pytest.mark.slow
-def test_a_place_is_looked_for_however_many_neighbours_there_are(monkeypatch):
-    # More views within views than functions may be called within functions.
-    monkeypatch.setattr(examine, "unplaced", lambda stars, *_: np.arange(len(stars)))
-    monkeypatch.setattr(examine, "MOST_EFFORT", 10**9)
+def test_a_position_is_sought_for_any_number_of_neighbours(monkeypatch):
+    # There are more nested visibility regions than Python allows nested calls.
+    monkeypatch.setattr(examine, "find_unplaced", lambda stars, *_: np.arange(len(stars)))
+    monkeypatch.setattr(examine, "MAX_EFFORT", 10**9)
     problem, usual = crooked_wheel(400), sys.getrecursionlimit()
     sys.setrecursionlimit(len(inspect.stack(0)) + 200)
     try:
@@ -266,19 +266,19 @@ def test_a_place_is_looked_for_however_many_neighbours_there_are(monkeypatch):
         sys.setrecursionlimit(usual)
 
 
-def test_effort_ends_within_one_star(monkeypatch):
-    monkeypatch.setattr(examine, "unplaced", lambda stars, *_: np.arange(len(stars)))
-    monkeypatch.setattr(examine, "MOST_EFFORT", 2_000)
+def test_the_effort_limit_also_applies_within_one_star(monkeypatch):
+    monkeypatch.setattr(examine, "find_unplaced", lambda stars, *_: np.arange(len(stars)))
+    monkeypatch.setattr(examine, "MAX_EFFORT", 2_000)
     diagnosis = diagnose(crooked_wheel(100))
     assert diagnosis.obstructions == ()
     assert "sees all fixed neighbours of vertex 100" in diagnosis.unchecked[0]
 
 
 @pytest.mark.nightly
-def test_five_thousand_neighbours_take_some_seconds():
+def test_five_thousand_neighbours_take_a_few_seconds():
     began = time.process_time()
     assert diagnose(crooked_wheel(5_000)).obstructions == ()
-    # Five where nothing else runs.
+    # It takes five seconds on an idle machine.
     assert time.process_time() - began < 40
 
 
@@ -288,7 +288,7 @@ def test_ten_thousand_boundary_vertices(kind):
     problem = onto(grid(4980, 20), outlines(kind, 10_000))
     began = time.process_time()
     assert diagnose(problem).obstructions == ()
-    # Under a second where nothing else runs.
+    # It takes less than a second on an idle machine.
     assert time.process_time() - began < 10
 
 

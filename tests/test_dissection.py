@@ -1,4 +1,4 @@
-"""Nested dissection: a permutation, separators that separate, and factors as sparse as other orderings make them."""
+"""Nested dissection: permutations, separators, and fill compared with other orderings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def edges_of(F, n):
 
 
 def graded(n):
-    """An irregular disk whose triangles at the rim are twenty times as large as in the middle, and as regular."""
+    """An irregular disk with triangles twenty times as large at the boundary as at the centre, and a regular one."""
     V, F = surfaces.random_delaunay(n, 2)
     z = V[:, 0] + 1j * V[:, 1]
     w = np.exp(1.5 * z)
@@ -53,14 +53,14 @@ def mesh(request):
 
 
 def pattern(n, tail, head):
-    """A matrix with this graph that can be factored without pivoting."""
+    """Return a matrix with this graph that can be factored without pivoting."""
     A = sp.coo_array((-np.ones(tail.size), (tail, head)), shape=(n, n)).tocsr()
     A = A + A.T
     return sp.csc_array(A + sp.csr_array(sp.diags(np.asarray(abs(A).sum(axis=1)).ravel() + 1)))
 
 
 def fill(n, tail, head, order=None):
-    """Entries of the factor when the unknowns are eliminated in this order, by default in that of minimum degree."""
+    """Return the number of entries of the factor for an elimination order; the default is minimum degree."""
     A = pattern(n, tail, head)
     if order is not None:
         A = A[order][:, order]
@@ -69,7 +69,7 @@ def fill(n, tail, head, order=None):
 
 
 def metis(n, tail, head):
-    """The order that METIS finds, asked for by way of PARDISO."""
+    """Return the METIS order, through PARDISO."""
     A = sp.csr_array(sp.triu(pattern(n, tail, head), format="csr"))
     A.sort_indices()
     handle = mkl.Handle(A.indptr.astype(np.int32), A.indices.astype(np.int32), A.data, sequential=False, ordered=False)
@@ -83,7 +83,7 @@ def metis(n, tail, head):
     return order
 
 
-def test_every_vertex_once(mesh):
+def test_every_vertex_occurs_once(mesh):
     V, tail, head = mesh
     before = V.copy(), tail.copy(), head.copy()
     order = nested_dissection(V, tail, head)
@@ -93,14 +93,14 @@ def test_every_vertex_once(mesh):
     np.testing.assert_array_equal(nested_dissection(V, tail, head), order)
 
 
-def test_about_as_little_fill_as_minimum_degree(mesh):
-    """1.0 to 1.2 times as much; 1.4 times in the strip, for which dissection is no method."""
+def test_fill_is_close_to_that_of_minimum_degree(mesh):
+    """1.0 to 1.2 times as much; 1.4 times for the strip, which is unsuitable for dissection."""
     V, tail, head = mesh
     assert fill(len(V), tail, head, nested_dissection(V, tail, head)) < 1.5 * fill(len(V), tail, head)
 
 
 @pytest.mark.skipif(mkl.find_mkl() is None, reason="METIS comes with MKL")
-def test_about_as_little_fill_as_metis(mesh):
+def test_fill_is_close_to_that_of_metis(mesh):
     """0.95 to 1.2 times as much."""
     V, tail, head = mesh
     known = fill(len(V), tail, head, metis(len(V), tail, head))
@@ -108,7 +108,7 @@ def test_about_as_little_fill_as_metis(mesh):
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
-def test_neither_size_nor_a_third_coordinate_matters(scale):
+def test_size_and_third_coordinate_do_not_matter(scale):
     V, F = surfaces.random_delaunay(3000, 1)
     edges = edges_of(F, len(V))
     order = nested_dissection(V, *edges)
@@ -116,7 +116,7 @@ def test_neither_size_nor_a_third_coordinate_matters(scale):
     np.testing.assert_array_equal(nested_dissection(np.column_stack([V, np.zeros(len(V))]), *edges), order)
 
 
-def test_numbering_of_the_vertices_does_not_matter_much():
+def test_numbering_of_the_vertices_has_little_effect():
     V, F = surfaces.grid(60, 60)
     shuffled = np.random.default_rng(0).permutation(len(V))
     place = np.argsort(shuffled)
@@ -133,7 +133,7 @@ def test_few_vertices(n):
     assert sorted(order) == list(range(n))
 
 
-def test_poor_cuts_are_refused():
+def test_poor_cuts_are_rejected():
     V, F = surfaces.grid(100, 100)
     edges = edges_of(F, len(V))
     turn = 12 * np.pi * V[:, 0]
@@ -148,7 +148,7 @@ def test_poor_cuts_are_refused():
 @settings(max_examples=50, deadline=None)
 @given(n=st.integers(2, 60), share=st.floats(0.5, 4), seed=st.integers(0, 2**32 - 1))
 def test_separators_separate(n, share, seed):
-    """Of an arbitrary graph with an arbitrary bisection: without a separator its part falls into its two halves."""
+    """Arbitrary graphs with an arbitrary bisection: without the separator, the part falls into its two halves."""
     rng = np.random.default_rng(seed)
     bits = 2 * dissection.BITS
     code = rng.integers(2 ** (bits + 2), size=n).astype(np.int32)
@@ -163,7 +163,7 @@ def test_separators_separate(n, share, seed):
 
 @settings(max_examples=100, deadline=None)
 @given(m=st.integers(1, 12), n=st.integers(1, 12), density=st.floats(0.05, 1), seed=st.integers(0, 2**32 - 1))
-def test_covers_are_smallest(m, n, density, seed):
+def test_covers_are_minimal(m, n, density, seed):
     joined = np.random.default_rng(seed).random((m, n)) < density
     joined[0, 0] = True
     u, v = np.nonzero(joined)
@@ -173,7 +173,7 @@ def test_covers_are_smallest(m, n, density, seed):
 
 
 def matching(joined):
-    """Size of a largest matching, by augmenting paths."""
+    """Return the size of a maximum matching, by augmenting paths."""
     mate = {}
 
     def free(i, seen):
@@ -189,7 +189,7 @@ def matching(joined):
 
 
 def test_a_separator_leaves_two_halves():
-    """The last vertices in the order, as many as the first cut has, divide a grid into two nearly equal parts."""
+    """The last vertices in the order, as many as the first cut has, divide a grid into two almost equal parts."""
     V, F = surfaces.grid(64, 64)
     n = len(V)
     tail, head = edges_of(F, n)
@@ -202,11 +202,11 @@ def test_a_separator_leaves_two_halves():
     assert sorted(sizes[sizes > 0])[0] > 0.45 * n
 
 
-# ---- in the Laplacian ---------------------------------------------------------------------------------------------
+# --- in the Laplacian -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("solver", ["auto", "superlu"])
-def test_the_laplacian_is_the_same_in_any_order(monkeypatch, solver):
+def test_the_laplacian_is_the_same_in_every_order(monkeypatch, solver):
     V, F = surfaces.random_delaunay(3000, 1)
     (loop,) = boundary_loops(F, len(V))
     rng = np.random.default_rng(0)
@@ -218,21 +218,21 @@ def test_the_laplacian_is_the_same_in_any_order(monkeypatch, solver):
         operator = Laplacian(F, len(V), loop, solver, V).factor(stiffness)
         map_ = operator.extend(w)
         answers.append((map_, operator.respond(w), operator.flux(map_)))
-        ascending = bool(np.all(np.diff(operator.pattern.free) > 0))
+        ascending = bool(np.all(np.diff(operator.laplacian.free) > 0))
         assert ascending == (least > 0 or not takes_order(solver))
-        np.testing.assert_array_equal(np.sort(operator.pattern.free), np.setdiff1d(np.arange(len(V)), loop))
+        np.testing.assert_array_equal(np.sort(operator.laplacian.free), np.setdiff1d(np.arange(len(V)), loop))
     for one, other in zip(*answers, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
 
 
-def test_a_solver_that_cannot_be_told_an_order_keeps_the_numbers_of_the_mesh(monkeypatch):
+def test_a_solver_without_an_order_option_keeps_the_mesh_s_numbering(monkeypatch):
     pytest.importorskip("qdldl")
     monkeypatch.setattr(laplacian, "DISSECT_FROM", 0)
     V, F = surfaces.random_delaunay(1000, 1)
     (loop,) = boundary_loops(F, len(V))
     assert np.all(np.diff(Laplacian(F, len(V), loop, "qdldl", V).free) > 0)
     assert not np.all(np.diff(Laplacian(F, len(V), loop, "superlu", V).free) > 0)
-    # Whatever "auto" stands for.
+    # Whichever solver "auto" chooses.
     monkeypatch.setattr("quasiharmonic.linsolve.mkl.find_mkl", lambda: None)
     monkeypatch.setattr("quasiharmonic.linsolve.cholmod.Cholmod.present", classmethod(lambda cls: False))
     unaware = Laplacian(F, len(V), loop, "auto", V)
@@ -252,7 +252,7 @@ def test_one_fixed_vertex_and_a_free_boundary(monkeypatch):
     np.testing.assert_allclose(*answers, rtol=0, atol=1e-10)
 
 
-def test_without_good_cuts_the_order_is_left_to_the_solver(monkeypatch):
+def test_without_good_cuts_the_solver_chooses_the_order(monkeypatch):
     monkeypatch.setattr(laplacian, "DISSECT_FROM", 0)
     V, F = surfaces.grid(60, 60)
     (loop,) = boundary_loops(F, len(V))

@@ -1,4 +1,4 @@
-"""Distances along surfaces against known ones, what a map makes of them, and the descent that keeps them."""
+"""Distances along surfaces: known values, their errors in maps, and the descent that reduces these."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from quasiharmonic import distortion, surfaces
+from quasiharmonic import distortion, flatten, surfaces
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.distances.descent import DistanceDescent, keep_distances, kept
+from quasiharmonic.apps.flattening.distances.distance_descent import DistancePairs, keep_distances, lower_distance_error
 from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy
-from quasiharmonic.apps.flattening.distances.multilevel import kept_by_coarse
-from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.piece import Piece, Settings
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
 from quasiharmonic.energies.distances import surface_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.geodesics import straight_segments
+from quasiharmonic.problem.certification import certify
 from quasiharmonic.problem.result import Status
-from shared.told import Told
+from shared.distinct_steps import DistinctSteps
 
 
 def rolled(V, radius):
-    """A planar mesh rolled up around the y axis: distances along it stay."""
+    """Roll a planar mesh around the y axis; distances along it do not change."""
     angle = V[:, 0] / radius
     return np.stack([radius * np.sin(angle), V[:, 1], radius * np.cos(angle)], axis=1)
 
 
 def spherical(V, radius):
-    """A planar mesh put onto a sphere such that distances from the origin stay."""
+    """Put a planar mesh on a sphere without changing distances from the origin."""
     r = np.hypot(V[:, 0], V[:, 1])
     flat = radius * np.sin(r / radius) / np.where(r > 0, r, 1)
     return np.stack([V[:, 0] * flat, V[:, 1] * flat, radius * np.cos(r / radius)], axis=1)
@@ -67,20 +67,20 @@ def test_straight_segments_of_a_plane_are_exact(flat):
     assert abs(straight_segments(V, F, 3) - straight_segments(V, F, 3).T).max() < 1e-14
 
 
-def test_segments_cross_no_more_edges_than_they_may():
+def test_segments_cross_at_most_the_given_number_of_edges():
     V, F = surfaces.grid(3, 3)
     squares = [set((9 * straight_segments(V, F, k).data ** 2).round(6).tolist()) for k in range(3)]
     assert squares[0] == {1, 2}
-    # Across one edge: the other diagonal of a square, the long way over two; straight through a vertex, by rounding.
+    # Across one edge: the other diagonal of a square, and its detour over two edges; through a vertex, by rounding.
     assert {1, 2, 5} <= squares[1] <= {1, 2, 4, 5}
     assert squares[1] <= squares[2] <= {1, 2, 4, 5, 8, 10}
 
 
 @pytest.mark.parametrize("lift", [lambda V: V, lambda V: rolled(V, 0.4)], ids=["plane", "cylinder"])
-def test_distances_on_what_can_be_unrolled(flat, lift):
+def test_distances_on_developable_surfaces(flat, lift):
     V, F = flat
     lifted = lift(V)
-    # A fine mesh of a cylinder is no cylinder; how far the mesh is from it shows in its edges.
+    # A fine mesh of a cylinder is not a cylinder; its edges show the difference.
     chord = 0.0 if lifted.shape[1] == 2 else 1e-2
     last = np.inf
     for crossings, most in ((1, 3e-2), (3, 1e-2), (5, 5e-3)):
@@ -107,9 +107,9 @@ def test_distances_on_a_sphere():
     assert ratio.min() > 0.99
 
 
-def test_no_way_leads_across_a_cut():
+def test_no_path_crosses_a_cut():
     V, F = surfaces.grid(12, 12)
-    # Slit from the left side to the middle: the upper side of the slit gets vertices of its own.
+    # A slit from the left side to the centre: its upper side has its own vertices.
     middle = np.flatnonzero((np.abs(V[:, 1] - 0.5) < 1e-9) & (V[:, 0] < 0.5 - 1e-9))
     above = (V[F].mean(axis=1)[:, 1] > 0.5)[:, None] & np.isin(F, middle)
     copies = np.full(len(V), -1)
@@ -130,9 +130,9 @@ def test_scale_of_coordinates_does_not_matter(dome):
         assert found.error(np.ldexp(V[:, :2], exponent)).mean == wanted.error(V[:, :2]).mean
 
 
-def test_sample_has_the_pairs_asked_for(dome):
+def test_sample_has_the_requested_pairs(dome):
     V, F = dome
-    F = np.concatenate([F, F[:1] * 0 + len(V) + [[1, 2, 3]]])  # vertex len(V) belongs to nothing
+    F = np.concatenate([F, F[:1] * 0 + len(V) + [[1, 2, 3]]])  # vertex len(V) is isolated
     V = np.concatenate([V, [[9, 9, 9], [3, 0, 0], [4, 0, 0], [3, 1, 0]]])
     every = surface_distances(V, F, rings=2, sources=10_000)
     assert np.array_equal(np.unique(every.source), np.unique(F))
@@ -155,7 +155,7 @@ def test_sample_has_the_pairs_asked_for(dome):
 # --- in the plane
 
 
-def test_scale_is_the_best_there_is(dome):
+def test_the_scale_is_optimal(dome):
     V, F = dome
     rng = np.random.default_rng(0)
     uv = V[:, :2] * [3, 1] + rng.normal(0, 0.02, (len(V), 2))
@@ -175,7 +175,7 @@ def test_scale_is_the_best_there_is(dome):
     assert sample.error(7 * turned(uv, 1.0)).mean == pytest.approx(found.mean, rel=1e-12)
 
 
-def test_isometries_have_no_error_and_a_point_has_all(flat):
+def test_isometries_have_no_error_and_a_point_has_the_whole_error(flat):
     V, F = flat
     assert surface_distances(rolled(V, 50.0), F, rings=5, crossings=20).error(turned(V, 0.3)).mean < 1e-5
     point = distortion(V, F, np.zeros_like(V), rings=5).distances
@@ -196,7 +196,7 @@ def test_isometries_have_no_error_and_a_point_has_all(flat):
         ({"F": np.zeros((0, 3), dtype=int)}, "at least one triangle"),
     ],
 )
-def test_bad_input_is_named(options, message):
+def test_invalid_input_is_named(options, message):
     given = {"V": [[0, 0], [1, 0], [1, 1], [0, 1]], "F": [[0, 1, 2], [0, 2, 3]], "uv": np.eye(4)[:, :2], **options}
     uv = given.pop("uv")
 
@@ -207,7 +207,7 @@ def test_bad_input_is_named(options, message):
         measured()
 
 
-def test_figures_come_with_how_they_were_taken(dome):
+def test_statistics_name_their_sampling(dome):
     V, F = dome
     found = surface_distances(V, F, rings=3, sources=25, crossings=2).error(V[:, :2])
     told = found.to_dict()
@@ -245,7 +245,7 @@ def test_derivatives_of_the_energy(energy):
     assert rise / (2 * h) == pytest.approx(float((gradient.conj() * dw).real.sum()), rel=1e-6)
 
 
-def test_value_is_the_softened_mean_error(energy):
+def test_the_value_is_the_smoothed_mean_error(energy):
     total, piece, distances = energy
     w = some_map(piece)
     off = np.abs(w[distances.source] - w[distances.target]) / distances.length - 1
@@ -256,8 +256,8 @@ def test_value_is_the_softened_mean_error(energy):
     assert total.value_of(total.deform(w)) == pytest.approx(wanted, rel=1e-12)
 
 
-def test_pairs_form_is_the_second_derivative_without_its_negative_part(energy):
-    """Where all pairs are too long nothing of it is negative, and it is the second derivative."""
+def test_the_quadratic_form_is_the_second_derivative_without_its_negative_part(energy):
+    """If all pairs are too long, no part is negative, and the form is the second derivative."""
     total, piece, _ = energy
     w = 9 * some_map(piece)
     rng = np.random.default_rng(2)
@@ -265,19 +265,19 @@ def test_pairs_form_is_the_second_derivative_without_its_negative_part(energy):
     h = 1e-5 * np.abs(w).max()
 
     def pull(places):
-        moment = total.deform(places)
-        barrier = 3e-3 * total.barrier.gradient_of(moment.deformation, w.size)
-        return total.gradient_of(moment, w.size) - barrier
+        derivatives = total.deform(places)
+        barrier = 3e-3 * total.barrier.gradient_of(derivatives.deformation, w.size)
+        return total.gradient_of(derivatives, w.size) - barrier
 
     form = total.pairs_at(w)
     assert (form.c - np.abs(form.c2) > 0).all()
     product = form.apply(dw)
     assert np.allclose(product, (pull(w + h * dw) - pull(w - h * dw)) / (2 * h), atol=1e-5 * np.abs(product).max())
-    # Where they are too short it is not negative all the same.
+    # If they are too short, the form is still not negative.
     assert float((dw.conj() * total.pairs_at(w / 90).apply(dw)).real.sum()) > 0
 
 
-def test_blocks_on_the_diagonal_are_the_forms(energy):
+def test_diagonal_blocks_are_those_of_the_form(energy):
     total, piece, _ = energy
     form = total.pairs_at(some_map(piece))
     xx, xy, yy = form.diagonal
@@ -291,33 +291,36 @@ def test_blocks_on_the_diagonal_are_the_forms(energy):
 
 
 def test_direction_solves_newtons_system(energy):
-    """Conjugate gradients against a solution with the whole matrix at hand."""
+    """Conjugate gradients agree with a solution that uses the whole matrix."""
     total, piece, _ = energy
     w = some_map(piece)
-    descent = DistanceDescent(total, np.stack([w.real, w.imag], axis=1), "auto", Rim(piece.loops))
-    descent.assemble(0.0)
-    descent.system.factor(1e-12)
-    free = descent.system.free
-    gradient = descent.energy.gradient_of(descent.energy.deform(w), w.size)[free]
-    found = descent.solve(-gradient)
+    uv = np.stack([w.real, w.imag], axis=1)
+    pairs = DistancePairs(total)
+    model = SurfaceDescent(total, uv, "auto", rim=Rim(piece.loops), pairs=pairs).model
+    state = model.start(uv)
+    model.assemble(state, 0.0)
+    model.system.factor(1e-12)
+    free = model.system.free
+    gradient = model.gradient(state)
+    found = model.solve(-gradient)
 
-    matrix = descent.system.matrix().toarray()
+    matrix = model.system.matrix().toarray()
     for k in range(2 * free.size):
         unit = np.zeros(2 * free.size)
         unit[k] = 1
         whole = np.zeros(w.size, dtype=complex)
         whole[free] = unit.view(complex)
-        matrix[:, k] += descent.pairs.apply_off_diagonal(whole)[free].view(float)
+        matrix[:, k] += total.pairs_at(w).apply_off_diagonal(whole)[free].view(float)
     exact = np.linalg.solve(matrix, -gradient.view(float))
     off = found.view(float) - exact
     assert np.sqrt(off @ matrix @ off) < 0.2 * np.sqrt(exact @ matrix @ exact)
 
 
-def test_distances_are_kept_better_and_the_map_stays_bijective(dome):
+def test_distance_errors_decrease_and_the_map_stays_bijective(dome):
     V, F = dome
-    # All of the dome, seen from above: the rim is pressed together.
+    # A dome seen from above: its boundary region is compressed.
     start = V[:, :2]
-    steps = Told()
+    steps = DistinctSteps()
     result = keep_distances(V, F, start, rings=8, callback=steps.append)
     before, after = (distortion(V, F, uv, rings=8).distances for uv in (start, result.uv))
     assert result.status is Status.POLISHED
@@ -325,7 +328,7 @@ def test_distances_are_kept_better_and_the_map_stays_bijective(dome):
     assert certify(F, result.uv).bijective
     assert after.mean < 0.5 * before.mean
     assert after.rms < 0.5 * before.rms
-    # In the surface's own unit.
+    # In the unit of the surface.
     assert after.scale == pytest.approx(1, abs=0.05)
     energies = [step.energy for step in steps]
     assert steps == result.history
@@ -333,22 +336,22 @@ def test_distances_are_kept_better_and_the_map_stays_bijective(dome):
     assert np.array_equal(keep_distances(V, F, start, rings=8).uv, result.uv)
 
 
-def test_unit_and_place_of_the_start_do_not_matter(dome):
+def test_unit_and_position_of_the_start_do_not_matter(dome):
     V, F = dome
     wanted = keep_distances(V, F, V[:, :2], rings=6).uv
     far = keep_distances(np.ldexp(V, 300), F, np.ldexp(V[:, :2], -200), rings=6).uv
     assert np.allclose(np.ldexp(far, -300), wanted, atol=1e-9)
 
 
-def test_what_can_be_unrolled_is_unrolled(flat):
+def test_developable_surfaces_are_unrolled(flat):
     V, F = flat
     start = np.stack([V[:, 0] * (1 + 0.5 * V[:, 0]), V[:, 1]], axis=1)
-    result = keep_distances(rolled(V, 1.0), F, start, rings=8, tolerance=1e-6)
+    result = keep_distances(rolled(V, 1.0), F, start, rings=8, tol=1e-6)
     assert distortion(V, F, result.uv, rings=8).distances.mean < 5e-3
 
 
-def test_no_boundary_runs_into_itself():
-    """A ramp that winds more than once around would lie on itself if its distances had their way."""
+def test_the_boundary_does_not_cross_itself():
+    """A ramp with more than one turn would overlap itself if all distances were exact."""
     V, F = surfaces.grid(60, 6)
     radius, angle = 1.5 - V[:, 1], 8.0 * V[:, 0]
     ramp = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.01 * angle], axis=1)
@@ -363,11 +366,12 @@ def test_no_boundary_runs_into_itself():
 
 
 @pytest.mark.parametrize("seed", [1, 8, 13])
-def test_a_start_that_rounding_would_invert_is_taken_as_it_is(seed):
+def test_a_start_that_scaling_would_invert_is_not_scaled(seed):
     V, F = surfaces.grid(4, 4)
     rng = np.random.default_rng(seed)
     uv = turned(V, rng.uniform(0.2, 1.3))
-    # A vertex so near to the opposite side that few scales keep it there: of these seeds the one wanted does not.
+    # A vertex is so close to the opposite side that few scales keep it there; with these seeds, the chosen scale does
+    # not.
     a, b, c = (0, 1, 6)
     foot = 0.3 * uv[a] + 0.7 * uv[b]
     uv[c] = foot + (uv[c] - foot) * 2.0 ** -rng.uniform(49, 54)
@@ -379,7 +383,7 @@ def test_a_start_that_rounding_would_invert_is_taken_as_it_is(seed):
     assert result.history[-1].energy < result.history[0].energy
 
 
-def test_ctrl_c_hands_back_the_best_map_so_far(dome):
+def test_ctrl_c_returns_the_best_map_so_far(dome):
     V, F = dome
 
     def stop(step):
@@ -395,10 +399,10 @@ def test_ctrl_c_hands_back_the_best_map_so_far(dome):
 def test_few_iterations(dome):
     V, F = dome
     result = keep_distances(V, F, V[:, :2], rings=6, max_iterations=1)
-    assert (result.status, result.iterations) == (Status.STILL_FALLING, 1)
+    assert (result.status, result.n_iterations) == (Status.STILL_FALLING, 1)
     untouched = keep_distances(V, F, V[:, :2], rings=6, max_iterations=0)
     assert untouched.certificate.bijective
-    assert untouched.iterations == 0
+    assert untouched.n_iterations == 0
 
 
 @pytest.mark.parametrize(
@@ -409,25 +413,25 @@ def test_few_iterations(dome):
         (lambda uv: np.where(uv > 0.5, np.inf, uv), "uv is not finite"),
     ],
 )
-def test_starts_that_will_not_do(dome, change, message):
+def test_unusable_starts(dome, change, message):
     V, F = dome
     with pytest.raises(ValueError, match=re.escape(message)):
         keep_distances(V, F, change(V[:, :2]))
 
 
 @pytest.mark.parametrize("rings", [None, "a", [3], 0, 2.5])
-def test_rings_that_are_no_number_of_edges_are_refused(dome, rings):
+def test_numbers_of_rings_that_are_not_valid_are_rejected(dome, rings):
     V, F = dome
     with pytest.raises(ValueError, match="rings must be an integer of at least 1, not"):
         keep_distances(V, F, V[:, :2], rings=rings)
 
 
-def test_record_keeps_maps_on_the_way(dome):
+def test_record_stores_intermediate_maps(dome):
     V, F = dome
     result = keep_distances(V, F, V[:, :2], rings=6, record_every=2)
     last = result.history[-1].iteration
-    assert [kept.iteration for kept in result.path] == [*range(0, last + 1, 2)]
-    assert all(certify(F, kept.uv).bijective for kept in result.path)
+    assert [lower_distance_error.iteration for lower_distance_error in result.path] == [*range(0, last + 1, 2)]
+    assert all(certify(F, lower_distance_error.uv).bijective for lower_distance_error in result.path)
     if last % 2 == 0:
         assert np.array_equal(result.path[-1].uv, result.uv)
     assert not keep_distances(V, F, V[:, :2], rings=6).path
@@ -447,36 +451,36 @@ def folded():
 
 @pytest.fixture(scope="module")
 def asked():
-    return Settings(SymmetricDirichlet(), "distances", 1e-3, 100, "auto", None, 0)
+    return Settings("symmetric-dirichlet", 1e-3, 100, "auto", None, 0)
 
 
 @pytest.mark.slow
-def test_a_coarse_mesh_serves_the_fine_one(folded, asked):
+def test_a_coarse_mesh_helps_the_fine_one(folded, asked):
     plain = flatten(folded.V, folded.F)
-    found = kept_by_coarse(folded, 16, asked, least=900)
-    whole = kept(folded, plain.uv, 16, asked)
+    found = lower_coarse_distance_error(folded, 16, asked, least=900)
+    whole = lower_distance_error(folded, plain.uv, 16, asked)
     sample = surface_distances(folded.V, folded.F, rings=16, sources=400)
     errors = [sample.error(uv) for uv in (plain.uv, whole.uv, found.uv)]
     assert found.status is Status.POLISHED
     assert certify(folded.F, found.uv).bijective
     assert errors[1].mean < 0.9 * errors[0].mean
-    # Of what the descent on the mesh itself gains most is gained.
+    # It achieves most of the gain of the descent on the mesh itself.
     assert errors[2].mean < errors[1].mean + 0.3 * (errors[0].mean - errors[1].mean)
     assert errors[2].rms < errors[0].rms
     assert errors[2].scale == pytest.approx(1, abs=0.03)
     assert [stage.name for stage in found.stages] == ["start, coarse", "guarded descent, distances, coarse"]
-    assert np.array_equal(kept_by_coarse(folded, 16, asked, least=900).uv, found.uv)
+    assert np.array_equal(lower_coarse_distance_error(folded, 16, asked, least=900).uv, found.uv)
 
 
-def test_rings_too_few_for_any_coarser_mesh(folded, asked):
-    assert kept_by_coarse(folded, 3, asked, least=900) is None
-    assert kept_by_coarse(folded, 20, asked, least=len(folded.V)) is None
+def test_too_few_rings_for_a_coarser_mesh(folded, asked):
+    assert lower_coarse_distance_error(folded, 3, asked, least=900) is None
+    assert lower_coarse_distance_error(folded, 20, asked, least=len(folded.V)) is None
 
 
 @pytest.mark.slow
-def test_what_the_coarse_way_tells_and_records(folded, asked):
+def test_callbacks_and_records_on_a_coarse_mesh(folded, asked):
     steps = []
-    found = kept_by_coarse(folded, 16, replace(asked, callback=steps.append, record_every=1), least=900)
+    found = lower_coarse_distance_error(folded, 16, replace(asked, callback=steps.append, record_every=1), least=900)
     assert steps == found.history
     assert [step.iteration for step in steps] == [*range(len(steps))]
     assert steps[-1].energy < steps[0].energy
@@ -486,12 +490,12 @@ def test_what_the_coarse_way_tells_and_records(folded, asked):
 
 
 @pytest.mark.slow
-def test_ctrl_c_on_the_coarse_mesh_hands_back_a_map_of_the_surface(folded, asked):
+def test_ctrl_c_on_the_coarse_mesh_returns_a_map_of_the_surface(folded, asked):
     def stop(step):
         if step.iteration == 1:
             raise KeyboardInterrupt
 
-    found = kept_by_coarse(folded, 16, replace(asked, callback=stop), least=900)
+    found = lower_coarse_distance_error(folded, 16, replace(asked, callback=stop), least=900)
     assert found.status is Status.INTERRUPTED
     assert len(found.uv) == len(folded.V)
     assert certify(folded.F, found.uv).bijective
@@ -506,7 +510,7 @@ def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh():
     assert found.stages[-1].name == "guarded descent, distances, coarse"
     assert certify(F, found.uv).bijective
     assert sample.error(found.uv).mean < 0.95 * sample.error(plain.uv).mean
-    # A map of one's own is descended from on the mesh itself.
+    # A given map is optimised on the mesh itself.
     given = flatten(V, F, energy="distances", start=plain.uv, max_iterations=1)
     assert given.stages[-1].name == "guarded descent, distances"
 
@@ -542,16 +546,16 @@ def test_flatten_ends_with_the_descent_of_distances():
     errors = [sample.error(found.uv).mean for found in (plain, result, alone)]
     assert errors[1] < 0.9 * errors[0]
     assert errors[1] == pytest.approx(errors[2], rel=1e-3)
-    # In the surface's own unit, laid along its axis.
+    # In the unit of the surface, aligned with its axis.
     assert sample.error(result.uv).scale == pytest.approx(1, abs=0.02)
     assert np.allclose(result.uv.min(axis=0), 0)
     assert [stage.name for stage in result.stages][-1] == "guarded descent, distances"
     assert [step.iteration for step in result.history] == [*range(len(result.history))]
-    assert [kept.iteration for kept in result.path] == [*range(len(result.history))]
+    assert [lower_distance_error.iteration for lower_distance_error in result.path] == [*range(len(result.history))]
 
 
 @pytest.mark.slow
-def test_flatten_keeps_the_distances_of_each_piece(dome):
+def test_flatten_preserves_the_distances_of_each_piece(dome):
     V, F = dome
     both = np.concatenate([V, 0.5 * V + [5, 0, 0]]), np.concatenate([F, F + len(V)])
     result = flatten(*both, energy="distances", rings=6, gap=3.0)
@@ -561,14 +565,14 @@ def test_flatten_keeps_the_distances_of_each_piece(dome):
     assert np.allclose(first, alone.uv, atol=1e-9)
     assert np.allclose(second - second.min(axis=0), 0.5 * alone.uv, atol=1e-9)
     assert second[:, 0].min() - first[:, 0].max() == pytest.approx(3.0)
-    # By itself there is a twentieth of the longest side.
+    # The pieces are separated by a twentieth of the longest side.
     near = flatten(*both, energy="distances", rings=6).uv
     room = near[len(V) :, 0].min() - near[: len(V), 0].max()
     assert room == pytest.approx(0.05 * np.ptp(first, axis=0).max())
 
 
-def test_what_is_sampled_stands_for_all(dome):
-    """Also of few rings and on a small surface no map is made that pleases the pairs of the sample alone."""
+def test_sampled_pairs_represent_all_pairs(dome):
+    """With few rings and on a small surface, too, the map does not fit the sampled pairs alone."""
     V, F = spherical(surfaces.disk(14)[0], 0.45), dome[1]
     sample = surface_distances(V, F, rings=4)
     before, after = (sample.error(flatten(V, F, **o).uv) for o in ({}, {"energy": "distances", "rings": 4}))
@@ -592,13 +596,13 @@ def test_ctrl_c_ends_flattening_by_distances_with_a_map(dome, stage):
     assert result.history[-1].iteration == last
 
 
-def test_ctrl_c_while_distances_are_sampled_leaves_the_map_there_is(dome, monkeypatch):
-    from quasiharmonic.apps.flattening.distances import descent as distance_descent
+def test_ctrl_c_during_sampling_returns_the_current_map(dome, monkeypatch):
+    from quasiharmonic.apps.flattening.distances import distance_descent as distance_descent
 
     def cut_short(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(distance_descent, "sampled", cut_short)
+    monkeypatch.setattr(distance_descent, "sample_distances", cut_short)
     result = flatten(*dome, energy="distances", rings=6)
     assert result.status is Status.INTERRUPTED
     assert np.array_equal(result.uv, flatten(*dome).uv)
@@ -613,6 +617,6 @@ def test_ctrl_c_while_distances_are_sampled_leaves_the_map_there_is(dome, monkey
         ({"gap": -1}, "gap must be a finite number of at least 0"),
     ],
 )
-def test_what_distances_do_not_go_with_is_named(dome, options, message):
+def test_incompatible_options_of_distances_are_named(dome, options, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         flatten(*dome, energy="distances", **options)

@@ -24,7 +24,7 @@ def folder(tmp_path):
 
 
 def rows(text):
-    """The cells of every row that a table in Markdown has for a problem."""
+    """Return the cells of each problem row of a Markdown table."""
     found = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     return [row for row in found if row[0].startswith("set/")]
 
@@ -39,13 +39,13 @@ def test_tables(folder, capsys):
     first, _, harmonised, polished, *_ = mips
     assert polished <= harmonised * 1.01 < first
     assert min(seconds[2:]) >= seconds[0] > 0
-    # What the boundary forces, no map goes below; the energy that minds lengths comes nearest.
+    # No map goes below the bound given by the boundary; the energy that includes lengths comes closest.
     forced, *worst = map(float, star_stretch[1:])
     assert 1 < forced <= min(worst) * 1.01
     assert worst[-1] == min(worst)
 
 
-def test_a_strategy_that_fails_has_no_other_ones_numbers(folder, capsys, monkeypatch):
+def test_a_strategy_that_fails_has_no_numbers_of_another(folder, capsys, monkeypatch):
     found = benchmark.first_map
     monkeypatch.setattr(benchmark, "first_map", lambda p, strategy: None if strategy == "paper" else found(p, strategy))
     benchmark.compare([folder / "star"])

@@ -1,59 +1,91 @@
-"""Every Python block of the pages runs; those of one section, and all of the tutorial, share their names."""
+"""Run every Python block of the pages, and the commands of the README and the tutorials.
+
+The blocks of a section, and all blocks of a tutorial, share their names.
+
+A comment `# prints …` after a `print` states its output, and the test compares it.
+"""
 
 from __future__ import annotations
 
+import csv
 import re
+import shlex
 from importlib import import_module
+from inspect import ismodule
 from pathlib import Path
 
 import pytest
 
 import quasiharmonic
+from quasiharmonic.ui.cli import main
 
 FOLDER = Path(__file__).parent.parent
-PAGES = (
-    FOLDER / "README.md",
-    FOLDER / "docs" / "index.md",
-    FOLDER / "docs" / "existence.md",
-    FOLDER / "docs" / "files.md",
-    FOLDER / "docs" / "flatten.md",
-    FOLDER / "docs" / "gradients.md",
-    FOLDER / "docs" / "howto.md",
-    FOLDER / "docs" / "method.md",
-    FOLDER / "docs" / "notebook.md",
-    FOLDER / "docs" / "registration.md",
-    FOLDER / "docs" / "tutorial.md",
-)
+PAGES = (FOLDER / "README.md", *sorted((FOLDER / "docs").rglob("*.md")))
 
 
 def sections(page):
-    """Title and code of each section that has code; the tutorial is one."""
-    text = page.read_text(encoding="utf-8")
-    for section in [text] if page.stem == "tutorial" else re.split(r"^#+ ", text, flags=re.MULTILINE):
-        blocks = re.findall(r"^```python\n(.*?)^```", section, flags=re.MULTILINE | re.DOTALL)
-        if blocks:
-            yield section.splitlines()[0], "\n".join(blocks)
+    """Return title and code of each section with code; a tutorial is one section."""
+    found = [(page.name, [])]
+    # A line that begins with # is a comment in a block, and a heading outside.
+    for heading, language, code in re.findall(
+        r"^#+ ([^\n]*)$|^```([^\n]*)\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    ):
+        if heading and page.parent.name != "tutorials":
+            found.append((heading, []))
+        elif language == "python":
+            found[-1][1].append(code)
+    return [(title, "\n".join(blocks)) for title, blocks in found if blocks]
 
 
 CASES = [
-    pytest.param(code, id=f"{page.stem}: {title}") for page in PAGES if page.exists() for title, code in sections(page)
+    pytest.param(code, id=f"{page.relative_to(FOLDER)}: {title}") for page in PAGES for title, code in sections(page)
 ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", CASES)
-def test_block_runs(code, tmp_path, monkeypatch):
+def test_block_runs(code, tmp_path, monkeypatch, capsys):
     if "import SimpleITK" in code:
         pytest.importorskip("SimpleITK", reason="no dependency, not even of the tests: .ci/optional installs it")
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "block", "exec"), {"__name__": "block"})
+    printed = capsys.readouterr().out.splitlines()
+    assert [
+        line for line in re.findall(r"^ *print\(.*\)  # prints (.*)$", code, re.MULTILINE) if line not in printed
+    ] == []
 
 
-REFERENCE = re.findall(r"^   ([\w.]+)$", (FOLDER / "docs" / "reference.md").read_text(encoding="utf-8"), re.MULTILINE)
+DOCS = FOLDER / "docs"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorials/first_shape.md", "docs/tutorials/textured_model.md"])
+def test_commands_run(page, tmp_path, monkeypatch):
+    commands = re.findall(r"^    (qhm .*)$", (FOLDER / page).read_text(encoding="utf-8"), re.MULTILINE)
+    assert commands
+    monkeypatch.chdir(tmp_path)
+    for command in commands:
+        assert main(shlex.split(command, comments=True)[1:]) == 0, command
+
+
+def test_the_speed_table_of_the_readme_has_the_measured_times():
+    with (FOLDER / "docs" / "speed" / "speed.csv").open(encoding="utf-8") as file:
+        seconds = {(row["problem"], int(row["triangles"]), row["tool"]): row["seconds"] for row in csv.DictReader(file)}
+    table = re.findall(
+        r"^\| ([\d,]+) triangles \| ([\d.]+) s \| ([\d.]+) s \|$", PAGES[0].read_text("utf-8"), re.MULTILINE
+    )
+    assert len(table) == 3
+    for triangles, *times in table:
+        for tool, time in zip(("quasiharmonic", "igl.harmonic"), times, strict=True):
+            measured = float(seconds["cat on R", int(triangles.replace(",", "")), tool])
+            assert time == f"{measured:.{len(time.partition('.')[2])}f}"
+
+
+REFERENCE = re.findall(r"^   ([\w.]+)$", (DOCS / "reference/python.md").read_text(encoding="utf-8"), re.MULTILINE)
 
 
 def found(name):
-    """What a name of the reference stands for: a module, or an attribute of one."""
+    """Return what a name of the reference denotes: a module, or an attribute of one."""
     try:
         return import_module(f"quasiharmonic.{name}")
     except ModuleNotFoundError:
@@ -62,16 +94,17 @@ def found(name):
 
 
 @pytest.mark.parametrize("name", REFERENCE)
-def test_what_the_reference_names_is_there(name):
+def test_names_of_the_reference_exist(name):
     assert found(name).__doc__
 
 
 def test_the_reference_has_every_public_name():
-    assert set(quasiharmonic.__all__) <= set(REFERENCE)
+    names = {name for name in quasiharmonic.__all__ if not ismodule(getattr(quasiharmonic, name))}
+    assert names <= set(REFERENCE)
 
 
-def test_tests_that_the_page_on_the_paper_names_are_there():
-    named = set(re.findall(r"`(test_\w+|Test\w+)`", (FOLDER / "docs" / "paper.md").read_text(encoding="utf-8")))
+def test_tests_named_on_the_page_about_the_paper_exist():
+    named = set(re.findall(r"`(test_\w+|Test\w+)`", (DOCS / "development/paper.md").read_text(encoding="utf-8")))
     text = "\n".join(path.read_text(encoding="utf-8") for path in (FOLDER / "tests").glob("test_*.py"))
     there = set(re.findall(r"^ *(?:def|class) (\w+)", text, re.MULTILINE))
     assert len(named) > 10

@@ -1,4 +1,4 @@
-"""The examples in the docstrings, run as they stand there."""
+"""Run the examples of the docstrings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMES = sorted(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_examples_print_what_they_say(name, tmp_path, monkeypatch):
+def test_examples_print_the_shown_output(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     failed, tried = doctest.testmod(importlib.import_module(name))
     assert tried

@@ -18,8 +18,8 @@ from quasiharmonic.energies.energies import (
     conformal_area_blend,
 )
 from quasiharmonic.energies.springs import MassSpring
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.geometry.mesh.topology import edges
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.surfaces import random_delaunay
 from shared.meshes import lift
 
@@ -90,7 +90,7 @@ def test_density_in_singular_values(energy, formula):
 def test_spring_energy_is_a_sum_over_edges():
     energy, _, V, F = springs()
     shapes = rest_shapes(V, F)
-    # The lengths of edges in an actual map, read off its own Jacobians.
+    # The lengths of edges in an actual map, from its own Jacobians.
     w = (V[:, 0] + 0.3 * V[:, 1] ** 2) + 1j * (0.8 * V[:, 1] + 0.1 * V[:, 0])
     g = shapes.half_gradients() / shapes.unit
     p, q = np.sum(w[F.T] * g.conj(), axis=0), np.sum(w[F.T] * g, axis=0)
@@ -103,7 +103,7 @@ def test_spring_energy_is_a_sum_over_edges():
 
 @pytest.mark.parametrize("energy", ISOTROPIC, ids=name_of)
 @pytest.mark.parametrize("negative", [0.0, -1.0, 1.0])
-def test_curvature_filters_eigenvalues_as_an_eigensolver_does(energy, negative):
+def test_curvature_is_filtered_like_by_an_eigensolver(energy, negative):
     d = random_deformation(200, seed=7)
     eigenvalues, vectors = np.linalg.eigh(energy.curvature(d, negative=1.0).matrices())
     kept = np.where(eigenvalues < 0, negative * eigenvalues, eigenvalues)
@@ -114,7 +114,7 @@ def test_curvature_filters_eigenvalues_as_an_eigensolver_does(energy, negative):
 
 
 @pytest.mark.parametrize("energy", ISOTROPIC, ids=name_of)
-def test_turning_image_or_triangle_changes_nothing(energy, rng):
+def test_rotations_of_image_or_triangle_change_nothing(energy, rng):
     d = random_deformation(30)
     image, triangle = np.exp(1j * rng.uniform(0, 6, (2, 30)))
     turned = Deformation.of(d.p * image * triangle, d.q * image / triangle)
@@ -127,18 +127,18 @@ def test_isometries_are_minima(energy, rng):
     d = Deformation.of(turn, np.zeros(20, dtype=complex))
     assert np.all(energy.density(d) < 1e-24)
     assert all(np.abs(part).max() < 1e-12 for part in energy.gradient(d))
-    # Where q vanishes it has no direction, and none is needed.
+    # If q is zero it has no direction, and none is needed.
     assert np.linalg.eigvalsh(energy.curvature(d, negative=1.0).matrices()).min() > -1e-12
 
 
-def test_mips_does_not_see_scale():
+def test_mips_does_not_depend_on_scale():
     d = random_deformation(30)
     scaled = Deformation.of(1e-7 * d.p, 1e-7 * d.q)
     np.testing.assert_allclose(MIPS().density(scaled), MIPS().density(d), rtol=1e-10)
 
 
 @pytest.mark.parametrize("energy", ISOTROPIC, ids=name_of)
-def test_what_is_said_about_collapse_is_so(energy):
+def test_properties_at_collapse_are_true(energy):
     inverted = energy.density(inverted_deformation(10))
     assert np.all(np.isposinf(inverted)) if energy.barrier else np.all(np.isfinite(inverted))
     thin = Deformation.of(np.full(1, 1 + 0j), np.full(1, 1 - 1e-9 + 0j))
@@ -152,14 +152,14 @@ def test_arap_at_its_kink():
     assert np.isfinite(ARAP().curvature(d).matrices()).all()
 
 
-def test_spring_of_no_length():
+def test_spring_of_zero_length():
     energy, _, _, F = springs()
     nothing = Deformation.of(np.zeros(len(F), dtype=complex), np.zeros(len(F), dtype=complex))
     assert all(np.all(part == 0) for part in energy.gradient(nothing))
     assert np.isfinite(energy.curvature(nothing).matrices()).all()
 
 
-def test_a_form_and_its_matrix_are_the_same():
+def test_a_form_and_its_matrix_agree():
     d = random_deformation(10)
     form = MIPS().curvature(d, negative=1.0)
     along_p, along_q = form.apply(d.q, d.p)
@@ -183,7 +183,7 @@ def test_an_energy_with_first_derivatives_only():
         Dirichlet().curvature(random_deformation(3))
 
 
-def test_wrong_derivatives_are_found():
+def test_wrong_derivatives_are_detected():
     class Wrong(MIPS):
         def density_gradient(self, d):
             a, b = super().density_gradient(d)
@@ -212,11 +212,11 @@ def test_derivative_error_of_complex_variables(rng):
 
 
 @pytest.mark.parametrize("theta", [-0.1, 1.5, np.nan])
-def test_a_blend_is_one(theta):
+def test_a_blend_is_one_energy(theta):
     with pytest.raises(ValueError, match="theta must be between 0 and 1"):
         conformal_area_blend(theta)
 
 
-def test_springs_refuse_flat_triangles():
+def test_springs_reject_flat_triangles():
     with pytest.raises(ValueError, match="triangle 0 of zero area"):
         MassSpring([[0, 0], [1, 0], [2, 0]], np.array([[0, 1, 2]]))

@@ -1,4 +1,4 @@
-"""The paper's evaluation on problems of every size: its problems, its records, and what is said of them."""
+"""The paper's evaluation on problems of every size: problems, records and the stated figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def rows():
     return evaluation.read(evaluation.RECORDS)
 
 
-def test_names_are_all_different_and_of_every_family_and_size():
+def test_names_are_distinct_and_cover_every_family_and_size():
     names = list(evaluation.names(2100))
     assert len(set(names)) == 2100
     assert {evaluation.family_of(name) for name in names} == set(evaluation.FAMILIES)
@@ -28,7 +28,7 @@ def test_names_are_all_different_and_of_every_family_and_size():
     assert heights == {str(height) for height in evaluation.HEIGHTS}
 
 
-def test_records_are_of_two_thousand_problems_of_all_sizes(rows):
+def test_records_cover_two_thousand_problems_of_all_sizes(rows):
     assert len({row["problem"] for row in rows}) == len(rows) >= 2000
     assert {row["problem"] for row in rows} <= set(evaluation.names(2100))
     bands = evaluation.in_bands(rows, "triangles", evaluation.SIZES)
@@ -39,7 +39,7 @@ def test_records_are_of_two_thousand_problems_of_all_sizes(rows):
 
 
 @pytest.mark.parametrize("name", ["comb:2000001:0.049 triangles=386", "swirl:2000000:0.35 triangles=1414"])
-def test_a_record_comes_out_again(rows, name):
+def test_a_record_is_reproduced(rows, name):
     (row,) = (row for row in rows if row["problem"] == name)
     again = evaluation.measured(name)
     assert (str(again["triangles"]), str(again["feasible"])) == (row["triangles"], row["feasible"])
@@ -56,7 +56,7 @@ def test_thin_triangles_are_those_with_an_angle_below_25_degrees():
     assert [evaluation.thin(triangle(degrees)) for degrees in (24, 26, 129, 131)] == [1, 0, 0, 1]
 
 
-def test_a_table_is_read_up_to_where_it_was_cut_short(tmp_path):
+def test_a_truncated_table_is_read_up_to_its_last_complete_row(tmp_path):
     table = tmp_path / "table.csv"
     lines = gzip.decompress(evaluation.RECORDS.read_bytes()).decode().splitlines(keepends=True)
     table.write_text("".join(lines[:3]) + lines[3][:20])
@@ -64,7 +64,7 @@ def test_a_table_is_read_up_to_where_it_was_cut_short(tmp_path):
     assert evaluation.read(tmp_path / "none.csv") == []
 
 
-def test_what_a_stage_is_called_and_what_it_brought():
+def test_label_and_contribution_of_a_stage():
     case = evaluation.problem_named("noise:2000001:0.049 triangles=386")[0]
     result = solve(case, strategy="paper")
     (outcome,) = stages.outcomes(["comb:0:0.1"], "paper")

@@ -1,4 +1,4 @@
-"""Extreme numbers and meshes, each with the outcome that is defined for it."""
+"""Extreme numbers and meshes, each with its defined result."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from quasiharmonic.problem.diagnosis import Kind
 from quasiharmonic.surfaces import cat, disk, grid, random_delaunay
 from quasiharmonic.targets import boundary_to
 from quasiharmonic.ui.cli import main
+from shared.infeasible_problems import OBSTRUCTED, moved, onto
 from shared.meshes import boundary_of, signed_areas
-from shared.obstructed import OBSTRUCTED, moved, onto
 from shared.polygons import circle
 from shared.small_meshes import eared
-from shared.solvable import star_problem
+from shared.solvable_problems import star_problem
 
 SCALES = [1e-300, 1e-150, 1e-12, 1.0, 1e12, 1e150, 1e300]
 
 
 def through_all(V, F, fixed, target, **more):
-    """The certified map of a problem that has one, after everything else has been tried on it too."""
+    """Return the certified map of a problem that has one, after everything else was tried on it, too."""
     problem = Problem(V, F, fixed, target, **more)
     assert diagnose(problem).obstructions == ()
     result = injective_map(V, F, fixed, target, **more)
@@ -56,7 +56,7 @@ class TestScales:
     def test_of_the_rest_mesh(self, scale, reference):
         V, F, fixed, target = star_problem(n=100)
         uv = through_all(V * scale, F, fixed, target, reference=reference)
-        # Nothing depends on it but rounding.
+        # Only rounding depends on it.
         np.testing.assert_allclose(uv, through_all(V, F, fixed, target, reference=reference), atol=1e-6)
 
     @pytest.mark.parametrize("scale", SCALES)
@@ -73,11 +73,11 @@ class TestScales:
         assert better.injective
         before, after = (distortion(V * rest, F, w) for w in (uv, better.uv))
         assert np.isfinite(before.mips).all()
-        assert after.summary("mips").mean < before.summary("mips").mean
+        assert after.statistics("mips").mean < before.statistics("mips").mean
         np.testing.assert_allclose(before.mips, distortion(V, F, uv / image).mips, rtol=1e-9)
 
     @pytest.mark.parametrize("image", [1e-300, 1e300])
-    def test_measures_whose_numbers_have_no_double(self, image):
+    def test_measures_that_overflow(self, image):
         V, F = disk(3)
         found = distortion(V / image, F, V * image)
         np.testing.assert_allclose(found.mips, 0, atol=1e-9)
@@ -101,8 +101,8 @@ class TestScales:
         assert main(["map", str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj")]) == 0
         np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "out.obj"))[fixed], target * scale)
 
-    def test_targets_of_a_few_of_the_least_numbers_are_mapped_without_a_warning(self):
-        """Their curvatures underflow to nothing, by which a step of Newton's would divide."""
+    def test_targets_of_the_size_of_the_least_positive_doubles_cause_no_warning(self):
+        """Their curvatures underflow to zero, by which a Newton step would divide."""
         V, F = cat(4)
         fixed, target = boundary_to(V, F, "letter:R")
         result = injective_map(V, F, fixed, target * 5e-324)
@@ -112,15 +112,15 @@ class TestScales:
 
 class TestOffsets:
     @pytest.mark.parametrize("offset", [1e3, 1e6, 1e8])
-    def test_of_many_times_the_size(self, offset):
+    def test_many_times_the_size(self, offset):
         V, F, fixed, target = star_problem(n=100)
         away = offset * np.array([1.0, -0.7])
         uv = through_all(V, F, fixed, target + away)
         assert signed_areas(F, uv - away).min() > 0
         through_all(V + offset, F, fixed, target)
 
-    def test_beyond_what_doubles_hold(self):
-        """The positions themselves have become a point: an impossible problem, and no other kind of failure."""
+    def test_beyond_the_resolution_of_doubles(self):
+        """The positions coincide: the problem is impossible, and there is no other failure."""
         V, F, fixed, target = star_problem(n=100)
         result = injective_map(V, F, fixed, target + 1e17)
         assert result.status is Status.IMPOSSIBLE
@@ -129,7 +129,7 @@ class TestOffsets:
         with pytest.raises(ValueError, match="zero area in the rest mesh"):
             injective_map(V + 1e17, F, fixed, target)
 
-    def test_one_vertex_far_off(self):
+    def test_one_distant_vertex(self):
         V, F, fixed, target = star_problem(n=100)
         target = target.copy()
         target[0] *= 1e12
@@ -144,17 +144,17 @@ class TestSinglePrecision:
         io.write_obj(path, io.MeshData(V, F).with_map(uv(V)))
         return str(path)
 
-    def test_triangles_below_its_spacing_are_reported(self, tmp_path, capsys):
+    def test_triangles_below_the_spacing_of_single_precision_are_reported(self, tmp_path, capsys):
         path = self.write(tmp_path / "far.obj", lambda V: V + 1e8)
         assert main(["check", path]) == 0
         assert "Injective" in capsys.readouterr().out
         assert main(["check", path, "--as", "float32", "--json", "-"]) == 1
         facts = json.loads(capsys.readouterr().out)
         assert facts["precision"] == "float32"
-        # All of a disk of radius 1 is one place where single precision counts by eights.
+        # All of a disk of radius 1 is one point where the spacing of single precision is 8.
         assert len(facts["degenerate"]) == facts["triangles"]
 
-    def test_only_those(self, tmp_path, capsys):
+    def test_no_other_triangles_are_reported(self, tmp_path, capsys):
         def shrunk(V):
             uv = V + 1.0
             uv[:7] = 1.0 + 1e-9 * V[:7]  # the innermost ring, smaller than 2⁻²³
@@ -186,7 +186,7 @@ class TestRestMeshes:
         V[inner[0]] = V[inner[1]]
         return V, F, fixed, target
 
-    def test_without_area_need_the_callers_word(self):
+    def test_zero_area_needs_an_option(self):
         V, F, fixed, target = self.flat()
         for reference in (None, "rest"):
             with pytest.raises(ValueError, match="zero area in the rest mesh; choose the reference 'equilateral'"):
@@ -202,7 +202,7 @@ class TestRestMeshes:
         V, F, fixed, target = star_problem(n=100)
         through_all(V * squash, F, fixed, target, reference=reference)
 
-    def test_of_wild_proportions(self):
+    def test_extreme_proportions(self):
         V, F, fixed, target = star_problem(n=100)
         through_all(V * [1, 1e-6, 1], F, fixed, target, reference="rest")
         through_all(V * [1, 1e-6, 1], F, fixed, target)
@@ -214,7 +214,7 @@ class TestCollinearRuns:
         V, F = grid(9, 7)
         fixed = boundary_of(F)
         target = V[fixed] @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
-        # In the turned one rounding bends the sides by an ulp, which some ears do not survive.
+        # In the rotated one, rounding bends the sides by an ulp; some ears do not survive this.
         problem = Problem(V, F, fixed, target)
         if turn:
             refine_problem(problem)
@@ -222,8 +222,8 @@ class TestCollinearRuns:
             through_all(V, F, fixed, target)
 
     @pytest.mark.parametrize("raised", [0.0, 1.0, -1.0])
-    def test_an_ear_on_them_has_no_room(self, raised):
-        """The middle of three vertices on a slanting line, and what one unit in its last place makes of it."""
+    def test_an_ear_on_them_has_no_space(self, raised):
+        """The middle of three vertices on a slanted line, and the effect of one unit in its last place."""
         tip = [1.5, 0.5 - raised * np.spacing(0.5)]
         problem = moved(eared(), {0: [0, 0], 1: tip, 2: [3, 1], 3: [0, 4]})
         flat = [o for o in diagnose(problem).obstructions if o.kind is Kind.INVERTED_TRIANGLE]
@@ -270,9 +270,9 @@ class TestSmallMeshes:
         through_all(V, F, [2, 0, 1], V[[2, 0, 1]] * 7 - 3)
 
 
-class TestTargetsThatCrossThemselves:
-    def test_are_mapped_where_that_is_possible(self):
-        """A band that laps over itself: injective triangle by triangle, and said not to be bijective."""
+class TestCrossingTargets:
+    def test_are_mapped_where_possible(self):
+        """A band that overlaps itself: the map is injective per triangle and not bijective."""
         V, F = grid(24, 3)
         t, radius = -2 * np.pi * 1.3 * V[:, 0], 1 + V[:, 1]
         fixed = boundary_of(F)
@@ -281,7 +281,7 @@ class TestTargetsThatCrossThemselves:
         assert result.status is Status.INJECTIVE
         assert result.certificate.bijective is False
 
-    def test_are_impossible_where_they_turn_too_little(self):
+    def test_are_impossible_if_they_turn_too_little(self):
         V, F = random_delaunay(60, seed=1)
         (loop,) = onto((V, F), circle(len(boundary_of(F)))).domain.loops
         t = 2 * np.pi * (np.arange(len(loop)) + 0.3) / len(loop)
@@ -292,7 +292,7 @@ class TestTargetsThatCrossThemselves:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_none(bad):
+def test_numbers_that_are_not_finite(bad):
     V, F = disk(3)
     fixed = boundary_of(F)
     broken = V.copy()
@@ -307,7 +307,7 @@ def test_numbers_that_are_none(bad):
         polish(V, F, broken, fixed=fixed)
     with pytest.raises(ValueError, match="uv is not finite at vertex 4"):
         distortion(V, F, broken)
-    # To judge a broken map is what certificates are for.
+    # Certificates also apply to broken maps.
     certificate = certify(F, broken)
     assert certificate.nonfinite.tolist() == np.flatnonzero((F == 4).any(axis=1)).tolist()
     assert not certificate.injective
@@ -316,19 +316,19 @@ def test_numbers_that_are_none(bad):
 class TestFlatteningAtScales:
     @pytest.mark.parametrize("scale", [1e-322, 1e-310, 1e-300, 1.0, 1e300])
     @pytest.mark.parametrize("place", [[0.0, 0.0], [1.0, 2.0], [1e-300, 1e-300], [1e300, 2.0], [1.7e308, -1.7e308]])
-    def test_one_pin_anywhere_gives_finite_positions(self, scale, place):
+    def test_one_pin_at_any_position_gives_finite_positions(self, scale, place):
         V, F = cat(3)
         result = flatten(V / np.abs(V).max() * scale, F, fixed=[3], target=[place], record_every=1)
         assert np.isfinite(result.uv).all()
         assert all(np.isfinite(snapshot.uv).all() for snapshot in result.path)
         np.testing.assert_array_equal(result.uv[3], place)
         if not result.certificate.bijective:
-            # Doubles do not tell triangles of this size so far from the origin.
+            # Doubles do not distinguish triangles of this size so far from the origin.
             assert result.status is Status.ROUNDED
             assert np.abs(place).max() > 1e10 * scale
 
     @pytest.mark.parametrize("pins", [{}, {"fixed": [3, 9], "target": [[1e308, 2], [-1e308, 3.0]]}])
-    def test_maps_beyond_the_range_of_doubles_are_refused(self, pins):
+    def test_maps_beyond_the_range_of_doubles_are_rejected(self, pins):
         V, F = cat(6)
         scale = 1.0 if pins else 1e308
         with pytest.raises(ValueError, match="range of doubles"):
@@ -345,8 +345,8 @@ class TestFlatteningAtScales:
     @pytest.mark.parametrize("flat", [1.2e-16, 1e-17, 1e-30, 1.2e-124, 1e-153])
     @pytest.mark.parametrize("axis", [0, 1])
     @pytest.mark.parametrize("energy", ["symmetric-dirichlet", "mips", "distances"])
-    def test_disks_too_thin_for_doubles_stay_as_they_lie(self, flat, axis, energy):
-        """Their energy is all rounding, and leads to maps that have collapsed."""
+    def test_disks_too_thin_for_doubles_are_not_changed(self, flat, axis, energy):
+        """Their energy is dominated by rounding and would lead to collapsed maps."""
         V, F = disk(4)
         V[:, axis] *= flat
         for start in ({}, {"start": V}):
@@ -367,7 +367,7 @@ class TestFlatteningAtScales:
 
 
 @pytest.mark.parametrize("scale", [1e-310, 1e-200, 1e-100, 1e100, 1e200, 1e300])
-def test_derivatives_are_finite_or_refused(scale):
+def test_derivatives_are_finite_or_rejected(scale):
     V, F = np.array([[0, 0, 0], [1, 0, 0], [0.3, 0.8, 0]]) * scale, np.array([[0, 1, 2]])
     uv = flatten(V, F).uv
     for derivative_of in (
@@ -383,7 +383,7 @@ def test_derivatives_are_finite_or_refused(scale):
 
 
 def test_derivatives_next_to_the_largest_double():
-    """Each triangle's area is a double, and their sum is not."""
+    """The area of each triangle is a double, but their sum overflows."""
     V, F = disk(2)
     rim = boundary_of(F)
     for map_scale in (1.0, 1e154):

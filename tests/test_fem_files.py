@@ -1,4 +1,4 @@
-"""Files of finite-element programs: only positions change, by the word of the libraries that define the formats."""
+"""Files of finite-element programs: only positions change, according to the libraries that define the formats."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shared import gmsh_files, vtk_files
 
 
 def shifted(mesh):
-    """Other positions: some vertices elsewhere, most where they were."""
+    """Return other positions: some vertices move, most do not."""
     points = mesh.points.copy()
     points[::3] += [1 / 3, -1e-17]
     return points
@@ -28,7 +28,7 @@ def shifted(mesh):
 
 @pytest.fixture(scope="module")
 def gmsh():
-    """Calls functions of `gmsh_files` in a process of its own."""
+    """Call functions of `gmsh_files` in a separate process."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         if reason := process.submit(gmsh_files.missing).result():
             pytest.skip(f"no gmsh: {reason}")
@@ -42,13 +42,13 @@ GMSH_KINDS = [
     for version in (2.2, 4.0, 4.1)
     for binary in (False, True)
     for options in ({}, {"gaps": True}, {"groups": False}, {"parametric": True})
-    # Gmsh writes 4.0 as text only, and 2.2 with parameters in a section of its own.
+    # Gmsh writes 4.0 as text only, and 2.2 with parameters in their own section.
     if not (version == 4.0 and binary) and not ("parametric" in options and version == 2.2)
 ]
 
 
 @pytest.mark.parametrize(("version", "binary", "options"), GMSH_KINDS)
-def test_gmsh_finds_all_it_found_before(gmsh, tmp_path, version, binary, options):
+def test_gmsh_finds_everything_that_was_there_before(gmsh, tmp_path, version, binary, options):
     path, out = tmp_path / "square.msh", tmp_path / "moved.msh"
     gmsh(gmsh_files.square, path, version, binary, **options)
     mesh = read_fem(path)
@@ -61,20 +61,20 @@ def test_gmsh_finds_all_it_found_before(gmsh, tmp_path, version, binary, options
         assert before[1][1, 3][3] == [7, 8]
     if version != 4.0:
         assert sum(key[0] == "view" for key in before[1]) == 5
-    # Positions by tag, of every node.
+    # Positions of every node by tag.
     tags = before[1]["nodes"]
     own = np.searchsorted(tags, sorted(tags))
     assert np.array_equal(after[0][own, 2], before[0][own, 2])
     assert sorted(map(tuple, after[0][:, :2].tolist())) == sorted(map(tuple, points.tolist()))
     moved = (after[0] != before[0]).any(axis=1).sum()
     assert moved == len(points[::3])
-    # Nothing to move is nothing to change.
+    # Without moved vertices nothing changes.
     write_fem(out, mesh, mesh.points)
     assert out.read_bytes() == path.read_bytes()
 
 
 @pytest.mark.parametrize("binary", [False, True])
-def test_a_mesh_repeated_with_every_view(gmsh, tmp_path, binary):
+def test_a_mesh_that_is_repeated_with_every_view(gmsh, tmp_path, binary):
     path, out = tmp_path / "square.msh", tmp_path / "moved.msh"
     gmsh(gmsh_files.square, path, 4.1, binary, repeated=True)
     assert path.read_bytes().count(b"$Nodes") == 4
@@ -82,7 +82,7 @@ def test_a_mesh_repeated_with_every_view(gmsh, tmp_path, binary):
     write_fem(out, mesh, shifted(mesh))
     before, after = gmsh(gmsh_files.content, path), gmsh(gmsh_files.content, out)
     assert after[1] == before[1]
-    # All four moved alike: whichever Gmsh takes, and another reader.
+    # All four copies move alike, for Gmsh, whichever it takes, and for another reader.
     again = read_fem(out)
     assert np.array_equal(again.points, shifted(mesh))
     path.write_bytes(path.read_bytes() + out.read_bytes())
@@ -92,7 +92,7 @@ def test_a_mesh_repeated_with_every_view(gmsh, tmp_path, binary):
 
 @pytest.mark.parametrize("version", [2.2, 4.1])
 @pytest.mark.parametrize("binary", [False, True])
-def test_the_last_of_several_times_moves_the_boundary(gmsh, tmp_path, version, binary):
+def test_the_last_of_several_time_steps_moves_the_boundary(gmsh, tmp_path, version, binary):
     path, out, report = tmp_path / "square.msh", tmp_path / "moved.msh", tmp_path / "report.json"
     gmsh(gmsh_files.square, path, version, binary, gaps=True)
     assert main(["morph", str(path), "-o", str(out), "--field", "displacement", "--json", str(report)]) == 0
@@ -106,7 +106,7 @@ def test_the_last_of_several_times_moves_the_boundary(gmsh, tmp_path, version, b
 
 @pytest.fixture(scope="module")
 def vtk():
-    """Calls functions of `vtk_files` in a process of its own."""
+    """Call functions of `vtk_files` in a separate process."""
     if find_spec("vtkmodules") is None:
         pytest.skip("vtk is not installed")
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
@@ -133,7 +133,7 @@ VTK_KINDS = {
 
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("name", VTK_KINDS)
-def test_vtk_finds_all_it_found_before(vtk, tmp_path, name, single):
+def test_vtk_finds_everything_that_was_there_before(vtk, tmp_path, name, single):
     path, out = tmp_path / name, tmp_path / f"moved_{name}"
     vtk(vtk_files.write, path, single=single, **VTK_KINDS[name])
     mesh = read_fem(path)
@@ -160,7 +160,7 @@ def test_polygons_with_three_corners(vtk, tmp_path, binary):
     assert vtk(vtk_files.content, out)[1] == vtk(vtk_files.content, path)[1]
 
 
-def test_two_times_in_one_vtu(vtk, tmp_path):
+def test_two_time_steps_in_one_vtu(vtk, tmp_path):
     path, out = tmp_path / "times.vtu", tmp_path / "moved.vtu"
     vtk(vtk_files.write, path, mode="Ascii")
     text = path.read_text()
@@ -214,7 +214,7 @@ def test_positions_too_large_for_single_precision(vtk, tmp_path, capsys):
         ("42-text.vtk", lambda d: d[30:], "does not start like"),
     ],
 )
-def test_damaged_vtk_files_are_refused(vtk, tmp_path, name, change, message):
+def test_damaged_vtk_files_are_rejected(vtk, tmp_path, name, change, message):
     path = tmp_path / name
     vtk(vtk_files.write, path, **VTK_KINDS[name])
     path.write_bytes(change(path.read_bytes()))
@@ -238,7 +238,7 @@ def test_damaged_vtk_files_are_refused(vtk, tmp_path, name, change, message):
         (lambda d: re.sub(rb"\n2 1 2 \d+\n", rb"\n2 1 2 999999\n", d), "ends too early"),
     ],
 )
-def test_damaged_gmsh_files_are_refused(gmsh, tmp_path, change, message):
+def test_damaged_gmsh_files_are_rejected(gmsh, tmp_path, change, message):
     path = tmp_path / "square.msh"
     gmsh(gmsh_files.square, path, 4.1, False)
     path.write_bytes(change(path.read_bytes()))
@@ -304,7 +304,7 @@ def test_another_format_would_lose_data(tmp_path, capsys, suffix):
 
 
 def binary_msh(version, order):
-    """One triangle as Gmsh of other machines and other times wrote it."""
+    """One triangle as written by Gmsh on other machines and by other versions."""
     nodes = np.array([(1, 0, 0, 0), (2, 1, 0, 0), (3, 0, 1, 0)], dtype=f"{order}i4,{order}f8,{order}f8,{order}f8")
 
     def words(kind, *numbers):
@@ -368,7 +368,7 @@ VECTORS u float
         ("text.vtk", LEGACY.encode()),
     ],
 )
-def test_no_damage_surprises(tmp_path, name, whole):
+def test_damage_causes_no_unexpected_error(tmp_path, name, whole):
     path = tmp_path / name
     rng = np.random.default_rng(7)
     path.write_bytes(whole)

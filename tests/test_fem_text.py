@@ -1,4 +1,4 @@
-"""Files of finite-element programs written by hand, section by section: what is read of them, and what is refused."""
+"""Hand-written files of finite-element programs, section by section: what is read, and what is rejected."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def refused(path, data, message):
 
 
 def moved(path):
-    """What the file reads as once a map has been written to it, everything else as it was."""
+    """Return the file as read after a map was written to it; everything else is unchanged."""
     mesh, out = read_fem(path), path.with_name(f"out{path.suffix}")
     points = mesh.points + np.array([0.125, -0.25])
     write_fem(out, mesh, points)
@@ -64,7 +64,7 @@ SECTIONS = {
 @pytest.mark.parametrize("name", SECTIONS)
 def test_sections_around_the_vectors(tmp_path, name):
     path = tmp_path / "four.vtk"
-    # Vectors follow, and are found only if the section's end is.
+    # Vectors follow; they are found only if the end of the section is.
     path.write_text(HEAD + PLACES + CELLS + SECTIONS[name] + "POINT_DATA 4\n" + VECTORS)
     mesh, again = moved(path)
     np.testing.assert_array_equal(mesh.points, POINTS[:, :2])
@@ -73,7 +73,7 @@ def test_sections_around_the_vectors(tmp_path, name):
         assert one.point_field("my u", range(4)).tolist() == U[:, :2].tolist()
 
 
-def test_cells_as_of_version_5(tmp_path):
+def test_cells_of_version_5(tmp_path):
     path = tmp_path / "four.vtk"
     cells = "CELLS 3 6\nOFFSETS vtktypeint64\n0 3 6\nCONNECTIVITY vtktypeint64\n0 1 2 0 2 3\nCELL_TYPES 2\n5 5\n"
     path.write_text(HEAD.replace("3.0", "5.1") + PLACES + cells)
@@ -90,8 +90,8 @@ def test_polygons(tmp_path):
     np.testing.assert_array_equal(mesh.F, F)
 
 
-def test_binary_with_strings_of_every_length_and_bits(tmp_path):
-    """A string's first two bits say how many bytes its length takes."""
+def test_binary_strings_and_bits_of_every_length(tmp_path):
+    """The first two bits of a string give the number of bytes of its length."""
     path = tmp_path / "four.vtk"
     strings = bytes([3 << 6 | 3]) + b"abc" + struct.pack(">H", 2 << 14 | 300) + b"x" * 300
     strings += struct.pack(">I", 1 << 30 | 70_000) + b"y" * 70_000
@@ -134,11 +134,11 @@ def test_binary_with_strings_of_every_length_and_bits(tmp_path):
         (HEAD + "POINTS -1 double\n", "a count is negative or too small"),
     ],
 )
-def test_what_is_wrong_with_a_legacy_file_is_said(tmp_path, text, message):
+def test_errors_in_legacy_vtk_files_are_described(tmp_path, text, message):
     refused(tmp_path / "bad.vtk", text, message)
 
 
-def test_a_binary_file_cut_short(tmp_path):
+def test_a_truncated_binary_file(tmp_path):
     head = HEAD.replace("ASCII", "BINARY").encode() + b"POINTS 4 float\n"
     refused(tmp_path / "bad.vtk", head + bytes(20), "ends too early")
     whole = head + POINTS.astype(">f4").tobytes() + b"\nPOINT_DATA 4\nVECTORS u double\n" + bytes(40)
@@ -153,14 +153,14 @@ def legacy(points, faces):
     return HEAD + f"POINTS {len(points)} double\n{rows}\n" + lists
 
 
-def test_what_becomes_of_a_boundary_that_cannot_be_or_overlaps_itself(tmp_path, capsys):
+def test_boundaries_that_are_impossible_or_overlap_themselves(tmp_path, capsys):
     mesh, table, out = tmp_path / "strip.vtk", tmp_path / "to.csv", tmp_path / "out.vtk"
     points, faces = surfaces.grid(24, 2)
     mesh.write_text(legacy(points, faces))
     rim = boundary_of(faces)
     command = ["morph", str(mesh), "-o", str(out), "--positions", str(table)]
 
-    # Once around and a little further: every triangle is right, and some lie on others.
+    # Slightly more than one turn: every triangle is positive, and some overlap others.
     turn = np.exp(8j * points[:, 0]) * (1.5 - 0.5 * points[:, 1])
     table.write_text("".join(f"{k},{turn[k].real:.17g},{turn[k].imag:.17g}\n" for k in rim))
     assert main(command) == 0
@@ -181,7 +181,7 @@ def test_what_becomes_of_a_boundary_that_cannot_be_or_overlaps_itself(tmp_path, 
 
 
 def block(values, word, coder=None, pieces=1):
-    """An array as VTK codes it: its length and its bytes, or packed in parts."""
+    """An array as VTK encodes it: length and bytes, or compressed in parts."""
     data = values.tobytes()
     if coder is None:
         return np.array([len(data)], dtype=word).tobytes() + data, b""
@@ -266,11 +266,11 @@ def test_every_coding(tmp_path, form, coder, order, word):
         (vtu("ascii", points=np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, np.inf, 0]])), "not finite at point 3"),
     ],
 )
-def test_what_is_wrong_with_a_vtu_file_is_said(tmp_path, data, message):
+def test_errors_in_vtu_files_are_described(tmp_path, data, message):
     if message is not None:
         refused(tmp_path / "bad.vtu", data, message)
         return
-    # What nobody asked for may be damaged; who asks is told.
+    # Unused data may be damaged; an error appears only if the data is requested.
     (tmp_path / "bad.vtu").write_bytes(data)
     mesh = read_fem(tmp_path / "bad.vtu")
     with pytest.raises(MeshFileError, match="refers to appended data that do not exist"):
@@ -279,7 +279,7 @@ def test_what_is_wrong_with_a_vtu_file_is_said(tmp_path, data, message):
 
 @pytest.mark.parametrize("coder", [ZLIB, LZMA], ids=["zlib", "lzma"])
 @pytest.mark.parametrize("form", ["inline", pytest.param("raw", marks=pytest.mark.slow)])
-def test_nothing_is_unpacked_beyond_what_there_is_room_for(tmp_path, form, coder):
+def test_nothing_larger_than_the_memory_limit_is_decompressed(tmp_path, form, coder):
     pack, name = coder
     zeros = bytes(32 << 20)
     claims = "compressed data have 33554528 bytes, but at most 96 are expected"
@@ -299,7 +299,7 @@ def test_nothing_is_unpacked_beyond_what_there_is_room_for(tmp_path, form, coder
 
 
 @pytest.mark.parametrize("form", ["ascii", "raw"])
-def test_positions_that_single_precision_does_not_hold(tmp_path, form):
+def test_positions_beyond_single_precision(tmp_path, form):
     path, out = tmp_path / "four.vtu", tmp_path / "out.vtu"
     path.write_bytes(vtu(form, precision="f4"))
     mesh = read_fem(path)
@@ -343,7 +343,7 @@ $EndElements
 """
 
 
-def test_a_mesh_repeated_is_one_and_another_is_not(tmp_path):
+def test_repeated_meshes_count_as_one_and_different_ones_do_not(tmp_path):
     path = tmp_path / "four.msh"
     sections = MSH4[MSH4.index("$Nodes") :]
     path.write_text(MSH4 + sections)
@@ -362,12 +362,14 @@ def test_a_mesh_repeated_is_one_and_another_is_not(tmp_path):
         (MSH4.replace("4.1 0 8", "1.0 0 8"), "version 1.0 is not supported"),
     ],
 )
-def test_what_is_wrong_with_a_gmsh_file_is_said(tmp_path, text, message):
+def test_errors_in_gmsh_files_are_described(tmp_path, text, message):
     refused(tmp_path / "bad.msh", text, message)
 
 
-def test_formats_that_are_not_read(tmp_path, capsys):
+def test_unsupported_formats(tmp_path, capsys):
     path = tmp_path / "mesh.inp"
-    refused(path, "*HEADING\n", r"\.inp cannot be read.*convert it to \.msh, \.vtk or \.vtu")
+    refused(
+        path, "*HEADING\n", r"\.inp files cannot be read as a mesh of finite elements; supported: \.msh, \.vtk, \.vtu"
+    )
     assert main(["morph", str(path), "-o", str(path), "--field", "u"]) == 2
     assert "mesh.inp" in capsys.readouterr().err

@@ -1,27 +1,26 @@
-"""Surfaces laid flat with a free boundary: bijective whatever their shape, and of as little distortion as is known."""
+"""Flattening with a free boundary: maps are bijective for every shape and have the least known distortion."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from quasiharmonic import boundary_loops
+from quasiharmonic import boundary_loops, flatten
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.flattened import flatten
-from quasiharmonic.apps.flattening.layout import laid_along_axis
+from quasiharmonic.apps.flattening.layout import align_with_axis
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.derivatives import check_energy
 from quasiharmonic.energies.energies import Deformation, Isotropic, SymmetricDirichlet
-from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
-from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.problem.certification import certify
 from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, cat, disk, grid
-from shared.told import Told
+from shared.distinct_steps import DistinctSteps
 
 
 def cylinder(turns, cells=(90, 6), height=0.6, radius=1.0, steep=0.0):
-    """A strip wound around a cylinder, which is developable: flat it is a rectangle, or for a cone a ring's part."""
+    """A strip around a cylinder, which is developable: its flat shape is a rectangle, or part of a ring for a cone."""
     square, F = grid(*cells)
     angle = 2 * np.pi * turns * square[:, 0]
     r = radius + steep * square[:, 1]
@@ -30,7 +29,7 @@ def cylinder(turns, cells=(90, 6), height=0.6, radius=1.0, steep=0.0):
 
 
 def overlapping_ring(degrees=420.0, around=80):
-    """A flat ring of more than a full turn, one end above the other: unrolled, its ends overlap."""
+    """A ring of more than one turn, with one end above the other: unrolled, its ends overlap."""
     square, F = grid(around, 5)
     angle, r = np.radians(degrees) * square[:, 0], 1 + 0.5 * square[:, 1]
     return np.stack([r * np.cos(angle), r * np.sin(angle), 0.02 * angle], axis=1), F
@@ -59,7 +58,7 @@ def test_energies_fall_and_maps_stay_bijective(energy):
     assert result.status is Status.POLISHED
     reference = flatten(V, F)
     if energy == "mips":
-        # Angles alone: the map keeps them better than any other, and has the surface's area.
+        # The MIPS map preserves angles best and has the surface's area.
         assert result.history[-1].energy < DeformationEnergy(V, F, _mips()).value(in_units(reference.uv, 0))
         doubled = 0.5 * np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1).sum()
         np.testing.assert_allclose(_area(F, result.uv), doubled, rtol=1e-6)
@@ -83,12 +82,12 @@ def test_holes_and_planar_meshes():
     assert mean_energy(V, F, result.uv) < 1e-6
 
 
-def test_what_would_overlap_is_kept_apart():
+def test_overlaps_are_avoided():
     V, F = overlapping_ring()
     result = flatten(V, F)
     assert [stage.kept for stage in result.stages if "descent" in stage.name] == [False, True]
     assert result.certificate.bijective
-    # Without overlap it cannot be an isometry, but nearly.
+    # Without overlap it cannot be an isometry, but almost.
     assert 1e-4 < mean_energy(V, F, result.uv) < 0.05
 
 
@@ -111,7 +110,7 @@ def test_scales():
         np.testing.assert_allclose(other.uv / factor, one.uv, atol=1e-3)
 
 
-def test_the_same_input_gives_the_same_map_and_stays_as_it_was():
+def test_flattening_is_deterministic_and_does_not_change_its_input():
     V, F = cat(6)
     before = V.copy(), F.copy()
     np.testing.assert_array_equal(flatten(V, F).uv, flatten(V.astype(np.float64), F.astype(np.int32)).uv)
@@ -138,7 +137,7 @@ def test_one_triangle():
     np.testing.assert_allclose(np.sort([np.linalg.norm(result.uv[i] - result.uv[i - 1]) for i in range(3)]), [3, 4, 5])
 
 
-class TestLayout:
+class TestPlacement:
     def test_axis_and_origin(self):
         V, F = grid(8, 4)
         V = V * (4, 1)
@@ -147,17 +146,17 @@ class TestLayout:
         np.testing.assert_allclose(uv.min(axis=0), 0, atol=1e-15)
         np.testing.assert_allclose(uv.max(axis=0), (4, 1), atol=1e-3)
 
-    def test_how_the_surface_lies_in_space_does_not_matter_to_the_sheet(self):
+    def test_the_orientation_of_the_surface_in_space_does_not_matter(self):
         V, F = cat(6)
         turned = V @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
         np.testing.assert_allclose(flatten(turned, F).uv, flatten(V, F).uv, atol=1e-3)
 
     def test_moments(self):
-        # Against a sum over small pieces.
+        # Compared with a sum over small pieces.
         rng = np.random.default_rng(1)
         V, F = disk(4)
         V = V * (1, 0.5) + 0.3 * V[:, :1] ** 2 + 0.01 * rng.normal(size=V.shape)
-        laid = laid_along_axis(F, V)
+        laid = align_with_axis(F, V)
         bary = rng.dirichlet((1, 1, 1), 4000)
         samples = np.einsum("sk,fkd->fsd", bary, laid[F])
         weight = np.abs(_areas(F, laid))[:, None] / len(bary)
@@ -174,7 +173,7 @@ class TestLayout:
         assert uv.max() <= 1
         assert np.ptp(uv, axis=0).max() == pytest.approx(1)
 
-    def test_several_pieces_stand_side_by_side(self):
+    def test_several_pieces_are_placed_side_by_side(self):
         V, F = cat(5)
         W, G = grid(4, 3)
         both = np.concatenate([V, np.column_stack([W, np.zeros(len(W))])])
@@ -189,29 +188,29 @@ def _areas(F, uv):
 
 
 class TestOptions:
-    def test_a_start_of_ones_own(self):
+    def test_a_given_start(self):
         V, F = cat(10)
         first = flatten(V, F)
         again = flatten(V, F, start=3 * first.uv + 7)
-        assert again.iterations <= 4
+        assert again.n_iterations <= 4
         assert again.certificate.bijective
         assert again.history[-1].energy == pytest.approx(first.history[-1].energy, rel=1e-2)
 
     def test_a_start_that_overlaps_itself_is_replaced(self):
         V, F = overlapping_ring()
-        start = V[:, :2] * (1, -1)  # seen from the side on which the triangles are counterclockwise
+        start = V[:, :2] * (1, -1)  # seen from the side where triangles are counterclockwise
         assert not certify(F, start).bijective
         result = flatten(V, F, start=start)
         assert result.certificate.bijective
 
-    def test_a_start_with_flips_is_refused(self):
+    def test_a_start_with_inverted_triangles_is_rejected(self):
         V, F = grid(4, 4)
         start = V.copy()
         start[12] = (2, 2)
         with pytest.raises(ValueError, match="start is not injective: triangles"):
             flatten(V, F, start=start)
 
-    def test_weights_spare_what_weighs_much(self):
+    def test_heavily_weighted_triangles_are_distorted_less(self):
         V, F = cat(10)
         face = V[F].mean(axis=1)[:, 2] > 0.5
         density = []
@@ -221,7 +220,7 @@ class TestOptions:
             density.append(SymmetricDirichlet().density(energy.deform(in_units(uv, 0)))[face].mean())
         assert density[1] < 0.5 * density[0]
 
-    def test_an_energy_of_ones_own(self):
+    def test_a_user_defined_energy(self):
         class Cautious(Isotropic):
             barrier = True
 
@@ -241,7 +240,7 @@ class TestOptions:
 
     def test_iterations_callback_and_record(self):
         V, F = cat(8)
-        seen = Told()
+        seen = DistinctSteps()
         result = flatten(V, F, max_iterations=3, callback=seen.append, record_every=2)
         assert result.status is Status.STILL_FALLING
         assert result.certificate.bijective
@@ -268,11 +267,11 @@ class TestOptions:
             ({"weights": np.zeros(32)}, "the weight is not positive at triangles 0, 1, 2"),
             ({"start": [[0, 0]]}, "start must have shape"),
             ({"max_iterations": -1}, "max_iterations"),
-            ({"tolerance": -1}, "tolerance"),
+            ({"tol": -1}, "tol"),
             ({"fixed": [0]}, "give fixed and target together"),
         ],
     )
-    def test_wrong_options(self, options, words):
+    def test_invalid_options(self, options, words):
         V, F = grid(4, 4)
         with pytest.raises(ValueError, match=words):
             flatten(V, F, **options)
@@ -307,7 +306,7 @@ class TestBadSurfaces:
         with pytest.raises(ValueError, match=r"edge \(0, 1\) in more than two triangles"):
             flatten(V, [[0, 1, 2], [1, 0, 3], [0, 1, 4]])
 
-    def test_a_piece_is_named(self):
+    def test_the_faulty_piece_is_named(self):
         V, F = grid(3, 3)
         W = np.concatenate([np.column_stack([V, 0 * V[:, 0]]), [[0, 0, 5], [1, 0, 5], [0, 1, 5], [0, 0, 6]]])
         tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]) + len(V)
@@ -315,7 +314,7 @@ class TestBadSurfaces:
             flatten(W, np.concatenate([F, tetrahedron]))
 
 
-def test_the_proxies_have_the_energy_s_slope_and_are_convex():
+def test_the_proxies_have_the_gradient_of_the_energy_and_are_convex():
     rng = np.random.default_rng(0)
     p = np.exp(1j * rng.uniform(0, 6, 50)) * rng.uniform(0.5, 2, 50)
     q = p * rng.uniform(0, 0.95, 50) * np.exp(1j * rng.uniform(0, 6, 50))
@@ -324,7 +323,7 @@ def test_the_proxies_have_the_energy_s_slope_and_are_convex():
     assert check_energy(SymmetricDirichlet()).passed
     form = energy.curvature(d)
     assert np.linalg.eigvalsh(form.matrices()).min() > 0
-    # The step to the proxy's minimum is to the nearest rotation: W² (J − R) is the gradient.
+    # The step to the minimum of the proxy leads to the nearest rotation: W² (J − R) is the gradient.
     to_p, to_q = p / np.abs(p) - p, -q
     along_p, along_q = form.apply(to_p, to_q)
     by_p, by_q = energy.gradient(d)
@@ -335,8 +334,8 @@ def test_the_proxies_have_the_energy_s_slope_and_are_convex():
 @pytest.mark.parametrize(
     ("sizes", "goals"), [((1e-4, 1e-5), (3e-4, 3e-5)), ((0.5, 1e-2), (1, 3e-2)), ((9, 0.4), (3, 1))]
 )
-def test_a_proxy_aims_at_no_more_than_so_many_times_a_triangle_s_size(sizes, goals):
-    """Its step changes the singular values to the goals; directions stay."""
+def test_the_goal_of_a_proxy_is_limited_relative_to_the_size_of_a_triangle(sizes, goals):
+    """Its step changes the singular values to the goals; directions do not change."""
     along_p, along_q = np.exp(0.3j), np.exp(1.1j)
 
     def halves(first, second):
@@ -349,26 +348,26 @@ def test_a_proxy_aims_at_no_more_than_so_many_times_a_triangle_s_size(sizes, goa
     np.testing.assert_allclose(np.negative(pull), energy.gradient(at), rtol=1e-9)
 
 
-def test_how_much_of_a_boundary_is_tangled():
+def test_the_crossing_part_of_a_boundary_is_measured():
     """A strip of which two edges cross two others; the rest of its boundary is free."""
     strip, F = grid(9, 2)
     (loop,) = boundary_loops(F, len(strip))
     rim = Rim([loop])
-    assert rim.tangled(strip) == 0
+    assert rim.tangled_fraction(strip) == 0
     crossed = strip.copy()
     upper = np.flatnonzero(strip[:, 1] == 1)
     crossed[upper[np.argsort(strip[upper, 0])][4], 1] = -1
-    assert rim.tangled(crossed) == 6 / loop.size
+    assert rim.tangled_fraction(crossed) == 6 / loop.size
 
 
-def test_loops_are_the_surface_s():
+def test_loops_are_those_of_the_surface():
     V, F = annulus(8)
     result = flatten(V, F)
     assert [loop.tolist() for loop in result.certificate.loops] == [b.tolist() for b in boundary_loops(F, len(V))]
 
 
 @pytest.mark.parametrize("size", [1e-300, 1e-200, 1e-162, 1e-155, 1e155, 1e200, 1e300])
-def test_a_start_of_any_size_is_brought_to_the_surfaces(size):
+def test_a_start_of_any_size_is_scaled_to_the_surface(size):
     V, F = disk(8)
     V = np.column_stack([V, np.sqrt(1.2 - (V**2).sum(axis=1))])
     own = flatten(V, F)
@@ -380,7 +379,7 @@ def test_a_start_of_any_size_is_brought_to_the_surfaces(size):
 
 @pytest.mark.parametrize("stretch", [1.0, 1e3, 1e6, 1e8, 1e11])
 @pytest.mark.parametrize("turn", [1, -1])
-def test_what_is_plane_is_its_own_map(stretch, turn):
+def test_planar_surfaces_are_their_own_maps(stretch, turn):
     V, F = grid(20, 20)
     result = flatten(V * [stretch * turn, 1], F if turn > 0 else F[:, ::-1])
     assert result.status is Status.POLISHED

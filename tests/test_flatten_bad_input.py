@@ -1,4 +1,4 @@
-"""What cannot be flattened, or only just: the same outcome for a caller of `flatten` and of ``qhm flatten``."""
+"""Surfaces that cannot be flattened, or only just: `flatten` and ``qhm flatten`` give the same result."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from quasiharmonic import io
-from quasiharmonic.apps.flattening.flattened import flatten
-from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic import flatten, io
+from quasiharmonic.problem.certification import certify
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.cli import main
 
@@ -25,7 +24,7 @@ def octahedron():
 
 
 def torus(n=8):
-    """Its last two triangles left out, so that it has a boundary."""
+    """A mesh without its last two triangles, so that it has a boundary."""
     i, j = np.divmod(np.arange(n * n), n)
     at = 2 * np.pi / n
     V = np.stack([np.cos(at * i), np.sin(at * i), 0 * i]).T * (2 + np.cos(at * j))[:, None]
@@ -61,7 +60,7 @@ REFUSED = {
 
 
 def command(tmp_path, V, F, fixed=(), target=(), options=()):
-    """Exit status of ``qhm flatten``, its report and its map, if it wrote any."""
+    """Return the exit status of ``qhm flatten``, its report, and its map if it wrote one."""
     mesh = io.MeshData(V, F)
     call = ["flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--json", tmp_path / "report.json", *options]
     if len(fixed):
@@ -79,7 +78,7 @@ def command(tmp_path, V, F, fixed=(), target=(), options=()):
 
 @pytest.mark.parametrize(("mesh", "message"), REFUSED.values(), ids=REFUSED)
 @pytest.mark.parametrize(("fixed", "target"), [((), ()), ((2, 3), ((0.0, 0.0), (1.0, 0.0)))], ids=["free", "pinned"])
-def test_what_is_refused_is_named(mesh, message, fixed, target, tmp_path, capsys):
+def test_rejected_surfaces_are_named(mesh, message, fixed, target, tmp_path, capsys):
     given = {"fixed": fixed, "target": target} if fixed else {}
     with pytest.raises(ValueError, match=message):
         flatten(*mesh, **given)
@@ -95,7 +94,7 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize(("fixed", "target", "kind", "message"), IMPOSSIBLE.values(), ids=IMPOSSIBLE)
-def test_what_is_impossible_is_told_with_the_best_map(fixed, target, kind, message, tmp_path, capsys):
+def test_impossible_problems_are_reported_with_the_best_map(fixed, target, kind, message, tmp_path, capsys):
     result = flatten(V, F, fixed=fixed, target=target)
     assert result.status.name == "IMPOSSIBLE"
     assert not result.certificate.bijective
@@ -126,7 +125,7 @@ def test_any_size_is_flattened(scale, pinned, tmp_path):
 
 
 @pytest.mark.parametrize("apart", [1e-150, 1e150])
-def test_pins_of_any_size_are_met(apart, tmp_path):
+def test_pins_of_any_size_are_reached(apart, tmp_path):
     fixed, target = [1, 50], np.array([(0.0, 0.0), (apart, 0.0)])
     result = flatten(V, F, fixed=fixed, target=target)
     assert result.certificate.bijective
@@ -164,6 +163,6 @@ def test_pins_on_an_annulus_of_twenty_triangles(tmp_path):
     np.testing.assert_array_equal(uv[fixed], target)
 
 
-def test_steps_are_not_negative(tmp_path):
+def test_negative_numbers_of_steps_are_rejected(tmp_path):
     with pytest.raises(SystemExit):
         command(tmp_path, V, F, options=["--max-iterations", "-1"])

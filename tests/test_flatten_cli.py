@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import atlas, distortion, io
-from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.problem.certification import certify
 from quasiharmonic.surfaces import cat, grid
 from quasiharmonic.ui.cli import main
 
@@ -54,7 +54,7 @@ def test_start_from_the_file(head, tmp_path):
     out, again, report = tmp_path / "flat.obj", tmp_path / "again.obj", tmp_path / "report.json"
     assert run("flatten", head, "-o", out) == 0
     assert run("flatten", out, "-o", again, "--start", "--json", report) == 0
-    assert json.loads(report.read_text())["iterations"] <= 4
+    assert json.loads(report.read_text())["n_iterations"] <= 4
     assert run("flatten", head, "-o", again, "--start") == 2
 
 
@@ -81,12 +81,12 @@ def test_closed_surfaces_are_named_and_cut(tmp_path, capsys):
     np.testing.assert_array_equal(written.F, flat.ravel()[F])
 
 
-def test_nothing_to_cut_is_no_error(head, tmp_path):
+def test_an_unneeded_cut_is_no_error(head, tmp_path):
     assert run("flatten", head, "-o", tmp_path / "flat.obj", "--cut") == 0
     assert len(io.read_mesh(tmp_path / "flat.obj").V) == len(cat(6)[0])
 
 
-def test_interrupted_writes_the_best_map(head, tmp_path, monkeypatch):
+def test_interrupted_command_writes_the_best_map(head, tmp_path, monkeypatch):
     from quasiharmonic.apps.flattening import piece
 
     def cut_short(*arguments):
@@ -105,7 +105,7 @@ def test_interrupted_writes_the_best_map(head, tmp_path, monkeypatch):
         (["--cut", "--start"], "which new seams discard"),
     ],
 )
-def test_wrong_calls(head, tmp_path, capsys, options, words):
+def test_invalid_calls(head, tmp_path, capsys, options, words):
     io.write_map(head, io.read_mesh(head), cat(6)[0][:, :2])
     assert run("flatten", head, "-o", tmp_path / "flat.obj", *options) == 2
     assert words in capsys.readouterr().err
@@ -117,24 +117,24 @@ def test_wrong_calls(head, tmp_path, capsys, options, words):
     [
         (["flatten"], ["--rings", 4], "--energy distances"),
         (["flatten"], ["--unit", "cm"], "--pattern"),
-        (["flatten"], ["--margin", "0.1"], "--pack"),
-        (["polish"], ["--margin", "0.1"], "--pack"),
-        (["harmonise"], ["--margin", "0.1"], "--pack"),
-        (["map", "--to", "disk"], ["--margin", "0.1"], "--pack"),
+        (["flatten"], ["--padding", "8"], "--pack"),
+        (["polish"], ["--padding", "8"], "--pack"),
+        (["harmonise"], ["--padding", "8"], "--pack"),
+        (["map", "--to", "disk"], ["--padding", "8"], "--pack"),
     ],
 )
-def test_an_option_without_effect_is_refused(head, tmp_path, capsys, command, option, belongs):
+def test_an_option_without_effect_is_rejected(head, tmp_path, capsys, command, option, belongs):
     assert run(*command, head, "-o", tmp_path / "flat.obj", *option) == 2
     assert f"{option[0]} needs {belongs}" in capsys.readouterr().err
     assert not (tmp_path / "flat.obj").exists()
 
 
-def test_rings_of_what_is_not_measured_are_refused(head, capsys):
+def test_rings_without_distances_are_rejected(head, capsys):
     assert run("measure", head, "--rings", 4) == 2
     assert "--rings needs --distances" in capsys.readouterr().err
 
 
-def test_bad_weights_are_named(head, tmp_path, capsys):
+def test_invalid_weights_are_named(head, tmp_path, capsys):
     (tmp_path / "weights.txt").write_text("1\nheavy\n")
     assert run("flatten", head, "-o", tmp_path / "flat.obj", "--weights", tmp_path / "weights.txt") == 2
     assert "'heavy' is not a finite number at line 2" in capsys.readouterr().err
@@ -157,7 +157,7 @@ def test_distances(head, tmp_path, capsys):
         facts["distortion"]["distances"]["mean"]
         == distortion(V, F, io.map_of(io.read_mesh(out)), rings=4).distances.mean
     )
-    # What belongs beside the figure is beside it.
+    # The report states how the distances were sampled.
     assert (errors[1]["rings"], errors[1]["crossings"], errors[1]["sources"]) == (4, 5, len(V))
     said = capsys.readouterr().out
     assert f"distances off by {100 * errors[1]['mean']:.3g} % on average" in said
@@ -166,7 +166,7 @@ def test_distances(head, tmp_path, capsys):
 
 @pytest.mark.parametrize("allowance", [0, 0.2])
 def test_pattern(tmp_path, allowance):
-    """Two squares of 1 and 0.6 inch: their outlines true to scale, far enough apart for their allowances."""
+    """Two squares of 1 and 0.6 inch: their outlines are true to scale and far enough apart for seam allowances."""
     if allowance:
         pytest.importorskip("shapely")
     square, F = grid(3, 3)
@@ -196,7 +196,7 @@ def test_pattern(tmp_path, allowance):
         (["--energy", "distances", "--fixed", "held.txt"], "omit fixed and weights"),
     ],
 )
-def test_wrong_patterns_and_distances(head, tmp_path, capsys, monkeypatch, options, words):
+def test_invalid_patterns_and_distances(head, tmp_path, capsys, monkeypatch, options, words):
     monkeypatch.chdir(tmp_path)
     io.write_map(head, io.read_mesh(head), cat(6)[0][:, :2])
     (tmp_path / "held.txt").write_text("0\n5\n")
@@ -215,7 +215,7 @@ def test_missing_packages_are_named_before_any_work(head, tmp_path, capsys, monk
     assert [path.name for path in tmp_path.iterdir()] == ["head.obj"]
 
 
-def test_no_output_takes_the_place_of_another(head, tmp_path, capsys):
+def test_outputs_may_not_overwrite_each_other(head, tmp_path, capsys):
     drawing = tmp_path / "one.svg"
     assert run("flatten", head, "-o", tmp_path / "f.obj", "--pattern", drawing, "--json", drawing) == 2
     assert "is also the file of --pattern" in capsys.readouterr().err

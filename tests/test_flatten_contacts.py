@@ -1,4 +1,4 @@
-"""What keeps a free boundary apart: contacts against differences and brute force, guarded steps, exact overlap."""
+"""The barrier that keeps a free boundary apart: contacts against differences and brute force, steps, overlap."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import pytest
 
 from quasiharmonic import boundary_loops
 from quasiharmonic.apps.flattening.contacts import HATS, Contacts, Rim
-from quasiharmonic.apps.flattening.descent import GuardedDescent, descend
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.energies.newton.newton_descent import in_units
-from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.energies.newton.map_model import in_units
+from quasiharmonic.problem.certification import certify
 from quasiharmonic.surfaces import annulus, grid
 
 
 def horseshoe(gap):
-    """A strip bent until its ends are a gap apart, in the plane."""
+    """A planar strip bent until its ends are a gap apart."""
     square, F = grid(40, 4)
     r = 1 + 0.4 * (1 - square[:, 1])
     angle = (2 * np.pi - gap) * square[:, 0]
@@ -30,12 +30,12 @@ def pairs():
     return Rim(boundary_loops(F, len(V))).contacts(w), w
 
 
-def test_horseshoe_is_what_it_is_meant_to_be():
+def test_the_horseshoe_is_as_described():
     V, F = horseshoe(0.03)
     assert certify(F, V).bijective
 
 
-def test_contacts_are_found_across_the_gap_only(pairs):
+def test_contacts_are_found_only_across_the_gap(pairs):
     found, w = pairs
     found = found.within(w, 1.0)
     assert found.reach.size
@@ -45,13 +45,13 @@ def test_contacts_are_found_across_the_gap_only(pairs):
     assert (((vertex < 20) & (tail > 20) & (head > 20)) | ((vertex > 20) & (tail < 20) & (head < 20))).all()
 
 
-def test_contacts_are_those_of_all_pairs():
+def test_contacts_agree_with_all_pairs():
     V, F = horseshoe(0.1)
     rng = np.random.default_rng(0)
     V = V + 0.004 * rng.normal(size=V.shape)
     (loop,) = boundary_loops(F, len(V))
     found = Rim([loop]).contacts(in_units(V, 0))
-    # Brute force: near pairs whose connecting segment leaves the vertex and reaches the edge outside.
+    # Brute force: near pairs whose connecting segment leaves the vertex and reaches the edge from outside.
     shapely = pytest.importorskip("shapely")
     polygon = shapely.Polygon(V[loop])
     for v, a, b in found.corners.T.tolist():
@@ -82,7 +82,7 @@ def test_gradient_and_curvature(pairs):
 
 
 def test_curvature_of_one_contact():
-    # A vertex straight above the middle of an edge: only its height counts.
+    # A vertex directly above the middle of an edge: only its height matters.
     w = np.array([0.5 + 0.2j, 0, 1])
     one = Contacts(np.array([[0], [1], [2]]), np.array([0.5]))
     height, reach = 0.2, 0.5
@@ -95,7 +95,7 @@ def test_curvature_of_one_contact():
     assert float((along_p.conj() * dp + along_q.conj() * dq).real.sum()) == pytest.approx(second)
 
 
-def test_split_keeps_reaches_and_loses_none(pairs):
+def test_split_edges_keep_all_contacts(pairs):
     found, w = pairs
     known, strangers = found.split(found.corners[:, ::-1], w.size)
     np.testing.assert_array_equal(known.reach, found.reach[::-1])
@@ -121,14 +121,14 @@ def test_blocks_bound_the_curvature(pairs):
 
 
 @pytest.mark.parametrize("gap", [0.03, -0.03])
-def test_overlap_is_decided_as_the_certificate_does(gap):
+def test_overlap_agrees_with_the_certificate(gap):
     V, F = horseshoe(gap)
     rim = Rim(boundary_loops(F, len(V)))
     assert rim.meets_itself(V) is (not certify(F, V).bijective)
     assert bool(rim.meetings(V).size) is (gap < 0)
 
 
-def test_touching_in_one_point_is_overlap():
+def test_touching_in_one_point_counts_as_overlap():
     V, F = horseshoe(0.2)
     loop = boundary_loops(F, len(V))
     rim = Rim(loop)
@@ -139,7 +139,7 @@ def test_touching_in_one_point_is_overlap():
 
 @pytest.mark.parametrize("surface", [horseshoe(0.02), annulus(8)], ids=["disk", "annulus"])
 def test_guarded_steps_stay_bijective(surface):
-    # A rest shape that is bent further than a full turn wants to overlap.
+    # A rest shape that is bent by more than a full turn would overlap.
     V, F = surface
     rest = np.column_stack([V, 0 * V[:, 0]])
     if len(boundary_loops(F, len(V))) == 1:
@@ -147,7 +147,7 @@ def test_guarded_steps_stay_bijective(surface):
         r, angle = 1 + 0.4 * (1 - square[:, 1]), 7.0 * square[:, 0]
         rest = np.stack([r * np.cos(angle), r * np.sin(angle), 0.02 * angle], axis=1)
     energy = DeformationEnergy(rest, F, SymmetricDirichlet())
-    descent = GuardedDescent(energy, V, "auto", Rim(boundary_loops(F, len(V))))
+    descent = SurfaceDescent(energy, V, "auto", rim=Rim(boundary_loops(F, len(V))))
     values = [descent.distortion]
     for _ in descend(descent, SymmetricDirichlet(), 1e-4):
         values.append(descent.distortion)

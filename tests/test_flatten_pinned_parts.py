@@ -1,14 +1,13 @@
-"""Several surfaces, some with vertices held: each where its pins say, the others beside, and none over another."""
+"""Several surfaces, some with pins: pinned parts go to their pins, others next to them, and none overlap."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from quasiharmonic import boundary_loops
-from quasiharmonic.apps.flattening.flattened import flatten
-from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic import boundary_loops, flatten
 from quasiharmonic.io import MeshData, map_of, read_mesh, write_obj
+from quasiharmonic.problem.certification import certify
 from quasiharmonic.problem.diagnosis import Forbids, Kind
 from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, disk
@@ -16,7 +15,7 @@ from quasiharmonic.ui.cli import main
 
 
 def several(*surfaces):
-    """Planar surfaces as one mesh, and the first vertex of each."""
+    """Return planar surfaces as one mesh, and the first vertex of each."""
     firsts = np.cumsum([0, *(len(V) for V, _ in surfaces)])
     V = np.concatenate([V for V, _ in surfaces])
     return V, np.concatenate([F + first for (_, F), first in zip(surfaces, firsts, strict=False)]), firsts[:-1]
@@ -35,15 +34,15 @@ def lengths(F, uv):
     return np.linalg.norm(uv[F] - uv[np.roll(F, -1, axis=1)], axis=2)
 
 
-def test_each_goes_where_its_pins_say():
+def test_each_part_goes_to_its_pins():
     V, F, (_, second) = several(disk(6), disk(4))
     result = solved(V, F, [3, 40, second + 3], [V[3], V[40], (4.0, 1.0)])
-    # Nothing is in the way of anything: both are as they are.
+    # There are no obstacles, so both parts keep their shape.
     np.testing.assert_allclose(lengths(F, result.uv), lengths(F, V), atol=1e-6)
     np.testing.assert_allclose(result.uv[:second], V[:second], atol=1e-6)
 
 
-def test_those_without_pins_are_laid_beside():
+def test_parts_without_pins_are_placed_next_to_the_others():
     V, F, (_, second, third) = several(disk(6), disk(5), disk(3))
     result = solved(V, F, [second + 3, third + 3], [(10.0, 20.0), (10.2, 20.0)], gap=0.5)
     held, free = result.uv[second:], result.uv[:second]
@@ -52,33 +51,33 @@ def test_those_without_pins_are_laid_beside():
     assert free[:, 1].min() == pytest.approx(held[:, 1].min())
 
 
-def test_what_would_overlap_makes_room():
+def test_overlapping_parts_move_apart():
     V, F, (_, second) = several(disk(6), disk(6))
     fixed = [3, 50, second + 3, second + 50]
     result = solved(V, F, fixed, [(0.0, 0), (1, 0), (0.5, 0.1), (0.7, 0.8)])
     again = solved(V, F, fixed, [(0.0, 0), (1, 0), (0.5, 0.1), (0.7, 0.8)])
     np.testing.assert_array_equal(result.uv, again.uv)
-    # Alone, each of them lies over pins of the other.
+    # Alone, each of them would cover pins of the other.
     where = [(0, 0), (1, 0)], [(0.5, 0.1), (0.7, 0.8)]
     alone = [flatten(*disk(6), fixed=[3, 50], target=places).uv for places in where]
     assert not certify(F, np.concatenate(alone)).bijective
 
 
-def test_one_finds_the_hole_of_another():
+def test_one_part_is_placed_in_the_hole_of_another():
     ring, tile = annulus(6), disk(5)
     V, F, (_, second) = several(ring, tile)
     inner = min(boundary_loops(ring[1], second), key=len)
     result = solved(V, F, [*inner, second + 3], [*V[inner], V[inner].mean(axis=0)])
-    # Within, and so smaller than it is, although the tile by itself would lie over all of the ring.
+    # The tile shrinks to fit inside, although alone it would cover the whole ring.
     assert np.abs(result.uv[second:]).max() < np.abs(V[inner]).max()
 
 
-def test_three_in_one_spot():
+def test_three_parts_at_one_location():
     V, F, (_, second, third) = several(disk(4), disk(4), disk(4))
     solved(V, F, [3, second + 3, third + 3], [(10.0, 10), (10.2, 10), (10.1, 10.1)], energy="mips")
 
 
-def test_what_forbids_it_has_the_mesh_s_numbers():
+def test_the_reason_for_impossibility_uses_the_numbers_of_the_mesh():
     V, F, (_, second) = several(disk(6), disk(6))
     result = flatten(V, F, fixed=[3, second + 3], target=np.zeros((2, 2)))
     assert result.status is Status.IMPOSSIBLE
@@ -89,7 +88,7 @@ def test_what_forbids_it_has_the_mesh_s_numbers():
     (crossing,) = result.diagnosis.obstructions
     assert crossing.forbids is Forbids.BIJECTIVE
     assert {frozenset(edge) for edge in crossing.edges.tolist()} == {frozenset(pair), frozenset(pair + second)}
-    # Of one part alone, and found by its search only: a rim held the wrong way round.
+    # Only the search on one part finds it: a boundary fixed with the wrong orientation.
     loop = boundary_loops(F[len(F) // 2 :] - second, second)[0] + second
     result = flatten(V, F, fixed=[3, *loop], target=[(9.0, 9), *(V[loop] * (1, -1))])
     assert result.status is Status.IMPOSSIBLE
@@ -100,7 +99,7 @@ def test_what_forbids_it_has_the_mesh_s_numbers():
     assert not result.certificate.injective
 
 
-def test_what_doubles_do_not_tell_apart_is_said():
+def test_pins_that_doubles_do_not_distinguish_are_reported():
     V, F, (_, second) = several(disk(4), disk(4))
     result = flatten(V, F, fixed=[3, 20], target=[(1e150, 0.0), (2e150, 0.0)])
     assert result.status is Status.ROUNDED
@@ -109,7 +108,7 @@ def test_what_doubles_do_not_tell_apart_is_said():
 
 
 @pytest.mark.parametrize("at", [1, 3, 12])
-def test_ctrl_c_leaves_every_pin_in_place(at):
+def test_ctrl_c_leaves_every_pin_at_its_target_position(at):
     V, F, (_, second, _) = several(disk(5), disk(5), disk(3))
     seen = []
 
@@ -125,20 +124,20 @@ def test_ctrl_c_leaves_every_pin_in_place(at):
     np.testing.assert_array_equal(result.uv[fixed], target)
 
 
-def test_the_command_takes_several(tmp_path, capsys):
+def test_the_command_accepts_several_parts(tmp_path, capsys):
     V, F, (_, second) = several(disk(4), disk(4))
     write_obj(tmp_path / "in.obj", MeshData(np.column_stack([V, 0 * V[:, 0]]), F).with_map(V + 7))
     (tmp_path / "pins.txt").write_text(f"3\n{second + 9}\n")
     call = ["flatten", str(tmp_path / "in.obj"), "--fixed", str(tmp_path / "pins.txt"), "-o", str(tmp_path / "out.obj")]
     assert main(call) == 0
-    # Both pins are a step of the disk apart, so the two surfaces have to make room for each other.
+    # Both pins are one grid step of the disk apart, so the two parts must move apart.
     assert "the distortion has converged" in capsys.readouterr().out
     written = read_mesh(tmp_path / "out.obj")
     np.testing.assert_array_equal(map_of(written)[[3, second + 9]], (V + 7)[[3, second + 9]])
     assert certify(written.F, map_of(written)).bijective
 
 
-def test_the_command_s_messages_have_the_file_s_numbers(tmp_path, capsys, rng):
+def test_the_messages_of_the_command_have_the_numbers_of_the_file(tmp_path, capsys, rng):
     V, F, (_, second) = several(disk(4), disk(4))
     number, order = rng.permutation(len(V)), rng.permutation(len(F))
     places, triangles = np.empty_like(V), number[F][order]
@@ -150,7 +149,7 @@ def test_the_command_s_messages_have_the_file_s_numbers(tmp_path, capsys, rng):
     call = ["flatten", str(tmp_path / "in.obj"), "--fixed", str(tmp_path / "pins.txt"), "-o", str(tmp_path / "out.obj")]
     assert main(call) == 1
     assert f"Vertices {pins.min()}, {pins.max()} are fixed at the same position" in capsys.readouterr().out
-    # With room for both, every triangle is where the file has it.
+    # There is space for both, so all triangles keep their shape from the file.
     write_obj(tmp_path / "in.obj", mesh.with_map(places + 7))
     assert main(call) == 0
     written = read_mesh(tmp_path / "out.obj")

@@ -1,4 +1,4 @@
-"""Vertices held, the boundary free: bijective with every pin in place, or a reason why not."""
+"""Pins with a free boundary: bijective maps with every pin at its target position, or a reason for failure."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic import flatten
 from quasiharmonic.apps.flattening.piece import Piece, Settings
 from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
-from quasiharmonic.apps.flattening.pins.pins import Pinned, moved_onto
-from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, move_onto_pins
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
+from quasiharmonic.problem.certification import certify
 from quasiharmonic.problem.diagnosis import Forbids, Kind
 from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay
@@ -23,14 +22,14 @@ DONE = {Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING}
 
 
 def swirled(uv, angle):
-    """Turned around the middle, the more the nearer to it."""
+    """Rotate around the centre, more near the centre than far from it."""
     z = (uv - uv.mean(axis=0)) @ (1, 1j)
     z = z * np.exp(1j * angle * np.clip(1 - abs(z) / abs(z).max(), 0, 1))
     return np.stack([z.real, z.imag], axis=1)
 
 
 def solved(V, F, fixed, target, **options):
-    """The result, its promises checked by other means."""
+    """Flatten and check the promises of the result independently."""
     given = V.copy(), F.copy(), np.copy(fixed), np.copy(target)
     result = flatten(V, F, fixed=fixed, target=target, **options)
     assert all(np.array_equal(a, b) for a, b in zip(given, (V, F, fixed, target), strict=True))
@@ -43,7 +42,7 @@ def solved(V, F, fixed, target, **options):
 
 
 def energy_by_hand(V, F, uv):
-    """Mean symmetric Dirichlet energy, 0 for an isometry, from singular values."""
+    """Return the mean symmetric Dirichlet energy, 0 for an isometry, from singular values."""
     V = np.column_stack([V, np.zeros(len(V))])[:, :3]
     total = area = 0.0
     for t in F:
@@ -60,7 +59,7 @@ def energy_by_hand(V, F, uv):
 
 @pytest.mark.parametrize("angle", [1.0, -4.0])
 @pytest.mark.parametrize("surface", [cat(12), random_delaunay(700, 1), disk(14), grid(25, 25)])
-def test_pins_of_a_swirl_are_met(surface, angle):
+def test_pins_of_a_swirl_are_reached(surface, angle):
     V, F = surface
     flat = flatten(V, F).uv
     hidden = swirled(flat, angle)
@@ -68,7 +67,7 @@ def test_pins_of_a_swirl_are_met(surface, angle):
     result = solved(V, F, fixed, hidden[fixed])
     found = energy_by_hand(V, F, result.uv)
     assert np.isclose(result.history[-1].energy, found, rtol=1e-9)
-    # The plain swirl is one way to meet them, and not the best.
+    # The original swirl is one solution, but not the best.
     assert not certify(F, hidden).injective or found < energy_by_hand(V, F, hidden)
 
 
@@ -77,7 +76,7 @@ def test_a_hole_is_turned_and_the_outside_follows():
     inner = min(boundary_loops(F, len(V)), key=len)
     turned = V[inner] @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + 3
     result = solved(V, F, inner, turned)
-    # All of it turns as a rigid body: nothing else is held.
+    # The whole surface rotates as a rigid body, because nothing else is fixed.
     assert result.history[-1].energy < 1e-9
     assert np.allclose(result.uv, V @ [[0, 1], [-1, 0]] + 3, atol=1e-4)
 
@@ -88,7 +87,7 @@ def test_vertices_that_must_pass_each_other():
     solved(V, F, fixed, np.random.default_rng(0).permutation(V[fixed]))
 
 
-def test_any_number_from_one_to_all():
+def test_any_number_of_pins_from_one_to_all():
     V, F = disk(5)
     solved(V, F, [7], [[3.0, -1.0]])
     solved(V, F, [7, 60], [[0.0, 0.0], [0.0, 2.0]])
@@ -97,22 +96,22 @@ def test_any_number_from_one_to_all():
     assert np.array_equal(result.uv, 2 * V)
 
 
-def test_a_boundary_that_is_held_is_met_inside_out():
+def test_a_boundary_fixed_inside_out_is_reached():
     V, F = disk(6)
     loop = boundary_loops(F, len(V))[0][:18]
     solved(V, F, loop, V[loop] * [1, -1])
 
 
 @pytest.mark.parametrize("scale", [1e150, 1e-150])
-def test_any_unit_will_do(scale):
+def test_the_unit_of_length_does_not_matter(scale):
     V, F = disk(5)
     fixed, target = np.array([1, 50, 60]), np.array([[0.0, 0], [1, 0], [2, 0.3]])
     ordinary = solved(V, F, fixed, target)
     other = solved(scale * V, F, fixed, scale * target)
     assert np.allclose(other.uv / scale, ordinary.uv, rtol=0, atol=1e-6)
-    # Where pins are so far apart, or so near, that no double has the energy, it is lowered all the same.
+    # If pins are so far apart or so close that the energy overflows, it is still lowered.
     far = solved(V, F, fixed, scale * target)
-    energies = [step.energy for step in far.history[-far.stages[-1].iterations - 1 :]]
+    energies = [step.energy for step in far.history[-far.stages[-1].n_iterations - 1 :]]
     assert np.isfinite(energies).all()
     assert energies[-1] < 0.99 * energies[0]
 
@@ -125,7 +124,7 @@ def test_is_deterministic():
     assert np.array_equal(first.uv, second.uv)
 
 
-def test_distortion_is_that_asked_for():
+def test_the_requested_energy_is_minimised():
     V, F = cat(8)
     fixed, target = np.array([5, 100, 150]), np.array([[0.0, 0], [1, 0], [0.5, 1.5]])
     plain = solved(V, F, fixed, target)
@@ -134,7 +133,7 @@ def test_distortion_is_that_asked_for():
     assert not np.allclose(angles.uv, plain.uv, atol=1e-3)
     assert not np.allclose(weighted.uv, plain.uv, atol=1e-3)
     for result in (plain, angles, weighted):
-        energies = [step.energy for step in result.history[-result.stages[-1].iterations - 1 :]]
+        energies = [step.energy for step in result.history[-result.stages[-1].n_iterations - 1 :]]
         assert energies[-1] <= energies[0]
 
 
@@ -147,7 +146,7 @@ def impossible(V, F, fixed, target):
     return result.diagnosis.obstructions
 
 
-def test_what_is_impossible_is_named():
+def test_impossible_problems_are_named():
     V, F = disk(6)
     (shared,) = impossible(V, F, [3, 40], [[0.0, 0], [0, 0]])
     assert shared.kind is Kind.PIN
@@ -167,7 +166,7 @@ def test_what_is_impossible_is_named():
     assert within.vertices.tolist() == [80, *F[5]]
 
 
-def test_a_boundary_held_the_wrong_way_round_is_named():
+def test_a_boundary_fixed_with_the_wrong_orientation_is_named():
     V, F = disk(6)
     loop = boundary_loops(F, len(V))[0]
     (patch,) = impossible(V, F, loop, V[loop] * [1, -1])
@@ -175,8 +174,8 @@ def test_a_boundary_held_the_wrong_way_round_is_named():
 
 
 @pytest.mark.parametrize(("twist", "possible"), [(0.3, True), (1.0, True), (1.3, False)])
-def test_a_vertex_that_finds_no_place_among_the_pins_around_it_is_named(twist, possible):
-    # The ring around the middle becomes a star whose three arms bend, up to where no point sees all of it.
+def test_a_vertex_without_a_position_among_surrounding_pins_is_named(twist, possible):
+    # The ring around the centre becomes a star with three bent arms, until no point sees all of it.
     V, F = disk(3)
     ring = np.arange(1, 7)
     ring = ring[np.argsort(np.arctan2(V[ring, 1], V[ring, 0]))]
@@ -191,7 +190,7 @@ def test_a_vertex_that_finds_no_place_among_the_pins_around_it_is_named(twist, p
         assert blind.vertices[0] == 0
 
 
-def test_pins_of_a_map_are_never_called_impossible():
+def test_pins_of_an_existing_map_are_never_called_impossible():
     rng = np.random.default_rng(5)
     for seed in range(10):
         V, F = random_delaunay(120, seed)
@@ -199,7 +198,7 @@ def test_pins_of_a_map_are_never_called_impossible():
         assert not pin_obstructions(F, len(V), edges(F, len(V)), fixed, V[fixed]).obstructions
 
 
-def test_malformed_input_is_refused():
+def test_malformed_input_is_rejected():
     V, F = disk(3)
     for fixed, target, message in (
         ([], np.zeros((0, 2)), "fixed has no vertex"),
@@ -217,7 +216,7 @@ def test_malformed_input_is_refused():
 
 
 @pytest.mark.parametrize("at", [1, 5, 40])
-def test_ctrl_c_gives_the_best_map_so_far(at):
+def test_ctrl_c_returns_the_best_map_so_far(at):
     V, F = cat(12)
     fixed = np.arange(0, len(V), 5)
     target = swirled(flatten(V, F).uv, 3.0)[fixed]
@@ -244,13 +243,13 @@ def test_ctrl_c_gives_the_best_map_so_far(at):
         (Status.IMPOSSIBLE, Status.IMPOSSIBLE),
     ],
 )
-def test_a_map_that_overlaps_itself_has_the_status_of_its_search_where_that_says_more(ended, told):
+def test_a_map_that_overlaps_itself_has_the_more_specific_status(ended, told):
     V, F = grid(40, 2)
     z = (1 + V[:, 1]) * np.exp(-2.4j * np.pi * V[:, 0])
     uv = np.stack([z.real, z.imag], axis=1)
-    settings = Settings(SymmetricDirichlet(), "symmetric-dirichlet", 1e-4, 10, "auto", None, 0)
+    settings = Settings("symmetric-dirichlet", 1e-4, 10, "auto", None, 0)
     piece = Piece(V, F)
-    run = Pinned(piece, np.array([5]), np.ldexp(uv[5:6], piece.exponent), settings, None)
+    run = PinSearch(piece, np.array([5]), np.ldexp(uv[5:6], piece.exponent), settings, None)
     run.keep(uv)
     run.status = ended
     result = run.result()
@@ -260,8 +259,8 @@ def test_a_map_that_overlaps_itself_has_the_status_of_its_search_where_that_says
 
 
 @pytest.mark.slow
-def test_what_other_air_does_not_help_is_started_anew():
-    # Three pins of 250 vertices, two of them next to each other on the rim, which have to change sides.
+def test_if_another_scaffold_does_not_help_the_search_restarts():
+    # Three pins of 250 vertices, two of them next to each other on the boundary, which must swap sides.
     rng = np.random.default_rng(3)
     V, F = random_delaunay(int(rng.integers(40, 300)), 3)
     count = int(rng.integers(2, 25))
@@ -274,13 +273,13 @@ def test_least_squares_of_a_similarity():
     uv = rng.normal(size=(20, 2))
     turn = 3 * np.array([[np.cos(1), np.sin(1)], [-np.sin(1), np.cos(1)]])
     fixed = np.array([3, 5, 11])
-    assert np.allclose(moved_onto(uv, fixed, (uv @ turn + 7)[fixed]), uv @ turn + 7)
-    # Of one vertex, a translation; of vertices that are to meet in a point, no scaling to nothing.
-    assert np.allclose(moved_onto(uv, fixed[:1], np.array([[1.0, 2.0]])), uv - uv[3] + (1, 2))
-    assert np.allclose(moved_onto(uv, fixed, np.ones((3, 2))), uv - uv[fixed].mean(0) + 1)
+    assert np.allclose(move_onto_pins(uv, fixed, (uv @ turn + 7)[fixed]), uv @ turn + 7)
+    # For one vertex, a translation; for vertices that share a target, no scaling to zero.
+    assert np.allclose(move_onto_pins(uv, fixed[:1], np.array([[1.0, 2.0]])), uv - uv[3] + (1, 2))
+    assert np.allclose(move_onto_pins(uv, fixed, np.ones((3, 2))), uv - uv[fixed].mean(0) + 1)
 
 
-def test_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
+def test_the_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import pin_problems
     import pins
@@ -300,7 +299,7 @@ def test_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
     assert pins.main(["-n", "3", "-o", str(results)]) == 0
     lines = results.read_text().splitlines()
     assert len(lines) == 3
-    # What is there is not done again, and a torn line is.
+    # Finished problems are not repeated, nor is an incomplete line read.
     results.write_text("\n".join(lines[:2]) + "\n" + lines[2][:30])
     assert pins.main(["-n", "3", "-o", str(results)]) == 0
     assert len(pins.read(results)) == 3

@@ -1,4 +1,4 @@
-"""V₁ … V₄ against the paper's matrices, against differences, and against its theorems."""
+"""V₁ … V₄ against the paper's matrices, differences and theorems."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MESHES = surfaces()
 IDS = [name for name, _, _ in MESHES]
 NAMES = list(FUNCTIONALS)
 SIGHTED = [name for name in NAMES if FUNCTIONALS[name].sees_positions]
-# V₁ … V₄ in the paper's dense matrices: of the map w, its residual, L, its pseudo-inverse, D and the Neumann data g.
+# V₁ … V₄ by the paper's dense matrices, from the map w, its residual, L, its pseudo-inverse, D and the Neumann data g.
 PAPER = {
     "neumann": lambda w, residual, L, pinv, D, g: np.vdot(residual, residual).real / 2,
     "sobolev": lambda w, residual, L, pinv, D, g: (residual.conj() @ pinv @ residual).real / 2,
@@ -33,7 +33,7 @@ PAPER = {
 
 
 def posed(V, F, pins=0, noise=0.0, seed=0):
-    """Boundary (and pins) where `bend` puts them, disturbed by some noise."""
+    """Place the boundary (and pins) by `bend`, with some noise."""
     boundary = boundary_of(F)
     rng = np.random.default_rng(seed)
     inner = np.setdiff1d(np.arange(len(V)), boundary)
@@ -43,21 +43,21 @@ def posed(V, F, pins=0, noise=0.0, seed=0):
 
 
 def matrices(problem, iterate, reference="equilateral"):
-    """L, D, pseudo-inverse and Neumann data of an iterate, dense, by the paper's definitions."""
+    """Return dense L, D, pseudo-inverse and Neumann data of an iterate, by the paper's definitions."""
     op = operators(problem.V, problem.F, reference)
     L = op.laplacian(iterate.field.entries().T).toarray()
     return L, op.D.toarray(), np.linalg.pinv(L, hermitian=True)
 
 
 def inverse_field(mesh, w):
-    """The μ of eq. 39 for an injective map: 𝒜 = det J (JᵀJ)⁻¹ is the tensor whose μ is q/p."""
+    """Return the μ of eq. 39 for an injective map: 𝒜 = det J (JᵀJ)⁻¹ is the tensor whose μ is q/p."""
     p, q, _ = mesh.derivatives(w)
     return q / p
 
 
 @pytest.mark.parametrize(("name", "V", "F"), MESHES, ids=IDS)
 class TestValues:
-    def test_are_the_papers(self, name, V, F):
+    def test_agree_with_the_papers_formulas(self, name, V, F):
         problem = posed(V, F, noise=0.05)
         for functional, formula in PAPER.items():
             iterate = Objective(problem, functional).evaluate(random_xi(F))
@@ -81,7 +81,10 @@ class TestValues:
         assert v4.value >= -v3.value
 
     def test_dirichlet_to_neumann_and_back(self, name, V, F):
-        """Eq. 13, 14, 28: the flux of the map is S(A) b; S(A)† is RᵀL†R on data without constants; V₃ its weak form."""
+        """Eq. 13, 14, 28: the flux of the map is S(A) b.
+
+        S(A)† is RᵀL†R on data without constants, and V₃ is its weak form.
+        """
         problem = posed(V, F, noise=0.05)
         at = Objective(problem).evaluate(random_xi(F))
         L, D, pinv = matrices(problem, at)
@@ -92,7 +95,7 @@ class TestValues:
         np.testing.assert_allclose(R.T @ at.operator.flux(at.w), dtn @ b, atol=1e-10)
         area = at.w.real @ D @ at.w.imag
         assert at.value == pytest.approx((b.conj() @ dtn @ b).real / 2 - area, rel=1e-10)
-        # The pseudo-inverses differ in the constants alone.
+        # The pseudo-inverses differ by constants only.
         k = len(b)
         no_constant = np.eye(k) - np.full((k, k), 1 / k)
         ntd = R.T @ pinv @ R
@@ -122,15 +125,16 @@ class TestValues:
             assert np.linalg.det(np.array([[a[0], a[1]], [a[1], a[2]]]).T).min() > 1 - 1e-9
             assert energy(a) >= unsigned >= signed
         assert energy(scale * unit) > energy(unit)
-        # The least tensors for this map, at which it is tight: those of the map with inverted triangles mirrored.
+        # The smallest tensors for this map, for which the bound is tight: those of the map with mirrored inverted
+        # triangles.
         p, q, _ = problem.domain.mesh("equilateral").derivatives(w)
         mu = np.where(np.abs(q) < np.abs(p), q / p, np.conj(p / q))
         least = TANH.field(TANH.invert(mu)).entries()
         assert energy(least) == pytest.approx(unsigned, rel=1e-9)
         assert energy(0.9 * least) < unsigned
 
-    def test_areas_tell_injective_maps(self, name, V, F):
-        """Proposition C.4: unsigned and signed area are the same, and no triangle degenerates, iff all are positive."""
+    def test_equal_areas_characterise_injective_maps(self, name, V, F):
+        """Proposition C.4: signed and unsigned area are equal without degeneracy iff all triangles are positive."""
         straight = bend(V[:, :2])
         disturbed = straight + 0.2 * np.random.default_rng(3).standard_normal(straight.shape)
         collapsed = straight.copy()
@@ -155,7 +159,7 @@ class TestValues:
         assert iterate.inverted > 0
 
     def test_are_frame_and_similarity_invariant(self, name, V, F):
-        """Turning each triangle's corners turns its frame: ξ turns by twice the angle and nothing else happens."""
+        """If a triangle's corners rotate, its ξ rotates by twice the angle, and nothing else changes."""
         problem = posed(V, F, noise=0.05)
         turned = Problem(V, np.roll(F, -1, axis=1), problem.fixed, problem.target)
         # Scaling by a power of two and half a turn are exact, so the solver's frame is the same one mirrored.
@@ -163,7 +167,7 @@ class TestValues:
         xi = random_xi(F)
         for functional in NAMES:
             a = Objective(problem, functional).evaluate(xi)
-            # In an equilateral triangle the next side lies at 120°.
+            # In an equilateral triangle, the next side is rotated by 120°.
             b = Objective(turned, functional).evaluate(xi * np.exp(-2j * np.deg2rad(120)))
             c = Objective(moved, functional).evaluate(xi)
             assert b.value == pytest.approx(a.value, rel=1e-10)
@@ -194,12 +198,12 @@ def test_gradients_against_differences(functional, parameterisation, reference, 
 class TestTheorems:
     @pytest.mark.parametrize("pins", [0, 5])
     def test_completeness(self, name, V, F, pins):
-        """Theorem 6.4, Proposition B.2: any injective map is reproduced from its own A, where V₁ … V₄ vanish."""
+        """Theorem 6.4, Proposition B.2: every injective map is reproduced from its own A, where V₁ … V₄ are zero."""
         problem = posed(V, F, pins)
         uv = bend(V[:, :2])
         assert signed_areas(F, uv).min() > 0
         w = problem.frame.inward(uv)
-        # A random injective map of the mesh is not needed: every interior position is arbitrary already.
+        # Every interior position is already arbitrary, so no random injective map is needed.
         inner = np.setdiff1d(np.arange(len(V)), problem.fixed)
         w[inner] += 0.02 * np.random.default_rng(4).standard_normal((inner.size, 2)).view(complex).ravel() * 0.2
         assert signed_areas(F, problem.frame.outward(w)).min() > 0
@@ -212,7 +216,7 @@ class TestTheorems:
             assert np.abs(iterate.gradient).max() < 1e-6
 
     def test_positive_semidefinite(self, name, V, F):
-        """Proposition A.1: GᵀAG + iD ⪰ 0 for determinant 1 and above; the A of an injective map is the tight case."""
+        """Proposition A.1: GᵀAG + iD ⪰ 0 for determinants of at least 1; the A of an injective map is tight."""
         op = operators(V, F, "equilateral")
         problem = posed(V, F)
         mu = inverse_field(problem.domain.mesh("equilateral"), problem.frame.inward(bend(V[:, :2])))
@@ -225,9 +229,10 @@ class TestTheorems:
 
     @pytest.mark.parametrize("functional", SIGHTED)
     def test_a_vanishing_functional_means_an_injective_map(self, name, V, F, functional):
-        """Theorem 6.4 the other way, by descent: as V → 0 the last triangle is righted, from any of them.
+        """Converse of Theorem 6.4, by descent: as V → 0 the last inverted triangle becomes positive, for each
+        functional.
 
-        Newton finishes (its functional is V₃), and V is what the tensors found give.
+        Newton's method, whose functional is V₃, finishes the descent; V is evaluated at the tensors found.
         """
         problem = posed(V, F)
         stages = [
@@ -243,7 +248,7 @@ class TestTheorems:
         assert end.inverted == 0
 
     def test_sufficiency(self, name, V, F):
-        """Theorem 6.4 the other way: where the Neumann data do not fit, V₃ exceeds twice the inverted area."""
+        """Converse of Theorem 6.4: if the Neumann data do not fit, V₃ exceeds twice the inverted area."""
         problem = posed(V, F, noise=0.2)
         iterate = Objective(problem).evaluate(random_xi(F))
         inverted = -iterate.dw.area[iterate.dw.area < 0].sum()
@@ -251,7 +256,7 @@ class TestTheorems:
         assert iterate.value >= 2 * inverted
 
     def test_v1_and_v2_vanish_only_where_v3_does(self, name, V, F):
-        """With r = Lw − g, V₃ = ½ wᴴr at the held vertices: bounded by the norm of r in which V₁ and V₂ are."""
+        """With r = Lw − g, V₃ = ½ wᴴr at the fixed vertices. It is bounded by the norm of r that V₁ and V₂ use."""
         problem = posed(V, F, noise=0.2)
         at = Objective(problem).evaluate(random_xi(F))
         v1, v2 = (Objective(problem, functional).evaluate(at.xi).value for functional in ("neumann", "sobolev"))
@@ -265,8 +270,8 @@ class TestTheorems:
 def test_v4_can_be_negative():
     """The paper's V₄ ≥ 0 (§7.3.4, Proposition E.1) does not hold in linear elements.
 
-    There V₄ = V₃ on a disk. Linear elements raise a Dirichlet energy and lower its dual, so on a coarse
-    mesh with a rough tensor V₄ drops below zero. V₂ = V₃ + V₄ ≥ 0 still bounds it from below.
+    There V₄ = V₃ on a disk. Linear elements raise a Dirichlet energy and lower its dual, so on a coarse mesh with a
+    rough tensor V₄ is negative. V₂ = V₃ + V₄ ≥ 0 still bounds it from below.
     """
     V, F = random_delaunay(150, seed=3)
     problem = posed(V, F, noise=0.05)
@@ -279,7 +284,7 @@ def test_v4_vanishes_at_a_map_with_inverted_triangles():
     (loop,) = boundary_loops(F, len(V))
     turn = np.angle(V[loop] @ (1, 1j))
     problem = Problem(V, F, loop, (1 + 0.7 * np.cos(5 * turn))[:, None] * V[loop])
-    # An injective map exists, as the propositions ask.
+    # An injective map exists, as the propositions require.
     assert solve(problem).injective
 
     poisson, rough = Objective(problem, "poisson"), random_xi(F, 1.5)
@@ -288,12 +293,12 @@ def test_v4_vanishes_at_a_map_with_inverted_triangles():
     assert abs(at.value) < 1e-12 * area
     assert at.dirichlet > 0.5 * area
     assert np.count_nonzero(signed_areas(F, problem.frame.outward(at.w)) < 0) > 50
-    # It lies lower still farther on, so zero is no minimum either.
+    # The functional decreases further along this line, so zero is no minimum either.
     assert poisson.evaluate(rough).value < -0.1 * area
 
 
 def edge_matrices(problem, field):
-    """Crouzeix–Raviart elements by their definition: Laplacian, Neumann data and middles of edges, dense."""
+    """Crouzeix–Raviart elements by their definition: Laplacian, Neumann data and edge midpoints, dense."""
     V, F = problem.V, problem.F
     pairs = np.sort(np.concatenate([F[:, (1, 2)], F[:, (2, 0)], F[:, (0, 1)]]), axis=1)
     ends, number = np.unique(pairs, axis=0, return_inverse=True)
@@ -305,11 +310,11 @@ def edge_matrices(problem, field):
     for corners, edges_of, (a11, a12, a22), (e1, _) in zip(
         F, number, field.entries().T, V[F][:, 1:] - V[F][:, :1], strict=True
     ):
-        # The frame in which a triangle's tensor is written has its first side along x.
+        # The first side of each triangle is along x in the frame of its tensor.
         x = e1 / np.hypot(*e1)
         frame = np.stack([x, [-x[1], x[0]]])
         A = frame.T @ [[a11, a12], [a12, a22]] @ frame
-        # The functions that are 1 at one middle and 0 at the other two.
+        # The functions that are 1 at one midpoint and 0 at the other two.
         grad = np.linalg.inv(np.column_stack([np.ones(3), middles[edges_of]]))[1:]
         (bx, by), (cx, cy) = V[corners[1]] - V[corners[0]], V[corners[2]] - V[corners[0]]
         L[np.ix_(edges_of, edges_of)] += 0.5 * (bx * cy - by * cx) * grad.T @ A @ grad
@@ -319,10 +324,10 @@ def edge_matrices(problem, field):
 
 
 class TestEdgePoisson:
-    """V₄ in Crouzeix–Raviart elements, where what the paper says of it holds, and what it then is."""
+    """V₄ in Crouzeix–Raviart elements, for which the paper's statements hold, and its value there."""
 
     @pytest.mark.parametrize("mesh", [0, 2, 4], ids=["disk", "annulus", "random annulus"])
-    def test_is_v4_by_the_elements_definition(self, mesh):
+    def test_agrees_with_the_elements_definition(self, mesh):
         _, V, F = MESHES[mesh]
         boundary = boundary_of(F)
         target = bend(V[boundary]) + 0.05 * np.random.default_rng(0).standard_normal((len(boundary), 2))
@@ -335,9 +340,9 @@ class TestEdgePoisson:
     @pytest.mark.parametrize("pins", [0, 5])
     @pytest.mark.parametrize("mesh", [0, 1], ids=["disk", "bowl"])
     @pytest.mark.parametrize("reference", ["equilateral", "rest"])
-    # At twice that the determinants of the rounded tensors differ from 1 in the sixth digit.
+    # At twice that, the determinants of the rounded tensors differ from 1 in the sixth digit.
     @pytest.mark.parametrize("scale", [0.0, 0.7, 1.0])
-    def test_is_v3_without_pins_on_a_disk(self, mesh, pins, reference, scale):
+    def test_equals_v3_without_pins_on_a_disk(self, mesh, pins, reference, scale):
         _, V, F = MESHES[mesh]
         pinned = posed(V, F, pins, noise=0.05)
         k = len(boundary_of(F))
@@ -345,21 +350,21 @@ class TestEdgePoisson:
         xi = random_xi(F, scale)
         v4 = Objective(pinned, "edge-poisson", reference=reference).evaluate(xi)
         v3 = Objective(free, "dirichlet", reference=reference).evaluate(xi)
-        # Frames take their size from the target, pins included.
+        # The frame size depends on the target including pins.
         unit = (pinned.frame.outward(np.array([1 + 0j])) - pinned.frame.outward(np.array([0j])))[0, 0]
         unit /= (free.frame.outward(np.array([1 + 0j])) - free.frame.outward(np.array([0j])))[0, 0]
         assert v4.value * unit**2 == pytest.approx(v3.value, rel=1e-8)
         np.testing.assert_allclose(v4.gradient * unit**2, v3.gradient, atol=1e-7 * np.abs(v3.gradient).max())
 
     @pytest.mark.parametrize("mesh", [2, 4], ids=["annulus", "random annulus"])
-    def test_is_v3_with_inner_loops_carried_to_where_it_is_least(self, mesh):
+    def test_equals_v3_with_inner_loops_at_their_best_position(self, mesh):
         _, V, F = MESHES[mesh]
         problem, xi = posed(V, F, noise=0.05), random_xi(F)
         at = Objective(problem).evaluate(xi)
         L, _, _ = matrices(problem, at)
         inner = np.sort(min(problem.domain.loops, key=len))
         assert not np.isin(inner, max(problem.domain.loops, key=len)).any()
-        # The response of the map to carrying the inner loop by one, and so the best place for it.
+        # The response of the map to a unit translation of the inner loop gives its best position.
         carried, fixed = np.zeros(problem.n), problem.fixed
         carried[inner] = 1
         free = np.setdiff1d(np.arange(problem.n), fixed)
@@ -368,7 +373,7 @@ class TestEdgePoisson:
         assert gain > 1e-3
         assert Objective(problem, "edge-poisson").evaluate(xi).value == pytest.approx(at.value - gain, rel=1e-9)
 
-    def test_descends_to_an_injective_map_where_linear_elements_do_not(self):
+    def test_descends_to_an_injective_map_where_linear_elements_fail(self):
         V, F = disk(10)
         (loop,) = boundary_loops(F, len(V))
         turn = np.angle(V[loop] @ (1, 1j))
@@ -378,15 +383,15 @@ class TestEdgePoisson:
             for name in ("dirichlet", "edge-poisson", "poisson")
         }
         assert found["edge-poisson"].injective
-        # On V₃'s very path.
-        assert found["edge-poisson"].iterations == found["dirichlet"].iterations
+        # It follows exactly the path of V₃.
+        assert found["edge-poisson"].n_iterations == found["dirichlet"].n_iterations
         np.testing.assert_allclose(found["edge-poisson"].uv, found["dirichlet"].uv, atol=1e-6)
         assert not found["poisson"].injective
 
 
 class TestPoissonIsBlind:
-    def test_to_a_loop_moved_against_the_others(self):
-        """V₄ sees C b only: an inner loop carried right out of the outer one changes nothing."""
+    def test_to_a_translation_of_an_inner_loop(self):
+        """V₄ depends on C b only: moving an inner loop out of the outer one changes nothing."""
         V, F = annulus(8)
         boundary = boundary_of(F)
         target = V[boundary].copy()
@@ -417,7 +422,7 @@ class TestPoissonIsBlind:
 
 
 class TestSettings:
-    def test_a_functional_in_the_table_is_one_to_descend(self, monkeypatch):
+    def test_every_functional_of_the_table_can_be_descended(self, monkeypatch):
         class Logarithm(FUNCTIONALS["dirichlet"]):
             def value(self, at):
                 return float(np.log1p(at.dirichlet))
@@ -437,13 +442,13 @@ class TestSettings:
 
     @pytest.mark.parametrize("setting", ["functional", "parameterisation", "reference"])
     @pytest.mark.parametrize("word", ["v3", None, ["tanh"]])
-    def test_others_are_refused(self, setting, word):
+    def test_other_names_are_rejected(self, setting, word):
         with pytest.raises(ValueError, match=f"{setting} must be one of "):
             LBFGS(**{setting: word})
 
 
 def test_maps_at_their_own_tensors():
-    """Each triangle's V₃ there is twice its area where it is inverted and nothing where it is not."""
+    """There, V₃ of each triangle is twice its area if it is inverted, and zero otherwise."""
     V, F = random_delaunay(80, seed=2)
     mesh = ReferenceMesh(V, F, "equilateral")
     w = V[:, 0] + 1j * V[:, 1]

@@ -18,7 +18,7 @@ from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.tensor import TANH
-from quasiharmonic.solver.search.solving import quasi_harmonic_map
+from quasiharmonic.solver.mapping import quasi_harmonic_map
 from quasiharmonic.surfaces import random_delaunay
 from shared.meshes import bend, boundary_of, lift, random_xi, signed_areas, surfaces
 
@@ -28,7 +28,7 @@ IDS = [name for name, _, _ in MESHES]
 
 
 def random_pair(rng, count, real=False):
-    """Pairs all over |μ| + |ν| < 1."""
+    """Random pairs in |μ| + |ν| < 1."""
     total, share = np.sqrt(rng.random(count)) * 0.98, rng.random(count)
     turn = np.exp(2j * np.pi * rng.random((2, count)))
     nu = total * (1 - share) * (np.sign(turn[1].real) if real else turn[1])
@@ -36,20 +36,20 @@ def random_pair(rng, count, real=False):
 
 
 def random_tensor(rng, count, symmetric=False):
-    """Elliptic matrices, from no formula of the module."""
+    """Random elliptic matrices, independent of the module's formulas."""
     B = rng.standard_normal((count, 2, 2))
     A = B @ np.swapaxes(B, 1, 2) + 0.05 * np.eye(2)
     return A if symmetric else A + rng.standard_normal(count)[:, None, None] * STAR
 
 
 def wirtinger(J):
-    """f_z and f_z̄ from rows ∇u and ∇v."""
+    """Return f_z and f_z̄ from rows ∇u and ∇v."""
     (ux, uy), (vx, vy) = np.moveaxis(J, 0, -1)
     return 0.5 * (ux + vy + 1j * (vx - uy)), 0.5 * (ux - vy + 1j * (vx + uy))
 
 
 def admitted_pair(problem, w, rng, complex_nu=True):
-    """On every triangle of a positive map a random pair whose Beltrami equation the map satisfies."""
+    """Return, for every triangle of a positive map, a random pair whose Beltrami equation the map satisfies."""
     p, q, _ = ReferenceMesh(problem.V, problem.F, "rest").derivatives(w)
     nu = 0.49 * (1 - np.abs(q / p)) * np.sqrt(rng.random(p.size))
     nu = nu * (np.exp(2j * np.pi * rng.random(p.size)) if complex_nu else rng.choice([-1, 1], p.size))
@@ -57,7 +57,7 @@ def admitted_pair(problem, w, rng, complex_nu=True):
 
 
 def bent(V, F, rng):
-    """A problem whose solution is known: `bend` with its interior disturbed, still positive."""
+    """A problem with a known solution: `bend` with a perturbed interior, still positive."""
     fixed = boundary_of(F)
     uv, length = bend(V[:, :2]), 0.3 / np.sqrt(len(F))
     noise = length * rng.uniform(-1, 1, uv.shape)
@@ -87,7 +87,7 @@ class TestTensor:
         ) / (np.abs(1 + nu) ** 2 - np.abs(mu) ** 2)
         A = beltrami_tensor(mu, nu)
         np.testing.assert_allclose((A + np.swapaxes(A, 1, 2)) / 2, np.moveaxis(printed, 2, 0), rtol=1e-12)
-        # Its own pair is another one, so it does not stand for the Beltrami equation of (μ, ν).
+        # Its own pair is different, so it does not represent the Beltrami equation of (μ, ν).
         assert np.max(np.abs(beltrami_pair(np.moveaxis(printed, 2, 0))[1] - nu)) > 0.1
 
     @pytest.mark.parametrize("real", [True, False])
@@ -113,7 +113,7 @@ class TestTensor:
         np.testing.assert_allclose(values[:, 1], (1 + k - nu) / (1 - k + nu), rtol=1e-9)
         assert np.all(values > 0)
 
-    def test_unit_determinant_is_nu_zero_is_eq_33(self, rng):
+    def test_unit_determinant_and_zero_nu_give_eq_33(self, rng):
         field = TANH.field(random_xi(np.zeros(200)))
         A = beltrami_tensor(field.mu, 0)
         np.testing.assert_allclose(np.linalg.det(A), 1, rtol=1e-10)
@@ -123,7 +123,7 @@ class TestTensor:
         np.testing.assert_allclose(beltrami_pair(unit)[1], 0, atol=1e-13)
         assert np.all(np.sign(np.linalg.det(beltrami_tensor(0.2j, [0.3, -0.3])) - 1) == (-1, 1))
 
-    def test_turns_with_the_frame(self, rng):
+    def test_rotates_with_the_frame(self, rng):
         mu, nu = random_pair(rng, 50)
         c, s = np.cos(0.7), np.sin(0.7)
         Q = np.array([[c, -s], [s, c]])
@@ -131,7 +131,7 @@ class TestTensor:
             beltrami_tensor(mu * np.exp(-1.4j), nu), Q.T @ beltrami_tensor(mu, nu) @ Q, rtol=1e-9, atol=1e-9
         )
 
-    def test_refuses_what_is_not_elliptic(self):
+    def test_rejects_tensors_that_are_not_elliptic(self):
         with pytest.raises(ValueError, match="entry 1"):
             beltrami_tensor([0.5, 0.5, 0.1], [0.1, 0.5, 0.1])
         with pytest.raises(ValueError, match="below 1"):
@@ -148,7 +148,7 @@ class TestConjugate:
         mu, nu = random_pair(rng, 100)
         np.testing.assert_allclose(beltrami_pair(conjugate_tensor(beltrami_tensor(mu, nu))), (mu, -nu), atol=1e-12)
 
-    def test_is_itself_exactly_at_unit_determinant(self, rng):
+    def test_is_equal_to_the_map_exactly_at_unit_determinant(self, rng):
         A = random_tensor(rng, 100, symmetric=True)
         apart = np.abs(conjugate_tensor(A) - A).max(axis=(1, 2))
         assert np.all((apart > 1e-9) == (np.abs(np.linalg.det(A) - 1) > 1e-9))
@@ -160,7 +160,7 @@ class TestConjugate:
 class TestMap:
     @pytest.mark.parametrize("complex_nu", [False, True])
     def test_reproduces_every_positive_map_from_every_pair_it_admits(self, name, V, F, rng, complex_nu):
-        """Proposition B.2 beyond det A = 1, Neumann data included."""
+        """Proposition B.2 for any det A, including Neumann data."""
         problem, uv = bent(V, F, rng)
         w = uv.view(complex).ravel()
         mu, nu = admitted_pair(problem, w, rng, complex_nu)
@@ -171,11 +171,11 @@ class TestMap:
         D = operators(V, F).D
         np.testing.assert_allclose(self.flux(problem, A, uv[:, 0]), D @ uv[:, 1], atol=1e-12)
         np.testing.assert_allclose(self.flux(problem, conjugate_tensor(A), uv[:, 1]), -D @ uv[:, 0], atol=1e-12)
-        # The same tensor for both coordinates is another map: Definition 8.1 is not Definition 4.1.
+        # The same tensor for both coordinates gives another map: Definition 8.1 differs from Definition 4.1.
         same = conjugate_quasi_harmonic_map(problem, conjugate_tensor(A))
         assert np.abs(same[:, 0] - uv[:, 0]).max() > 1e-3
 
-    def test_is_the_solvers_where_nu_is_zero(self, name, V, F, rng):
+    def test_is_the_solvers_if_nu_is_zero(self, name, V, F, rng):
         problem, _ = bent(V, F, rng)
         xi = random_xi(F)
         problem = Problem(V, F, problem.fixed, problem.target, reference="equilateral")
@@ -183,7 +183,7 @@ class TestMap:
         np.testing.assert_allclose(found, quasi_harmonic_map(problem, TANH.field(xi).mu), atol=1e-10)
 
     def test_sandwich(self, name, V, F, rng):
-        """Eq. 42 for conjugate pairs: ½(uᵀLu + vᵀL̄v) ≥ unsigned area, equal where the Beltrami equation holds."""
+        """Eq. 42 for conjugate pairs: ½(uᵀLu + vᵀL̄v) ≥ unsigned area, with equality if the Beltrami equation holds."""
         problem, uv = bent(V, F, rng)
         A = beltrami_tensor(*admitted_pair(problem, uv.view(complex).ravel(), rng))
         assert self.energy(problem, A, uv) == pytest.approx(0.5 * signed_areas(F, uv).sum(), rel=1e-12)
@@ -205,7 +205,7 @@ class TestMap:
 
 
 def test_beltrami_equation_holds_for_affine_maps_of_constant_pairs(rng):
-    """One pair for the whole plane: the map a z + (μ a + ν ā) z̄, A brought into each triangle's frame."""
+    """One pair for the whole plane: the map a z + (μ a + ν ā) z̄, with A in the frame of each triangle."""
     V, F = random_delaunay(120, seed=2)
     problem_fixed = boundary_of(F)
     edge = V[F[:, 1]] - V[F[:, 0]]
@@ -235,19 +235,19 @@ class TestBoundaryCondition:
         size = np.linalg.norm(image, axis=1)
         n_hat = np.stack([image[:, 1], -image[:, 0]], axis=1) / size[:, None]
         derivative = conormal_derivative(A, J, n)
-        # The definition, one gradient at a time.
+        # The definition, for one gradient at a time.
         np.testing.assert_allclose(derivative[:, 0], np.einsum("fi,fij,fj->f", n, A, J[:, 0]), atol=1e-12)
         np.testing.assert_allclose(derivative[:, 1], np.einsum("fi,fij,fj->f", n, A, J[:, 1]), atol=1e-12)
         symmetric = (A + np.swapaxes(A, 1, 2)) / 2
         s = np.einsum("fi,fi->f", n_hat, conormal_derivative(symmetric, J, n))
         weight = np.einsum("fi,fij,fj->f", n, A, n)
         np.testing.assert_allclose(np.linalg.det(J), s * size / weight, rtol=1e-9, atol=1e-9)
-        # An antisymmetric part adds a tangential derivative only.
+        # An antisymmetric part only adds a tangential derivative.
         np.testing.assert_allclose(np.einsum("fi,fi->f", n_hat, derivative), s, atol=1e-9)
 
     @pytest.mark.parametrize(("name", "V", "F"), MESHES, ids=IDS)
     @pytest.mark.parametrize("reference", ["rest", "equilateral"])
-    def test_s_is_positive_on_edges_exactly_where_their_triangles_are(self, name, V, F, reference, rng):
+    def test_s_is_positive_on_exactly_those_edges_whose_triangles_are_positive(self, name, V, F, reference, rng):
         problem, uv = bent(V, F, rng)
         uv = uv + 0.25 * rng.standard_normal(uv.shape)
         A = random_tensor(rng, len(F))
@@ -260,7 +260,7 @@ class TestBoundaryCondition:
         np.testing.assert_array_equal(found.s > 0, beside > 0)
 
     @pytest.mark.parametrize(("name", "V", "F"), MESHES, ids=IDS)
-    def test_own_tensor_meets_eq_9_and_any_multiple_meets_eq_8(self, name, V, F, rng):
+    def test_own_tensor_satisfies_eq_9_and_any_multiple_satisfies_eq_8(self, name, V, F, rng):
         problem, uv = bent(V, F, rng)
         p, q, _ = ReferenceMesh(problem.V, problem.F, "rest").derivatives(uv.view(complex).ravel())
         A = beltrami_tensor(q / p, 0)
@@ -279,8 +279,10 @@ class TestBoundaryCondition:
         np.testing.assert_allclose(vertex_conormal(problem, 3 * A, uv).misalignment, 0, atol=1e-9)
 
     def test_positive_s_does_not_make_a_linear_map_positive(self):
-        """Why the solver asks for eq. 17 and not for a sign: rough tensors of unit determinant invert triangles
-        inside with s > 0 on every edge, and at the boundary with s > 0 at every vertex.
+        """The reason why the solver requires eq. 17 instead of a sign.
+
+        Rough tensors of unit determinant invert interior triangles although s > 0 on every edge, and boundary triangles
+        although s > 0 at every vertex.
         """
         V, F = random_delaunay(150, seed=1)
         fixed = boundary_of(F)
@@ -295,7 +297,7 @@ class TestBoundaryCondition:
         assert (True, False) in found
         assert (False, True) in found
 
-    def test_a_collapsed_edge_has_no_s(self):
+    def test_s_is_not_defined_on_a_collapsed_edge(self):
         V, F = random_delaunay(60, seed=1)
         fixed = boundary_of(F)
         target = V[fixed].copy()
@@ -307,7 +309,7 @@ class TestBoundaryCondition:
         assert np.all(np.isfinite(found.misalignment))
 
 
-def test_refuses_tensors_of_another_shape_or_not_elliptic():
+def test_rejects_tensors_of_another_shape_or_not_elliptic():
     V, F = random_delaunay(40)
     fixed = boundary_of(F)
     problem = Problem(lift(V), F, fixed, V[fixed])
@@ -319,6 +321,6 @@ def test_refuses_tensors_of_another_shape_or_not_elliptic():
         edge_conormal(problem, A, V)
 
 
-def test_no_free_vertex_is_a_map_too():
+def test_without_free_vertices():
     problem = Problem(np.eye(3), [[0, 1, 2]], [0, 1, 2], [[0, 0], [1, 0], [0, 1]])
     np.testing.assert_array_equal(conjugate_quasi_harmonic_map(problem, [np.eye(2)]), problem.target)

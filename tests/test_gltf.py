@@ -1,4 +1,4 @@
-"""glTF: what others wrote is read, what is written others read, and nothing but the map changes."""
+"""glTF: files of other programs are read, other programs read ours, and only the map changes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read(made, tmp_path, name="mesh.glb"):
 
 
 def cube():
-    """A cube as exporters have it: 24 vertices, each face an island of its own."""
+    """A cube as exporters write it: 24 vertices, and each face is an island."""
     trimesh = pytest.importorskip("trimesh", reason="an independent reader and writer of glTF")
     V = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -31,7 +31,7 @@ def cube():
     return trimesh.Trimesh(V[quads.ravel()], F, visual=visual, process=False)
 
 
-def test_a_cube_is_closed_and_its_seams_are_in_the_places(tmp_path):
+def test_a_cube_is_closed_and_its_seams_are_at_the_right_edges(tmp_path):
     there = cube()
     there.export(tmp_path / "cube.glb")
     mesh = io.read_mesh(tmp_path / "cube.glb")
@@ -42,7 +42,7 @@ def test_a_cube_is_closed_and_its_seams_are_in_the_places(tmp_path):
     assert b"usemtl paint\n" in mesh.statements
 
 
-def test_another_library_reads_what_is_written(tmp_path):
+def test_another_library_reads_written_files(tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="an independent reader and writer of glTF")
     V, F = cat(8)
     rng = np.random.default_rng(5)
@@ -92,8 +92,8 @@ def test_only_the_map_changes(tmp_path):
     assert "JOINTS_0 of vertices" in io.not_held("out.ply", mesh)
 
 
-def test_what_others_refer_to_stays(tmp_path):
-    """Two sets of coordinates by one accessor, and two meshes by the same: only what is the map's changes."""
+def test_shared_data_does_not_change(tmp_path):
+    """Two sets of coordinates by one accessor, and two meshes by one accessor: only the map's data changes."""
     made = square(TEXCOORD_0=SQUARE[:, :2])
     first = made.tree["meshes"][0]["primitives"][0]
     first["attributes"]["TEXCOORD_1"] = shared = first["attributes"]["TEXCOORD_0"]
@@ -110,7 +110,7 @@ def test_what_others_refer_to_stays(tmp_path):
         )
 
 
-def test_vertices_are_split_along_seams_with_all_that_they_have(tmp_path):
+def test_vertices_are_split_along_seams_with_all_attributes(tmp_path):
     colours = np.arange(12, dtype="u1").reshape(4, 3) * 10
     made = square(TEXCOORD_0=SQUARE[:, :2], COLOR_0=colours)
     primitive = made.tree["meshes"][0]["primitives"][0]
@@ -136,8 +136,8 @@ def test_vertices_are_split_along_seams_with_all_that_they_have(tmp_path):
     assert len(io.seamed(again).islands) == 2
 
 
-def test_forms_of_numbers(tmp_path):
-    """Integers that mean shares, rows with gaps, numbers of which few are given, lists without indices."""
+def test_number_formats(tmp_path):
+    """Normalised integers, strides, sparse accessors, and primitives without indices."""
     made = Gltf()
     places = np.array([[0, 0], [65535, 0], [65535, 65535]], dtype="u2")
     rows = np.zeros((3, 5), dtype="f4")
@@ -162,7 +162,7 @@ def test_forms_of_numbers(tmp_path):
     np.testing.assert_array_equal(mesh.F, [[0, 1, 2]])
     np.testing.assert_array_equal(mesh.vt, [[0, 1], [1, 1], [1, 0]])
     assert mesh.normals == b"vn 0.0 0.0 0.0\nvn 0.0 0.0 0.0\nvn 0.0 0.0 1.0\n"
-    # Written, they are single precision, and still where they were.
+    # Written in single precision, they are still at the same positions.
     io.write_map(tmp_path / "out.gltf", mesh, mesh.vt)
     again = io.read_mesh(tmp_path / "out.gltf")
     np.testing.assert_array_equal(again.vt, mesh.vt)
@@ -177,7 +177,7 @@ def test_strips_and_fans(mode, expected, tmp_path):
 
 
 def test_several_meshes_in_a_scene(tmp_path):
-    """Objects stay apart where they touch, and stand where their nodes put them."""
+    """Objects stay separate where they touch, and are placed by their nodes."""
     made = Gltf()
     shared = {"POSITION": made.accessor(SQUARE), "NORMAL": made.accessor(np.tile(np.array([[1, 0, 0]], "f4"), (4, 1)))}
     one, other = made.accessor(HALVES[0]), made.accessor(HALVES[1])
@@ -221,7 +221,7 @@ def test_a_new_file_has_materials_normals_and_colours(tmp_path):
     assert lines[again.FN].tolist() == np.array([b"vn 0.0 0.0 1.0", b"vn 0.0 1.0 0.0"])[mesh.FN].tolist()
 
 
-def test_pictures_beside_a_file_are_taken_in(tmp_path):
+def test_external_images_are_embedded(tmp_path):
     made = square(TEXCOORD_0=SQUARE[:, :2])
     made.tree["images"] = [{"uri": "photo%20one.png"}, {"uri": "../secret.png"}, {"uri": "notes.png"}]
     folder = tmp_path / "in"
@@ -240,8 +240,8 @@ def test_pictures_beside_a_file_are_taken_in(tmp_path):
     assert "secret" in losses[0]
 
 
-def test_single_precision_is_what_is_judged(tmp_path):
-    """Triangles that single precision flattens are found flat in the file."""
+def test_single_precision_map_is_certified(tmp_path):
+    """Triangles that are flat in single precision are reported as flat in the file."""
     V = np.array([[0, 0], [1, 0], [0.5, 1e-12], [0.5, 1]])
     F = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 3]])
     io.write_map(tmp_path / "thin.glb", MeshData(V, F), V)
@@ -250,8 +250,8 @@ def test_single_precision_is_what_is_judged(tmp_path):
     np.testing.assert_array_equal(certify(again.F, io.map_of(again)).degenerate, [0])
 
 
-def test_vertices_that_single_precision_joins_are_told_before(tmp_path):
-    """Two triangles that touch at a corner without sharing it, and one that is too small to keep its corners."""
+def test_vertices_that_single_precision_merges_are_reported_before(tmp_path):
+    """Two triangles that touch at a corner without sharing it, and one that is too small for single precision."""
     V = np.array([[0, 0], [1, 0], [0, 1], [0, 0], [-1, 0], [0, -1], [5, 5], [5 + 1e-9, 5], [5, 6.0]])
     mesh = MeshData(V, np.arange(9).reshape(3, 3))
     (digits, joined) = io.not_held("out.glb", mesh)
@@ -261,7 +261,7 @@ def test_vertices_that_single_precision_joins_are_told_before(tmp_path):
     assert len(io.read_mesh(tmp_path / "out.glb").V) == 7
 
 
-def test_what_is_too_large_for_single_precision(tmp_path):
+def test_too_large_for_single_precision(tmp_path):
     V, F = cat(4)
     mesh = MeshData(V, F)
     with pytest.raises(ValueError, match="single precision"):
@@ -321,7 +321,7 @@ def placed(tree, **node):
         ),
     ],
 )
-def test_what_is_damaged_is_named(change, message, tmp_path):
+def test_damaged_parts_are_named(change, message, tmp_path):
     made = square()
     tree = json.loads(made.gltf())
     change(tree)
@@ -331,7 +331,7 @@ def test_what_is_damaged_is_named(change, message, tmp_path):
         io.read_mesh(path)
 
 
-def test_nodes_that_hold_themselves_and_deep_nests(tmp_path):
+def test_nodes_that_contain_themselves_and_deep_nesting(tmp_path):
     made = square()
     made.tree |= {"nodes": [{"children": [0, 1]}, {"mesh": 0, "children": [0]}], "scenes": [{"nodes": [0]}]}
     assert len(read(made, tmp_path).F) == 2
@@ -340,7 +340,7 @@ def test_nodes_that_hold_themselves_and_deep_nests(tmp_path):
         io.read_mesh(tmp_path / "deep.gltf")
 
 
-def test_a_mesh_that_changed_is_written_anew(tmp_path):
+def test_a_changed_mesh_is_written_as_a_new_file(tmp_path):
     mesh = read(square(TEXCOORD_0=SQUARE[:, :2]), tmp_path)
     fewer = replace(mesh, F=mesh.F[:1], FT=mesh.FT[:1])
     io.write_mapped(tmp_path / "out.glb", fewer)

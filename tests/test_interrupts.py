@@ -1,4 +1,4 @@
-"""Ctrl-C on the command: whenever it comes, it ends the command, in a sentence and with its exit status."""
+"""Ctrl-C during the command: at any time, it ends the command with a message and the proper exit status."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import quasiharmonic
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.cli.commands import measure
 
-# Calls the command in a process whose imports are interrupted at a module's name.
+# Calls the command in a process and interrupts it when a module with a given name is imported.
 INTERRUPTED = """
 import importlib, signal, sys
 
@@ -35,22 +35,29 @@ ENTRY = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text()
 
 
 def interrupted(at, *arguments):
-    """The command, as its console script calls it, with Ctrl-C when some module is looked for."""
+    """Run the command as its console script does, with Ctrl-C when a given module is imported."""
     return subprocess.run(
         [sys.executable, "-c", INTERRUPTED, at, ENTRY, *map(str, arguments)], capture_output=True, text=True, timeout=60
     )
 
 
 @pytest.mark.parametrize(
-    "at", ["argparse", "quasiharmonic.ui.cli", "quasiharmonic.ui.cli.commands.map", "quasiharmonic.ui.cli.sliding"]
+    "at",
+    [
+        "argparse",
+        "quasiharmonic.ui.cli",
+        "quasiharmonic.ui.cli.commands.map",
+        "quasiharmonic.ui.cli.slide_options",
+        "quasiharmonic.io",
+    ],
 )
-def test_while_the_command_itself_is_loaded(at):
+def test_while_the_command_itself_is_imported(at):
     done = interrupted(at, "map", "in.obj", "-o", "out.obj")
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "qhm: interrupted, nothing was written\n")
 
 
-@pytest.mark.parametrize("at", ["quasiharmonic.io", "numpy", "numpy.linalg", "quasiharmonic.util.arrays"])
-def test_while_what_it_needs_is_loaded(tmp_path, at):
+@pytest.mark.parametrize("at", ["numpy", "numpy.linalg", "quasiharmonic.util.arrays"])
+def test_while_its_dependencies_are_imported(tmp_path, at):
     path = tmp_path / "grid.off"
     path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     done = interrupted(at, "check", path)
@@ -77,7 +84,7 @@ def test_in_a_finaliser(monkeypatch, capsys):
 
 
 def test_turned_into_another_error(monkeypatch, capsys):
-    # As extension modules do that are interrupted while they are loaded.
+    # Some extension modules do this if they are interrupted during import.
     def run(options):
         try:
             signal.raise_signal(signal.SIGINT)
@@ -89,13 +96,13 @@ def test_turned_into_another_error(monkeypatch, capsys):
     assert capsys.readouterr().err == "qhm measure: interrupted, nothing was written\n"
 
 
-def test_out_of_code_that_is_made_on_the_way(tmp_path):
-    # As dataclasses make theirs. The interpreter takes such an interrupt for one that nobody has caught.
+def test_in_generated_code(tmp_path):
+    # For example, in code that dataclasses generate. The interpreter reports such an interrupt as uncaught.
     (tmp_path / "sitecustomize.py").write_text(
         "import sys\n"
         "class Interrupting:\n"
         "    def find_spec(self, name, *_):\n"
-        "        if name == 'quasiharmonic.io':\n"
+        "        if name == 'numpy':\n"
         "            exec('raise KeyboardInterrupt')\n"
         "sys.meta_path.insert(0, Interrupting())\n"
     )
@@ -110,8 +117,8 @@ def test_out_of_code_that_is_made_on_the_way(tmp_path):
     assert (done.returncode, done.stderr) == (2, "qhm check: interrupted, nothing was written\n")
 
 
-def test_not_where_it_is_ignored(monkeypatch):
-    # As by a shell for what runs in the background.
+def test_not_if_interrupts_are_ignored(monkeypatch):
+    # A shell does this for background processes.
     monkeypatch.setattr(measure, "run", lambda options: signal.raise_signal(signal.SIGINT) or 0)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -121,8 +128,8 @@ def test_not_where_it_is_ignored(monkeypatch):
         signal.signal(signal.SIGINT, before)
 
 
-def test_after_the_last_word():
-    # Too late to undo anything: what has been said stays true.
+def test_after_the_last_output():
+    # Too late to undo anything: the printed report stays true.
     late = "import signal; atexit.register(signal.raise_signal, signal.SIGINT)"
     code = f"import atexit, sys; {late}; sys.argv[1:] = ['--version']; from quasiharmonic.__main__ import main; main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

@@ -7,15 +7,16 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic import InverseMap, SurfaceMap, SurfacePoints, boundary_loops, distortion
+from quasiharmonic import InverseMap, SurfaceMap, boundary_loops, distortion
 from quasiharmonic.geometry.exact.nested_grid import NestedGrid
 from quasiharmonic.geometry.exact.predicates import twice_area
+from quasiharmonic.results import SurfacePoints
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import bend, lift, random_annulus, signed_areas, surfaces
 
 
 def exact_areas(p, corners):
-    """Twice the areas that a point forms with the edges opposite to the corners, as fractions."""
+    """Return twice the areas that a point forms with the edges opposite to the corners, as fractions."""
     x, y = map(Fraction, p)
     (ax, ay), (bx, by), (cx, cy) = (map(Fraction, corner) for corner in corners)
 
@@ -26,7 +27,7 @@ def exact_areas(p, corners):
 
 
 def brute_force(F, uv, points):
-    """The first closed triangle that contains each point, and the barycentric coordinates, all in fractions."""
+    """Return the first closed triangle that contains each point, and the barycentric coordinates, all in fractions."""
     triangles, weights = [], []
     low, high = uv[F].min(axis=1), uv[F].max(axis=1)
     for p in points.tolist():
@@ -44,7 +45,7 @@ def brute_force(F, uv, points):
 
 
 def tricky_points(F, uv, rng):
-    """Vertices, points on edges or an ulp beside them, points in triangles, points all over the place."""
+    """Return vertices, points on edges or an ulp beside them, points in triangles, and random points."""
     i, j = F[:, 0], F[:, 1]
     middles = uv[i] / 2 + uv[j] / 2
     toward = rng.choice([-np.inf, np.inf], size=middles.shape)
@@ -56,7 +57,7 @@ def tricky_points(F, uv, rng):
 
 
 def maps():
-    """(name, F, uv): maps of small meshes, of all magnitudes."""
+    """Yield (name, F, uv): maps of small meshes, of all magnitudes."""
     V, F = random_delaunay(40, seed=5)
     ring, ring_faces = annulus(4)
     hole, hole_faces = random_annulus(60, seed=2)
@@ -73,7 +74,7 @@ def maps():
 
 
 @pytest.mark.parametrize(("F", "uv"), [pytest.param(F, uv, id=name) for name, F, uv in maps()])
-def test_brute_force(F, uv, rng):
+def test_agrees_with_brute_force(F, uv, rng):
     inverse = InverseMap(uv, F, uv)
     points = tricky_points(F, uv, rng)
     at = inverse.locate(points)
@@ -81,17 +82,17 @@ def test_brute_force(F, uv, rng):
     assert np.array_equal(at.triangle, triangle)
     assert set(np.sign(at.triangle)) >= {-1, 1}
     np.testing.assert_allclose(at.barycentric, barycentric, rtol=1e-9, atol=1e-12)
-    # Zero exactly on edges; 1e-300 beside them products underflow.
+    # Products are exactly zero on edges; 1e-300 beside them they underflow.
     assert np.array_equal(at.barycentric == 0, barycentric < 1e-300)
     assert np.nanmin(at.barycentric) >= 0
-    # Back in the plane within rounding, and within the triangle's box.
+    # The point returns to the plane within rounding and lies within the triangle's box.
     back, corners = inverse.plane(at)[at.found], uv[F[at.triangle[at.found]]]
     np.testing.assert_allclose(back, points[at.found], rtol=1e-15, atol=1e-15 * np.abs(uv).max())
     assert np.all((back >= corners.min(axis=1)) & (back <= corners.max(axis=1)))
 
 
 def test_needles(rng):
-    """A fan of needles, many to a cell, around a vertex of 600."""
+    """A fan of needles, many per grid cell, around a vertex with 600 neighbours."""
     angle = np.linspace(0, 2 * np.pi, 601)[:-1]
     uv = np.concatenate([[[0.0, 0.0]], np.stack([np.cos(angle), np.sin(angle)], axis=1)])
     rim = np.arange(600)
@@ -113,12 +114,12 @@ def test_identity(name, V, F, rng):
     assert np.array_equal(
         at.triangle[start.barycentric.min(axis=1) > 1e-9], triangle[start.barycentric.min(axis=1) > 1e-9]
     )
-    # And the other way round.
+    # The other direction.
     places = inverse.plane(at)
     np.testing.assert_allclose(inverse.plane(inverse.locate(places)), places, rtol=0, atol=1e-15)
 
 
-def test_error_is_what_the_map_makes_of_rounding(rng):
+def test_error_is_that_of_rounding_in_the_map(rng):
     V, F = random_delaunay(3000, seed=4)
     for uv in (V * np.hypot(*V.T)[:, None] ** 5, V * [1, 1e-7] + [3, 0], bend(V)):
         inverse = InverseMap(V, F, uv)
@@ -160,7 +161,7 @@ def test_grid_lists_every_triangle_that_meets_the_cell(rng):
         assert np.all(np.diff(listed) > 0)
 
 
-def test_annulus_hole_is_outside():
+def test_hole_of_an_annulus_is_outside():
     V, F = annulus(8)
     at = InverseMap(V, F, V).locate(
         [[0.0, 0.0], [0.5, 0.0], [np.nextafter(0.5, 0), 0.0], [0.7, 0.7], [1.0, 1.0], [1.5, 0]]
@@ -192,7 +193,7 @@ def test_values_normals_and_shapes():
     assert inverse.surface(single).shape == (3,)
 
 
-def test_nothing_outside():
+def test_nothing_is_outside():
     V, F = disk(3)
     inverse = InverseMap(V, F, V)
     at = inverse.locate([[2, 0], [np.nan, 0], [np.inf, 0], [0, -np.inf], [0, 0]])
@@ -214,7 +215,7 @@ def test_vertices():
     assert np.array_equal(inverse.locate(V).triangle, at.triangle[:-1])
 
 
-def test_inputs_of_any_kind_are_left_alone():
+def test_inputs_of_any_type_are_not_changed():
     V, F = grid(4, 4)
     arrays = (V * 4).astype(np.float32), F.astype(np.uint16), (V * 4).astype(np.int32)
     before = [a.copy() for a in arrays]
@@ -226,7 +227,7 @@ def test_inputs_of_any_kind_are_left_alone():
     assert inverse.surface(at).dtype == np.float64
 
 
-def test_sample_grid_reaches_the_sides():
+def test_sample_grid_includes_the_sides():
     uv, F = random_square()
     inverse = InverseMap(lift(uv), F, uv)
     u, v, at = inverse.sample_grid(33, 17)
@@ -239,7 +240,7 @@ def test_sample_grid_reaches_the_sides():
 
 
 def random_square(seed=3):
-    """An irregular mesh of the unit square whose boundary lies exactly on its sides."""
+    """Return an irregular mesh of the unit square whose boundary lies exactly on its sides."""
     uv, F = grid(12, 9)
     inside = np.setdiff1d(np.arange(len(uv)), boundary_loops(F, len(uv))[0])
     uv[inside] += np.random.default_rng(seed).uniform(-0.02, 0.02, (inside.size, 2))
@@ -247,13 +248,13 @@ def random_square(seed=3):
 
 
 def overlapping_strip():
-    """A strip wound one and a half times around the origin."""
+    """Return a strip wound one and a half times around the origin."""
     V, F = grid(60, 2)
     angle, radius = 3 * np.pi * V[:, 0], 1 + V[:, 1]
     return F[:, ::-1], np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
-def test_overlapping_maps_are_refused_unless_wanted(rng):
+def test_overlapping_maps_are_rejected_by_default(rng):
     F, uv = overlapping_strip()
     with pytest.raises(ValueError, match=r"no inverse.*boundary.*overlapping=True"):
         InverseMap(uv, F, uv)
@@ -270,7 +271,7 @@ def disk_map():
     return V, F, V
 
 
-def test_bad_input_is_named():
+def test_invalid_input_is_named():
     V, F = disk(3)
     folded = V.copy()
     folded[0] = [0.9, 0]
@@ -304,11 +305,11 @@ def test_transfer_between_meshes_of_one_square(rng):
     partners = SurfaceMap(source, target)
     assert partners.onto
     assert partners.inverse().onto
-    # Linear functions of the place come over exactly.
+    # Linear functions of the position are transferred exactly.
     np.testing.assert_allclose(partners.transfer(warp @ [1, -2.0]), coarse @ [1, -2.0], atol=1e-14)
     by_triangle = partners.transfer(np.arange(len(fine_faces)), per="triangle")
     assert np.array_equal(by_triangle, target.locate(coarse).triangle)
-    # There and back again, from the boundary too.
+    # The inverse transfer, also from the boundary.
     start = source.vertices()
     there = partners(start)
     assert there.found.all()
@@ -321,7 +322,7 @@ def test_transfer_between_meshes_of_one_square(rng):
     assert partners(SurfacePoints(right, weights)).found.all()
 
 
-def test_images_that_differ_are_not_onto():
+def test_images_that_differ_are_rejected():
     V, F = grid(4, 4)
     square = InverseMap(V, F, V)
     finer, finer_faces = grid(7, 7)
@@ -339,8 +340,8 @@ def test_images_that_differ_are_not_onto():
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
-def test_outside_the_nearest_point_of_the_rim(rng, scale):
-    """Against the distance to every boundary edge, sampled."""
+def test_outside_points_use_the_nearest_boundary_point(rng, scale):
+    """Compare with the distance to every boundary edge, sampled."""
     uv, F = disk(5)
     inverse = InverseMap(lift(uv), F, scale * uv)
     places = rng.uniform(-2, 2, (60, 2))
@@ -354,12 +355,12 @@ def test_outside_the_nearest_point_of_the_rim(rng, scale):
     samples = ((1 - t) * uv[rim] + t * uv[np.roll(rim, -1)]).reshape(-1, 2)
     least = np.linalg.norm(places[:, None] - samples, axis=2).min(axis=1)
     np.testing.assert_allclose(np.linalg.norm(inverse.plane(near) / scale - places, axis=1), least, atol=1e-4)
-    # What is inside, or nowhere, is as ever.
+    # Points inside, and points that are NaN, have the usual result.
     inside = np.array([[0.1 * scale, 0.2 * scale], [np.nan, 0]])
     assert inverse.nearest(inside).triangle.tolist() == [inverse.locate(inside).triangle[0], -1]
 
 
-def test_transfer_leaves_no_hole_at_the_rim():
+def test_transfer_covers_the_boundary():
     V, F = disk(8)
     finer, finer_faces = disk(11)
     source, target = InverseMap(V, F, V), InverseMap(finer, finer_faces, finer)
@@ -373,7 +374,7 @@ def test_transfer_leaves_no_hole_at_the_rim():
 
 
 def test_twice_area_is_accurate(rng):
-    """Corners in line but for a rounding, against fractions."""
+    """Corners that are collinear up to rounding, against fractions."""
     a, b = rng.uniform(-1, 1, (2, 400, 2))
     c = a + rng.uniform(0, 1, (400, 1)) * (b - a)
     c[::7] = a[::7]

@@ -20,12 +20,11 @@ from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError, OutputError
 from quasiharmonic.io.formats.obj import read_regular
 from quasiharmonic.io.formats.objlines import read_obj_lines
-from quasiharmonic.io.meshdata import is_planar
-from quasiharmonic.io.numbers import read_rows
-from quasiharmonic.io.textual import read_text
+from quasiharmonic.io.lowlevel.textual import read_rows, read_text
+from quasiharmonic.io.models.meshdata import is_planar
 from shared.datasets import write_problem
-from shared.solvable import star_problem
-from shared.written import written
+from shared.obj_reader import written
+from shared.solvable_problems import star_problem
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX")
 
@@ -34,7 +33,7 @@ SQUARE_VT = "vt 0 0\nvt 2 0\nvt 2 2\nvt 0 2\n"
 SQUARE_VN = "vn 0 0 1\nvn 0 0 -1\n"
 SQUARE_F = [[0, 1, 2], [0, 2, 3]]
 
-# Every double there is but the two that are none; hypothesis favours the nasty ones.
+# Every finite double; hypothesis prefers difficult ones.
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
@@ -51,12 +50,12 @@ def put(tmp_path):
 
 
 def bits(a):
-    """Doubles as integers: equal means equal to the last bit, -0.0 and NaN included."""
+    """Return doubles as integers: equal means equal to the last bit, including -0.0 and NaN."""
     return np.ascontiguousarray(a, dtype=np.float64).view(np.int64).tolist()
 
 
 def same(a, b):
-    """Whether two meshes agree in all they hold, bit by bit."""
+    """Test whether two meshes agree in all data, bit by bit."""
     for name in ("V", "vt", "extra"):
         x, y = getattr(a, name), getattr(b, name)
         if (x is None) != (y is None) or (x is not None and (x.shape != y.shape or bits(x) != bits(y))):
@@ -100,12 +99,12 @@ def test_face_forms(put, tmp_path, faces, FT, FN):
     assert same(mesh, io.read_mesh(tmp_path / "again.obj"))
 
 
-def test_negative_indices_count_back_from_where_they_stand(put):
+def test_negative_indices_count_back_from_their_line(put):
     mesh = io.read_mesh(put("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 5 0 0\nv 6 0 0\nv 5 1 0\nf -3 -2 -1\n"))
     assert mesh.F.tolist() == [[0, 1, 2], [3, 4, 5]]
 
 
-def test_a_face_may_come_before_its_vertices(put):
+def test_a_face_may_precede_its_vertices(put):
     assert io.read_mesh(put("f 1 2 3\nf 1 3 4\n" + SQUARE)).F.tolist() == SQUARE_F
 
 
@@ -156,7 +155,7 @@ def test_decimal_text_is_rounded_correctly(put, regular):
     V = io.read_mesh(path).V
 
     def nearest(x):
-        # Among the neighbours of what was read none is nearer; ties go to the even one.
+        # No neighbour of the value read is closer; ties go to the even one.
         exact = Fraction(x)
         got = float(x)
         rivals = [r for r in (math.nextafter(got, -math.inf), math.nextafter(got, math.inf)) if math.isfinite(r)]
@@ -241,7 +240,7 @@ def test_a_comment_that_ends_in_a_backslash_ends_there(put):
     assert mesh.statements == b"# C:\\out\\\n"
 
 
-def test_what_cannot_be_opened(tmp_path):
+def test_files_that_cannot_be_opened(tmp_path):
     with pytest.raises(MeshFileError, match="there is no such file"):
         io.read_mesh(tmp_path / "none.obj")
     (tmp_path / "folder.obj").mkdir()
@@ -254,7 +253,7 @@ def test_what_cannot_be_opened(tmp_path):
 
 
 @posix
-def test_a_pipe_is_not_waited_for(tmp_path):
+def test_reading_a_pipe_does_not_block(tmp_path):
     os.mkfifo(tmp_path / "pipe.obj")
     with pytest.raises(MeshFileError, match="not a regular file"):
         io.read_mesh(tmp_path / "pipe.obj")
@@ -275,7 +274,7 @@ def test_suffixes_in_capitals(put):
     assert len(io.read_mesh(put(SQUARE + "f 1 2 3\n", "MESH.OBJ")).V) == 4
 
 
-def test_the_error_survives_pickling_and_odd_names():
+def test_errors_can_be_pickled_and_contain_odd_names():
     error = pickle.loads(pickle.dumps(MeshFileError("a.obj", "what", 3, "then")))
     assert (str(error), error.line) == ("a.obj: what at line 3; then", 3)
     assert str(MeshFileError("\udcff.obj", "what")).encode() == b"\\udcff.obj: what"
@@ -283,9 +282,9 @@ def test_the_error_survives_pickling_and_odd_names():
 
 @pytest.mark.slow
 @posix
-def test_memory_stays_bounded_on_hostile_files(tmp_path):
-    # Lines of 100 MB and of 20 MB; taken apart by the token they would need gigabytes. And indices and counts that
-    # an array of their size would be made for.
+def test_memory_stays_bounded_for_malicious_files(tmp_path):
+    # Lines of 100 MB and of 20 MB, which would need gigabytes if split into tokens, and indices and counts that would
+    # allocate an array of their size.
     script = f"""
 import resource
 from quasiharmonic.io import MeshFileError, read_handles, read_mesh
@@ -317,7 +316,7 @@ for index in (b"2147483648", b"-2147483648", b"999999999999999999"):
     assert len(done.stdout.splitlines()) == 5 + 12
 
 
-# What is kept
+# Data that is preserved
 
 
 DECORATED = """\
@@ -346,7 +345,7 @@ l 1 2 3
 """
 
 
-def test_statements_keep_their_places_among_the_faces(put, tmp_path):
+def test_statements_keep_their_position_among_the_faces(put, tmp_path):
     path = put(DECORATED)
     mesh = io.read_mesh(path)
     assert both_readers_agree(put(DECORATED.replace("l 1 2 3\n", ""), "regular.obj"))
@@ -384,7 +383,7 @@ l 1 2 3
     assert bits(again.V) == bits(mesh.V)
 
 
-def test_invalid_utf8_in_names_passes_through(put, tmp_path):
+def test_invalid_utf8_in_names_is_preserved(put, tmp_path):
     mesh = io.read_mesh(put(b"usemtl \xff\xe9\n" + SQUARE.encode() + b"f 1 2 3\n"))
     io.write_obj(tmp_path / "out.obj", mesh)
     assert (tmp_path / "out.obj").read_bytes().startswith(b"usemtl \xff\xe9\nv ")
@@ -425,7 +424,7 @@ def test_long_runs_of_faces_are_written_in_order(tmp_path):
 
 @settings(max_examples=60, deadline=None)
 @given(arrays(np.float64, (4, 3), elements=finite), arrays(np.float64, (4, 2), elements=finite))
-def test_every_double_survives(tmp_path_factory, V, uv):
+def test_every_double_is_preserved(tmp_path_factory, V, uv):
     folder = tmp_path_factory.getbasetemp()
     mesh = MeshData(V, SQUARE_F)
     for suffix in (".obj", ".off"):
@@ -438,14 +437,14 @@ def test_every_double_survives(tmp_path_factory, V, uv):
 
 
 @pytest.mark.parametrize("size", [np.finfo(np.float64).max, 1.0, 5e-324])
-def test_planar_at_any_size(size):
+def test_planar_meshes_of_any_size(size):
     flat = size * np.array([[-1.0, 0, 1], [1, 0, 1], [1, 1, 1]])
     assert is_planar(flat)
-    # Turned onto its edge.
+    # Rotated to its edge.
     assert not is_planar(flat[:, [1, 2, 0]])
 
 
-def test_inputs_of_other_types_are_taken_and_left_alone(tmp_path):
+def test_inputs_of_other_types_are_accepted_and_not_changed(tmp_path):
     V = np.asfortranarray(np.random.default_rng(1).random((4, 3)).astype(np.float32))
     F = np.array(SQUARE_F, dtype=np.int32)[:, ::-1]
     uv = np.random.default_rng(2).random((8, 2)).astype(np.float32)[::2]
@@ -485,7 +484,7 @@ def test_inputs_of_other_types_are_taken_and_left_alone(tmp_path):
         ),
     ],
 )
-def test_arrays_that_make_no_mesh(make, message):
+def test_arrays_that_are_not_a_mesh(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -496,12 +495,12 @@ def test_arrays_that_make_no_mesh(make, message):
 def test_map_without_seams(put):
     shared = io.read_mesh(put(SQUARE + SQUARE_VT + "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"))
     assert io.map_of(shared).tolist() == [[0, 0], [2, 0], [2, 2], [0, 2]]
-    # The same numbers under another index are the same place.
+    # The same coordinates with another index are the same position.
     doubled = io.read_mesh(put(SQUARE + SQUARE_VT + "vt -0 0\nf 1/1 2/2 3/3\nf 1/5 3/3 4/4\n"))
     assert io.map_of(doubled).tolist() == io.map_of(shared).tolist()
 
 
-def test_map_with_seams_is_refused_by_vertex(put):
+def test_map_with_seams_is_rejected_with_a_vertex(put):
     seams = io.read_mesh(put(SQUARE + SQUARE_VT + "vt 5 5\nvt 6 5\nf 1/1 2/2 3/3\nf 1/5 3/6 4/4\n"))
     with pytest.raises(MeshFileError, match=r"more than one pair of texture coordinates for vertices 0, 2 \(0-based\)"):
         io.map_of(seams)
@@ -522,12 +521,12 @@ def test_rounding_in_z_leaves_a_mesh_planar(put):
         io.map_of(io.read_mesh(put(SQUARE.replace("v 1 1 0", "v 1 1 1e-3") + "f 1 2 3\nf 1 3 4\n")))
 
 
-def test_map_of_only_some_faces_is_refused(put):
+def test_map_of_some_faces_only_is_rejected(put):
     with pytest.raises(MeshFileError, match=r"face 1 \(0-based\) without texture coordinates"):
         io.map_of(io.read_mesh(put(SQUARE + SQUARE_VT + "f 1/1 2/2 3/3\nf 1 3 4\n")))
 
 
-def test_a_vertex_without_a_face_has_no_place(put):
+def test_a_vertex_without_a_face_has_no_position(put):
     uv = io.map_of(io.read_mesh(put(SQUARE + SQUARE_VT + "f 1/1 2/2 3/3\n")))
     assert np.isnan(uv).tolist() == [[False] * 2] * 3 + [[True] * 2]
 
@@ -608,7 +607,7 @@ FAN = (
 )
 
 
-def test_boundary_is_fixed_without_handles(put, tmp_path):
+def test_without_handles_the_boundary_is_fixed(put, tmp_path):
     for source in (put(FAN, "input.obj"), tmp_path):
         V, F, fixed, target = io.read_problem(source)
         assert (V.shape, F.shape, fixed.tolist()) == ((5, 3), (4, 3), [0, 1, 2, 3])
@@ -621,7 +620,7 @@ def test_handles_may_pin_the_interior(put, tmp_path):
     for problem in (io.read_problem(tmp_path), io.read_problem(tmp_path / "input.obj", handles)):
         assert problem.fixed.tolist() == [3, 4, 0, 1, 2]
         assert problem.target.tolist() == [[0, 2], [1.5, 0.25], [0, 0], [2, 0], [2, 2]]
-    # A mesh named on its own is taken on its own.
+    # A mesh file named directly is used without the handles file next to it.
     assert io.read_problem(tmp_path / "input.obj").fixed.tolist() == [0, 1, 2, 3]
 
 
@@ -645,7 +644,7 @@ def test_malformed_handles_are_named_with_their_line(put, text, message):
     assert message in str(caught.value)
 
 
-def test_problems_that_do_not_say_where_vertices_go(put, tmp_path):
+def test_problems_without_target_positions(put, tmp_path):
     with pytest.raises(MeshFileError, match="the fixed vertices have no target positions"):
         io.read_problem(put(SQUARE + "f 1 2 3\nf 1 3 4\n"))
     with pytest.raises(MeshFileError, match="no such file"):
@@ -679,7 +678,7 @@ def test_write_whole(tmp_path):
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyError("x"), KeyboardInterrupt()])
-def test_failure_leaves_the_old_file(tmp_path, error):
+def test_failure_keeps_the_old_file(tmp_path, error):
     path = tmp_path / "file"
 
     def fail(file):
@@ -695,7 +694,7 @@ def test_failure_leaves_the_old_file(tmp_path, error):
     assert path.read_bytes() == b"old"
 
 
-def test_places_that_cannot_be_written(tmp_path):
+def test_paths_that_cannot_be_written(tmp_path):
     mesh = MeshData([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
     (tmp_path / "folder.obj").mkdir()
     (tmp_path / "file").write_bytes(b"")
@@ -722,7 +721,7 @@ def test_devices_are_not_replaced():
 
 
 @posix
-def test_permissions_and_links_are_kept(tmp_path):
+def test_permissions_and_links_are_preserved(tmp_path):
     path, link = tmp_path / "file", tmp_path / "link"
     old = os.umask(0o027)
     try:
@@ -741,7 +740,7 @@ def test_permissions_and_links_are_kept(tmp_path):
 def test_write_protection_is_respected(tmp_path, monkeypatch):
     path = tmp_path / "file"
     path.write_bytes(b"old")
-    # What a user who is not root would be told.
+    # The error that a user without root rights would get.
     monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != path)
     with pytest.raises(OutputError, match="write-protected"):
         io.write_whole(path, b"new")
@@ -752,7 +751,7 @@ def test_write_protection_is_respected(tmp_path, monkeypatch):
 
 
 @posix
-def test_a_full_disk_leaves_the_old_file(tmp_path):
+def test_a_full_disk_keeps_the_old_file(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"old")
     script = f"""
@@ -772,7 +771,7 @@ except OutputError as error:
 
 @pytest.mark.slow
 @posix
-def test_kill_9_leaves_the_old_file_or_a_new_one(tmp_path):
+def test_kill_9_leaves_the_complete_old_or_new_file(tmp_path):
     path = tmp_path / "mesh.obj"
     script = f"""
 import numpy as np
@@ -799,11 +798,14 @@ for k in range(10**9):
 def test_import_is_light():
     script = "import sys, quasiharmonic.io; print(*sorted({m.split('.')[0] for m in sys.modules}))"
     done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True)
+    assert not {"numpy", "scipy", "matplotlib", "meshio", "trimesh"} & set(done.stdout.split())
+    script = "import sys; from quasiharmonic.io import *; print(*sorted({m.split('.')[0] for m in sys.modules}))"
+    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True)
     assert "numpy" in done.stdout.split()
     assert not {"scipy", "matplotlib", "meshio", "trimesh"} & set(done.stdout.split())
 
 
-def test_problems_written_and_read_in_every_way(tmp_path):
+def test_problems_in_every_combination_of_formats(tmp_path):
     V, F, fixed, target = star_problem()
     path, out = tmp_path / "star" / "input.obj", tmp_path / "out.obj"
     write_problem(path.parent, V, F, fixed, target)
@@ -814,7 +816,7 @@ def test_problems_written_and_read_in_every_way(tmp_path):
     assert np.array_equal(uv[fixed], target)
     moved = uv + np.random.default_rng(0).normal(size=uv.shape)
     io.write_map(out, mesh, moved)
-    # As plain text, with nothing of the library.
+    # Written as plain text, without the library.
     found = written(out)
     assert bits(found.uv) == bits(moved)
     assert np.array_equal(found.F, F)
@@ -833,7 +835,7 @@ def test_problems_written_and_read_in_every_way(tmp_path):
         ("\ufeffvertex;x;y\n1; 2,5; -3,0E-2\n", [[1, 2.5, -0.03]]),
     ],
 )
-def test_rows_of_numbers_in_any_usual_notation(tmp_path, text, rows):
+def test_rows_of_numbers_in_every_usual_notation(tmp_path, text, rows):
     path = tmp_path / "rows.csv"
     path.write_text(text, encoding="utf-8", newline="")
     assert [values for _, values in read_rows(path, 3)] == rows
@@ -851,14 +853,14 @@ def test_rows_of_numbers_in_any_usual_notation(tmp_path, text, rows):
         ("1;2.5;3;\n", "not 3 numbers"),
     ],
 )
-def test_rows_of_something_else(tmp_path, text, words):
+def test_rows_with_other_contents(tmp_path, text, words):
     path = tmp_path / "rows.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(MeshFileError, match=re.escape(words)):
         read_rows(path, 3)
 
 
-def test_exponents_of_fortran_in_a_mesh(tmp_path):
+def test_fortran_exponents_in_a_mesh(tmp_path):
     path = tmp_path / "m.obj"
     path.write_text("v 0 0 0\nv 1.0D+00 0 0\nv 0 5d-1 0\nf 1 2 3\n")
     assert io.read_mesh(path).V.tolist() == [[0, 0, 0], [1, 0, 0], [0, 0.5, 0]]

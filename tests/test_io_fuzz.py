@@ -15,7 +15,7 @@ from quasiharmonic.io import MeshFileError
 from quasiharmonic.io.formats import obj as obj_module
 from quasiharmonic.io.formats import off as off_module
 from quasiharmonic.io.formats.objlines import read_obj_lines
-from shared.damaged import VALID, damaged
+from shared.damaged_files import VALID, damaged
 from shared.gltf_files import SQUARE, square
 
 quick = settings(max_examples=150, deadline=None)
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 
 def held(mesh):
-    """Everything in a mesh, comparable to the last bit."""
+    """Return all data of a mesh, comparable to the last bit."""
 
     def plain(a):
         if a is None:
@@ -39,7 +39,7 @@ def held(mesh):
 
 
 def outcome(read, *args):
-    """What a reader makes of its input: a mesh or an error of our own, and nothing else."""
+    """Return what a reader makes of its input: a mesh or an error of this package; other errors propagate."""
     try:
         return held(read(*args))
     except MeshFileError as error:
@@ -55,13 +55,13 @@ def read_back(data, name):
         except MeshFileError as error:
             str(error).encode()
             return
-        # What is accepted can be written, and comes back as it was.
+        # Accepted input can be written and is read back unchanged.
         io.write_obj(path.with_suffix(".obj"), mesh)
         again = io.read_mesh(path.with_suffix(".obj"))
         assert held(again) == held(mesh)
 
 
-# Files that are nearly right, which is where two readers could differ.
+# Files that are almost valid, for which two readers might differ.
 
 numbers = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False).map(repr),
@@ -130,7 +130,7 @@ def test_both_obj_readers_agree(data):
 
 @quick
 @given(obj_texts())
-def test_obj_comes_back_as_it_was(data):
+def test_obj_is_read_back_unchanged(data):
     read_back(data, "fuzz.obj")
 
 
@@ -187,7 +187,7 @@ def test_damaged_files(name, data):
 
 
 def branches(node, path=()):
-    """Where the values of a document are."""
+    """Yield the positions of the values in a document."""
     items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     for key, value in items:
         yield (*path, key)
@@ -204,7 +204,7 @@ odd_values = st.one_of(
 @quick
 @given(data=st.data())
 def test_odd_documents(data):
-    """A glTF file with values in it that are not what they should be is refused, or can be written again."""
+    """A glTF file with invalid values is rejected or can be written again."""
     made = square(TEXCOORD_0=SQUARE[:, :2], NORMAL=SQUARE)
     made.tree |= {"nodes": [{"mesh": 0, "scale": [1, 2, 3]}], "scenes": [{"nodes": [0]}], "images": [{"uri": "a.png"}]}
     made.tree["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": made.accessor(SQUARE)}]

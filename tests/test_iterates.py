@@ -1,4 +1,4 @@
-"""An iterate answers for its own tensors, whatever has been factored since."""
+"""An iterate evaluates at its own tensors, although the domain was factored for others since."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def asked(iterate):
 
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize("other", [None, *MAKERS])
-def test_asked_after_another_evaluation(name, other):
-    """Evaluate at ξ₁, then at ξ₂ (by another objective of the same problem), then ask the first."""
+def test_used_after_another_evaluation(name, other):
+    """Evaluate at ξ₁, then at ξ₂ (with another objective of the same problem), then use the first iterate."""
     xi1, xi2 = (random_xi(posed().F, 0.1, seed) for seed in (1, 2))
     value, gradient = asked(MAKERS[name](posed()).evaluate(xi1))
     assert np.isfinite(value)
@@ -66,7 +66,7 @@ def test_asked_after_another_evaluation(name, other):
 
 
 def test_operators_in_turn():
-    """Each gives its own answers, however often the other has refactored in between."""
+    """Each one gives its own results, although the other refactors in between."""
     problem = posed()
     objective = Objective(problem)
     one, two = (objective.evaluate(random_xi(problem.F, 0.3, seed)).operator for seed in (3, 4))
@@ -79,7 +79,7 @@ def test_operators_in_turn():
 
 @pytest.fixture
 def hasty():
-    """Threads take turns as often as they can."""
+    """Make threads switch as often as possible."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     yield
@@ -97,7 +97,7 @@ SHARED = {
 @pytest.mark.parametrize("shared", SHARED)
 @pytest.mark.parametrize("name", MAKERS)
 def test_threads_share_a_domain(name, shared):
-    """Whatever other threads evaluate on the same domain meanwhile, each gets what it would get alone."""
+    """Other threads evaluate on the same domain; each one gets the result that it would get alone."""
     make = MAKERS[name]
     xis = [random_xi(posed().F, 0.1, seed) for seed in range(4)]
     expected = [asked(make(posed()).evaluate(xi)) for xi in xis]
@@ -119,7 +119,7 @@ def test_threads_share_a_domain(name, shared):
 
 @pytest.mark.usefixtures("hasty")
 def test_a_solve_beside_another_thread():
-    """A search is not disturbed by an objective of the same problem that somebody else evaluates."""
+    """An objective of the same problem in another thread does not disturb a search."""
     alone, problem = solve(posed()), posed()
     objective, xi, done = Objective(problem), random_xi(problem.F, 0.3), []
 
@@ -133,7 +133,7 @@ def test_a_solve_beside_another_thread():
             for _ in range(4):
                 beside = solve(problem)
                 np.testing.assert_array_equal(beside.uv, alone.uv)
-                assert beside.iterations == alone.iterations
+                assert beside.n_iterations == alone.n_iterations
         finally:
             done.append(True)
         spinning.result()
@@ -147,7 +147,7 @@ def test_a_domain_with_factors_is_pickled_and_copied():
         assert Objective(other).evaluate(xi).value == value
 
 
-def test_a_map_at_its_own_tensors_is_what_they_give_back():
+def test_a_map_at_its_own_tensors_is_reproduced():
     problem = posed()
     inside = problem.frame.inward(bend(problem.V[:, :2]))
     for functional in FUNCTIONALS:

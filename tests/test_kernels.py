@@ -1,4 +1,4 @@
-"""Every kernel in C does what its text in NumPy does, and refuses what it was not written for."""
+"""Every compiled kernel agrees with its NumPy version and rejects unsuitable arrays."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pkgutil
 import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,14 +19,16 @@ from quasiharmonic import certify
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh, rest_frames
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.surfaces import disk
 from quasiharmonic.util import kernels
+from quasiharmonic.util.kernels.constants import shared_constants
 from shared.kernels import ARGUMENTS
 
-# Packages that need extras, and that have no kernels.
+# Packages that require extras and have no kernels.
 _WITHOUT = "torch", "jax", "notebook", "studio", "batch", "report"
 for module in pkgutil.walk_packages(quasiharmonic.__path__, "quasiharmonic."):
     if not {*_WITHOUT, "__main__"} & {*module.name.split(".")}:
@@ -36,13 +39,13 @@ CASES = [pytest.param(name, make, id=f"{name}-{i}") for name, some in ARGUMENTS.
 
 
 def outcome(kernel, arguments):
-    """What a kernel makes of its arguments, and its answer; the arrays are copies, laid out as they were."""
+    """Return a kernel's arguments after the call, and its result; the arguments are copies with the original layout."""
     given = [each.copy() if isinstance(each, np.ndarray) and each.flags.writeable else each for each in arguments]
     return [*given, kernel(*given)]
 
 
 def same(one, other):
-    """Arrays of integers alike, of floats but for rounding where they are not tiny beside their neighbours."""
+    """Compare arrays: integers exactly, floats up to rounding relative to their neighbours."""
     if isinstance(one, np.ndarray) and one.dtype.kind in "fc":
         scale = np.abs(one[np.isfinite(one)]).max(initial=0)
         with np.errstate(all="ignore"):  # of infinities, by NumPy 1
@@ -50,18 +53,18 @@ def same(one, other):
     return one == pytest.approx(other, rel=1e-11) if isinstance(one, float) else np.array_equal(one, other)
 
 
-def test_every_kernel_has_arguments_here():
+def test_every_kernel_has_test_arguments():
     assert set(ARGUMENTS) == set(kernels.TWINS)
 
 
 @needs_extension
-def test_every_kernel_has_a_text_in_numpy():
-    assert {name for name in dir(kernels.extension) if not name.startswith("_")} == set(kernels.TWINS)
+def test_every_kernel_has_a_numpy_version():
+    assert {name for name in dir(kernels.extension) if not name.startswith("_")} == {"constants", *kernels.TWINS}
 
 
 @needs_extension
 @pytest.mark.parametrize(("name", "make"), CASES)
-def test_both_texts_say_the_same(name, make):
+def test_both_versions_agree(name, make):
     for seed in range(3):
         arguments = make(np.random.default_rng(seed))
         with np.errstate(all="ignore"):
@@ -72,8 +75,8 @@ def test_both_texts_say_the_same(name, make):
 
 @needs_extension
 @pytest.mark.parametrize(("name", "make"), CASES)
-def test_other_arrays_are_refused(name, make):
-    """Another type of any of them, one too few, one too many."""
+def test_unsuitable_arrays_are_rejected(name, make):
+    """Another type for any of them, one argument too few, one too many."""
     kernel, arguments = getattr(kernels.extension, name), make(np.random.default_rng(0))
     for i, each in enumerate(arguments):
         if isinstance(each, np.ndarray):
@@ -85,8 +88,8 @@ def test_other_arrays_are_refused(name, make):
 
 
 @needs_extension
-def test_the_order_of_bytes_may_be_named():
-    """As it is in arrays that come from `ctypes`, copies of them included."""
+def test_an_explicit_byte_order_is_accepted():
+    """Arrays from `ctypes` have one, and so do copies of them."""
     V, F = disk(3)
     named = np.ctypeslib.as_array((ctypes.c_double * V.size)(*V.ravel().tolist())).reshape(V.shape)
     assert memoryview(named.copy()).format in ("<d", ">d")
@@ -96,7 +99,7 @@ def test_the_order_of_bytes_may_be_named():
         rest_frames(V.astype(V.dtype.newbyteorder()), F)
 
 
-# Arrays by number that may be of many lengths: room for what is found, and what indices in other arrays point into.
+# Arrays, by number, that may have many lengths: space for results, and arrays that indices refer to.
 _ANY_LENGTH = {
     "wirtinger": {0},
     "lay_flat": {0},
@@ -126,7 +129,7 @@ _ANY_LENGTH = {
 
 @needs_extension
 @pytest.mark.parametrize(("name", "make"), CASES)
-def test_arrays_that_are_too_short_are_refused(name, make):
+def test_arrays_that_are_too_short_are_rejected(name, make):
     kernel, arguments = getattr(kernels.extension, name), make(np.random.default_rng(0))
     for i, each in enumerate(arguments):
         if isinstance(each, np.ndarray) and each.size and i not in _ANY_LENGTH.get(name, ()):
@@ -135,7 +138,7 @@ def test_arrays_that_are_too_short_are_refused(name, make):
 
 
 def off_beat(array, *, strides):
-    """The same numbers where they are not aligned: in a buffer from its second byte on, or in a table of records."""
+    """Return the same numbers without alignment: in a buffer from its second byte on, or in a table of records."""
     if strides:
         table = np.zeros(array.shape[:1], dtype=[("numbers", array.dtype, array.shape[1:]), ("rest", np.float64)])
         table["numbers"] = array
@@ -147,7 +150,7 @@ def off_beat(array, *, strides):
 
 
 @needs_extension
-def test_what_is_not_aligned_is_refused():
+def test_unaligned_arrays_are_rejected():
     F, label = np.array([[0, 1], [1, 2]]), np.empty(3, dtype=np.int64)
     with pytest.raises(TypeError, match=r"link_nodes.*not aligned"):
         kernels.extension.link_nodes(off_beat(F, strides=False), F, label)
@@ -159,7 +162,7 @@ def test_what_is_not_aligned_is_refused():
 
 
 @needs_extension
-def test_a_curve_through_a_vertex_that_is_not_there_is_refused():
+def test_a_curve_through_a_missing_vertex_is_rejected():
     places, starts, pairs = np.zeros((3, 2)), np.array([0, 3]), np.zeros((9, 2), dtype=np.int64)
     for wrong in (-1, 3):
         with pytest.raises(ValueError, match="doubtful_pairs do not fit"):
@@ -167,7 +170,7 @@ def test_a_curve_through_a_vertex_that_is_not_there_is_refused():
 
 
 @pytest.mark.parametrize("strides", [False, True])
-def test_triangles_that_are_not_aligned_are_taken(strides):
+def test_unaligned_triangles_are_accepted(strides):
     V, F = disk(3)
     given = off_beat(F, strides=strides)
     assert not given.flags.c_contiguous if strides else not given.flags.aligned
@@ -199,13 +202,13 @@ BEYOND = np.where(F == 0, len(V), F)
         lambda: certify(F, V, loops=[[0, 1, len(V)]]),
     ],
 )
-def test_no_kernel_is_given_vertices_that_are_not_there(call):
-    """By those that users may call themselves."""
+def test_kernels_do_not_get_missing_vertices(call):
+    """Public functions check indices."""
     with pytest.raises(ValueError, match=r"refers? to ver|shape"):
         call()
 
 
-def test_an_extension_of_before_is_told(monkeypatch):
+def test_an_outdated_extension_is_reported(monkeypatch):
     def newer():
         pass
 
@@ -216,7 +219,7 @@ def test_an_extension_of_before_is_told(monkeypatch):
 
 
 @pytest.mark.parametrize(("value", "switched"), [("1", True), ("", False), ("0", False)])
-def test_the_environment_switches_them_off(value, switched):
+def test_the_environment_switches_kernels_off(value, switched):
     code = "from quasiharmonic.util import kernels; print(kernels.extension is None)"
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"QUASIHARMONIC_PURE": value},
                           capture_output=True, text=True, check=True)  # fmt: skip
@@ -229,3 +232,12 @@ def test_the_extension_exports_its_entry_point_alone():
     library = ctypes.CDLL(kernels.extension.__file__)
     assert hasattr(library, "PyInit__compiled")
     assert not [name for name in ("take", "fit", "done", "sort_edges") if hasattr(library, name)]
+
+
+@pytest.mark.skipif(kernels.extension is None, reason="there is no extension")
+def test_shared_constants_have_the_values_of_the_python_source():
+    expected = shared_constants(Path(quasiharmonic.__path__[0]))
+    scalars = {name: value for name, value in expected.items() if not isinstance(value, tuple)}
+    assert kernels.extension.constants == scalars
+    assert scalars["TANH_BOUND"] == TANH.bound
+    assert "INWARDS" in expected

@@ -1,4 +1,4 @@
-"""Link distances against closed forms, against themselves, and against random walks."""
+"""Link distances against closed forms, metric properties, and random walks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def star(rng, n):
 
 
 def comb(teeth):
-    """Teeth that hang from a bar: from the bottom of one to that of another takes three segments."""
+    """Teeth below a bar: from the bottom of one tooth to that of another, three segments are needed."""
     lower = [(x, y) for k in range(teeth) for x, y in ((3 * k, 1), (3 * k, -9), (3 * k + 1, -9), (3 * k + 1, 1))]
     return [*lower, (3 * teeth, 1), (3 * teeth, 2), (-1, 2), (-1, 1)]
 
@@ -42,7 +42,7 @@ def test_triangles_fill_the_polygon(corners):
     np.testing.assert_allclose(area, np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]))
 
 
-def test_convex_polygons_are_overlooked_from_everywhere():
+def test_convex_polygons_are_visible_from_everywhere():
     assert (table(circle(12)) == 1 - np.eye(12)).all()
 
 
@@ -60,8 +60,8 @@ def test_teeth_of_a_comb():
     assert set(distance[np.ix_(bottoms, bottoms)].ravel()) == {0, 3}
 
 
-def test_stairs_take_a_segment_a_step():
-    # Narrow stairs, 1 up and 1 to the right each: sight passes over one step at most.
+def test_stairs_need_one_segment_per_step():
+    # Narrow stairs, 1 up and 1 right each: a segment crosses at most one step.
     steps, width = 6, 0.01
     low = [(k + d, k + e) for k in range(steps) for d, e in ((0, 0), (1, 0))]
     high = [(x - width, y + width) for x, y in reversed(low)]
@@ -78,7 +78,7 @@ def test_distances_are_a_metric(corners):
     assert (np.diag(np.roll(distance, -1, axis=1)) == 1).all()
 
 
-def test_limit_is_kept():
+def test_the_limit_is_respected():
     corners = spiral(14, 1.6)
     distance, found = table(corners), polygon(corners)
     far = np.unravel_index(np.argmax(distance), distance.shape)
@@ -87,7 +87,7 @@ def test_limit_is_kept():
 
 
 def test_random_paths_are_no_shorter():
-    # Places tried at random and how few segments lead from each corner to them and on to the others.
+    # Random points, and the least number of segments from each corner to them and on to the others.
     rng = np.random.default_rng(5)
     corners = spiral(12, 1.2)
     middles = np.concatenate([0.5 * (corners[k] + corners[[j]]) for k in range(24) for j in range(k)])
@@ -96,7 +96,7 @@ def test_random_paths_are_no_shorter():
     p, q = corners, np.roll(corners, -1, axis=0)
 
     def free(a, b):
-        """Whether segments (m, n) from a (m, 2) to b (n, 2) cross no side."""
+        """Return whether segments (m, n) from a (m, 2) to b (n, 2) cross no side."""
         a, b = a[:, None, None], b[None, :, None]
         crossed = (orientation(a, b, p) * orientation(a, b, q) < 0) & (orientation(p, q, a) * orientation(p, q, b) < 0)
         return ~crossed.any(axis=2)

@@ -1,4 +1,4 @@
-"""What floating point decides in a hurry about loops and triangles, against rational arithmetic."""
+"""Fast floating-point tests of loops and triangles, against rational arithmetic."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.loops import contacts, simple_loops
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
+from quasiharmonic.problem.certification import certify
 from shared.exact import exact_orientation, exact_relation
 
 lattice = st.integers(-2, 2).map(float)
-# Near a line through the origin, one unit in the last place to its sides.
+# Points near a line through the origin, one unit in the last place beside it.
 near = st.builds(lambda k, ulps: float(k / 8 * (1 + ulps * 2.0**-52)), st.integers(-8, 8), st.integers(-1, 1))
 tiny = st.builds(lambda k, exponent: float(np.ldexp(k, exponent)), st.integers(-3, 3), st.sampled_from([-1074, 0, 900]))
 coordinates = pytest.mark.parametrize("number", [lattice, near, tiny], ids=["lattice", "near", "tiny"])
 
 
 def simple(places):
-    """Whether a closed polygon meets itself nowhere but where an edge ends and the next begins, all in rationals."""
+    """Test in rationals whether a closed polygon meets itself only where one edge ends and the next begins."""
     k = len(places)
     ends = [(places[i], places[(i + 1) % k]) for i in range(k)]
     for i, j in combinations(range(k), 2):
@@ -85,8 +85,8 @@ def test_signs_of_triangles(number):
     check()
 
 
-def test_a_loop_of_more_doubtful_pairs_than_edges():
-    """All in one place, along one line, and beside a loop that is simple."""
+def test_a_loop_with_more_uncertain_pairs_than_edges():
+    """All vertices at one point, on one line, and beside a simple loop."""
     around = np.exp(2j * np.pi * np.arange(400) / 400)
     circle = np.stack([around.real, around.imag], axis=1)
     line = np.stack([np.arange(400) % 7, np.arange(400) % 7], axis=1) / 7
@@ -99,7 +99,7 @@ def test_a_loop_of_more_doubtful_pairs_than_edges():
     assert not found.complete
 
 
-def test_vertices_that_are_not_there():
+def test_missing_vertices():
     with pytest.raises(ValueError, match=r"F refers to vertex 7, but there are only vertices 0 … 3"):
         certify([[0, 1, 2], [0, 2, 7]], np.eye(4, 2))
     with pytest.raises(ValueError, match=r"F refers to vertex -1"):

@@ -1,11 +1,11 @@
-"""Materials and pictures: what an OBJ names is found again, and what is written opens with its picture."""
+"""Materials and images: those of an OBJ file are found, and written files refer to their image."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from quasiharmonic import io
+from quasiharmonic import flatten, io
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io import MeshData, MeshFileError
 from quasiharmonic.plot import plot_texture, save_texture_figure
@@ -18,7 +18,7 @@ HALVES = "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
 
 @pytest.fixture
 def qhm(capfd):
-    """The command: its exit status, and what it says."""
+    """Run the command; return its exit status and output."""
 
     def call(*arguments):
         capfd.readouterr()
@@ -28,7 +28,7 @@ def qhm(capfd):
 
 
 def gradient(path, width=64, height=32):
-    """A picture that is as red as it is far to the right, and as green as it is high."""
+    """An image whose red grows to the right and whose green grows upwards."""
     from PIL import Image
 
     across, up = (np.arange(width) + 0.5) / width, (np.arange(height)[::-1] + 0.5) / height
@@ -37,13 +37,13 @@ def gradient(path, width=64, height=32):
     return path
 
 
-def test_a_hundred_materials_and_all_else_stay(tmp_path, qhm):
-    """Negative indices, places that are unused or there twice, a material for each face."""
+def test_a_hundred_materials_and_all_other_data_are_preserved(tmp_path, qhm):
+    """Negative indices, unused and repeated positions, a material per face."""
     V, F = grid(10, 5)
     lines = ["mtllib all.mtl", "o sheet", *(f"v {x!r} {y!r} {x * y!r}" for x, y in V.tolist())]
     lines += ["vt 7 7", *(f"vt {x!r} {y!r}" for x, y in V.tolist()), "vt 8 8"]
     n = len(V)
-    # The corner of the first face refers to a second copy of its place.
+    # The corner of the first face refers to a second copy of its position.
     lines += ["vt " + " ".join(map(repr, V[F[0, 0]].tolist())), "vn 0 0 1"]
     for k, face in enumerate(F.tolist()):
         lines += [f"usemtl m{k:03}", f"s {k % 2}"]
@@ -82,7 +82,7 @@ def test_a_library_is_found_from_another_folder(name, tmp_path):
     assert named == f"mtllib ../../in/{name}"
     assert (there / named.removeprefix("mtllib ")).read_text() == "newmtl x\n"
     assert io.not_held(there / "out.obj", mesh) == []
-    # Where the old one is found it stays, and so does one that is beside the new file too.
+    # A reference that is valid from the new file does not change, even if it finds another library.
     io.write_mapped(tmp_path / "in" / "out.obj", mesh)
     assert (tmp_path / "in" / "out.obj").read_text().startswith(line + "\n")
     (there / name).parent.mkdir(exist_ok=True)
@@ -91,7 +91,7 @@ def test_a_library_is_found_from_another_folder(name, tmp_path):
     assert (there / "out.obj").read_text().startswith(line + "\n")
 
 
-def test_a_library_that_is_nowhere_stays_as_it_is_named(tmp_path):
+def test_a_missing_library_keeps_its_name(tmp_path):
     source = tmp_path / "mesh.obj"
     source.write_text("mtllib  gone.mtl here.mtl\n" + SQUARE + HALVES)
     (tmp_path / "here.mtl").write_text("")
@@ -103,12 +103,12 @@ def test_a_library_that_is_nowhere_stays_as_it_is_named(tmp_path):
     assert (tmp_path / "x.obj").read_text().startswith("mtllib  gone.mtl here.mtl\n")
 
 
-def test_an_obj_opens_with_its_picture(tmp_path, qhm):
+def test_a_written_obj_refers_to_its_image(tmp_path, qhm):
     trimesh = pytest.importorskip("trimesh", reason="an independent reader of OBJ and its materials")
     picture = gradient(tmp_path / "photo.png")
     (tmp_path / "in.obj").write_text("mtllib old.mtl\nusemtl old\no kept\n" + SQUARE + "usemtl old\n" + HALVES)
     out = tmp_path / "my map.obj"
-    status, said, told = qhm("polish", tmp_path / "in.obj", "-o", out, "--picture", picture)
+    status, said, told = qhm("polish", tmp_path / "in.obj", "-o", out, "--texture", picture)
     assert status == 0, said + told
     assert "its own materials" in told
     assert (tmp_path / "my_map-texture.png").read_bytes() == picture.read_bytes()
@@ -122,8 +122,8 @@ def test_an_obj_opens_with_its_picture(tmp_path, qhm):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".glb", ".gltf"])
-def test_a_glb_is_drawn_with_its_picture_by_another_library(suffix, tmp_path):
-    """Colours that it finds at the vertices, and ours where these are drawn, are those of the picture."""
+def test_another_library_draws_a_glb_with_its_image(suffix, tmp_path):
+    """The colours at vertices, as read by the other library and as drawn here, are those of the image."""
     trimesh = pytest.importorskip("trimesh", reason="an independent reader of glTF and its materials")
     flat, F = grid(12, 9)
     uv = 0.04 + 0.92 * flat / np.ptp(flat, axis=0) + 0.03 * np.sin(flat[:, ::-1])
@@ -133,20 +133,20 @@ def test_a_glb_is_drawn_with_its_picture_by_another_library(suffix, tmp_path):
     there = trimesh.load(tmp_path / f"cat{suffix}", process=False, force="mesh")
     colours = there.visual.to_color().vertex_colors[:, :2] / 255
     np.testing.assert_allclose(colours, uv, atol=1 / 16)
-    image = plot_texture(V, F, io.map_of(io.read_mesh(tmp_path / f"cat{suffix}")), picture=tmp_path / "photo.png")
+    image = plot_texture(V, F, io.map_of(io.read_mesh(tmp_path / f"cat{suffix}")), texture=tmp_path / "photo.png")
     drawn = image.axes[1].images[0]
     pixels, (left, right, low, high) = np.asarray(drawn.get_array()), drawn.get_extent()
     inner = uv[np.setdiff1d(np.arange(len(V)), boundary_edges(F, len(V)))]
     column = (inner[:, 0] - left) / (right - left) * pixels.shape[1]
     row = (high - inner[:, 1]) / (high - low) * pixels.shape[0]
     found = pixels[row.astype(int), column.astype(int), :3]
-    # The light in the plane darkens all colours alike, so that their shares stay.
+    # Lighting darkens all colours of the plane equally, so their ratios do not change.
     expected = np.column_stack([inner, np.full(len(inner), 0.5)])
     shares = [c / c.sum(axis=1, keepdims=True) for c in (found, expected)]
     assert np.abs(shares[0] - shares[1]).max() < 0.05
 
 
-def test_the_checkerboard_is_a_picture_that_repeats(tmp_path):
+def test_the_checkerboard_is_a_repeating_image(tmp_path):
     from PIL import Image
 
     texture = io.checkerboard()
@@ -160,12 +160,12 @@ def test_the_checkerboard_is_a_picture_that_repeats(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_picture_is_repeated_and_its_glass_is_white(tmp_path):
+def test_an_image_repeats_and_its_transparent_parts_are_white(tmp_path):
     from PIL import Image
 
     Image.fromarray(np.array([[[255, 0, 0, 255], [0, 0, 0, 0]]], dtype=np.uint8)).save(tmp_path / "two.png")
     V, F = grid(2, 2)
-    image = plot_texture(V, F, 2 * V - 1, picture=tmp_path / "two.png").axes[1].images[0].get_array()
+    image = plot_texture(V, F, 2 * V - 1, texture=tmp_path / "two.png").axes[1].images[0].get_array()
     middle = image[len(image) // 3]
     red = middle[:, 0] > 2 * middle[:, 1]
     covered = np.flatnonzero(middle[:, 3] == 1)
@@ -175,62 +175,62 @@ def test_a_picture_is_repeated_and_its_glass_is_white(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])
-def test_a_picture_that_is_missing_is_named_and_nothing_is_written(suffix, tmp_path, qhm):
+def test_a_missing_image_is_named_and_nothing_is_written(suffix, tmp_path, qhm):
     (tmp_path / "in.obj").write_text(SQUARE + HALVES)
     (tmp_path / "text.png").write_text("no picture")
     before = sorted(tmp_path.iterdir())
     for name, message in (("gone.png", "no such file"), ("text.png", "not a PNG or JPEG")):
         for command in (("polish", tmp_path / "in.obj", "-o", tmp_path / f"out{suffix}"),
                         ("plot", tmp_path / "in.obj", "-o", tmp_path / "out.png")):  # fmt: skip
-            status, _, told = qhm(*command, "--picture", tmp_path / name)
+            status, _, told = qhm(*command, "--texture", tmp_path / name)
             assert status == 2
             assert name in told
             assert message in told
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_picture_that_is_damaged_is_named(tmp_path):
+def test_a_damaged_image_is_named(tmp_path):
     V, F = grid(2, 2)
     whole = gradient(tmp_path / "photo.png").read_bytes()
     (tmp_path / "half.png").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(MeshFileError, match=r"half\.png: is a damaged picture"):
-        save_texture_figure(tmp_path / "out.png", V, F, V, picture=tmp_path / "half.png")
+    with pytest.raises(MeshFileError, match=r"half\.png: is a damaged image"):
+        save_texture_figure(tmp_path / "out.png", V, F, V, texture=tmp_path / "half.png")
     assert not (tmp_path / "out.png").exists()
 
 
 @pytest.mark.slow
-def test_a_picture_is_drawn_on_the_surface_alone(tmp_path, qhm):
+def test_an_image_is_drawn_on_the_surface_only(tmp_path, qhm):
     (tmp_path / "in.obj").write_text(SQUARE + HALVES)
-    asked = "plot", tmp_path / "in.obj", "-o", tmp_path / "out.png", "--picture", gradient(tmp_path / "photo.png")
+    asked = "plot", tmp_path / "in.obj", "-o", tmp_path / "out.png", "--texture", gradient(tmp_path / "photo.png")
     status, _, told = qhm(*asked, "--kind", "distortion")
     assert status == 2
     assert "--kind distortion" in told
-    status, *_ = qhm(*asked[:4], "--picture", tmp_path / "out.png")
+    status, *_ = qhm(*asked[:4], "--texture", tmp_path / "out.png")
     assert status == 2
     assert qhm(*asked)[0] == 0
 
 
-def test_what_goes_with_an_obj_replaces_nothing_of_the_users(tmp_path, qhm):
+def test_files_written_with_an_obj_replace_no_other_files(tmp_path, qhm):
     (tmp_path / "in.obj").write_text(SQUARE + HALVES)
     picture = gradient(tmp_path / "out-texture.png")
     kept = picture.read_bytes()
-    status, _, told = qhm("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--picture", picture)
+    status, _, told = qhm("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--texture", picture)
     assert status == 2
     assert "would replace another file" in told
     assert picture.read_bytes() == kept
     assert not (tmp_path / "out.obj").exists()
-    status, _, told = qhm("polish", tmp_path / "in.obj", "-o", tmp_path / "out.ply", "--material")
+    status, _, told = qhm("polish", tmp_path / "in.obj", "-o", tmp_path / "out.ply", "--texture", "checkerboard")
     assert status == 2
-    assert ".ply has room for none" in told
+    assert ".ply files cannot store an image; supported: .obj, .glb, .gltf" in told
 
 
 def test_commands_from_format_to_format(tmp_path, qhm):
-    """An STL is laid flat into a GLB, that is judged in single precision, and what is lost is told beforehand."""
+    """An STL is flattened into a GLB, which is certified in single precision; lost data is reported first."""
     trimesh = pytest.importorskip("trimesh", reason="an independent writer of STL")
     V, F = cat(8)
     trimesh.Trimesh(V, F, process=False).export(tmp_path / "cat.stl")
     status, said, told = qhm(
-        "flatten", tmp_path / "cat.stl", "-o", tmp_path / "flat.glb", "--unit-square", "--material"
+        "flatten", tmp_path / "cat.stl", "-o", tmp_path / "flat.glb", "--unit-square", "--texture", "checkerboard"
     )
     assert status == 0, said + told
     assert "flat.glb will not have: digits beyond single precision" in told
@@ -248,7 +248,7 @@ def test_commands_from_format_to_format(tmp_path, qhm):
     assert ".stl files cannot be written" in told
 
 
-def test_seams_do_not_go_into_an_off_file(tmp_path, qhm):
+def test_seams_cannot_be_written_to_an_off_file(tmp_path, qhm):
     torn = SQUARE.replace("vt 0 1\n", "vt 0 1\nvt 5 5\nvt 6 6\n") + "f 1/1 2/2 3/3\nf 1/5 3/6 4/4\n"
     (tmp_path / "torn.obj").write_text(torn)
     status, _, told = qhm("repair", tmp_path / "torn.obj", "-o", tmp_path / "out.off")
@@ -257,3 +257,31 @@ def test_seams_do_not_go_into_an_off_file(tmp_path, qhm):
     status, _, told = qhm("polish", tmp_path / "torn.obj", "-o", tmp_path / "out.off")
     assert status == 2
     assert not (tmp_path / "out.off").exists()
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb"])
+def test_a_model_is_drawn_with_its_own_texture(tmp_path, suffix, qhm):
+    V, F = cat(4)
+    texture = io.read_texture(gradient(tmp_path / "photo.png"))
+    uv = flatten(V, F, unit_square=True).uv
+    model = tmp_path / f"model{suffix}"
+    io.write_mapped(model, MeshData(V, F, texture=texture).with_map(uv))
+    assert io.own_texture(io.read_mesh(model)) == texture
+    own, given, board = (tmp_path / f"{name}.png" for name in ("own", "given", "board"))
+    assert qhm("plot", model, "-o", own, "--kind", "texture")[0] == 0
+    assert qhm("plot", model, "-o", given, "--texture", tmp_path / "photo.png")[0] == 0
+    assert qhm("plot", model, "-o", board, "--texture", "checkerboard")[0] == 0
+    assert own.read_bytes() == given.read_bytes() != board.read_bytes()
+
+
+def test_models_without_a_usable_texture_have_none(tmp_path):
+    V, F = cat(4)
+    mesh = MeshData(V, F).with_map(V[:, :2])
+    for name in ("a.obj", "a.glb", "a.ply"):
+        io.write_mapped(tmp_path / name, mesh)
+        assert io.own_texture(io.read_mesh(tmp_path / name)) is None
+    text = (tmp_path / "a.obj").read_text()
+    (tmp_path / "b.obj").write_text("mtllib b.mtl\n" + text)
+    assert io.own_texture(io.read_mesh(tmp_path / "b.obj")) is None
+    (tmp_path / "b.mtl").write_text("newmtl m\nmap_Kd missing.png\nmap_Kd b.mtl\n")
+    assert io.own_texture(io.read_mesh(tmp_path / "b.obj")) is None

@@ -17,7 +17,7 @@ from quasiharmonic.ui.cli.arguments import MEASURES as OFFERED
 
 @pytest.fixture
 def stretched(tmp_path):
-    """A grid stretched to 3 × 1 in a file, its triangles, and its map."""
+    """A file with a grid stretched to 3 × 1, its triangles, and its map."""
     V, F = surfaces.grid(6, 5)
     uv = V * (3, 1) + np.sin(V[:, ::-1] * 3) * 0.01
     path = tmp_path / "map.obj"
@@ -29,7 +29,7 @@ def test_the_command_offers_every_measure():
     assert OFFERED == MEASURES
 
 
-def test_csv_holds_every_digit(stretched, tmp_path):
+def test_csv_contains_every_digit(stretched, tmp_path):
     path, V, F, uv = stretched
     assert main(["measure", str(path), "--export", str(tmp_path / "faces.csv")]) == 0
     with open(tmp_path / "faces.csv", encoding="utf-8", newline="") as file:
@@ -40,7 +40,7 @@ def test_csv_holds_every_digit(stretched, tmp_path):
         assert np.array_equal([float(row[name]) for row in rows], found[name]), name
 
 
-def test_npz_holds_the_arrays(stretched, tmp_path):
+def test_npz_contains_the_arrays(stretched, tmp_path):
     path, V, F, uv = stretched
     assert main(["measure", str(path), "--export", str(tmp_path / "faces.npz")]) == 0
     with np.load(tmp_path / "faces.npz") as file:
@@ -49,7 +49,7 @@ def test_npz_holds_the_arrays(stretched, tmp_path):
         assert np.array_equal(file["mips"], distortion(V, F, uv).mips)
 
 
-def test_ply_is_read_by_others(stretched, tmp_path):
+def test_other_programs_read_ply(stretched, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     path, V, F, uv = stretched
     assert main(["measure", str(path), "--export", str(tmp_path / "faces.ply")]) == 0
@@ -62,7 +62,7 @@ def test_ply_is_read_by_others(stretched, tmp_path):
     assert np.array_equal(raw["vertex"]["data"]["s"].ravel(), uv[:, 0])
 
 
-def test_ply_by_its_own_header(stretched, tmp_path):
+def test_ply_according_to_its_header(stretched, tmp_path):
     _, V, F, uv = stretched
     io.write_per_triangle(tmp_path / "faces.ply", V, F, uv, {"half": np.full(len(F), 0.5)})
     header, body = (tmp_path / "faces.ply").read_bytes().split(b"end_header\n")
@@ -80,9 +80,9 @@ def test_ply_by_its_own_header(stretched, tmp_path):
     assert (rows["values"] == 0.5).all()
 
 
-@pytest.mark.parametrize("suffix", io.PER_TRIANGLE_FORMATS)
+@pytest.mark.parametrize("suffix", io.suffixes("encode_values"))
 @pytest.mark.parametrize("name", ["triangle", "F", "uv", "file", "allow_pickle", "vertex_indices", "quality"])
-def test_names_that_the_formats_use_themselves(stretched, tmp_path, suffix, name):
+def test_names_that_the_formats_reserve(stretched, tmp_path, suffix, name):
     _, V, F, uv = stretched
     one = np.ones(len(F))
     with pytest.raises(ValueError, match="choose another name"):
@@ -93,7 +93,7 @@ def test_names_that_the_formats_use_themselves(stretched, tmp_path, suffix, name
 def test_values_that_cannot_be_written(stretched, tmp_path):
     _, V, F, uv = stretched
     one = np.ones(len(F))
-    with pytest.raises(io.OutputError, match=r"\.csv, \.npz, \.ply"):
+    with pytest.raises(io.MeshFileError, match=r"\.txt files cannot store values per triangle; .*\.ply, \.csv, \.npz"):
         io.write_per_triangle(tmp_path / "faces.txt", V, F, uv, {"one": one})
     with pytest.raises(ValueError, match="not a word"):
         io.write_per_triangle(tmp_path / "faces.csv", V, F, uv, {"one, two": one})
@@ -109,7 +109,7 @@ def test_measure_reports(stretched, capsys):
     output = capsys.readouterr()
     facts = json.loads(output.out)
     assert facts["triangles"] == len(F)
-    assert facts["conformal"]["median"] == distortion(V, F, uv).summary("conformal").median
+    assert facts["conformal"]["median"] == distortion(V, F, uv).statistics("conformal").median
     assert "0 of 60 triangles inverted" in output.err
     assert "isometric" in output.err
 
@@ -132,7 +132,7 @@ def test_plot(stretched, tmp_path, kind, size):
 
 
 @pytest.mark.parametrize("arguments", [["plot", "-o", "map.png"], ["view", "--screenshot", "map.png"]])
-def test_pictures_of_what_is_no_map(tmp_path, monkeypatch, capsys, arguments):
+def test_pictures_of_broken_maps(tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.chdir(tmp_path)
     mesh = tmp_path / "mesh.obj"
     io.write_obj(mesh, io.MeshData([[0, 0, 0], [1, 0, 0], [0, 1, 1.0]], [[0, 1, 2]]))
@@ -146,12 +146,12 @@ def test_pictures_of_what_is_no_map(tmp_path, monkeypatch, capsys, arguments):
     [
         (["plot", "-o", "picture.jpg"], "written as .png"),
         (["plot", "-o", "nowhere/picture.png"], "no directory"),
-        (["measure", "--export", "faces.xlsx"], ".csv, .npz, .ply"),
+        (["measure", "--export", "faces.xlsx"], "supported: .ply, .csv, .npz"),
         (["measure", "--json", "map.obj"], "would replace an input"),
         (["view", "--screenshot", "picture.gif"], "written as .png"),
     ],
 )
-def test_outputs_that_cannot_be(stretched, tmp_path, monkeypatch, capsys, arguments, message):
+def test_invalid_outputs(stretched, tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     assert main([*arguments, "map.obj"]) == 2
     assert message in capsys.readouterr().err
@@ -159,7 +159,7 @@ def test_outputs_that_cannot_be(stretched, tmp_path, monkeypatch, capsys, argume
 
 
 @pytest.mark.slow
-def test_vertices_of_no_triangle_have_no_place(stretched, tmp_path):
+def test_vertices_without_a_triangle_have_no_position(stretched, tmp_path):
     path, V, F, uv = stretched
     spaced = np.concatenate([[[9, 9]], V])
     io.write_obj(path, io.MeshData(spaced, F + 1, vt=uv, FT=F))

@@ -1,4 +1,4 @@
-"""Distortion per triangle and summed up."""
+"""Distortion per triangle, and its summaries."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from quasiharmonic.energies.measures import MEASURES, distortion
-from quasiharmonic.geometry.exact.certificate import inverted_triangles
+from quasiharmonic.problem.certification import inverted_triangles
 from quasiharmonic.surfaces import grid, random_delaunay
 from shared.meshes import bend, lift, surfaces
 
 
 def jacobians(V, F, uv):
-    """(f, 2, 2), by orthonormal frames of the triangles' planes."""
+    """Return (f, 2, 2) Jacobians from orthonormal frames of the triangles' planes."""
     V = np.column_stack([V, np.zeros((len(V), 3 - V.shape[1]))])
     found = []
     for i, j, k in F:
@@ -36,7 +36,7 @@ def test_singular_values_are_those_of_the_jacobian(name, V, F):
     np.testing.assert_allclose(found.sigma2, s[:, 1], rtol=1e-10)
     np.testing.assert_allclose(found.conformal, s[:, 0] / s[:, 1], rtol=1e-10)
     np.testing.assert_allclose(found.mips, s[:, 0] / s[:, 1] + s[:, 1] / s[:, 0] - 2, rtol=1e-8, atol=1e-12)
-    # μ = q/p by the Jacobian's entries.
+    # μ = q/p from the Jacobian's entries.
     p = 0.5 * (J[:, 0, 0] + J[:, 1, 1] + 1j * (J[:, 1, 0] - J[:, 0, 1]))
     q = 0.5 * (J[:, 0, 0] - J[:, 1, 1] + 1j * (J[:, 1, 0] + J[:, 0, 1]))
     np.testing.assert_allclose(found.beltrami, q / p, rtol=1e-9, atol=1e-12)
@@ -87,7 +87,7 @@ def test_inverted_and_collapsed_images():
         if arap is not None:
             assert found.arap == pytest.approx(arap)
     assert distortion(V, [[0, 1, 2]], [[0, 0], [1, 0], [0, 0]]).shear == pytest.approx(1)
-    # A mirror image keeps angles and has p = 0.
+    # A mirror image preserves angles and has p = 0.
     assert np.isinf(distortion(V, [[0, 1, 2]], [[0, 0], [1, 0], [0, -1]]).shear).all()
     point = distortion(V, [[0, 1, 2]], np.ones((3, 2)))
     assert point.scale == 1
@@ -95,9 +95,9 @@ def test_inverted_and_collapsed_images():
     assert np.isnan(point.shear).all()
 
 
-def test_the_sign_is_the_certificates(rng):
+def test_the_sign_is_that_of_the_certificate(rng):
     V, F = random_delaunay(80)
-    # Nearly collapsed images, of which floating point cannot tell the orientation.
+    # Almost collapsed images, whose orientation floating point cannot decide.
     x = rng.random(len(V))
     uv = np.stack([x, 0.1 * x], axis=1)
     found = distortion(V, F, uv)
@@ -106,7 +106,7 @@ def test_the_sign_is_the_certificates(rng):
     assert 0 < found.inverted.size < len(F)
 
 
-def test_flat_rest_triangles_are_undefined_and_left_out():
+def test_flat_rest_triangles_are_undefined_and_skipped():
     V = np.array([[0, 0], [1, 0], [0, 1], [2, 0]])
     uv = np.array([[0, 0], [1, 0], [0, 1], [2, 0.5]])
     found = distortion(V, [[0, 1, 2], [0, 1, 3]], uv)
@@ -115,21 +115,21 @@ def test_flat_rest_triangles_are_undefined_and_left_out():
     for name, values in found.per_triangle().items():
         assert np.isnan(values).tolist() == [False, True], name
     assert np.isnan(found.beltrami[1])
-    assert found.summary("conformal").maximum == pytest.approx(1)
+    assert found.statistics("conformal").maximum == pytest.approx(1)
     with pytest.raises(ValueError, match="mips is defined on no triangle"):
-        distortion(V, [[0, 1, 3]], uv).summary("mips")
+        distortion(V, [[0, 1, 3]], uv).statistics("mips")
     assert distortion(V, [[0, 1, 3]], uv).to_dict()["mips"] is None
 
 
 def test_summaries_are_weighted_by_area():
-    # Two unit squares' worth of halves; the second square is stretched to double height.
+    # The halves of two unit squares; the second square is stretched to double height.
     V = np.array([[0, 0], [3, 0], [3, 1], [0, 1], [4, 0], [4, 1]])
     F = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]])
     uv = V * [1.0, 1.0]
     uv[[4]] = [5, 0]
     uv[[5]] = [5, 1]
     found = distortion(V, F, uv)
-    summary = found.summary("conformal")
+    summary = found.statistics("conformal")
     assert summary.mean == pytest.approx((3 * 1 + 1 * 2) / 4)
     assert summary.median == pytest.approx(1)
     assert summary.p95 == pytest.approx(2)
@@ -137,10 +137,10 @@ def test_summaries_are_weighted_by_area():
     assert summary.lowest in (0, 1)
     assert summary.highest in (2, 3)
     with pytest.raises(ValueError, match="measure must be one of sigma1, "):
-        found.summary("beauty")
+        found.statistics("beauty")
 
 
-def test_reports_are_json_whatever_the_map():
+def test_reports_are_valid_json_for_every_map():
     V, F = grid(3, 3)
     for uv in (V, V * [1, -1], V * 0):
         report = distortion(V, F, uv).to_dict()
@@ -157,7 +157,7 @@ def test_any_dtype():
     np.testing.assert_array_equal(found.mips, expected.mips)
 
 
-def test_input_is_not_touched():
+def test_input_is_not_changed():
     V, F = grid(3, 3)
     uv = bend(V)
     before = [x.copy() for x in (V, F, uv)]

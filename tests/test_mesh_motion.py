@@ -27,34 +27,36 @@ def test_every_method_moves_a_hole_as_far_as_it_can(hole, monkeypatch):
     assert all(run.steps >= 2 for run in runs.values())
     assert runs[mesh_motion.OURS, "last"].steps == 12
     assert runs[mesh_motion.MORPH, "first"].at == [8]
-    # Nothing leaps.
+    # There are no jumps.
     assert all(1 <= move < 5 for move in runs[mesh_motion.OURS, "last"].moves)
     shape = np.array(runs[mesh_motion.OURS, "last"].quality)
     assert np.all((shape > 0) & (shape <= 1))
     (row, *_) = mesh_motion.rows("travelling hole", hole, runs, yardstick)
     assert row["method"] == "harmonic"
-    assert "**the end**" in mesh_motion.table([{**row, "steps": hole.steps}], {"travelling hole": hole})
+    assert "| **0.5** |" in mesh_motion.table(
+        [{**row, "steps": hole.steps, "valid to": 0.5}], {"travelling hole": hole}
+    )
 
 
-def test_likeness_is_one_for_a_similarity(hole):
+def test_similarity_is_one_for_a_similarity_transformation(hole):
     turned = hole.V @ [[0, 2], [-2, 0]]
     np.testing.assert_allclose(mesh_motion.likeness(hole, turned), 1)
     stretched = mesh_motion.likeness(hole, hole.V * [2, 1])
     np.testing.assert_allclose(stretched, 2 * 2 / (2**2 + 1))
 
 
-def test_how_far_edges_let_a_disk_turn():
-    """A ring of one layer of triangles: one edge, which spans what it spans."""
+def test_limit_of_rotation_from_edges():
+    """A ring of one layer of triangles: a single edge limits its rotation."""
     scene = moving_scenes.turning_disk(step=0.4)
     assert certify(scene.F, scene.V).bijective
     assert 100 < mesh_motion.forbidden_beyond(scene) < 600
 
 
 def test_heat_is_conserved_on_a_mesh_that_moves(hole):
-    history = moving_heat.run(hole, moving_heat.MOVERS["ours"](hole), 12)
+    history = moving_heat.run(hole, moving_heat.MOVERS["MovingMesh"](hole), 12)
     assert len(history.heat) == 13
     assert max(map(abs, history.heat)) < 1e-12
     assert max(history.uniform) < 1e-10
-    # It is carried and spreads: its highest value falls, and it is somewhere else.
+    # Heat is advected and diffuses: its maximum decreases and moves.
     first, last = history.temperatures[0], history.temperatures[-1]
     assert 0.02 < last.max() < 0.7 * first.max()

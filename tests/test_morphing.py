@@ -17,7 +17,7 @@ from quasiharmonic.ui.cli import main
 
 
 def dented(points, depth):
-    """Vertices of the upper side of the unit square, and where a dent of this depth puts them."""
+    """Return vertices of the upper side of the unit square, and their target positions on a dent."""
     upper = np.flatnonzero(points[:, 1] == 1)
     x = points[upper, 0]
     return upper, np.stack([x, 1 - depth * np.sin(np.pi * x) ** 8], axis=1)
@@ -27,15 +27,15 @@ def test_quality_of_known_triangles():
     points = np.array([[0, 0], [1, 0], [0.5, np.sqrt(3) / 2], [0, 1], [2, 0]])
     F = [[0, 1, 2], [0, 1, 3], [0, 2, 1], [0, 1, 4]]
     assert mean_ratio(points, F) == pytest.approx([1, np.sqrt(3) / 2, -1, 0])
-    # It has no scale, at either end of the doubles.
+    # It does not depend on scale, over the whole range of doubles.
     for unit in (1e-160, 1e150):
         assert mean_ratio(points * unit, F) == pytest.approx([1, np.sqrt(3) / 2, -1, 0])
 
 
-def test_deep_dent_stays_valid_where_springs_fold():
+def test_a_deep_dent_stays_valid_where_springs_invert_triangles():
     points, F = surfaces.grid(16, 16)
     moved, positions = dented(points, 0.9)
-    # The usual smoothing, the same weights for all neighbours, inverts triangles there.
+    # The usual smoothing, with equal weights for all neighbours, inverts triangles there.
     first = morph(points, F, moved, positions, energy=None)
     morphed = morph(points, F, moved, positions)
     assert first.valid
@@ -49,7 +49,7 @@ def test_deep_dent_stays_valid_where_springs_fold():
     assert json.loads(json.dumps(morphed.to_dict()))["quality_after"]["minimum"] > 0
 
 
-def test_nothing_moved_is_nothing_changed():
+def test_without_moved_vertices_nothing_changes():
     points, F = surfaces.random_delaunay(200, seed=2)
     kept = points.copy()
     morphed = morph(points, F, [], np.empty((0, 2)))
@@ -57,7 +57,7 @@ def test_nothing_moved_is_nothing_changed():
     assert np.array_equal(points, kept)
 
 
-def test_any_winding_and_idle_vertices():
+def test_any_winding_and_unused_vertices():
     points, F = surfaces.grid(6, 6)
     moved, positions = dented(points, 0.3)
     plain = morph(points, F, moved, positions)
@@ -78,7 +78,7 @@ def test_interior_vertices_can_be_moved():
     assert np.array_equal(morphed.points[middle], [[0.8, 0.2]])
 
 
-def test_a_boundary_that_crosses_itself_is_told():
+def test_a_boundary_that_crosses_itself_is_reported():
     points, F = surfaces.grid(8, 8)
     moved, positions = dented(points, 1.5)
     morphed = morph(points, F, moved, positions, max_iterations=60)
@@ -96,7 +96,7 @@ def test_a_boundary_that_crosses_itself_is_told():
         (lambda p, F: (p[:, :1], F, [0], [[0, 0]]), r"shape \(n, 2\)"),
         (lambda p, F: (p, F[:0], [0], [[0, 0]]), "the mesh has no triangles"),
         (lambda p, F: (p, F + 1, [0], [[0, 0]]), "F refers to vertex 16, but there are only vertices 0 … 15"),
-        (lambda p, F: (p, F, [0, 1], [[0, 0], [0, np.nan]]), "positions is not finite at row 1"),
+        (lambda p, F: (p, F, [0, 1], [[0, 0], [0, np.nan]]), "target is not finite at row 1"),
         (
             lambda p, F: (np.where(np.arange(16)[:, None] == 5, np.nan, p), F, [0], [[0, 0]]),
             "points is not finite at vertex 5",
@@ -113,7 +113,7 @@ def test_wrong_arguments(arguments, message):
 
 @pytest.fixture
 def plate(tmp_path):
-    """A function that writes a plate of two materials with what a finite-element program adds, in a format."""
+    """Return a function that writes a plate of two materials with finite-element data, in a format."""
     meshlane = pytest.importorskip("meshlane")
     flat, F = surfaces.grid(8, 8)
     # Ordered as Gmsh orders its points: those of the upper side, of the left material, of the right one.
@@ -161,7 +161,7 @@ FORMATS = {
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_all_but_the_positions_come_through(plate, tmp_path, name, capsys):
+def test_all_data_but_positions_is_preserved(plate, tmp_path, name, capsys):
     import meshlane
 
     path = plate(name, **FORMATS[name])
@@ -199,7 +199,7 @@ def test_positions_from_a_table(plate, tmp_path):
     path, table, out = plate("grid.vtu"), tmp_path / "to.csv", tmp_path / "out.vtu"
     corner = int(np.flatnonzero((read_fem(path).points == 1).all(axis=1))[0])
     table.write_bytes(codecs.BOM_UTF8 + f"vertex;x;y\n# the corner\n{corner}; 1.25;1.5\n".encode())
-    assert main(["morph", str(path), "-o", str(out), "--positions", str(table), "--energy", "none"]) == 0
+    assert main(["morph", str(path), "-o", str(out), "--positions", str(table), "--no-polish"]) == 0
     assert read_fem(out).points[corner].tolist() == [1.25, 1.5]
 
 
@@ -224,7 +224,7 @@ def test_tables_that_cannot_be_read(plate, tmp_path, capsys, text, message):
     assert not out.exists()
 
 
-def test_a_table_that_is_not_there(plate, tmp_path, capsys):
+def test_a_missing_table(plate, tmp_path, capsys):
     out, table = tmp_path / "out.vtu", tmp_path / "none.csv"
     assert main(["morph", str(plate("grid.vtu")), "-o", str(out), "--positions", str(table)]) == 2
     assert capsys.readouterr().err.strip() == f"qhm morph: {table}: there is no such file"

@@ -1,4 +1,4 @@
-"""The README's example as a notebook: the same lines, and pictures in what a fresh kernel makes of it."""
+"""The README's example as a notebook: the same code, and figures that appear in a new kernel."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def cells(kind):
     ]
 
 
-def test_it_is_the_example_of_the_readme():
+def test_the_code_is_that_of_the_readme():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     example = re.search(r"^## In Python\n\n```python\n(.*?)^```", readme, re.MULTILINE | re.DOTALL).group(1)
     code = cells("code")
-    # The same but for where comments stand, which is a matter of the formatter.
+    # Equal except for the positions of comments, which the formatter changes.
     assert ast.dump(ast.parse(code[0])) == ast.dump(ast.parse(example))
     assert "result" in code
     assert all(
@@ -38,7 +38,7 @@ def test_it_is_the_example_of_the_readme():
 
 
 @pytest.mark.slow
-def test_pictures_appear_by_themselves_in_a_fresh_kernel(tmp_path):
+def test_figures_appear_in_a_new_kernel(tmp_path):
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     import nbformat  # which the client brings
@@ -49,7 +49,7 @@ def test_pictures_appear_by_themselves_in_a_fresh_kernel(tmp_path):
     outputs = [output for cell in code for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
     assert "strictly positive, verified exactly" in code[0].outputs[0].text
-    # Each of the others shows one picture, in the page of a result or as a figure.
+    # Every other cell shows one picture, in the page of a result or as a figure.
     assert len(code) > 4
     for cell in code[1:]:
         (output,) = cell.outputs

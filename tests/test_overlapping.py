@@ -3,12 +3,12 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic.geometry.exact.overlapping import lying_on_others
+from quasiharmonic.geometry.exact.triangles import find_overlapping
 from quasiharmonic.surfaces import disk, grid
 
 
 def clipped_area(one, other):
-    """Area that two counterclockwise triangles share, by clipping one at the sides of the other, in fractions."""
+    """Return the common area of two counterclockwise triangles, by clipping in fractions."""
     ring = [tuple(map(Fraction, p)) for p in one.tolist()]
     for (ax, ay), (bx, by) in zip(other.tolist(), np.roll(other, -1, axis=0).tolist(), strict=True):
         ax, ay, bx, by = map(Fraction, (ax, ay, bx, by))
@@ -27,8 +27,8 @@ def clipped_area(one, other):
 
 
 @pytest.mark.parametrize("grid", [0, 4])
-def test_triangles_that_share_area_are_those_whose_intersection_has_some(grid):
-    # On a coarse grid many merely touch, or have sides on a line.
+def test_overlapping_triangles_have_an_intersection_with_area(grid):
+    # On a coarse grid many triangles only touch, or have collinear sides.
     rng = np.random.default_rng(3)
     uv = rng.integers(0, grid + 1, (30, 3, 2)).astype(float) if grid else rng.normal(size=(30, 3, 2))
     uv *= 1 if grid else 0.3
@@ -39,23 +39,23 @@ def test_triangles_that_share_area_are_those_whose_intersection_has_some(grid):
     uv = uv[turn != 0][:12]
     expected = [i for i in range(12) if any(clipped_area(uv[i], uv[j]) > 0 for j in range(12) if j != i)]
     assert 0 < len(expected) < 12 or grid
-    assert lying_on_others(np.arange(36).reshape(-1, 3), uv.reshape(-1, 2)).tolist() == expected
+    assert find_overlapping(np.arange(36).reshape(-1, 3), uv.reshape(-1, 2)).tolist() == expected
 
 
-def test_a_bijective_map_has_none():
+def test_a_bijective_map_has_no_overlap():
     V, F = disk(6)
-    assert lying_on_others(F, V).size == 0
+    assert find_overlapping(F, V).size == 0
 
 
-def test_of_a_band_around_a_point_one_and_a_half_times_both_ends_are_found():
+def test_both_ends_of_a_band_with_one_and_a_half_turns_are_found():
     V, F = grid(30, 2)
     angle, radius = 3 * np.pi * V[:, 0], 2 - V[:, 1]
     uv = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     column = V[F][..., 0].min(axis=1) * 30 + 1e-9
     found = np.zeros(len(F), dtype=bool)
-    found[lying_on_others(F, uv)] = True
+    found[find_overlapping(F, uv)] = True
     ends = (column < 10) | (column > 20)
-    # Next to where the ends lie, rounding decides.
+    # At the ends, rounding decides.
     inside = (column > 11) & (column < 19)
     assert found[ends].all()
     assert not found[inside].any()

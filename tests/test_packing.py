@@ -1,9 +1,8 @@
-"""Islands in the unit square: apart, inside, at one density, not mirrored, none of their triangles inverted."""
+"""Charts in textures: apart, inside, at one density, not mirrored."""
 
 from __future__ import annotations
 
 import time
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -11,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic import is_injective, surfaces
-from quasiharmonic.apps.atlas.packing import packed
-from quasiharmonic.apps.atlas.skyline import laid
-from shared.exact import exact_orientation
+from quasiharmonic.apps.atlas.packing.pack import pack_charts
+
+shapely = pytest.importorskip("shapely")
 
 
 def area(points, F):
@@ -21,186 +20,220 @@ def area(points, F):
     return float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2)
 
 
-def turned(points, degrees):
+def rotate(points, degrees):
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return points @ [[c, s], [-s, c]]
 
 
-def check(out, margin):
-    """Boxes within the square, and apart by the margin along an axis, without rounding."""
-    low, high = np.array([p.min(axis=0) for p in out]), np.array([p.max(axis=0) for p in out])
-    assert low.min() >= 0
-    assert high.max() <= 1
-    for i in range(len(out)):
-        near = [
-            j
-            for j in range(i)
-            if (low[i] < high[j] + 2 * margin + 1e-9).all() and (low[j] < high[i] + 2 * margin + 1e-9).all()
-        ]
-        for j in near:
-            gaps = [
-                Fraction(a) - Fraction(b)
-                for a, b in [*zip(low[i], high[j], strict=True), *zip(low[j], high[i], strict=True)]
-            ]
-            assert max(gaps) >= Fraction(margin)
-            assert max(gaps) > 0
+def check(charts, packing, size, padding):
+    """Check that charts lie in their tiles and are the padding apart, also after rounding to single precision."""
+    regions = {}
+    for (_, F), uv, placement in zip(charts, packing.uv, packing.placements, strict=True):
+        corner = np.array([placement.tile % 10, placement.tile // 10])
+        texels = (uv.astype(np.float32).astype(float) - corner) * size
+        assert texels.min() >= padding / 2
+        assert (texels.max(axis=0) <= np.array(size) - padding / 2).all()
+        triangles = texels[F]
+        region = shapely.union_all([*shapely.polygons(triangles), *shapely.linearrings(triangles)])
+        regions.setdefault(placement.tile, []).append(region)
+    for some in regions.values():
+        one, other = shapely.STRtree(some).query(some, predicate="dwithin", distance=padding + 1e-9)
+        near = one < other
+        distances = shapely.distance(np.array(some)[one[near]], np.array(some)[other[near]])
+        assert (distances >= padding).all()
+        assert (distances > 0).all()
 
 
-def rectangles(count, seed=0):
+def grids(count, seed=0):
     rng = np.random.default_rng(seed)
     V, F = surfaces.grid(2, 2)
-    return [turned(V * rng.uniform(0.1, 1, 2), rng.uniform(0, 360)) for _ in range(count)], [F] * count
+    return [(rotate(V[:, :2] * rng.uniform(0.1, 1, 2), rng.uniform(0, 360)), F) for _ in range(count)]
 
 
-def areas_of(uv, F):
-    return [area(points, rows) for points, rows in zip(uv, F, strict=True)]
+def ring(inner, outer=1.0, corners=64):
+    """A ring around the origin."""
+    turn = np.exp(2j * np.pi * np.arange(corners) / corners)
+    z = np.concatenate([inner * turn, outer * turn])
+    i, j = np.arange(corners), np.roll(np.arange(corners), -1)
+    F = np.concatenate([np.c_[i, i + corners, j + corners], np.c_[i, j + corners, j]])
+    return np.c_[z.real, z.imag], F
+
+
+def letter_l(width):
+    """An L of two unit bars of a width."""
+    V = np.array([(0, 0), (1, 0), (1, width), (width, width), (width, 1), (0, 1.0)])
+    return V, np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)])
 
 
 @st.composite
-def maps(draw):
-    """Islands of a few shapes, in many places, sizes and ways around, some mirrored."""
-    uv, F = [], []
-    for _ in range(draw(st.integers(1, 12))):
-        V, rows = draw(st.sampled_from([surfaces.grid(3, 2), surfaces.disk(2), surfaces.random_delaunay(12, 1)]))
-        stretch = draw(st.tuples(st.floats(0.05, 20), st.sampled_from([1.0, 0.1, -1.0])))
+def problems(draw):
+    """Charts of a few shapes at many positions, sizes and angles, some mirrored."""
+    charts = []
+    for _ in range(draw(st.integers(1, 9))):
+        V, F = draw(st.sampled_from([surfaces.grid(3, 2), surfaces.disk(2), ring(0.8), letter_l(0.2)]))
+        stretch = draw(st.tuples(st.floats(0.05, 5), st.sampled_from([1.0, 0.1, -1.0])))
         move = draw(st.tuples(st.floats(-5, 5), st.floats(-5, 5)))
-        uv.append(turned(V[:, :2] * stretch, draw(st.integers(0, 359))) + move)
-        F.append(rows)
-    surface = draw(st.lists(st.floats(0.01, 100), min_size=len(uv), max_size=len(uv)))
-    return uv, F, surface, draw(st.sampled_from([0, 1 / 1024, 0.02]))
+        charts.append((rotate(V[:, :2] * stretch, draw(st.integers(0, 359))) + move, F))
+    size = draw(st.sampled_from([(256, 256), (1024, 1024), (512, 256)]))
+    return charts, size, draw(st.sampled_from([0, 1.5, 8])), draw(st.integers(1, 2)), draw(st.booleans())
 
 
-@given(maps())
-@settings(max_examples=40, deadline=None)
-def test_what_is_promised(problem):
-    uv, F, surface, margin = problem
-    given_to_it = [points.copy() for points in uv]
-    out = packed(uv, F, surface, margin=margin)
-    assert all(np.array_equal(a, b) for a, b in zip(uv, given_to_it, strict=True))
-    assert all(np.array_equal(a, b) for a, b in zip(out, packed(uv, F, surface, margin=margin), strict=True))
-    check(out, margin)
-    density = [area(p, rows) / s for p, rows, s in zip(out, F, surface, strict=True)]
-    np.testing.assert_allclose(density, density[0], rtol=1e-6)
-    for before, after, rows in zip(uv, out, F, strict=True):
-        # The same shape, turned and scaled: no angle has another sign.
-        scale = np.sqrt(area(after, rows) / area(before, rows))
-        z = (before - before.mean(axis=0)).view(np.complex128).ravel()
-        w = (after - after.mean(axis=0)).view(np.complex128).ravel()
-        turn = np.vdot(z, w) / np.vdot(z, z).real
-        assert abs(turn) == pytest.approx(scale, rel=1e-6)
-        np.testing.assert_allclose(w, turn * z, atol=1e-7)
-        signs = [[exact_orientation(*points[row]) for row in rows] for points in (before, after)]
-        assert signs[0] == signs[1]
+@given(problems())
+@settings(max_examples=12, deadline=None)
+def test_packing_has_its_promised_properties(problem):
+    charts, size, padding, tiles, turns = problem
+    before = [uv.copy() for uv, _ in charts]
+    options = {"resolution": size, "padding": padding, "tiles": tiles, "rotate": turns}
+    packing = pack_charts(charts, **options)
+    assert all(np.array_equal(a, b) for (a, _), b in zip(charts, before, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(packing.uv, pack_charts(charts, **options).uv, strict=True))
+    check(charts, packing, size, padding)
+    covered = 0
+    for (uv, F), out, placement in zip(charts, packing.uv, packing.placements, strict=True):
+        # The same shape, rotated and scaled as reported, not mirrored.
+        texels = (out - [placement.tile % 10, placement.tile // 10]) * size
+        wanted = packing.texels_per_unit * rotate(uv, np.degrees(placement.angle)) + placement.offset
+        np.testing.assert_allclose(texels, wanted, atol=1e-8 * max(size))
+        assert not placement.mirrored
+        assert turns or placement.angle == 0
+        assert 0 <= placement.tile < tiles
+        covered += area(texels, F)
+    assert packing.utilisation == pytest.approx(covered / (tiles * size[0] * size[1]))
 
 
-@given(st.lists(st.tuples(st.floats(0, 1.2), st.floats(0, 1.2)), max_size=15))
-@settings(deadline=None)
-def test_boxes_do_not_overlap(boxes):
-    places = laid(boxes)
-    if places is None:
-        assert boxes
-        return
-    size = [(h, w) if place.turned else (w, h) for place, (w, h) in zip(places, boxes, strict=True)]
-    for i, (one, (w, h)) in enumerate(zip(places, size, strict=True)):
-        assert one.x + w <= 1
-        assert one.y + h <= 1 + 1e-15
-        for other, (w2, h2) in zip(places[:i], size, strict=False):
-            apart = max(one.x - other.x - w2, other.x - one.x - w, one.y - other.y - h2, other.y - one.y - h)
-            assert apart >= -1e-12
-
-
-def test_boxes_that_fill_the_square_and_one_more():
-    assert laid([(0.5, 0.5)] * 4) == [(0, 0, False), (0.5, 0, False), (0, 0.5, False), (0.5, 0.5, False)]
-    assert laid([(0.5, 0.5)] * 5) is None
-    assert laid([(1, 0.25), (0.75, 0.5), (0.7, 0.25)])[2] == (0.75, 0.25, True)
+def test_concave_parts_and_holes_are_used():
+    """Boxes cannot reach these utilisations: the box of an L, and that of a ring, exceeds its share."""
+    charts = [letter_l(0.3)] * 2
+    packing = pack_charts(charts, resolution=512, padding=2)
+    check(charts, packing, (512, 512), 2)
+    # Two boxes of an L need a square with four times the area of the box, which fills it by 0.255.
+    assert packing.utilisation > 0.5
+    disk = surfaces.disk(3)
+    charts = [ring(0.7), (0.6 * disk[0][:, :2], disk[1])]
+    packing = pack_charts(charts, resolution=512, padding=2)
+    check(charts, packing, (512, 512), 2)
+    np.testing.assert_allclose(np.ptp(packing.uv[0], axis=0), 1, atol=0.03)
 
 
 def test_a_square_fills_the_square():
     V, F = surfaces.grid(4, 4)
     for degrees in (0, 30, 45, 75, 180):
-        (out,) = packed([turned(V, degrees) * 7 + 3], [F], [2.5], margin=0.125)
-        np.testing.assert_allclose(out.min(axis=0), 0.0625, atol=1e-9)
-        np.testing.assert_allclose(out.max(axis=0), 0.9375, atol=1e-9)
-
-
-def test_an_island_stays_as_upright_as_its_least_box_lets_it():
-    """What is upright stays so, to the last bit but for size; what is turned a little is turned back."""
-    V, F = surfaces.grid(4, 4)
-    for degrees in (0, 20, -40, 60):
-        (out,) = packed([turned(V * [2, 1], degrees)], [F], [1], margin=0)
-        side = (out[4] - out[0]) @ [1, 1j]
-        back = np.degrees(np.angle(side)) - degrees
-        assert min(abs((back - k + 180) % 360 - 180) for k in (0, 90)) <= 45 + 1e-9
-        assert np.abs([side.real, side.imag]).min() < 1e-12
-    assert np.ptp(packed([V], [F], [1], margin=0)[0][:5, 1]) == 0
+        packing = pack_charts([(rotate(V[:, :2], degrees) * 7 + 3, F)], resolution=512, padding=2)
+        assert packing.utilisation > 0.95
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-100, 1e100, 1e300])
-def test_any_unit_will_do(scale):
-    uv, F = rectangles(6)
-    wanted = packed(uv, F, areas_of(uv, F))
-    found = packed([points * scale for points in uv], F, np.array(areas_of(uv, F)) * scale)
-    for one, other in zip(found, wanted, strict=True):
+def test_the_unit_of_length_does_not_matter(scale):
+    charts = grids(6)
+    wanted = pack_charts(charts)
+    found = pack_charts([(uv * scale, F) for uv, F in charts])
+    for one, other in zip(found.uv, wanted.uv, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
+    assert found.texels_per_unit * scale == pytest.approx(wanted.texels_per_unit)
 
 
-def test_share_of_the_square():
-    """What packing by boxes reaches; a worse way of doing it would fail here."""
-    for count, least in ((5, 0.75), (20, 0.8), (100, 0.88)):
-        uv, F = rectangles(count)
-        assert sum(areas_of(packed(uv, F, areas_of(uv, F), margin=0), F)) > least
+def test_a_given_density_is_kept():
+    charts = grids(6)
+    largest = pack_charts(charts, resolution=512).texels_per_unit
+    packing = pack_charts(charts, resolution=512, texels_per_unit=largest / 2)
+    assert packing.texels_per_unit == pytest.approx(largest / 2)
+    check(charts, packing, (512, 512), 4)
+    with pytest.raises(ValueError, match="6 charts with a padding of 4 texels do not fit into 512 × 512") as raised:
+        pack_charts(charts, resolution=512, texels_per_unit=3 * largest)
+    sufficient = int(str(raised.value).split("resolution=")[1].split()[0])
+    assert sufficient < 1700
+    check(charts, pack_charts(charts, resolution=sufficient, texels_per_unit=3 * largest), [sufficient] * 2, 4)
 
 
-@pytest.mark.slow
-def test_a_thousand_islands():
-    uv, F = rectangles(1000)
-    began = time.process_time()
-    out = packed(uv, F, areas_of(uv, F), margin=1 / 1024)
-    # About one on an idle machine.
-    assert time.process_time() - began < 10
-    check(out, 1 / 1024)
-    assert sum(areas_of(out, F)) > 0.85
+def test_several_tiles():
+    charts = grids(12)
+    packing = pack_charts(charts, resolution=256, tiles=12)
+    check(charts, packing, (256, 256), 4)
+    assert {placement.tile for placement in packing.placements} <= set(range(12))
+    assert max(placement.tile for placement in packing.placements) > 3
+    assert packing.texels_per_unit > 2 * pack_charts(charts, resolution=256).texels_per_unit
+    for uv, placement in zip(packing.uv, packing.placements, strict=True):
+        assert (np.floor(uv) == [placement.tile % 10, placement.tile // 10]).all()
 
 
-def test_islands_without_area_and_with_flips():
+def test_congruent_charts_share_their_position():
+    V, F = surfaces.disk(4)
+    V = V[:, :2] * [1, 0.5] + 0.1 * V[:, :2] ** 2
+    order = np.random.default_rng(0).permutation(len(V))
+    shuffled = np.empty_like(V)
+    shuffled[order] = rotate(V, 77) + 5
+    mirrored = rotate(V * [-1, 1], 12)
+    charts = [(V, F), (shuffled, order[F][::-1]), (mirrored, F[:, ::-1]), (V * 1.01, F)]
+    packing = pack_charts(charts, stack=True)
+    assert [placement.mirrored for placement in packing.placements] == [False, False, True, False]
+    np.testing.assert_allclose(packing.uv[1][order], packing.uv[0], atol=1e-12)
+    np.testing.assert_allclose(packing.uv[2], packing.uv[0], atol=1e-12)
+    check([charts[0], charts[3]], pack_charts(charts[::3], stack=True), (2048, 2048), 4)
+    texels = packing.texels_per_unit
+    for (uv, _), out, placement in zip(charts, packing.uv, packing.placements, strict=True):
+        wanted = rotate(uv * [-1, 1] if placement.mirrored else uv, np.degrees(placement.angle))
+        np.testing.assert_allclose(out * 2048, texels * wanted + placement.offset, atol=1e-6)
+    assert len({placement.offset for placement in pack_charts(charts).placements}) == 4
+    unequal = pack_charts([(V, F[:-1]), (V, np.roll(F, 1, axis=0)[:-1])], stack=True)
+    assert not np.allclose(unequal.uv[0], unequal.uv[1])
+
+
+def test_charts_without_area_and_with_inverted_triangles():
     V, F = surfaces.grid(2, 2)
     V = V[:, :2]
     folded = V.copy()
     folded[4] = (2, 2)
-    uv = [V, np.zeros((9, 2)), V * [1, 0], folded, V]
-    out = packed(uv, [F] * 5, [1, 1, 1, 2, 0], margin=0.01)
-    check(out, 0.01)
-    assert is_injective(F, out[0])
-    assert area(out[1], F) == 0
-    np.testing.assert_allclose(area(out[3], F), 2 * area(out[0], F))
-    assert is_injective(F, out[4])
+    charts = [(V, F), (np.zeros((9, 2)), F), (V * [1, 0], F), (folded, F)]
+    packing = pack_charts(charts, resolution=256)
+    check(charts, packing, (256, 256), 4)
+    assert is_injective(F, packing.uv[0])
+    check(charts[1:3], pack_charts(charts[1:3], resolution=256), (256, 256), 4)
 
 
 def test_nothing_to_pack():
-    assert packed([], [], []) == []
+    assert pack_charts([]).uv == ()
 
 
-def test_triangles_too_thin_for_the_square():
-    V, F = np.array([(0, 0), (1, 0), (1 / 3, 1e-22), (0.4, 1.0)]), np.array([(0, 1, 2), (0, 2, 3), (2, 1, 3)])
-    assert is_injective(F, V)
-    with pytest.raises(ValueError, match="island 1: its triangle 0 would be inverted by rounding in the unit square"):
-        packed([V + [(0, 1)] * 4, V], [F, F], [1, 1])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("count", "seconds"), [(5, 0.5), pytest.param(1000, 8, marks=pytest.mark.nightly), (10_000, 20)]
+)
+def test_time(count, seconds):
+    charts = grids(count)
+    began = time.process_time()
+    packing = pack_charts(charts, resolution=1024 if count < 10_000 else 2048, padding=4)
+    # Twice the time on an idle machine.
+    assert time.process_time() - began < 2 * seconds
+    check(charts, packing, [1024 if count < 10_000 else 2048] * 2, 4)
+
+
+def test_textures_too_small():
+    charts = grids(100)
+    with pytest.raises(ValueError, match="100 charts with a padding of 4 texels do not fit into 32 ×") as raised:
+        pack_charts(charts, resolution=32)
+    sufficient = int(str(raised.value).split("resolution=")[1].split()[0])
+    # Ten rows of ten charts of at most one texel.
+    assert 40 <= sufficient <= 56
+    check(charts, pack_charts(charts, resolution=sufficient), [sufficient] * 2, 4)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"areas": [1]}, "uv has 2 islands, F has 2, and areas has shape"),
-        ({"areas": [1, -1]}, "areas must be finite and not negative: check island 1"),
-        ({"areas": [1, np.nan]}, "check island 1"),
-        ({"margin": -0.1}, "margin must be a fraction of the square's side, at least 0 and less than 1, not -0.1"),
-        ({"margin": 0.7}, "2 islands do not fit with a margin of 0.7 of the square's side around each"),
-        ({"uv": [np.full((9, 2), np.inf)] * 2}, r"uv\[0\] is not finite at vertices 0, 1"),
-        ({"uv": [np.zeros((8, 2))] * 2}, "F refers to vertex 8"),
+        ({"charts": 3}, r"charts must be a list of pairs \(uv, F\), not 3"),
+        ({"charts": [3]}, r"charts\[0\] must be a pair \(uv, F\)"),
+        ({"charts": [(np.full((9, 2), np.inf), [[0, 1, 2]])]}, r"charts\[0\] is not finite at vertices 0, 1"),
+        ({"charts": [(np.zeros((2, 2)), [[0, 1, 2]])]}, "F refers to vertex 2"),
+        ({"padding": -1}, "padding must be a finite number of at least 0"),
+        ({"resolution": 0}, "resolution must be an integer of at least 1"),
+        ({"resolution": (1, 2, 3)}, "resolution must be a number of texels, or width and height"),
+        ({"tiles": 0}, "tiles must be an integer of at least 1"),
+        ({"texels_per_unit": 0}, "texels_per_unit must be positive and finite"),
+        ({"padding": 2000}, r"2 charts with a padding of 2000 texels do not fit into 1024 × 1024 texels: .* suffices"),
     ],
 )
-def test_wrong_calls(change, message):
+def test_invalid_calls(change, message):
     V, F = surfaces.grid(2, 2)
-    call = {"uv": [V, V], "F": [F, F], "areas": [1, 2], **change}
+    call = {"charts": [(V[:, :2], F)] * 2, "resolution": 1024, **change}
     with pytest.raises(ValueError, match=message):
-        packed(**call)
+        pack_charts(call.pop("charts"), **call)

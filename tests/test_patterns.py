@@ -1,4 +1,4 @@
-"""Outlines of flat maps, read back from the drawings: true to scale, with the allowance they were asked for."""
+"""Outlines of flat maps, read from the drawings: true to scale, with the requested seam allowance."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def length(loop):
 
 
 def distances(points, loop):
-    """From points to a closed polygon, side by side."""
+    """Return distances from points to a closed polygon, for arrays of both."""
     tail, side = loop, np.roll(loop, -1, axis=0) - loop
     apart = points[:, None] - tail[None]
     s = np.clip((apart * side).sum(axis=2) / (side**2).sum(axis=1), 0, 1)
@@ -34,7 +34,7 @@ def distances(points, loop):
 
 
 def drawn(path):
-    """Size on paper, what the drawing shows of it, and the closed lines of each group, y upwards again."""
+    """Return the size on paper, the size of the drawing, and the closed lines of each group, with y upwards."""
     root = ET.fromstring(path.read_bytes())
     paper = [re.fullmatch(r"(.*)mm", root.get(side)).group(1) for side in ("width", "height")]
     groups = {}
@@ -48,7 +48,7 @@ def drawn(path):
 
 @pytest.fixture
 def ring():
-    """A square ring of 2 by 2, its hole 1 by 1."""
+    """A square ring of 2 by 2 with a hole of 1 by 1."""
     return surfaces.annulus(6)
 
 
@@ -69,7 +69,7 @@ def test_drawing_is_true_to_scale(ring, tmp_path, unit):
         assert (loop * [1, -1] <= paper).all()
 
 
-def test_dxf_is_true_to_scale_and_always_the_same(ring, tmp_path):
+def test_dxf_is_true_to_scale_and_deterministic(ring, tmp_path):
     ezdxf = pytest.importorskip("ezdxf")
     pytest.importorskip("shapely")
     V, F = ring
@@ -88,7 +88,7 @@ def test_dxf_is_true_to_scale_and_always_the_same(ring, tmp_path):
     assert sorted(area(loop) for loop in wanted.seam) == pytest.approx([-(25.4**2) / 9, 25.4**2 * 4 / 9], rel=1e-12)
 
 
-def test_cut_is_just_so_far_outside_of_the_seam(ring):
+def test_the_cut_line_is_at_the_distance_of_the_allowance(ring):
     pytest.importorskip("shapely")
     V, F = ring
     turn = 0.7 * (V**2).sum(axis=1)
@@ -99,16 +99,16 @@ def test_cut_is_just_so_far_outside_of_the_seam(ring):
     for cut in found.cut:
         ends = np.array([distances(cut, seam) for seam in found.seam]).min(axis=0)
         assert np.allclose(ends, 4.0, rtol=1e-9)
-        # Between its corners it comes nearer by next to nothing.
+        # Between its corners it is closer by almost nothing.
         middle = np.array([distances((cut + np.roll(cut, -1, axis=0)) / 2, seam) for seam in found.seam]).min(axis=0)
         assert middle.min() > 4 * (1 - 4e-4)
         assert middle.max() < 4 * (1 + 1e-9)
-    # The outer one is longer than its seam by a turn around the allowance at least, the hole's shorter.
+    # The outer line is longer than its seam by at least a full circle around the allowance; the hole's is shorter.
     outer, hole = (max(found.cut, key=area), min(found.cut, key=area))
     assert area(outer) > area(max(found.seam, key=area)) > 0 > area(hole) > area(min(found.seam, key=area))
 
 
-def test_allowance_of_a_square_has_the_area_it_must_have():
+def test_allowance_of_a_square_has_the_expected_area():
     pytest.importorskip("shapely")
     V, F = surfaces.grid(3, 3)
     found = pattern(F, 100 * V, allowance=10.0)
@@ -124,7 +124,7 @@ def test_narrow_holes_vanish_in_the_allowance(ring):
     assert len(pattern(F, V, allowance=0.49).cut) == 2
 
 
-def test_pieces_need_room_for_their_allowances(tmp_path):
+def test_pieces_keep_a_distance_for_their_allowances(tmp_path):
     pytest.importorskip("shapely")
     V, F = surfaces.grid(2, 2)
     uv, both = np.concatenate([V, V + np.array([1.5, 0])]), np.concatenate([F, F + len(V)])
@@ -145,14 +145,14 @@ def test_pieces_need_room_for_their_allowances(tmp_path):
         (-1.0, {}, "overlaps itself, so its pattern cannot be cut out. Not injective"),
     ],
 )
-def test_what_makes_no_pattern_is_refused(ring, tmp_path, change, options, message):
+def test_unusable_patterns_are_rejected(ring, tmp_path, change, options, message):
     V, F = ring
     with pytest.raises(ValueError, match=re.escape(message)):
         write_pattern(tmp_path / "none.svg", F, V * [1, change], **options)
     assert not list(tmp_path.iterdir())
 
 
-def test_file_names_say_the_format(ring, tmp_path):
+def test_file_names_determine_the_format(ring, tmp_path):
     V, F = ring
     with pytest.raises(ValueError, match=r"must be \.svg or \.dxf, not \.pdf"):
         write_pattern(tmp_path / "ring.pdf", F, V)
@@ -175,7 +175,7 @@ def test_missing_packages_are_named(ring, tmp_path, monkeypatch, package, name, 
     assert not list(tmp_path.iterdir())
 
 
-def test_coordinates_that_no_double_holds_in_mm_are_refused():
+def test_coordinates_that_overflow_in_mm_are_rejected():
     V, F = surfaces.grid(2, 2)
     with pytest.raises(ValueError, match=r"are outside the range of doubles: check the unit m"):
         pattern(F, 1e306 * V, unit="m")

@@ -1,4 +1,4 @@
-"""Figures: sizes, red where and only where triangles are inverted, no global state."""
+"""Figures: sizes, red exactly at inverted triangles, no global state."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from quasiharmonic.plot import (
     save_map_figure,
     save_texture_figure,
 )
-from quasiharmonic.targets.boundary.correspondence import upright
+from quasiharmonic.targets.boundary.correspondence import viewer_axes
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.plot import interactive
 from quasiharmonic.ui.plot.canvas import RED, new_figure
@@ -42,7 +42,7 @@ def pixels(figure):
 
 
 def red(image):
-    """Pixels of the red that only inverted triangles have."""
+    """Return the pixels of the red that only inverted triangles have."""
     return (image[..., 0] > 0.8) & (image[..., 1] < 0.25) & (image[..., 2] < 0.35)
 
 
@@ -78,10 +78,10 @@ def test_inverted_triangles_can_be_given(planar):
     assert not red(pixels(plot_map(V, F, planar[2], inverted=[]).figure)).any()
 
 
-def test_triangles_too_small_to_see_are_marked():
+def test_triangles_too_small_to_be_visible_are_marked():
     V, F = surfaces.grid(40, 40)
     uv = V.copy()
-    # Nine vertices shrunk to a speck of a hundredth of a pixel, turned inside out.
+    # Nine vertices shrunk to a hundredth of a pixel and turned inside out.
     centre = 20 + 20 * 41
     near = [centre + i + 41 * j for i in (-1, 0, 1) for j in (-1, 0, 1)]
     uv[near] = V[centre] + (V[near] - V[centre])[:, ::-1] * 1e-4
@@ -90,7 +90,7 @@ def test_triangles_too_small_to_see_are_marked():
     assert flips(F, uv).sum() >= 8
 
 
-def test_interior_pins_are_drawn_and_boundary_ones_are_not(planar):
+def test_interior_pins_are_drawn_and_boundary_vertices_are_not(planar):
     V, F, _ = planar
     boundary = np.arange(int(np.unique(F).size ** 0.5))[:5]
     plain = pixels(plot_map(V, F, V).figure)
@@ -122,7 +122,7 @@ def test_saved_figure_has_three_panels_or_two(planar, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["three.png", "two.png"]
 
 
-def test_given_flips_are_those_of_the_map_not_of_the_guess(planar, tmp_path):
+def test_given_inverted_triangles_are_marked_on_the_map_only(planar, tmp_path):
     V, F, folded = planar
     save_map_figure(tmp_path / "map.png", V, F, V, folded, inverted=[3], fixed=[0])
     columns = red(imread(tmp_path / "map.png")).any(axis=0)
@@ -130,16 +130,16 @@ def test_given_flips_are_those_of_the_map_not_of_the_guess(planar, tmp_path):
     assert columns[800:].any()
 
 
-def test_surface_hides_what_is_behind():
+def test_the_surface_hides_what_is_behind():
     V, F = surfaces.cat(16)
     seen = view(V, F)
     assert seen.points.shape == (len(V), 2)
-    # Depth grows towards the viewer, who looks at the nose, far before the boundary.
+    # Depth grows towards the viewer, who looks at the nose, far in front of the boundary.
     assert seen.depth[0] > seen.depth[-96:].max()
     assert seen.inside.mean() < 0.25
     assert seen.color.min() >= 0
     assert seen.color.max() <= 1
-    # Without relief nothing is hidden and a planar mesh is shown as it is.
+    # Without relief nothing is hidden, and a planar mesh is shown in its plane.
     W, G = surfaces.annulus(6)
     flat = view(W, G)
     assert flat.points == pytest.approx(W)
@@ -147,21 +147,21 @@ def test_surface_hides_what_is_behind():
 
 
 def sphere(hole):
-    """Unit sphere without a small cap around the direction ``hole``."""
+    """Return a unit sphere without a small cap around the direction ``hole``."""
     V, F = surfaces.disk(16)
     angle = np.hypot(*V.T) * np.radians(165)
     turn = np.arctan2(V[:, 1], V[:, 0])
     top = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1)
-    return top @ upright(-np.asarray(hole, dtype=float)), F
+    return top @ viewer_axes(-np.asarray(hole, dtype=float)), F
 
 
 @pytest.mark.parametrize("hole", [(0, -1, 0), (0, 1, 0), (0, 0, -1), (1, 0, 0)])
-def test_surfaces_stand_on_their_hole(hole):
+def test_surfaces_are_shown_with_their_hole_below(hole):
     V, F = sphere(hole)
     assert view(V, F).points[-96:, 1].mean() < -0.8
 
 
-def test_inner_side_is_grey():
+def test_the_inner_side_is_grey():
     V, F = sphere((1, 1, 1))
     figure = new_figure((3, 3))
     ax = figure.add_axes((0, 0, 1, 1))
@@ -220,7 +220,7 @@ def test_distortion_is_drawn_for_every_measure(planar):
     assert tuple(LABELS) == MEASURES
 
 
-def test_distortion_histogram_has_all_the_area(planar):
+def test_the_histogram_of_distortion_contains_the_whole_area(planar):
     V, F, _ = planar
     bars = plot_distortion(V, F, V * (3, 1), "conformal").axes[2]
     heights = [bar.get_height() for bar in bars.patches]
@@ -231,8 +231,8 @@ def test_distortion_histogram_has_all_the_area(planar):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("measure", LABELS)
-def test_colours_can_be_read_off(planar, measure):
-    """Five values beside the bar, those of the histogram; open where there may be values beyond."""
+def test_colour_bars_have_labels(planar, measure):
+    """Five values at the colour bar, those of the histogram; its ends are open if values may lie beyond."""
     V, F, _ = planar
     figure = plot_distortion(V, F, np.column_stack([V[:, 0] ** 2 + V[:, 0], 1e-3 * V[:, 1]]), measure)
     figure.canvas.draw()
@@ -244,7 +244,7 @@ def test_colours_can_be_read_off(planar, measure):
     assert len(bar.patches) == (2 if measure in ("sigma1", "sigma2", "area_ratio") else 1)
 
 
-def test_distortion_of_flat_triangles_and_of_no_value():
+def test_distortion_of_flat_triangles_and_without_values():
     V, F = np.array([[0, 0], [1, 0], [2, 0], [0, 1.0]]), np.array([[0, 1, 2], [0, 1, 3]])
     uv = np.array([[0, 0], [1, 0], [2, 0.5], [0, 1.0]])
     assert plot_distortion(V, F, uv, "area_ratio") is not None
@@ -255,29 +255,29 @@ def test_distortion_of_flat_triangles_and_of_no_value():
 
 
 @pytest.mark.slow
-def test_texture_shows_the_board_and_what_is_inverted(planar, tmp_path):
+def test_texture_shows_the_checkerboard_and_inverted_triangles(planar, tmp_path):
     V, F, folded = planar
     figure = plot_texture(V, F, V, squares=4)
     assert not red(pixels(figure)).any()
     board = np.asarray(figure.axes[1].images[0].get_array())
-    # A round domain of diameter 2 at 600 pixels for 1/0.96 of it: as many light as dark pixels.
+    # A round domain of diameter 2 fills 600 pixels times 0.96, with as many light as dark pixels.
     inside = board[..., 3] == 1
     assert inside.mean() == pytest.approx(np.pi / 4 / 1.04**2, abs=0.02)
     blue = inside & (board[..., 0] < 0.4)
     assert blue.sum() / inside.sum() == pytest.approx(0.5, abs=0.03)
-    # Neighbouring squares have other colours, across both sides.
+    # Adjacent squares have different colours, across both sides.
     column = [blue[300 + round(600 / 1.04 / 4 * (k + 0.5) * s), 330] for k in (0, 1) for s in (-1, 1)]
     assert column[0] != column[1]
     assert column[0] != column[2]
     save_texture_figure(tmp_path / "folded.png", V, F, folded)
     assert red(imread(tmp_path / "folded.png")[..., :3]).any()
-    with pytest.raises(ValueError, match="squares must be at least 1"):
+    with pytest.raises(ValueError, match="squares must be an integer of at least 1"):
         plot_texture(V, F, V, squares=0)
 
 
 @pytest.mark.slow
-def test_texture_shows_the_nearer_of_two_sheets():
-    # Two squares over each other; only the upper one, mapped far to the right, is seen.
+def test_texture_shows_the_closer_of_two_sheets():
+    # Two overlapping squares; only the upper one, mapped far to the right, is visible.
     V = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     F = np.array([[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6]])
     uv = V[:, :2] + np.where(V[:, 2:] > 0, (0.0, 0.0), (10.0, 0.0))
@@ -309,8 +309,8 @@ def test_animation(planar, tmp_path, suffix):
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
-def test_an_animation_shows_all_of_every_frame(planar, tmp_path):
-    """One that leaves the first one's window, and inverted triangles that only a frame in the middle has."""
+def test_an_animation_shows_every_frame_completely(planar, tmp_path):
+    """One frame leaves the window of the first, and only a frame in the middle has inverted triangles."""
     V, F, folded = planar
     path = tmp_path / "a.gif"
     frames = [("small", V), ("folded", folded), ("large", 2 * V), ("apart", V + 0.7 * np.ptp(V))]
@@ -327,11 +327,11 @@ def test_an_animation_shows_all_of_every_frame(planar, tmp_path):
             [picture[-5:].reshape(-1, 3), picture[:, :5].reshape(-1, 3), picture[:, -5:].reshape(-1, 3)]
         )
         assert (rim == 1).all()
-    # Hundredths of a second is all there is: 30 a second on the whole, not 33.
+    # The format has a resolution of 0.01 s: the mean is 30 frames per second, not 33.
     assert durations == [30, 40, 30, 30 + 1000]
 
 
-def test_animation_says_what_is_wrong(planar, tmp_path):
+def test_errors_of_an_animation_are_reported(planar, tmp_path):
     V, F, _ = planar
     with pytest.raises(ValueError, match=r"must be \.gif or \.mp4"):
         save_animation(tmp_path / "a.avi", V, F, [("one", V)])
@@ -356,7 +356,7 @@ def test_animation_says_what_is_wrong(planar, tmp_path):
 
 
 @pytest.mark.parametrize("plot", [plot_map, plot_texture, plot_distortion])
-def test_maps_and_triangles_that_do_not_fit_are_refused(planar, plot):
+def test_maps_and_triangles_that_do_not_match_are_rejected(planar, plot):
     V, F, _ = planar
     with pytest.raises(ValueError, match=r"uv must have shape"):
         plot(V, F, V[:-1])
@@ -366,7 +366,7 @@ def test_maps_and_triangles_that_do_not_fit_are_refused(planar, plot):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-200, 1e200])
-def test_pictures_have_no_scale(planar, unit):
+def test_pictures_do_not_depend_on_scale(planar, unit):
     V, F, folded = planar
     for plot in (plot_map, plot_texture):
         plain, scaled = (plot(rest, F, uv) for rest, uv in ((V, folded), (V * unit, folded * unit)))
@@ -390,7 +390,7 @@ def test_window(planar, tmp_path, monkeypatch):
     polyscope.init("openGL_mock")
     interactive.add(V, F, folded)
     assert polyscope.has_surface_mesh("surface")
-    # Inverted triangles are meshes of their own, red; all is in the picture.
+    # Inverted triangles are separate red meshes; the picture contains everything.
     parts = [polyscope.get_surface_mesh(name).n_faces() for name in ("map", "map: inverted")]
     assert sum(parts) == len(F)
     assert parts[1] == len(inverted_triangles(F, folded)) > 0

@@ -1,4 +1,4 @@
-"""PLY and STL: read as independent readers do, written without loss, and bad files named."""
+"""PLY and STL: read as independent readers do, written without loss, and invalid files named."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from quasiharmonic import io, repair
 from quasiharmonic.io import MeshData, MeshFileError
 from quasiharmonic.surfaces import cat, disk
-from shared.damaged import VALID
+from shared.damaged_files import VALID
 from shared.gltf_files import SQUARE, square
 
 HEAD = b"ply\nformat ascii 1.0\ncomment made by hand\n"
@@ -25,7 +25,7 @@ MIXED = (
 
 
 def swapped(data):
-    """A text file of ours as big-endian bytes."""
+    """Return a text file of this package as big-endian bytes."""
     body = data.split(b"end_header\n")[1].splitlines()
     rows = [line.split() for line in body]
     out = data.split(b"end_header\n")[0].replace(b"ascii", b"binary_big_endian") + b"end_header\n"
@@ -38,7 +38,7 @@ def swapped(data):
 
 
 @pytest.mark.parametrize("form", [bytes, swapped, lambda data: data.replace(b"\n", b"\r\n")])
-def test_all_forms_of_ply(form, tmp_path):
+def test_all_variants_of_ply(form, tmp_path):
     path = tmp_path / "mixed.ply"
     path.write_bytes(form(MIXED))
     mesh = io.read_mesh(path)
@@ -49,7 +49,7 @@ def test_all_forms_of_ply(form, tmp_path):
     expected = np.array([[0, 0], [0.5, 0], [0.5, 0.5], [0, 0.5], [0.6, 0.6], [0.8, 0.6], [0.7, 0.9]])
     np.testing.assert_array_equal(mesh.vt[mesh.FT.ravel()[corners]], expected.astype("f4"))
     np.testing.assert_array_equal(mesh.extra, np.array([[5, 0, 0], [0, 5, 0], [0, 0, 5], [1, 1, 1], [0, 0, 0]]) / 5)
-    # Written again, all of it is there, and only the places may differ.
+    # Written again, the file contains all data, and only the positions may differ.
     io.write_mapped(tmp_path / "out.ply", mesh)
     data = (tmp_path / "out.ply").read_bytes()
     assert b"comment made by hand\n" in data
@@ -71,7 +71,7 @@ def test_all_forms_of_ply(form, tmp_path):
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_other_libraries_write_what_is_read(binary, tmp_path):
+def test_files_of_other_libraries_are_read(binary, tmp_path):
     meshlane = pytest.importorskip("meshlane", reason="an independent reader and writer of PLY")
     V, F = cat(6)
     data = {"s": V[:, 0] / 3, "t": V[:, 1] / 7}
@@ -83,7 +83,7 @@ def test_other_libraries_write_what_is_read(binary, tmp_path):
     np.testing.assert_array_equal(io.map_of(mesh), np.stack([data["s"], data["t"]], axis=1))
 
 
-def test_other_libraries_read_what_is_written(tmp_path):
+def test_other_libraries_read_written_files(tmp_path):
     meshlane = pytest.importorskip("meshlane", reason="an independent reader and writer of PLY")
     trimesh = pytest.importorskip("trimesh", reason="an independent reader and writer of PLY")
     V, F = cat(6)
@@ -100,7 +100,7 @@ def test_other_libraries_read_what_is_written(tmp_path):
 
 
 def test_an_obj_as_ply(tmp_path):
-    """Normals and colours go along where vertices have one each, and what does not is named."""
+    """Normals and colours are preserved if vertices have one each; other data that is lost is named."""
     text = "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0 0 0 .5\nvn 0 0 1\nvn 0 1 0\nusemtl a\nf 1//1 2//2 3//1\n"
     (tmp_path / "in.obj").write_text(text)
     mesh = io.read_mesh(tmp_path / "in.obj")
@@ -138,14 +138,14 @@ def test_an_obj_as_ply(tmp_path):
         (b"", "empty"),
     ],
 )
-def test_bad_ply(data, message, tmp_path):
+def test_invalid_ply(data, message, tmp_path):
     path = tmp_path / "bad.ply"
     path.write_bytes(data)
     with pytest.raises(MeshFileError, match=message):
         io.read_mesh(path)
 
 
-def test_stl_is_welded(tmp_path):
+def test_stl_vertices_are_merged(tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="an independent writer of STL")
     V, F = cat(6)
     V = V.astype("f4").astype(float)
@@ -157,7 +157,7 @@ def test_stl_is_welded(tmp_path):
         np.testing.assert_allclose(mesh.V[mesh.F], V[F], atol=1e-7)
         if name == "binary.stl":
             np.testing.assert_array_equal(mesh.V[mesh.F], V[F])
-            # In the order in which they come first.
+            # In the order of their first occurrence.
             np.testing.assert_array_equal(
                 np.unique(mesh.F, return_index=True)[1], np.sort(np.unique(F, return_index=True)[1])
             )
@@ -182,7 +182,7 @@ FACET = b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1
         b"",
     ],
 )
-def test_bad_stl(data, tmp_path):
+def test_invalid_stl(data, tmp_path):
     path = tmp_path / "bad.stl"
     path.write_bytes(data)
     with pytest.raises(MeshFileError, match=r"bad\.stl"):
@@ -190,7 +190,7 @@ def test_bad_stl(data, tmp_path):
 
 
 def with_floats(data):
-    """A PLY file with places and colours of vertices, and places of corners, all of them floats."""
+    """Return a PLY file with float positions and colours of vertices, and float texture coordinates of corners."""
     F = np.array([[0, 1, 2], [0, 2, 3]], dtype="<i4")
     names = ["x", "y", "z", "s", "t", "red", "green", "blue"]
     header = ["ply", "format binary_little_endian 1.0", "element vertex 4", *(f"property float {n}" for n in names)]
@@ -210,8 +210,8 @@ def with_floats(data):
         ("e.glb", "<", square(TEXCOORD_0=SQUARE[:, :2]).glb()),
     ],
 )
-def test_a_signalling_nan_is_an_error_and_no_warning(name, order, data, tmp_path):
-    """Wherever it stands in a binary file."""
+def test_a_signalling_nan_is_an_error_without_a_warning(name, order, data, tmp_path):
+    """At every position in a binary file."""
     number, not_finite = struct.pack(f"{order}I", 0x7FA00001), 0
     for at in range(max(0, len(data) - 160), len(data) - 3):
         (tmp_path / name).write_bytes(data[:at] + number + data[at + 4 :])
@@ -223,11 +223,11 @@ def test_a_signalling_nan_is_an_error_and_no_warning(name, order, data, tmp_path
 
 
 @pytest.mark.parametrize(("kind", "bits"), [("f4", 0x7FA00001), ("f8", 0x7FF4000000000001)])
-def test_a_signalling_nan_in_an_array_is_an_error_and_no_warning(kind, bits):
+def test_a_signalling_nan_in_an_array_is_an_error_without_a_warning(kind, bits):
     V, F = disk(3)
     odd = V.astype(kind)
     odd.view(f"u{kind[1]}")[0, 0] = bits
     with pytest.raises(ValueError, match="not finite at vertex 0"):
         repair(odd, F, V)
-    # A place that is no number is one to be found.
+    # A position that is NaN is to be computed.
     assert np.isfinite(repair(V, F, odd).uv).all()

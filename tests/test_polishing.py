@@ -1,4 +1,4 @@
-"""Polish: less distortion, injective at every step."""
+"""Polishing: less distortion, and injective at every step."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ import pytest
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.energies import ARAP, MIPS, AreaPreserving, Energy, conformal_area_blend
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.energies.newton import newton_descent
+from quasiharmonic.energies.newton import map_model
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
-from quasiharmonic.energies.polishing import ENERGIES, polish, polish_map
+from quasiharmonic.energies.polishing import ENERGIES, PolishOptions, polish, polish_map
 from quasiharmonic.energies.springs import MassSpring
-from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Domain
+from quasiharmonic.problem.certification import is_injective
 from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from shared.distinct_steps import DistinctSteps
 from shared.meshes import bend, boundary_of, lift
 from shared.polygons import circle
-from shared.told import Told
 
 
 def twisted(V, turns=0.2):
-    """Turn points by an angle that falls to zero on the unit circle."""
+    """Rotate points by an angle that decreases to zero at the unit circle."""
     angle = 2 * np.pi * turns * (1 - V[:, 0] ** 2 - V[:, 1] ** 2)
     z = (V[:, 0] + 1j * V[:, 1]) * np.exp(1j * angle)
     return np.stack([z.real, z.imag], axis=1)
 
 
 def shrunken(rings=12, power=8):
-    """A disk drawn together at its centre: the inmost triangles have rings^(2 - 2 power) of their area."""
+    """A disk contracted at its centre: the innermost triangles have rings^(2 - 2 power) of their area."""
     V, F = disk(rings)
     return V, F, V * np.linalg.norm(V, axis=1, keepdims=True) ** (power - 1)
 
@@ -45,15 +45,15 @@ def energies_of(result):
 
 
 @pytest.mark.parametrize("energy", ENERGIES)
-def test_falls_at_every_step_and_converges(energy):
+def test_decreases_at_every_step_and_converges(energy):
     V, F, uv, fixed = bowl()
-    result = polish(V, F, uv, fixed=fixed, energy=energy, tolerance=1e-8)
+    result = polish(V, F, uv, fixed=fixed, energy=energy, tol=1e-8)
     assert result.status is Status.POLISHED
     assert result.injective
     assert is_injective(F, result.uv)
     assert np.all(np.diff(energies_of(result)) < 0)
     np.testing.assert_array_equal(result.uv[fixed], uv[fixed])
-    # A local minimum: nothing near it is better, up to what was left to gain.
+    # A local minimum: nothing close to it is better, up to the remaining gain.
     rng = np.random.default_rng(0)
     free = np.setdiff1d(np.arange(len(V)), fixed)
     for size in (1e-3, 1e-2):
@@ -68,15 +68,15 @@ def test_energies_are_means_of_the_measures():
     for energy in ("mips", "symmetric-dirichlet"):
         result = polish(V, F, uv, fixed=fixed, energy=energy)
         name = energy.replace("-", "_")
-        assert result.history[0].energy == pytest.approx(distortion(V, F, uv).summary(name).mean)
-        assert result.history[-1].energy == pytest.approx(distortion(V, F, result.uv).summary(name).mean)
+        assert result.history[0].energy == pytest.approx(distortion(V, F, uv).statistics(name).mean)
+        assert result.history[-1].energy == pytest.approx(distortion(V, F, result.uv).statistics(name).mean)
         (stage,) = result.stages
         assert stage.energy == (result.history[0].energy, result.history[-1].energy)
-        assert stage.iterations == len(result.history) - 1
+        assert stage.n_iterations == len(result.history) - 1
         assert stage.name == f"polish, {energy}"
 
 
-def test_every_map_on_the_way_is_injective():
+def test_every_intermediate_map_is_injective():
     V, F, uv = shrunken()
     fixed = boundary_of(F)
     for steps in range(6):
@@ -88,16 +88,16 @@ def test_every_map_on_the_way_is_injective():
 
 
 @pytest.mark.parametrize("energy", ["symmetric-dirichlet", "blend", "arap-barrier"])
-def test_triangles_of_almost_no_area_recover(energy):
+def test_triangles_of_almost_zero_area_recover(energy):
     V, F, uv = shrunken()
     assert distortion(V, F, uv).area_ratio.min() < 1e-14
-    result = polish(V, F, uv, fixed=boundary_of(F), energy=energy, tolerance=1e-10)
+    result = polish(V, F, uv, fixed=boundary_of(F), energy=energy, tol=1e-10)
     assert result.status is Status.POLISHED
     np.testing.assert_allclose(result.uv, V, atol=1e-6)
 
 
-def test_thin_as_a_thread():
-    # Rows at heights 1e-0 … 1e-11: images of 1e-24 of the area next to those of order one.
+def test_a_very_thin_map():
+    # Rows at heights 1e-0 … 1e-11: some images have 1e-24 of the area of others.
     V, F, uv = shrunken(rings=12, power=12)
     assert distortion(V, F, uv).area_ratio.min() < 1e-22
     result = polish(V, F, uv, fixed=boundary_of(F), energy="mips")
@@ -106,8 +106,8 @@ def test_thin_as_a_thread():
 
 
 @pytest.mark.parametrize("energy", ENERGIES)
-def test_an_area_lost_in_rounding(energy):
-    # The last triangle's area is ε²/2, which is 0 in floating point and positive exactly.
+def test_an_area_lost_to_rounding(energy):
+    # The area of the last triangle is ε²/2, which is 0 in floating point but is positive.
     e = 2.0**-52
     uv = np.array([[0, 0], [2, 0], [1 + e, 1], [1, 1 - e]])
     F = np.array([[0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -120,7 +120,7 @@ def test_an_area_lost_in_rounding(energy):
 
 
 def nested_triangles(inner):
-    """A triangle (3, 4, 5) within another, and what is between them; positions with the inner one of such a size."""
+    """A triangle (3, 4, 5) within another and the region between them; the inner one has a given size."""
     corners = circle(3)
     F = np.array([[3, 4, 5], [0, 1, 3], [1, 4, 3], [1, 2, 4], [2, 5, 4], [2, 0, 5], [0, 3, 5]])
     return np.concatenate([corners, inner * corners]), F
@@ -131,7 +131,7 @@ def nested_triangles(inner):
 @pytest.mark.parametrize(
     ("outer", "inner", "slide"), [(1e300, 1e-25, False), (1e300, 1e-300, False), (3, 1e-320, True)]
 )
-def test_coordinates_that_span_more_than_a_unit_holds(energy, iterations, outer, inner, slide):
+def test_coordinates_with_a_larger_range_than_one_unit(energy, iterations, outer, inner, slide):
     V, F = nested_triangles(0.3)
     uv = nested_triangles(1.0)[0] * np.repeat([[outer], [inner]], 3, axis=0)
     assert is_injective(F, uv)
@@ -143,24 +143,24 @@ def test_coordinates_that_span_more_than_a_unit_holds(energy, iterations, outer,
 
 
 @pytest.mark.parametrize("thin", [1e-2, 1e-4, 1e-6, 1e-7, 1e-8, 1e-10])
-def test_a_square_pressed_thin(thin):
+def test_a_compressed_square(thin):
     V, F = grid(10, 10)
     x, y = V.T
     bump = x * (1 - x) * y * (1 - y)
     uv = np.stack([x + bump, thin * (y + bump)], axis=1)
     result = polish(V, F, uv, fixed=boundary_of(F))
-    # The best is to press all of it alike.
+    # The optimum compresses all of it equally.
     least = 2 * thin + 2 / thin - 4
     if thin >= 1e-7:
         assert result.status is Status.POLISHED
         assert result.history[-1].energy < (1 + 1e-4) * least
     else:
-        # What is left to gain along the rectangle is lost in the rounding of what holds across it, and that is said.
+        # The remaining gain along the rectangle is below the rounding error across it, and the status says so.
         assert result.status is Status.EXHAUSTED
     assert result.injective
 
 
-def test_a_perfect_map_stays():
+def test_a_perfect_map_does_not_change():
     V, F = random_delaunay(60)
     for energy in ENERGIES:
         result = polish(V, F, 3 * V, fixed=boundary_of(F), energy=energy)
@@ -168,7 +168,7 @@ def test_a_perfect_map_stays():
         np.testing.assert_allclose(result.uv, 3 * V, atol=1e-12)
 
 
-def test_pins_and_inner_loops_stay():
+def test_pins_and_inner_loops_do_not_move():
     V, F = annulus(12)
     pin = int(np.argmin(np.linalg.norm(V - [0.75, 0.1], axis=1)))
     uv = bend(V)
@@ -181,7 +181,7 @@ def test_pins_and_inner_loops_stay():
     assert free.history[-1].energy < result.history[-1].energy
 
 
-def test_nothing_to_move():
+def test_nothing_can_move():
     V, F = disk(1)
     result = polish(V, F, V, fixed=np.arange(len(V)))
     assert result.status is Status.POLISHED
@@ -189,23 +189,23 @@ def test_nothing_to_move():
 
 
 @pytest.mark.parametrize("power", [-600, 0, 600])
-def test_scales_of_map_and_surface_change_nothing(power):
+def test_scales_of_map_and_surface_do_not_matter(power):
     V, F, uv, fixed = bowl()
     expected = polish(V, F, uv, fixed=fixed, max_iterations=4)
     found = polish(np.ldexp(V, -power), F, np.ldexp(uv, power), fixed=fixed, max_iterations=4)
     np.testing.assert_array_equal(np.ldexp(found.uv, -power), expected.uv)
 
 
-def test_a_turn_and_an_offset_change_next_to_nothing():
+def test_rotation_and_translation_change_almost_nothing():
     V, F, uv, fixed = bowl()
     turn = np.array([[0.6, 0.8], [-0.8, 0.6]])
-    expected = polish(V, F, uv, fixed=fixed, tolerance=1e-10)
-    found = polish(V[:, [1, 2, 0]], F, uv @ turn + [1000, -500], fixed=fixed, tolerance=1e-10)
+    expected = polish(V, F, uv, fixed=fixed, tol=1e-10)
+    found = polish(V[:, [1, 2, 0]], F, uv @ turn + [1000, -500], fixed=fixed, tol=1e-10)
     assert found.status is Status.POLISHED
     np.testing.assert_allclose(found.uv, expected.uv @ turn + [1000, -500], atol=1e-5)
 
 
-def test_is_deterministic_and_leaves_its_input_alone():
+def test_is_deterministic_and_does_not_change_its_input():
     V, F, uv, fixed = bowl()
     before = [x.copy() for x in (V, F, uv, fixed)]
     for x in (V, F, uv, fixed):
@@ -232,7 +232,7 @@ def test_weights_shift_the_distortion():
     assert on_the_left(weighted) < on_the_left(plain)
 
 
-def test_an_energy_of_ones_own():
+def test_a_user_defined_energy():
     V, F, uv, fixed = bowl()
     by_name = polish(V, F, uv, fixed=fixed, energy="blend")
     by_hand = polish(V, F, uv, fixed=fixed, energy=conformal_area_blend(1 / 128))
@@ -250,7 +250,7 @@ def test_an_energy_of_ones_own():
         ("density_hessian", "the second derivative is"),
     ],
 )
-def test_an_energy_of_ones_own_that_is_no_number_is_named(spoilt, words):
+def test_a_user_defined_energy_that_is_not_finite_is_named(spoilt, words):
     class Spoilt(MIPS):
         def density(self, d):
             return self.at_some("density", super().density(d))
@@ -272,25 +272,25 @@ def test_an_energy_of_ones_own_that_is_no_number_is_named(spoilt, words):
         polish(V, F, uv, fixed=fixed, energy=Spoilt())
 
 
-def test_for_a_problem_at_hand():
+def test_an_existing_problem():
     V, F, uv, fixed = bowl()
     expected = polish(V, F, uv, fixed=fixed, energy="mips")
-    found = polish_map(Domain(V, F, fixed), uv, energy="mips")
+    found = polish_map(Domain(V, F, fixed), uv, PolishOptions(energy="mips"))
     np.testing.assert_array_equal(found.uv, expected.uv)
 
 
 @pytest.mark.parametrize("linear_solver", available())
 def test_other_linear_solvers(linear_solver):
     V, F, uv, fixed = bowl()
-    expected = polish(V, F, uv, fixed=fixed, tolerance=1e-9)
-    found = polish(V, F, uv, fixed=fixed, tolerance=1e-9, linear_solver=linear_solver)
+    expected = polish(V, F, uv, fixed=fixed, tol=1e-9)
+    found = polish(V, F, uv, fixed=fixed, tol=1e-9, linear_solver=linear_solver)
     assert found.linear_solver == linear_solver
     np.testing.assert_allclose(found.uv, expected.uv, atol=1e-6)
 
 
 def test_steps_are_reported_as_they_happen():
     V, F, uv, fixed = bowl()
-    seen = Told()
+    seen = DistinctSteps()
     result = polish(V, F, uv, fixed=fixed, callback=seen.append)
     assert seen == result.history
     assert [step.iteration for step in seen] == list(range(len(seen)))
@@ -311,7 +311,7 @@ def test_interruption_keeps_the_best_map():
     assert result.injective
 
 
-def test_what_the_exact_test_refuses_is_not_taken(monkeypatch):
+def test_steps_rejected_by_the_exact_test_are_not_taken(monkeypatch):
     V, F, uv, fixed = bowl()
     full = polish(V, F, uv, fixed=fixed, max_iterations=1)
     asked = []
@@ -320,19 +320,19 @@ def test_what_the_exact_test_refuses_is_not_taken(monkeypatch):
         asked.append(uv)
         return len(asked) == 3
 
-    monkeypatch.setattr(newton_descent, "is_injective", strict)
+    monkeypatch.setattr(map_model, "is_injective", strict)
     result = polish(V, F, uv, fixed=fixed, max_iterations=1)
-    # Refused twice, halved twice.
+    # Rejected twice, halved twice.
     np.testing.assert_allclose(result.uv - uv, (asked[0] - uv) / 4, atol=1e-14)
     np.testing.assert_array_equal(result.uv, asked[2])
     assert np.abs(full.uv - uv).max() >= np.abs(asked[0] - uv).max()
-    monkeypatch.setattr(newton_descent, "is_injective", lambda F, uv: False)
+    monkeypatch.setattr(map_model, "is_injective", lambda F, uv: False)
     result = polish(V, F, uv, fixed=fixed)
     assert result.status is Status.EXHAUSTED
     np.testing.assert_array_equal(result.uv, uv)
 
 
-def test_without_factorisations_it_still_descends(monkeypatch):
+def test_descends_without_factorisations(monkeypatch):
     V, F, uv, fixed = bowl()
     shifts = []
 
@@ -394,19 +394,19 @@ def test_malformed_input():
         polish(V, F, uv, fixed=fixed, weights=weights[4:])
 
 
-def test_barriers_may_come_as_objects():
+def test_barriers_may_be_objects():
     V, F, uv, fixed = bowl()
     assert polish(V, F, uv, fixed=fixed, energy=MIPS()).status is Status.POLISHED
 
 
-def test_options_that_make_no_sense():
+def test_invalid_options():
     V, F, uv, fixed = bowl()
     for wrong in (-1, 2.5, "many", None):
         with pytest.raises(ValueError, match="max_iterations must be an integer of at least 0"):
             polish(V, F, uv, fixed=fixed, max_iterations=wrong)
     for wrong in (-1, np.nan, np.inf, "small", None):
-        with pytest.raises(ValueError, match="tolerance must be a finite number of at least 0"):
-            polish(V, F, uv, fixed=fixed, tolerance=wrong)
+        with pytest.raises(ValueError, match="tol must be a finite number of at least 0"):
+            polish(V, F, uv, fixed=fixed, tol=wrong)
     with pytest.raises(ValueError, match="weights must contain real numbers, not <U5"):
         polish(V, F, uv, fixed=fixed, weights=["heavy"] * len(F))
 

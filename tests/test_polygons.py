@@ -1,4 +1,4 @@
-"""Faces of more than three corners: their triangulation, and their way through files."""
+"""Faces with more than three corners: their triangulation, and reading and writing them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import io
-from quasiharmonic.geometry.mesh.polygons import triangulated
+from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.solver.refine.refining import refine
 
@@ -20,7 +20,7 @@ def rings(polygons):
 def triangles(V, polygons):
     V = np.asarray(V, dtype=float)
     vertices, starts = rings(polygons)
-    T, found = triangulated(np.column_stack([V, np.zeros((len(V), 3 - V.shape[1]))]), vertices, starts)
+    T, found = triangulate_polygons(np.column_stack([V, np.zeros((len(V), 3 - V.shape[1]))]), vertices, starts)
     return vertices[T], found
 
 
@@ -30,7 +30,7 @@ def areas(V, F):
 
 
 class TestTriangulation:
-    def test_a_quad_that_is_not_convex_is_cut_at_its_inner_corner(self):
+    def test_a_quad_that_is_not_convex_is_cut_at_its_reflex_corner(self):
         V = [[0, 0], [2, 1], [0, 2], [0.5, 1]]
         for turn in range(4):
             F, _ = triangles(V, [np.roll([0, 1, 2, 3], turn)])
@@ -45,7 +45,7 @@ class TestTriangulation:
             assert areas(V, F).sum() == pytest.approx(6.0)
 
     @given(st.integers(4, 60), st.integers(0, 10**6))
-    def test_a_star_shaped_polygon_comes_out_whole(self, size, seed):
+    def test_a_star_shaped_polygon_is_triangulated_without_inversion(self, size, seed):
         rng = np.random.default_rng(seed)
         angle = 2 * np.pi * (np.arange(size) + 0.9 * rng.random(size)) / size
         V = (np.exp(0.7 * rng.normal(size=size)) * np.exp(1j * angle)).view(float).reshape(-1, 2)
@@ -57,7 +57,7 @@ class TestTriangulation:
         assert areas(V, F).sum() == pytest.approx(0.5 * (V[:, 0] * ahead[:, 1] - V[:, 1] * ahead[:, 0]).sum())
         assert np.array_equal(F.ravel()[found.corners], range(size))
 
-    def test_neither_place_nor_turn_nor_size_matters(self):
+    def test_position_rotation_and_size_do_not_matter(self):
         rng = np.random.default_rng(3)
         V = rng.normal(size=(8, 3)) * [1, 1, 0.2]
         quads = [[0, 1, 2, 3], [4, 5, 6, 7]]
@@ -81,9 +81,9 @@ class TestTriangulation:
         assert F.shape == (2, 3)
 
     @pytest.mark.parametrize("far", [np.inf, np.nan, 1e200])
-    def test_corners_out_of_range_are_triangulated_in_any_way(self, far):
+    def test_corners_out_of_range_are_triangulated_somehow(self, far):
         V = np.array([[far, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-        T, _ = triangulated(V, np.arange(4), np.array([0, 4]))
+        T, _ = triangulate_polygons(V, np.arange(4), np.array([0, 4]))
         assert T.shape == (2, 3)
 
     def test_a_ring_that_repeats_a_vertex_is_named(self):
@@ -119,7 +119,7 @@ f -8/1/1 5/2/1 8/3/1 -5/4/1
 
 
 class TestFiles:
-    def test_a_cube_of_quads_comes_back(self, tmp_path):
+    def test_a_cube_of_quads_is_read_back(self, tmp_path):
         (tmp_path / "cube.obj").write_text(CUBE)
         mesh = io.read_mesh(tmp_path / "cube.obj")
         assert mesh.F.shape == (12, 3)
@@ -131,7 +131,7 @@ class TestFiles:
         assert np.array_equal(again.F, mesh.F)
         assert np.array_equal(again.FT, mesh.FT)
 
-    def test_faces_of_every_size(self, tmp_path):
+    def test_faces_of_any_size(self, tmp_path):
         text = "".join(f"v {x} {y} 0\n" for x, y in [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1), (3, 1)])
         text += "f 1 2 5 6\nf 2 3 4\nf 2 4 5\n# between\nf 3 7 4\n"
         (tmp_path / "mixed.obj").write_text(text)
@@ -141,7 +141,7 @@ class TestFiles:
         io.write_obj(tmp_path / "again.obj", mesh)
         assert (tmp_path / "again.obj").read_text().replace(".0", "") == text
 
-    def test_the_quick_reader_and_the_careful_one_agree(self, tmp_path):
+    def test_the_fast_reader_and_the_general_one_agree(self, tmp_path):
         (tmp_path / "quick.obj").write_text(CUBE.replace("-8", "1").replace("-5", "4"))
         (tmp_path / "careful.obj").write_text(CUBE)
         quick, careful = (io.read_mesh(tmp_path / name) for name in ("quick.obj", "careful.obj"))
@@ -149,7 +149,7 @@ class TestFiles:
             assert np.array_equal(getattr(quick, name), getattr(careful, name))
         assert np.array_equal(quick.polygons.corners, careful.polygons.corners)
 
-    def test_lines_that_say_the_same_stay_as_they_stood(self, tmp_path):
+    def test_unchanged_lines_stay_as_they_were(self, tmp_path):
         text = "v 0 0 0\r\nv 1.00 0 0\r\nv 0 1e0 0\r\nvt 0.50 0 0\r\nvt 1 0 0.25\r\nvt 0 1.000\r\nf 1/1 2/2 3/3\r\n"
         (tmp_path / "a.obj").write_bytes(text.encode())
         mesh = io.read_mesh(tmp_path / "a.obj")
@@ -176,12 +176,12 @@ class TestFiles:
             ("f 1 2 3 9", "index 9, but the file has 4 vertices at line 5"),
         ],
     )
-    def test_bad_polygons_are_named_with_their_line(self, tmp_path, face, words):
+    def test_invalid_polygons_are_named_with_their_line(self, tmp_path, face, words):
         (tmp_path / "bad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n" + face + "\n")
         with pytest.raises(MeshFileError, match=words):
             io.read_mesh(tmp_path / "bad.obj")
 
-    def test_a_split_polygon_is_in_triangles_afterwards(self, tmp_path):
+    def test_a_split_polygon_becomes_triangles(self, tmp_path):
         (tmp_path / "cube.obj").write_text(CUBE)
         mesh = io.read_mesh(tmp_path / "cube.obj")
         (diagonal, *_) = mesh.polygons.diagonals(mesh.F)
@@ -194,7 +194,7 @@ class TestFiles:
         assert text.count("\nf ") == 9
         again = io.read_mesh(tmp_path / "new.obj")
         assert np.array_equal(np.sort(again.F, axis=None), np.sort(new.F, axis=None))
-        # The two materials and the group still stand before the faces they stood before.
+        # The two materials and the group are still before the same faces.
         before = [line for line in text.splitlines() if line.startswith(("usemtl", "g ", "f "))]
         counts = np.diff([i for i, line in enumerate(before) if not line.startswith("f ")] + [len(before)]) - 1
         assert counts.sum() == 9

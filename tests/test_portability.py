@@ -1,4 +1,4 @@
-"""What is tested on Linux alone assumes little of it: file names, integers, what a system has and what it has not."""
+"""Code tested on Linux alone makes few assumptions: file names, integers, and features that systems may lack."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from shared.datasets import record_of, write_stars
 
 ROOT = Path(quasiharmonic.__file__).parent
 HERE = Path(__file__).parent
-# Python's modules that one system or another is without.
+# Python's modules that some systems lack.
 SOMEWHERE = {"curses", "fcntl", "grp", "msvcrt", "posix", "pty", "pwd", "resource", "syslog", "termios", "winreg"}
-# Types whose size is the system's: `int` as a type of arrays is C's `long` in NumPy 1, `longdouble` is anything.
+# Types whose size depends on the system: `int` as an array type is C's `long` in NumPy 1, and `longdouble` varies.
 SIZED_BY_THE_SYSTEM = re.compile(
     r"\b(np|ctypes)\.(c_u?long|u?int_?|u?long|c?longdouble|float128|complex256)\b|dtype=int\b|astype\(int\b"
 )
 
 
 def sources():
-    """Names and texts of the package's files."""
+    """Yield names and texts of the package's files."""
     for path in sorted(ROOT.rglob("*.py")):
         yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
 
 
 def minded(tree):
-    """Imports in the body of a `try` that has a word for their failure."""
+    """Yield imports in the body of a `try` that handles their failure."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Try) and node.handlers:
             yield from (id(inner) for step in node.body for inner in ast.walk(step) if isinstance(inner, ast.Import))
 
 
 @pytest.mark.parametrize("folder", [ROOT, HERE], ids=["the package", "tests"])
-def test_names_of_files_are_good_everywhere(folder):
-    """No two differ by case alone, none is a device of Windows' or has a sign that Windows does not take."""
+def test_file_names_are_valid_everywhere(folder):
+    """No two names differ by case alone, and none is a Windows device or has a character that Windows rejects."""
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if "__pycache__" not in path.parts]
     assert names
     assert max(Counter(name.lower() for name in names).values()) == 1
@@ -48,14 +48,14 @@ def test_names_of_files_are_good_everywhere(folder):
     assert not [name for name in names if devices.search(name) or re.search(r'[<>:"\\|?*]|[. ](/|$)', name)]
 
 
-def test_no_type_of_the_systems_size():
+def test_no_type_of_system_dependent_size():
     assert SIZED_BY_THE_SYSTEM.search("np.zeros(3, dtype=int)")
     assert not SIZED_BY_THE_SYSTEM.search("np.zeros(3, dtype=np.int64)")
     lines = [(name, line) for name, text in sources() for line in text.splitlines() if ">>> " not in line]
     assert not [(name, line) for name, line in lines if SIZED_BY_THE_SYSTEM.search(line)]
 
 
-def test_what_a_system_may_lack_is_imported_where_that_is_minded():
+def test_imports_that_a_system_may_lack_are_guarded():
     seen = set()
     for name, text in sources():
         if not re.search(rf"import ({'|'.join(SOMEWHERE)})\b|from ({'|'.join(SOMEWHERE)}) ", text):
@@ -71,7 +71,7 @@ def test_what_a_system_may_lack_is_imported_where_that_is_minded():
     assert "ui/batch/lock.py" in seen, "this test sees nothing"
 
 
-# Loaded by every process of Python's that has it on its path: a system without what is Unix's, and without /proc.
+# Every Python process with this on its path simulates a system without Unix modules and without /proc.
 _ELSEWHERE = """
 import builtins, io, os, signal, sys
 for name in ("fcntl", "resource", "pwd", "grp", "termios", "pty", "psutil"):
@@ -92,8 +92,8 @@ io.open = builtins.open = opens
 
 
 @pytest.mark.slow
-def test_a_data_set_is_solved_on_a_system_without_what_is_unixs(tmp_path):
-    """In an encoding that has few signs, too, and names that it does not have."""
+def test_a_data_set_is_solved_on_a_system_without_unix_features(tmp_path):
+    """The encoding has few characters, and some names contain others."""
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "sitecustomize.py").write_text(_ELSEWHERE, encoding="utf-8")
     stars = write_stars(tmp_path / "sét", ["Größe", "b"])

@@ -26,7 +26,7 @@ def agrees(a, b, c):
 
 
 any_float = st.floats(allow_nan=False, allow_infinity=False)
-# Few bits and many magnitudes: products that cancel exactly, sums that underflow.
+# Few bits and many magnitudes: products that cancel exactly, and sums that underflow.
 sparse_float = st.builds(
     lambda bits, exponent: float(np.ldexp(float(bits), exponent)), st.integers(-9, 9), st.integers(-1074, 1019)
 )
@@ -51,7 +51,7 @@ def test_orientation_is_exact_for_all_doubles(kind):
     st.integers(-2, 2),
 )
 @settings(deadline=None)
-def test_orientation_of_points_next_to_a_line(ends, t, i, j):
+def test_orientation_of_points_close_to_a_line(ends, t, i, j):
     a, b = np.array(ends[:2]) / 2, np.array(ends[2:]) / 2
     c = a * (1 - t) + b * t
     c = c + np.array([i, j]) * np.spacing(c)
@@ -70,7 +70,7 @@ def test_orientation_at_any_scale(rng, scale, offset):
     agrees(a, b, rng.permutation(c))
 
 
-def test_orientation_where_every_stage_must_come_in(rng):
+def test_orientation_where_every_stage_is_needed(rng):
     size = 3000
     exponents = rng.integers(-430, 500, (3, size, 2)) * rng.integers(0, 2, (3, size, 2))
     a, b, c = rng.choice([-1.0, -0.75, 0.0, 1.0], (3, size, 2)) * 2.0**exponents
@@ -79,14 +79,14 @@ def test_orientation_where_every_stage_must_come_in(rng):
     d = rng.standard_normal((size, 2))
     agrees(d, 2.0**30 * d, 2.0**61 * d)
     agrees(2.0**30 * d, 2.0**61 * d, d)
-    # Products whose head is the same on both sides and whose tails decide.
+    # The heads of both products are equal, and their tails decide.
     head = 1 + rng.integers(0, 4, (size, 2)) * 2.0**-52
     agrees(head, -head, np.stack([head[:, 1] * 2.0**-60, head[:, 0] * 2.0**-60], axis=1) * 2.0**-300)
 
 
 def test_products_that_underflow_to_the_wrong_order():
-    # Left product 1.5 - 1.5ε, right one 1.5 - 1.5·2⁻¹⁰⁰ - ε, in units of the smallest double and with ε
-    # lost in the differences: the left one rounds to 2, the right one to 1, but the right one is larger.
+    # The left product is 1.5 - 1.5ε, the right one 1.5 - 1.5·2⁻¹⁰⁰ - ε, in units of the smallest double, and ε is lost
+    # in the differences. The left one rounds to 2, the right one to 1, but the right one is larger.
     unit = np.array([2.0**-500, 2.0**-574])
     a, b, c = np.array([[[1.5, 1.5 + 1.5 * 2.0**-50]], [[1 - 2.0**-50, 1.0]], [[0.0, 2.0**-80]]]) * unit
     assert orientation(a, b, c)[0] == exact_orientation(a[0], b[0], c[0]) == -1
@@ -94,13 +94,13 @@ def test_products_that_underflow_to_the_wrong_order():
 
 def test_a_hundred_thousand_exactly_collinear_triples(rng):
     x = rng.random((3, 100_000)) + 0.1
-    # With a slope of one and no rounding the points lie on the diagonal, inexact differences and all.
+    # With a slope of one and no rounding, the points lie on the diagonal, even with inexact differences.
     assert not orientation(*np.stack([x, x], axis=2)).any()
     d = rng.standard_normal((100_000, 2))
     assert not orientation(d, 2 * d, 4 * d).any()
 
 
-def test_antisymmetry_on_near_misses(rng):
+def test_antisymmetry_close_to_a_line(rng):
     a, b = rng.random((2, 2000, 2))
     c = (a + b) / 2
     expected = orientation(a, b, c)
@@ -109,7 +109,7 @@ def test_antisymmetry_on_near_misses(rng):
         np.testing.assert_array_equal(orientation(*permuted), parity * expected)
 
 
-def test_shapes_broadcast_and_are_kept():
+def test_shapes_broadcast_and_are_preserved():
     corner = np.array([0.0, 0.0])
     right = np.array([[1.0, 0.0], [2.0, 0.0]])
     third = np.array([[[0.0, 1.0]], [[3.0, 0.0]], [[0.0, -1e-320]]])
@@ -122,7 +122,7 @@ def test_shapes_broadcast_and_are_kept():
     assert orientation(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2))).shape == (0,)
 
 
-def test_what_is_not_finite_is_refused_or_named():
+def test_numbers_that_are_not_finite_are_rejected_or_named():
     a = np.zeros((6, 2))
     b = np.tile([1.0, 0.0], (6, 1))
     c = np.array([[0.0, 1], [np.nan, 1], [0, np.inf], [0, -1], [-np.inf, np.inf], [2, 0]])
@@ -145,9 +145,9 @@ def test_segment_relation_is_exact(segments, scale, offset):
     np.testing.assert_array_equal(segment_relation(s, r, p, q), expected)
 
 
-def test_segments_that_miss_each_other_by_a_rounding():
+def test_segments_that_miss_each_other_by_rounding():
     p, q = np.array([[0.0, 0.0]]), np.array([[3.0, 1.0]])
-    r = np.array([[0.3, 0.1]])  # not on pq: neither coordinate is what it reads
+    r = np.array([[0.3, 0.1]])  # not on pq: neither coordinate equals its decimal value
     away = np.array([[0.0, 5.0]])
     assert segment_relation(p, q, r, away)[0] == exact_relation(p[0], q[0], r[0], away[0]) != SegmentRelation.TOUCHING
     assert segment_relation(p, q, q / 2, away)[0] == SegmentRelation.TOUCHING
@@ -168,7 +168,7 @@ def test_box_pairs_within_groups(rng):
 
 
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
-def test_box_pairs_are_those_that_meet(rng, monkeypatch, chunk):
+def test_box_pairs_are_those_that_intersect(rng, monkeypatch, chunk):
     monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
     for count in (0, 1, 2, 3, 8, 57):
         lo = rng.integers(0, 20, (count, 2)).astype(float)
@@ -185,7 +185,7 @@ def test_box_pairs_are_those_that_meet(rng, monkeypatch, chunk):
 
 
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
-def test_box_pairs_between_two_kinds(rng, monkeypatch, chunk):
+def test_box_pairs_between_two_groups(rng, monkeypatch, chunk):
     monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
     for count, other in ((0, 3), (1, 1), (5, 0), (3, 40), (57, 8)):
         lo, low = rng.integers(0, 20, (count, 2)).astype(float), rng.integers(0, 20, (other, 2)).astype(float)

@@ -1,4 +1,4 @@
-"""What `Problem` refuses, with what words; and what it accepts as given."""
+"""Input that `Problem` rejects, with its messages, and input that it accepts."""
 
 from __future__ import annotations
 
@@ -83,13 +83,13 @@ def test_malformed_input_is_named(arguments, words):
         posed(**arguments)
 
 
-def test_touching_fans_are_refused():
-    """A bow-tie: two triangles that share a vertex only."""
+def test_touching_fans_are_rejected():
+    """A bow-tie: two triangles that share only a vertex."""
     with pytest.raises(ValueError, match="boundary passes more than once through vertex 2"):
         Problem(np.arange(10.0).reshape(5, 2) ** 2, [[0, 1, 2], [2, 3, 4]], range(5), np.zeros((5, 2)))
 
 
-def test_flat_triangles_are_accepted_on_the_callers_word():
+def test_flat_triangles_are_accepted_with_an_option():
     flat = changed(V, F[3, 0], V[F[3, 1]])
     for reference in ("equilateral", "corrected"):
         assert posed(V=flat, reference=reference).reference == reference
@@ -97,7 +97,7 @@ def test_flat_triangles_are_accepted_on_the_callers_word():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.longdouble, np.int32, np.uint8])
 @pytest.mark.parametrize("index", [np.int8, np.uint16, np.int32, np.uint64])
-def test_any_dtype_and_layout_is_accepted_and_nothing_modified(dtype, index):
+def test_any_dtype_and_layout_is_accepted_and_nothing_is_modified(dtype, index):
     V, F = grid(3, 3)
     V = np.asfortranarray((9 * V).astype(dtype))
     F, rim = F.astype(index), boundary_of(F).astype(index)
@@ -113,7 +113,7 @@ def test_any_dtype_and_layout_is_accepted_and_nothing_modified(dtype, index):
     np.testing.assert_array_equal(problem.F, F)
 
 
-def test_moved_shares_the_factorisation_and_checks_the_target():
+def test_another_target_shares_the_factorisation_and_is_checked():
     problem = posed()
     moved = problem.with_target(2 * TARGET)
     assert moved.domain.laplacian() is problem.domain.laplacian()
@@ -125,7 +125,7 @@ def test_moved_shares_the_factorisation_and_checks_the_target():
 
 
 @pytest.mark.parametrize("scale", [5e-324, 1e-300, 1e-150, 1.0, 1e150, 1e300, 1.7e308])
-def test_the_frame_is_of_unit_size_and_returns_what_it_took(scale, rng):
+def test_the_frame_has_unit_size_and_is_invertible(scale, rng):
     target = rng.uniform(-1, 1, TARGET.shape) * scale
     frame = posed(target=target).frame
     w = frame.inward(target)
@@ -154,8 +154,8 @@ class TestTopology:
         assert edges(np.array([[0, 1, 2], [0, 1, 3]]), 4).inconsistent.tolist() == [[0, 1]]
 
     @pytest.mark.parametrize("loaded", [True, False])
-    def test_of_many_triangles_are_those_that_a_dictionary_finds(self, loaded, monkeypatch, rng):
-        """Whichever way they are sorted, also where triangles are anything but a surface's."""
+    def test_edges_of_many_triangles_agree_with_a_dictionary(self, loaded, monkeypatch, rng):
+        """For both sorting methods, also if the triangles are not a surface."""
         import scipy.sparse
 
         if loaded:
@@ -175,12 +175,12 @@ class TestTopology:
             elif len(ways) > 2:
                 kinds["nonmanifold"].append(edge)
             else:
-                # A triangle that uses a vertex twice has an edge from it to itself, which has no sense.
+                # A triangle with a repeated vertex has an edge from it to itself, without a direction.
                 kinds["inconsistent" if ways[0] == ways[1] else "interior"].append(edge)
         for kind, expected in kinds.items():
             assert getattr(found, kind).tolist() == [list(edge) for edge in expected], kind
 
-    def test_loops_keep_the_surface_to_their_left(self):
+    def test_loops_have_the_surface_on_their_left(self):
         V, F = annulus(6)
         areas = []
         for loop in boundary_loops(F, len(V)):
@@ -188,7 +188,7 @@ class TestTopology:
             areas.append((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
         assert sorted(areas) == pytest.approx([-1, 4])
 
-    def test_against_brute_force(self, rng):
+    def test_agrees_with_brute_force(self, rng):
         V, F = random_delaunay(200, seed=5)
         half = [(int(a), int(b)) for t in F for a, b in zip(t, np.roll(t, -1), strict=True)]
         single = {(a, b) for a, b in half if (b, a) not in set(half)}

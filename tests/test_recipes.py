@@ -1,4 +1,4 @@
-"""The recipes in CONTRIBUTING.md run as they stand, and what they name is there."""
+"""The recipes in CONTRIBUTING.md run as shown, and the files that they name exist."""
 
 from __future__ import annotations
 
@@ -9,26 +9,28 @@ from pathlib import Path
 
 import pytest
 
-from shared.formats import try_format, with_map
+from quasiharmonic import io
+from quasiharmonic.io import registry
+from shared.formats import try_format
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-# Every block of a section is part of its recipe.
+# Every block of a section belongs to its recipe.
 RECIPES = {
     title: "\n".join(blocks)
     for title, *text in (section.split("\n", 1) for section in re.split(r"^##+ ", TEXT, flags=re.MULTILINE))
     if (blocks := re.findall(r"^```python\n(.*?)^```", *text, re.MULTILINE | re.DOTALL))
 }
-PAGES = "CONTRIBUTING.md", "docs/architecture.md"
+PAGES = "CONTRIBUTING.md", "docs/development/architecture.md"
 
 
-def test_there_is_one_for_each():
+def test_all_recipes_are_tested():
     assert set(RECIPES) == {
         "A functional",
         "An energy",
         "A linear solver",
         "A kernel",
-        "A way to descend",
+        "A descent method",
         "A file format",
         "An outline",
         "A subcommand",
@@ -42,15 +44,19 @@ def test_recipe_runs(name, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_the_format_stands_its_trials(tmp_path, monkeypatch):
+def test_the_format_passes_its_tests(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(RECIPES["A file format"], names)
-    try_format(names["read_npz"], with_map(names["write_npz"]), tmp_path / "mesh.npz")
+    monkeypatch.setattr(registry, "FORMATS", (names["NPM"], *io.FORMATS))
+    try_format(io.read_mesh, io.write_map, tmp_path / "mesh.npm")
+    assert io.format_names("write_map").startswith("NPM, OBJ")
+    mesh = io.MeshData([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]], statements=b"g a\n")
+    assert io.not_held("mesh.npm", mesh) == ["groups"]
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_every_path_named_is_there(page):
+def test_every_named_path_exists(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     named = set(re.findall(r"`((?:src|tests|docs|benchmarks|examples|[a-z]+/)[\w./]*\.\w+|[a-z]+/[\w./]+\.py)`", text))
     missing = [name for name in named if not any((base / name).exists() for base in (ROOT, ROOT / "src/quasiharmonic"))]

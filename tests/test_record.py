@@ -1,4 +1,4 @@
-"""The recorded path: the maps of every k-th iteration, and nothing at all when nobody asks."""
+"""The recorded path: the maps of every k-th iteration, and none by default."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def turned_ring():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("k", [1, 3, 7])
-def test_every_kth_map_is_kept(k):
+def test_every_kth_map_is_recorded(k):
     V, F, fixed, target = turned_ring()
     result = injective_map(V, F, fixed, target, record_every=k)
-    assert result.iterations > 20
-    assert [s.iteration for s in result.path] == list(range(0, result.iterations + 1, k))
+    assert result.n_iterations > 20
+    assert [s.iteration for s in result.path] == list(range(0, result.n_iterations + 1, k))
     for snapshot in result.path:
         step = result.history[snapshot.iteration]
         assert step.iteration == snapshot.iteration
@@ -33,7 +33,7 @@ def test_every_kth_map_is_kept(k):
         np.testing.assert_array_equal(snapshot.uv[fixed], target)
     if k == 1:
         np.testing.assert_array_equal(result.path[-1].uv, result.uv)
-    # Each has an array of its own.
+    # Each map has its own array.
     assert len({s.uv.ctypes.data for s in result.path}) == len(result.path)
 
 
@@ -46,12 +46,12 @@ def test_recording_changes_nothing_and_is_off_by_default():
     assert plain.history == recorded.history
 
 
-def test_counts_on_through_the_stages():
+def test_counting_continues_through_the_stages():
     stages = [VectorAdam(iterations=4), Newton(iterations=6, resume=True)]
     result = solve(Problem(*turned_ring()), strategy=stages, record_every=1)
     assert [s.iteration for s in result.path] == [s.iteration for s in result.history]
 
 
-def test_a_negative_interval_is_refused():
+def test_a_negative_interval_is_rejected():
     with pytest.raises(ValueError, match="record"):
         solve(Problem(*turned_ring()), record_every=-1)

@@ -1,4 +1,4 @@
-"""Edges are split where asked, conformingly, and everything can be traced back."""
+"""Requested edges are split into a conforming mesh, and all parts can be traced back."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from quasiharmonic import Problem
 from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.solver.refine.refining import refine, refine_problem
+from shared.infeasible_problems import OBSTRUCTED
 from shared.meshes import boundary_of, signed_areas, surfaces
-from shared.obstructed import OBSTRUCTED
 
 TWO = ([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], [[0, 1, 2], [0, 2, 3]])
 
@@ -29,7 +29,7 @@ def test_random_edges(name, V, F, share):
     np.testing.assert_allclose(refined.V[n:], (V[chosen[:, 0]] + V[chosen[:, 1]]) / 2)
     np.testing.assert_array_equal(refined.parents, chosen)
     np.testing.assert_array_equal(refined.weights, 0.5)
-    # Two more triangles for each split edge, and a surface with the same boundary.
+    # There are two more triangles for each split edge, and the surface has the same boundary.
     assert len(refined.F) == len(F) + 2 * s
     found = edges(refined.F, len(refined.V))
     assert not found.nonmanifold.size
@@ -37,7 +37,7 @@ def test_random_edges(name, V, F, share):
     np.testing.assert_array_equal(found.boundary, edges(F, n).boundary)
     assert len(found.interior) == len(interior) + 3 * s
     np.testing.assert_array_equal(np.unique(refined.F), np.arange(n + s))
-    # Triangles keep their index, and untouched ones all else.
+    # Triangles keep their index, and unchanged ones everything else.
     np.testing.assert_array_equal(refined.parent[: len(F)], np.arange(len(F)))
     split = {tuple(e) for e in chosen.tolist()}
     sides = np.sort(np.stack([F, np.roll(F, -1, axis=1)], axis=2), axis=2)
@@ -47,7 +47,7 @@ def test_random_edges(name, V, F, share):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.7, 1.0])
-def test_parts_fill_their_parents(share):
+def test_parts_fill_their_parent_triangles(share):
     _, V, F = surfaces()[0]
     every = np.concatenate([edges(F, len(V)).interior, edges(F, len(V)).boundary])
     chosen = every[np.random.default_rng(3).random(len(every)) < share]
@@ -58,7 +58,7 @@ def test_parts_fill_their_parents(share):
     np.testing.assert_allclose(np.bincount(refined.parent, parts), whole)
 
 
-def test_values_follow():
+def test_values_are_interpolated():
     _, V, F = surfaces()[1]
     refined = refine(V, F, edges(F, len(V)).interior[::5])
     np.testing.assert_allclose(refined.extend(V), refined.V)
@@ -67,7 +67,7 @@ def test_values_follow():
         refined.extend(refined.V)
 
 
-def test_boundary_only_on_request():
+def test_boundary_edges_are_split_only_on_request():
     with pytest.raises(ValueError, match=r"\(0, 1\), \(1, 2\): on the boundary"):
         refine(*TWO, [[0, 2], [2, 1], [0, 1]])
     refined = refine(*TWO, [[1, 0]], boundary=True)
@@ -75,11 +75,11 @@ def test_boundary_only_on_request():
     assert 4 in boundary_of(refined.F)
 
 
-def test_the_shorter_diagonal_is_taken():
+def test_the_shorter_diagonal_is_used():
     V = [[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [0.0, 1.0], [2.0, 0.5]]
     F = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
     refined = refine(V, F, [[0, 4], [1, 4]])
-    # Both diagonals of the trapezoid 0, 1, 6, 5 have the same length: one of them, not both.
+    # Both diagonals of the trapezoid 0, 1, 6, 5 have the same length; one of them is used.
     assert len(refined.F) == 4 + 4
     refined = refine(V, F, [[1, 4], [2, 4]])
     assert not edges(refined.F, 7).nonmanifold.size
@@ -124,12 +124,12 @@ def test_nothing_to_split():
         ),
     ],
 )
-def test_wrong_edges_are_named(pairs, message):
+def test_invalid_edges_are_named(pairs, message):
     with pytest.raises(ValueError, match=message):
         refine(*TWO, pairs)
 
 
-def test_wrong_triangles_are_refused():
+def test_invalid_triangles_are_rejected():
     with pytest.raises(ValueError, match="F refers to vertex 4, but there are only vertices 0 … 3"):
         refine(TWO[0], [[0, 1, 4]], [])
     with pytest.raises(ValueError, match="F must contain integer"):
@@ -144,13 +144,13 @@ def test_wrong_triangles_are_refused():
         (np.full((4, 2), np.nan), "V is not finite at vertices 0, 1, 2, 3"),
     ],
 )
-def test_wrong_vertices_are_refused(V, message):
+def test_invalid_vertices_are_rejected(V, message):
     with pytest.raises(ValueError, match=message):
         refine(V, TWO[1], [])
 
 
 def rounds_by_hand(problem):
-    """The same as `refine_problem`, and a function carried along from one mesh to the next."""
+    """Compute `refine_problem` independently, and transfer a function from each mesh to the next."""
     V, F, number = problem.V, problem.F, 0
     values = np.sin(np.arange(3 * len(V)).reshape(-1, 3))
     while len(split := diagnose(Problem(V, F, problem.fixed, problem.target, reference="equilateral")).split):
@@ -160,7 +160,7 @@ def rounds_by_hand(problem):
 
 
 @pytest.mark.slow
-def test_problems_are_refined_until_nothing_is_named():
+def test_problems_are_refined_until_no_obstruction_is_named():
     most = 0
     for problem, _ in OBSTRUCTED.values():
         result = refine_problem(problem)

@@ -1,4 +1,4 @@
-"""Displacement fields: when they fold, the nearest one that does not, and inverses."""
+"""Displacement fields: folds, the nearest field without folds, and inverses."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import minimize
 
 from quasiharmonic import certify, inverse_field, nearest_invertible
-from quasiharmonic.apps.displacement_fields.approach import ThinBarrier
 from quasiharmonic.apps.displacement_fields.nearest import fold_free
+from quasiharmonic.apps.displacement_fields.patch_descent import ThinBarrier
 from quasiharmonic.energies.derivatives import check_energy
 
 
@@ -18,26 +18,26 @@ def pixels(h, w):
 
 
 def bump(h, w, x, y, width, push):
-    """A field that pushes pixels about one place."""
+    """Return a field that displaces pixels around one point."""
     at = pixels(h, w) - (x, y)
     return np.exp(-(at**2).sum(axis=2) / (2 * width**2))[..., None] * np.array(push, dtype=float)
 
 
 def wobble(h, w, size, seed=0):
-    """A smooth random field."""
+    """Return a smooth random field."""
     dice = np.random.default_rng(seed)
     return np.stack([gaussian_filter(dice.normal(size=(h, w)), 4) for _ in range(2)], axis=-1) * size
 
 
 def determinants(field):
-    """At the four corners of each cell, by what a determinant is; (4, h - 1, w - 1)."""
+    """Return determinants at the four corners of each cell, by their definition; (4, h - 1, w - 1)."""
     places = pixels(*field.shape[:2]) + field
     along, down = np.diff(places, axis=1), np.diff(places, axis=0)
     pairs = [(a, d) for a in (along[:-1], along[1:]) for d in (down[:, :-1], down[:, 1:])]
     return np.stack([a[..., 0] * d[..., 1] - a[..., 1] * d[..., 0] for a, d in pairs])
 
 
-def test_a_field_without_folds_is_handed_back():
+def test_a_field_without_folds_is_returned():
     field = wobble(30, 40, 10)
     mended = nearest_invertible(field)
     assert np.array_equal(mended.field, field)
@@ -47,7 +47,7 @@ def test_a_field_without_folds_is_handed_back():
     assert "does not fold" in mended.summary()
 
 
-def test_one_fold_is_mended_and_the_rest_is_untouched():
+def test_one_fold_is_repaired_and_the_rest_does_not_change():
     field = wobble(50, 60, 10) + bump(50, 60, 30, 25, 2.5, (6, 1))
     kept = field.copy()
     mended = nearest_invertible(field)
@@ -63,7 +63,7 @@ def test_one_fold_is_mended_and_the_rest_is_untouched():
     assert not mended.moved_mask[away].any()
     apart = np.sqrt(((mended.field - field) ** 2).sum(axis=2).mean())
     assert mended.distance == pytest.approx(apart, rel=1e-12)
-    # A Gaussian as narrow as leaves no fold is much further away.
+    # A Gaussian narrow enough to leave no folds gives a much larger change.
     smooth = next(
         made
         for made in (
@@ -75,7 +75,7 @@ def test_one_fold_is_mended_and_the_rest_is_untouched():
 
 
 @pytest.mark.parametrize("push", [(2.4, 0.3), (-0.9, 2.2)])
-def test_no_nearer_field_is_found_by_other_means(push):
+def test_other_methods_find_no_nearer_field(push):
     field = bump(7, 7, 3.1, 2.9, 1.1, push)
     mended = nearest_invertible(field)
     assert mended.folds > 0
@@ -91,11 +91,11 @@ def test_no_nearer_field_is_found_by_other_means(push):
         assert mended.distance > 0.99 * other
 
 
-def test_folds_are_what_bilinear_interpolation_makes_of_a_cell():
+def test_folds_are_those_of_bilinear_interpolation():
     dice = np.random.default_rng(4)
     field = dice.normal(size=(25, 25, 2)) * 0.35
     corners = determinants(field)
-    # Corners (first, below, right, last) of each cell; the determinant is bilinear with no mixed term.
+    # Corners (first, below, right, last) of each cell; the determinant is bilinear and has no mixed term.
     s, t = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
     places = pixels(25, 25) + field
     a, b, c, d = places[:-1, :-1], places[:-1, 1:], places[1:, :-1], places[1:, 1:]
@@ -107,7 +107,7 @@ def test_folds_are_what_bilinear_interpolation_makes_of_a_cell():
     assert np.array_equal(fold_free(field), lowest > 0)
 
 
-def test_a_fold_that_one_diagonal_does_not_see():
+def test_a_fold_that_one_diagonal_does_not_detect():
     field = np.zeros((4, 4, 2))
     field[1, 1] = 0.7
     seen = [[5, 6, 10], [5, 10, 9]]
@@ -116,7 +116,7 @@ def test_a_fold_that_one_diagonal_does_not_see():
     assert fold_free(nearest_invertible(field).field).all()
 
 
-def test_pixels_that_are_held_stay():
+def test_fixed_pixels_do_not_move():
     field = bump(24, 24, 3, 12, 2.0, (-4, 2))
     border = np.ones((24, 24), dtype=bool)
     border[1:-1, 1:-1] = False
@@ -133,7 +133,7 @@ def test_pixels_that_are_held_stay():
         nearest_invertible(swapped, fixed=np.hypot(swapped[..., 0], swapped[..., 1]) > 0)
 
 
-def test_units_do_not_matter():
+def test_the_unit_of_length_does_not_matter():
     field = bump(30, 30, 15, 15, 2.0, (5, 2))
     one, other = nearest_invertible(field), nearest_invertible(4 * field, spacing=4)
     assert np.array_equal(4 * one.field, other.field)
@@ -142,7 +142,7 @@ def test_units_do_not_matter():
     assert fold_free(stretched.field, spacing=(0.5, 2)).all()
 
 
-def test_noise_far_away_is_mended_as_doubles_have_it():
+def test_noise_with_a_large_offset_is_repaired_in_double_precision():
     field = np.random.default_rng(3).normal(size=(14, 15, 2)) * 0.3 + 1e6
     assert not fold_free(field, spacing=0.1).all()
     mended = nearest_invertible(field, spacing=0.1, min_jacobian=0)
@@ -152,7 +152,7 @@ def test_noise_far_away_is_mended_as_doubles_have_it():
 
 
 @pytest.mark.parametrize("far", [1e8, 1e200])
-def test_one_pixel_far_away_leaves_the_rest_alone(far):
+def test_one_distant_pixel_leaves_the_rest_alone(far):
     field = wobble(24, 26, 0.2)
     field[11, 9] = far, -0.3 * far
     mended = nearest_invertible(field)
@@ -163,7 +163,7 @@ def test_one_pixel_far_away_leaves_the_rest_alone(far):
     assert max(np.abs(y - 11).max(), np.abs(x - 9).max()) < 6
 
 
-def test_a_field_turned_inside_out_has_a_nearest_one():
+def test_an_inverted_field_has_a_nearest_one_without_folds():
     places = pixels(12, 12)
     field = np.stack([11 - 2 * places[..., 0], 0.1 * places[..., 1]], axis=-1)
     mended = nearest_invertible(field)
@@ -172,12 +172,12 @@ def test_a_field_turned_inside_out_has_a_nearest_one():
     assert fold_free(mended.field).all()
 
 
-def test_the_barrier_has_the_derivatives_it_says():
+def test_the_barrier_has_the_stated_derivatives():
     assert check_energy(ThinBarrier(0.05, 3.0)).passed
 
 
 @pytest.mark.parametrize("spacing", [1.0, (0.5, 3.0)])
-def test_there_and_back(spacing):
+def test_field_and_inverse_cancel(spacing):
     field = nearest_invertible(wobble(40, 50, 25) * spacing, spacing=spacing).field
     back = inverse_field(field, spacing=spacing)
     inside = ~back.outside
@@ -192,7 +192,7 @@ def test_there_and_back(spacing):
     assert "% of the pixels lie outside" in back.summary()
 
 
-def test_the_inverse_of_what_has_one_in_closed_form():
+def test_inverse_of_a_field_with_a_closed_form():
     A = np.array([[0.9, 0.2], [-0.1, 1.1]])
     grid = pixels(20, 30)
     middle = np.array((14.5, 9.5))
@@ -203,10 +203,10 @@ def test_the_inverse_of_what_has_one_in_closed_form():
     assert (grid + back.field)[inside] == pytest.approx(inverse[inside], abs=1e-12)
 
 
-def test_what_has_no_inverse_is_refused():
+def test_fields_without_an_inverse_are_rejected():
     with pytest.raises(ValueError, match=r"folds.*pixels \(\d+, \d+\).*nearest_invertible"):
         inverse_field(bump(20, 20, 10, 10, 2, (5, 0)))
-    # A strip rolled up past its own beginning: no cell folds, the ends lie on each other.
+    # A strip rolled up beyond its start: no cell folds, but the ends overlap.
     x, y = pixels(6, 60).transpose(2, 0, 1)
     angle, radius = x * 2 * np.pi / 50, 30 - y
     rolled = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)[:, ::-1]
@@ -236,12 +236,12 @@ LOST[1, 4, 0], LOST[3, 2, 1] = np.nan, np.inf
         (WRONG, {"spacing": (1, 1, 1)}, "spacing must be a positive number, or two"),
     ],
 )
-def test_wrong_fields(function, field, options, message):
+def test_invalid_fields(function, field, options, message):
     with pytest.raises(ValueError, match=message):
         function(field, **options)
 
 
-def test_wrong_options():
+def test_invalid_options():
     with pytest.raises(ValueError, match="min_jacobian must be at least 0 and less than 1, not 1"):
         nearest_invertible(WRONG, min_jacobian=1)
     with pytest.raises(ValueError, match=r"min_jacobian must be at least 0 and less than 1, not '0\.5'"):

@@ -1,4 +1,4 @@
-"""Repair of maps with flips: what changes, what does not, and what is said about it."""
+"""Repair of maps with inverted triangles: what changes, what does not, and what is reported."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from quasiharmonic import distortion, inverted_triangles, io, repair
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.commands import run
 from shared.meshes import bend, boundary_of, lift, signed_areas
-from shared.seamed import islands, strips
+from shared.seam_meshes import islands, strips
 
 
 def damaged(uv, inner, count, scale, seed=0):
-    """A map some of whose inner places are pushed about; and which."""
+    """Return a map with some displaced interior positions, and these."""
     rng = np.random.default_rng(seed)
     pushed = rng.choice(inner, count, replace=False)
     uv = uv.copy()
@@ -25,12 +25,12 @@ def damaged(uv, inner, count, scale, seed=0):
 
 
 def inner_rows(FT, rows=slice(None)):
-    """Rows of places that are not on the boundary of the triangles' islands."""
+    """Return rows of texture coordinates that are not on the boundary of the triangles' islands."""
     return np.setdiff1d(FT[rows], boundary_of(FT[rows]))
 
 
 def exact_signs(uv, FT):
-    """Orientation of every triangle in rational arithmetic."""
+    """Return the orientation of every triangle in rational arithmetic."""
     signs = []
     for (ax, ay), (bx, by), (cx, cy) in uv[FT].tolist():
         area = (Fraction(bx) - Fraction(ax)) * (Fraction(cy) - Fraction(ay)) - (Fraction(by) - Fraction(ay)) * (
@@ -42,7 +42,7 @@ def exact_signs(uv, FT):
 
 class TestRepair:
     @pytest.mark.parametrize(("count", "scale"), [(1, 0.4), (12, 0.05), (12, 0.4), (120, 0.05)])
-    def test_only_what_was_pushed_moves(self, count, scale):
+    def test_only_displaced_vertices_move(self, count, scale):
         V, F = random_delaunay(400, seed=2)
         uv = bend(V)
         start, pushed = damaged(uv, inner_rows(F), count, scale)
@@ -55,22 +55,22 @@ class TestRepair:
         assert exact_signs(result.uv, F).min() == 1
         assert np.array_equal(island.inverted_before, flips)
         assert np.array_equal(result.moved_vertices, np.flatnonzero((result.uv != start).any(axis=1)))
-        # Hardly any vertex that was left alone has to make room.
+        # Almost no other vertex must move.
         assert len(np.setdiff1d(result.moved_vertices, pushed)) <= count // 20
         assert np.array_equal(result.FT, F)
 
-    def test_no_vertex_has_moved_in_vain(self):
+    def test_no_vertex_moves_without_need(self):
         V, F = random_delaunay(400, seed=2)
         start, _ = damaged(V, inner_rows(F), 30, 0.1)
         result = repair(V, F, start)
         assert result.injective
         distances = np.linalg.norm(result.uv - start, axis=1)
         assert distances[result.moved_vertices].min() > 0
-        # Patches are polished: no triangle around what moved is left all but flat.
+        # Patches are polished: no triangle around moved vertices stays almost flat.
         around = np.isin(F, result.moved_vertices).any(axis=1)
         assert signed_areas(F, result.uv)[around].min() > 1e-3 * np.median(signed_areas(F, V))
 
-    def test_inputs_are_left_alone_and_results_repeat(self):
+    def test_inputs_do_not_change_and_results_repeat(self):
         V, F = random_delaunay(100, seed=2)
         start, _ = damaged(V, inner_rows(F), 8, 0.2)
         arrays = V.astype(np.float32), F.astype(np.uint16), start
@@ -100,10 +100,10 @@ class TestRepair:
         assert len(result.uv) == len(start)
         assert len(np.setdiff1d(changed, pushed)) <= 1
         assert np.array_equal(result.FT, FT)
-        # Rows of places and vertices of the mesh are counted apart.
+        # Rows of coordinates and vertices of the mesh have different numbers.
         assert np.array_equal(result.islands[1].moved_vertices, np.unique(F[np.isin(FT, changed)]))
 
-    def test_whole_islands_when_asked(self):
+    def test_whole_islands_on_request(self):
         V, F, uv, FT, strip = strips()
         start, _ = damaged(uv, inner_rows(FT, strip == 1), 10, 0.1)
         result = repair(V, F, start, FT=FT, whole=True)
@@ -111,7 +111,7 @@ class TestRepair:
         changed = np.flatnonzero((result.uv != start).any(axis=1))
         assert np.array_equal(changed, inner_rows(FT, strip == 1))
 
-    def test_a_place_for_every_corner(self):
+    def test_texture_coordinates_per_corner(self):
         V, F = random_delaunay(100, seed=2)
         start, _ = damaged(V, inner_rows(F), 5, 0.2)
         result = repair(V, F, start[F.ravel()], FT=np.arange(F.size).reshape(-1, 3))
@@ -121,7 +121,7 @@ class TestRepair:
         np.testing.assert_array_equal(result.uv, whole.uv[F.ravel()])
 
     def test_stacked_islands(self):
-        """Sheets that share their rows of places stay on each other where both move alike, and part where not."""
+        """Sheets that share texture coordinates stay together where both move equally, and separate elsewhere."""
         plane, F = grid(6, 6)
         uv = plane.copy()
         uv[24] += 0.3
@@ -140,8 +140,8 @@ class TestRepair:
         assert np.array_equal(result.FT, np.where(FT == 24, [[49]] * len(F) + [[50]] * len(F), FT))
         assert len(islands(stacked, result.uv, result.FT)) == 2
 
-    def test_rows_that_others_use_are_not_touched(self):
-        """A vertex that moves, and a single triangle elsewhere that uses its row too."""
+    def test_rows_used_by_other_triangles_do_not_change(self):
+        """A vertex that moves, and a separate triangle that uses its row, too."""
         plane, F = grid(6, 6)
         uv = plane.copy()
         uv[24] += 0.3
@@ -158,7 +158,7 @@ class TestRepair:
         assert len(islands(np.concatenate([F, far]), result.uv, result.FT)) == 2
         assert exact_signs(result.uv, result.FT).min() == 1
 
-    def test_interior_vertices_may_be_nowhere(self):
+    def test_interior_vertices_may_have_no_position(self):
         V, F = random_delaunay(200, seed=2)
         start = V.copy()
         lost = inner_rows(F)[[3, 40, 41]]
@@ -176,7 +176,7 @@ class TestRepair:
         assert np.array_equal(result.uv[boundary_of(F)], V[boundary_of(F)])
 
     def test_boundary_that_crosses_itself(self):
-        """A map without inverted triangles exists and is found; that it overlaps is said."""
+        """A map without inverted triangles exists and is found; its overlap is reported."""
         V, F = grid(60, 4)
         angle, radius = -2.4 * np.pi * V[:, 0], 2 + V[:, 1]
         wound = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -202,7 +202,7 @@ class TestRepair:
         with pytest.raises(KeyboardInterrupt):
             repair(V, F, start, callback=interrupt)
 
-    def test_bad_input_is_named(self):
+    def test_invalid_input_is_named(self):
         V, F = grid(3, 3)
         with pytest.raises(ValueError, match=r"V must have shape \(n, 2\) or \(n, 3\), not"):
             repair(V[:, :1], F, V)
@@ -214,7 +214,7 @@ class TestRepair:
 
 class TestBeyondRepair:
     def test_the_boundary_alone_inverts_a_triangle(self):
-        """The rest is repaired all the same, and the reason names elements by the mesh's numbers."""
+        """The rest is repaired, and the reason names elements by the mesh's numbers."""
         V, F, uv, FT, strip = strips()
         # An ear of the last strip: a triangle with two boundary edges, folded inwards.
         ear = np.array([[0, 1, 2]]) + len(V)
@@ -237,7 +237,7 @@ class TestBeyondRepair:
         assert f"triangle {len(F) - 1}" in last.reason
         assert f"triangle {len(F) - 1} left" in result.summary()
 
-    def test_an_ear_does_not_keep_the_rest_from_being_repaired(self):
+    def test_an_inverted_ear_does_not_prevent_other_repairs(self):
         V, F = grid(8, 8)
         ear = np.array([[4, 3, len(V)]])  # below the bottom side, folded up
         F = np.concatenate([F, ear])
@@ -257,7 +257,7 @@ class TestBeyondRepair:
         assert "mirrored, left unchanged" in result.summary()
         assert np.array_equal(result.uv, uv)
 
-    def test_mirrored_and_turned_over(self):
+    def test_mirrored_and_reversed(self):
         V, F, uv, FT, strip = strips(4)
         rows = np.unique(FT[strip == 2])
         uv[rows] *= [-1, 1]
@@ -281,7 +281,7 @@ class TestBeyondRepair:
         assert not result.injective
         assert "closed" in result.islands[0].reason
 
-    def test_boundary_without_places(self):
+    def test_boundary_without_positions(self):
         V, F = grid(3, 3)
         uv = V.copy()
         uv[2] = np.nan
@@ -304,7 +304,7 @@ class TestBeyondRepair:
 
 @pytest.fixture
 def uv_file(tmp_path):
-    """An atlas with flips in two islands, as another program might have written it."""
+    """Write an atlas with inverted triangles in two islands, as another program might."""
     V, F, uv, FT, strip = strips(8)
     start, _ = damaged(uv, inner_rows(FT, strip == 0), 6, 0.1)
     start, _ = damaged(start, inner_rows(FT, strip == 2), 3, 0.2, seed=1)
@@ -341,7 +341,7 @@ class TestCommand:
         assert said.err == ""
 
     @pytest.mark.slow
-    def test_the_other_commands_take_seams(self, uv_file, tmp_path, capsys):
+    def test_the_other_commands_accept_seams(self, uv_file, tmp_path, capsys):
         out, report, faces = tmp_path / "repaired.obj", tmp_path / "report.json", tmp_path / "faces.npz"
         assert run("check", uv_file, "--json", report) == 1
         mesh = io.read_obj(uv_file)
@@ -352,7 +352,7 @@ class TestCommand:
         assert run("check", out) == 0
         assert f"vertices from {len(mesh.V)} on are copies of vertices" in capsys.readouterr().out
         assert run("measure", out, "--export", faces) == 0
-        # The same corner by corner: no triangle shares anything with another.
+        # The same, corner by corner: no triangle shares anything with another.
         written = io.read_obj(out)
         apart = np.arange(mesh.F.size).reshape(-1, 3)
         expected = distortion(written.V[written.F].reshape(-1, 3), apart, written.vt[written.FT].reshape(-1, 2))
@@ -376,12 +376,12 @@ class TestCommand:
         assert run("check", path) == 1
         assert run("repair", path, "-o", out) == 0
         assert run("check", out) == 0
-        assert run("repair", path, "-o", out, "--all") == 0
+        assert run("repair", path, "-o", out, "--whole") == 0
         assert run("check", out) == 0
         assert (io.map_of(io.read_obj(out)) != start).any(axis=1).sum() == len(inner_rows(F))
         capsys.readouterr()
 
-    def test_one_is_not_many(self, tmp_path, capsys):
+    def test_messages_use_the_singular(self, tmp_path, capsys):
         V, F = disk(3)
         start = V.copy()
         start[0] = [0.4, 0.1]
@@ -392,7 +392,7 @@ class TestCommand:
         assert first.endswith(" triangles inverted before, 0 now; 1 vertex moved")
         assert island.endswith(" inverted before, 0 now; 1 vertex moved")
 
-    def test_status_1_where_something_is_left(self, tmp_path, capsys):
+    def test_status_1_if_inverted_triangles_remain(self, tmp_path, capsys):
         V, F = grid(4, 4)
         path, out = tmp_path / "map.obj", tmp_path / "out.obj"
         io.write_obj(path, io.MeshData(V, F).with_map(V[:, ::-1]))
@@ -408,7 +408,7 @@ class TestCommand:
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.obj", "no face has texture coordinates"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3\n", "out.obj", "at all three corners"),
             ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 4 2\n", "out.obj", "uses a vertex twice"),
-            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", "OFF does not support seams"),
+            ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "out.off", ".off files cannot store seams"),
             (None, "out.obj", "there is no such file"),
         ],
     )
@@ -420,7 +420,7 @@ class TestCommand:
         assert message in capsys.readouterr().err
         assert not (tmp_path / output).exists()
 
-    def test_faces_without_a_map_are_left_alone(self, uv_file, tmp_path, capsys):
+    def test_faces_without_a_map_do_not_change(self, uv_file, tmp_path, capsys):
         uv_file.write_text(uv_file.read_text() + "f 1 2 3\n")
         out = tmp_path / "out.obj"
         assert run("repair", uv_file, "-o", out) == 0

@@ -1,4 +1,4 @@
-"""Tests share what is in `shared`: none imports another, reaches for private names, or looks outside the checkout."""
+"""Tests share the code in `shared`: they import no other test and no private names, and use no file outside."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent
 MODULES = sorted(FOLDER.rglob("*.py"))
 TESTS = {path.stem for path in FOLDER.rglob("test_*.py")}
-# What `namedtuple` offers has an underscore so that it is no field, what notebooks ask for by custom: none is private.
+# Methods of `namedtuple` have an underscore to be no fields, and notebooks' methods by convention: none is private.
 PUBLIC = {"_replace", "_asdict", "_fields", "_make", "_repr_html_", "_repr_png_"}
 
 
@@ -29,7 +29,7 @@ def private(name):
 
 
 def imports(tree):
-    """(module, name or None) of everything imported, wherever in the file."""
+    """Yield (module, name or None) of every import in the file."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name, None) for alias in node.names)
@@ -39,11 +39,11 @@ def imports(tree):
 
 
 def private_names(tree):
-    """What begins with an underscore and is imported, reached into, or replaced by `monkeypatch.setattr`."""
+    """Yield names with an underscore that are imported, accessed, or replaced by `monkeypatch.setattr`."""
     for module, name in imports(tree):
         yield from (part for part in (*module.split("."), name or "") if private(part))
     for node in ast.walk(tree):
-        # A class of the tests' own that fills in a protocol may call what it takes the place of.
+        # A class of the tests that implements a protocol may call the method that it replaces.
         if (
             isinstance(node, ast.Attribute)
             and private(node.attr)
@@ -66,23 +66,23 @@ def test_rules(path):
 @pytest.mark.parametrize(
     "code",
     [
-        "from quasiharmonic.solver.search.solving import _hidden",
+        "from quasiharmonic.solver.mapping import _hidden",
         "import quasiharmonic._hidden",
         "result._hidden()",
         "monkeypatch.setattr('quasiharmonic.solver.search.solving._hidden', 1)",
         "patch.setattr(solving, '_hidden', 1)",
     ],
 )
-def test_private_names_are_found(code):
+def test_private_names_are_detected(code):
     assert list(private_names(ast.parse(code))) == ["_hidden"]
 
 
-def test_a_test_is_found_wherever_it_is_imported():
+def test_imports_of_tests_are_detected():
     assert list(imports(ast.parse("def f():\n    from test_cli import run"))) == [("test_cli", "run")]
 
 
-def test_what_is_skipped_without_a_package_is_run_where_it_is_installed():
-    """Every package is required, of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
+def test_packages_that_tests_skip_without_are_installed_somewhere():
+    """Every package is required, is part of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
     wanted = {
         node.args[0].value
         for path in MODULES

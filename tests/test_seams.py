@@ -1,4 +1,4 @@
-"""Maps with seams: their islands, cuts along edges, places of vertices that have several."""
+"""Maps with seams: islands, cuts along edges, and vertices with several texture coordinates."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import pytest
 
 from quasiharmonic import certify
 from quasiharmonic.geometry.mesh.fans import fans
-from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import lift
-from shared.seamed import islands, strips
+from shared.seam_meshes import islands, strips
 
 
 class TestIslands:
-    def test_one_piece_keeps_its_numbers(self):
+    def test_one_piece_keeps_its_vertex_numbers(self):
         V, F = random_delaunay(60, seed=1)
         (one,) = islands(F, V)
         assert np.array_equal(one.F, F)
@@ -33,20 +33,20 @@ class TestIslands:
             assert np.all(np.diff(island.vertices) > 0)
             assert certify(island.F, island.uv).bijective
 
-    def test_a_place_for_every_corner_is_no_seam(self):
+    def test_separate_coordinates_for_every_corner_are_no_seam(self):
         V, F = random_delaunay(60, seed=1)
         (one,) = islands(F, V[F.ravel()], np.arange(F.size).reshape(-1, 3))
         assert np.array_equal(one.F, F)
         assert np.array_equal(one.uv, V)
 
-    def test_equal_numbers_are_one_place_whatever_the_sign_of_zero(self):
+    def test_equal_coordinates_are_one_row_for_either_sign_of_zero(self):
         F = np.array([[0, 1, 2], [1, 0, 3]])
         uv = np.array([[0.0, 0.0], [1, 0], [0.5, 1], [-0.0, -0.0], [1, -0.0], [0.5, -1]])
         assert len(islands(F, uv, [[0, 1, 2], [4, 3, 5]])) == 1
         uv[4, 0] = np.nextafter(1, 2)
         assert len(islands(F, uv, [[0, 1, 2], [4, 3, 5]])) == 2
 
-    def test_triangles_that_touch_at_a_vertex_are_apart(self):
+    def test_triangles_that_touch_at_a_vertex_are_separate(self):
         F = np.array([[0, 1, 2], [0, 3, 4]])
         found = islands(F, [[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
         assert [island.vertices.tolist() for island in found] == [[0, 1, 2], [0, 3, 4]]
@@ -64,13 +64,13 @@ class TestIslands:
         assert not component.any()
         assert len(np.unique(split)) == len(np.unique(pinched)) + 1
 
-    def test_what_is_no_surface_comes_apart(self):
+    def test_non_manifold_parts_are_separated(self):
         three_at_an_edge = [[0, 1, 2], [1, 0, 3], [0, 1, 4]]
         assert len(islands(three_at_an_edge, np.random.default_rng(0).random((5, 2)))) == 3
         wound_differently = [[0, 1, 2], [0, 1, 3]]
         assert len(islands(wound_differently, np.random.default_rng(0).random((4, 2)))) == 2
 
-    def test_triangles_without_places(self):
+    def test_triangles_without_coordinates(self):
         V, F = grid(4, 4)
         FT = F.copy()
         FT[3] = -1
@@ -81,7 +81,7 @@ class TestIslands:
         )
         assert islands(F, V, np.full_like(F, -1)) == []
 
-    def test_bad_input_is_named(self):
+    def test_invalid_input_is_named(self):
         V, F = grid(2, 2)
         with pytest.raises(ValueError, match="FT must have as many rows as F, 8, not 7"):
             islands(F, V, F[:-1])
@@ -100,7 +100,7 @@ class TestIslands:
 
 
 class TestCut:
-    def test_a_sheet_comes_apart_along_a_line(self):
+    def test_a_sheet_is_cut_along_a_line(self):
         V, F = grid(4, 3)
         line = [[k, k + 5] for k in (2, 7, 12)]
         cut = SeamedMesh(V, F).cut(line)
@@ -108,13 +108,13 @@ class TestCut:
         assert np.array_equal(cut.seams, line)
         assert np.array_equal(cut.V, V)
         assert np.array_equal(cut.F, F)
-        # Every vertex keeps its number on one side, and the four on the line have another on the other.
+        # Every vertex keeps its number on one side, and the four on the line have another on the other side.
         assert np.array_equal(np.unique(cut.FT), np.arange(len(V) + 4))
         opened = cut.opened()
         assert np.array_equal(opened.V[opened.F], V[F])
         assert len(opened.V) == len(V) + 4
 
-    def test_a_slit_that_ends_inside_splits_what_it_passes(self):
+    def test_a_slit_that_ends_inside_splits_interior_vertices(self):
         V, F = disk(4)
         inner = 0
         spoke = [inner]
@@ -126,23 +126,23 @@ class TestCut:
         assert spoke[-1] in rim
         cut = SeamedMesh(V, F).cut(np.column_stack([spoke[:-1], spoke[1:]]))
         (one,) = cut.islands
-        # The inner end of a slit has one place, and so have the edges there; every other vertex on it has two.
+        # The inner end of a slit has one position, as do its edges; every other vertex on it has two.
         assert len(one.vertices) == len(V) + len(spoke) - 1
         assert len(cut.seams) == len(spoke) - 1
 
-    def test_the_same_edge_in_either_sense_and_twice(self):
+    def test_edges_in_either_direction_and_repeated_edges(self):
         V, F = grid(2, 2)
         assert len(SeamedMesh(V, F).cut([[1, 4], [4, 1], [4, 7]]).islands) == 2
         assert len(SeamedMesh(V, F).cut(np.empty((0, 2), int)).islands) == 1
 
-    def test_what_is_no_edge_is_named(self):
+    def test_edges_not_in_the_mesh_are_named(self):
         V, F = grid(2, 2)
         with pytest.raises(ValueError, match=r"edge \(0, 5\): not an edge of the mesh, so it cannot be cut"):
             SeamedMesh(V, F).cut([[1, 4], [0, 5]])
         with pytest.raises(ValueError, match="edges refers to vertex 9"):
             SeamedMesh(V, F).cut([[1, 9]])
 
-    def test_seams_that_were_there_stay(self):
+    def test_existing_seams_remain(self):
         V, F, uv, FT, _ = strips(4)
         mesh = SeamedMesh(V, F, FT, uv)
         ends = F[0][[0, 1]]
@@ -151,8 +151,8 @@ class TestCut:
         assert cut.uv is None
 
 
-class TestPlaces:
-    def test_places_of_a_cut_surface(self):
+class TestRows:
+    def test_coordinates_of_a_cut_surface(self):
         V, F = grid(4, 3)
         cut = SeamedMesh(V, F).cut([[2, 7], [7, 12], [12, 17]])
         shifted = [V[island.vertices] + [10 * k, 0] for k, island in enumerate(cut.islands)]
@@ -180,14 +180,14 @@ class TestPlaces:
         assert np.array_equal(opened.V[opened.F], V[F])
         assert np.array_equal(opened.V[: len(V)], V)
 
-    def test_a_seamless_map_opens_into_itself(self):
+    def test_a_seamless_map_is_its_own_cut_mesh(self):
         V, F = annulus(3)
         mesh = SeamedMesh(lift(V), F, F, V)
         assert mesh.seamless
         assert not len(mesh.seams)
         assert np.array_equal(mesh.opened().F, F)
 
-    def test_triangles_without_a_place_do_not_open(self):
+    def test_triangles_without_coordinates_are_not_cut(self):
         V, F = grid(2, 2)
         FT = F.copy()
         FT[3, 1] = -1

@@ -1,4 +1,4 @@
-"""Meshes of simulation programs morphed as they come, put back, and the command on their files."""
+"""Morphing of other libraries' meshes: conversion in both directions, and the command on their files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shared.simulation import quadrilaterals, second_order
 
 
 def dent(points, depth=0.4):
-    """The upper side of the unit square, and where a dent puts it."""
+    """Return the upper side of the unit square, and the target positions of a dent."""
     upper = np.flatnonzero(points[:, 1] == points[:, 1].max())
     return upper, points[upper] - depth * np.array([(0, 1)]) * np.sin(np.pi * points[upper, :1]) ** 2
 
@@ -37,7 +37,7 @@ def in_space(points):
 
 TRIANGLES, QUADRILATERALS = surfaces.grid(4, 4), quadrilaterals(4, 4)
 CURVED = second_order(*TRIANGLES)
-# What each library calls its parts, and what is to come of them.
+# The names of each library for its parts, and the expected results.
 STAND_INS = {
     "triangles of scikit-fem": (SimpleNamespace(doflocs=TRIANGLES[0].T, t=TRIANGLES[1].T), TRIANGLES),
     "quadrilaterals of scikit-fem": (
@@ -52,7 +52,7 @@ STAND_INS = {
         SimpleNamespace(geometry=SimpleNamespace(x=QUADRILATERALS[0], dofmap=QUADRILATERALS[1][:, [0, 1, 3, 2]])),
         QUADRILATERALS,
     ),
-    # Its node number 3 is opposite to corner 0.
+    # Node number 3 is opposite to corner 0 in this library.
     "second order of DOLFINx": (
         SimpleNamespace(geometry=SimpleNamespace(x=CURVED[0], dofmap=CURVED[1][:, [0, 1, 2, 4, 5, 3]])),
         CURVED,
@@ -82,7 +82,7 @@ for mesh, (_, elements) in STAND_INS.values():
 
 
 @pytest.mark.parametrize("name", STAND_INS)
-def test_elements_are_taken_as_they_are(name):
+def test_supported_elements_are_converted(name):
     mesh, (points, F) = STAND_INS[name]
     found = planar_cells(mesh)
     assert np.array_equal(found[0], points)
@@ -92,7 +92,7 @@ def test_elements_are_taken_as_they_are(name):
     assert np.array_equal(morph(mesh, *dent(points)).points, expected.points)
 
 
-def test_cells_that_are_no_elements():
+def test_unsupported_cells():
     points, F = QUADRILATERALS
     for cells, message in (
         ([block("tetra", F)], "of a SimpleNamespace have the cell type 'tetra'"),
@@ -119,7 +119,8 @@ def test_scikit_fem(kind):
     assert np.array_equal(back.boundaries["top"], mesh.boundaries["top"])
     element = {"MeshTri": skfem.ElementTriP1, "MeshQuad": skfem.ElementQuad1, "MeshTri2": skfem.ElementTriP2}[kind]()
     before, after = (skfem.Basis(one, element, intorder=6) for one in (mesh, back))
-    # Its own determinants keep their signs at every point of integration, and make up the area: ∫ 0.4 sin² is 0.2.
+    # The library's own determinants keep their signs at every integration point and add up to the area: ∫ 0.4 sin² is
+    # 0.2.
     signs = [basis.mapping.detDF(basis.X) > 0 for basis in (before, after)]
     assert np.array_equal(*signs)
     assert after.dx.sum() == pytest.approx(0.8, abs=1e-3 if kind == "MeshTri2" else 1e-12)
@@ -160,7 +161,7 @@ def test_gmsh(order, recombined):
         assert morphed.valid
         for tag, place in zip(tags, morphed.points, strict=True):
             gmsh.model.mesh.setNode(tag, [*place, 0], [])
-        # Its own measure: the least determinant over the largest.
+        # The library's own measure: the smallest determinant over the largest.
         elements = np.concatenate(gmsh.model.mesh.getElements(dim=2)[1])
         assert min(gmsh.model.mesh.getElementQualities(elements, "minSJ" if order == 1 else "minDetJac")) > 0
         assert np.array_equal(gmsh.model.mesh.getNodes()[1].reshape(-1, 3)[:, :2], morphed.points)
@@ -169,10 +170,10 @@ def test_gmsh(order, recombined):
 
 
 @pytest.mark.parametrize("library", ["skfem", "meshio", "gmsh"])
-def test_what_the_documents_say_of_libraries(library):
+def test_examples_for_libraries_in_the_documentation(library):
     if find_spec(library) is None:
         pytest.skip(f"{library} is not installed; .ci/optional does it")
-    page = (Path(__file__).parent.parent / "docs" / "howto.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parent.parent / "docs" / "howto" / "simulation_meshes.md").read_text(encoding="utf-8")
     (code,) = re.findall(rf"^```py\n# {library}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     names = {}
     exec(compile(code, library, "exec"), names)
@@ -192,7 +193,7 @@ FORMATS = {
 
 
 def written(path, points, kind, F, depth=0.4):
-    """A file with a displacement of the upper side."""
+    """Return a file with a displacement of the upper side."""
     meshlane = pytest.importorskip("meshlane")
     moved, positions = dent(points, depth)
     displacement = np.zeros((len(points), 3))
@@ -237,7 +238,7 @@ def test_files_whose_quadrilaterals_cannot_be_morphed(tmp_path, capsys):
     assert main(["morph", str(path), "-o", str(out), "--field", "u"]) == 2
     assert "quadrilateral 10 not convex" in capsys.readouterr().err
     assert not out.exists()
-    # Pushed down by more than the square is high, the corner elements turn over.
+    # The side moves down by more than the height of the square, so corner elements are inverted.
     table = tmp_path / "to.csv"
     table.write_text("24 0.6 0.6\n")
     path = written(tmp_path / "good.vtu", points, "quad", F)
@@ -247,7 +248,7 @@ def test_files_whose_quadrilaterals_cannot_be_morphed(tmp_path, capsys):
     assert "Inverted for every position of the free nodes: quadrilateral 15" in said
 
 
-def test_tables_of_numbers_in_any_notation(tmp_path):
+def test_number_formats_in_tables(tmp_path):
     points, F = QUADRILATERALS
     path, table = written(tmp_path / "in.vtu", points, "quad", F), tmp_path / "to.csv"
     for text in ("24 1.25 1.5", "24, 1.25e0, +15.D-1", "24;1,25;1,5", "node\tx\ty\n24\t.125E+1\t1.5\n# end"):

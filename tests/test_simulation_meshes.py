@@ -1,4 +1,4 @@
-"""Meshes of simulations whose boundary moves: chains of steps, quadrilaterals, second-order triangles, sliding."""
+"""Simulation meshes with moving boundaries: chains of steps, quadrilaterals, second-order triangles, sliding."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from quasiharmonic import BoundaryCurves, Status, boundary_loops, morph, surface
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.geometry.mesh.elements import rim
 from shared.meshes import boundary_of
-from shared.simulation import channel, least_jacobian, quadrilaterals, second_order, turned
+from shared.simulation import channel, min_jacobian, quadrilaterals, second_order, turned
 
 
 @pytest.fixture(scope="module")
 def flap():
-    """A mesh around a flap, and the flap's vertices."""
+    """Return a mesh around a flap, and the flap's vertices."""
     points, F = surfaces.annulus(12, hole=(-0.6, -0.05, 0.6, 0.05))
     loops = boundary_loops(F, len(points))
     return points, F, min(loops, key=lambda loop: np.abs(points[loop]).max())
 
 
 def dent(points, depth, waves=1):
-    """The upper side of the unit square, and where so many dents of a depth put it."""
+    """Return the upper side of the unit square, and its target positions with some dents of a given depth."""
     upper = np.flatnonzero(points[:, 1] == 1)
     x = points[upper, 0]
     return upper, np.stack([x, 1 - depth * np.sin(waves * np.pi * x) ** 2], axis=1)
@@ -33,7 +33,7 @@ def dent(points, depth, waves=1):
 
 
 @pytest.mark.slow
-def test_fifty_small_steps_end_as_one_large_step_does(flap):
+def test_fifty_small_steps_end_like_one_large_step(flap):
     points, F, body = flap
     whole = morph(points, F, body, turned(points[body], 50))
     here = careless = points
@@ -47,12 +47,12 @@ def test_fifty_small_steps_end_as_one_large_step_does(flap):
     away = np.abs(here - whole.points).max()
     assert away < 1e-3 * size
     assert morphed.drift() == pytest.approx(np.hypot(*(here - whole.points).T).max(), rel=1e-6)
-    # Measured against the mesh before, every step is forgotten at the next.
+    # If each step is measured against the previous mesh, errors accumulate.
     assert np.abs(careless - whole.points).max() > 100 * away
 
 
 @pytest.mark.parametrize("slide", [False, True])
-def test_a_closed_path_leads_back(flap, slide):
+def test_a_closed_path_returns_to_the_start(flap, slide):
     points, F, body = flap
     here = points
     for degrees in (10, 20, 30, 20, 5, -10, 0):
@@ -64,7 +64,7 @@ def test_a_closed_path_leads_back(flap, slide):
 
 
 @pytest.mark.parametrize("kind", ["quadrilaterals", "second order"])
-def test_chains_of_other_elements_lead_back(flap, kind):
+def test_chains_of_other_elements_return_to_the_start(flap, kind):
     if kind == "quadrilaterals":
         first, F, body = channel(16)
     else:
@@ -81,33 +81,33 @@ def test_chains_of_other_elements_lead_back(flap, kind):
     assert np.abs(here - first).max() < 1e-6
 
 
-def test_a_chain_that_drifts_says_so(flap):
+def test_drift_of_a_chain_is_reported(flap):
     points, F, body = flap
-    # Without an energy a mesh is where its search happened to find it.
+    # Without an energy, the mesh depends on the start of the search.
     here = points
     for degrees in (20, 40, 60):
         morphed = morph(here, F, body, turned(points[body], degrees), rest=points, energy=None)
         here = morphed.points
     assert morphed.valid
     assert morphed.drift() > 1e-3
-    # What one step does not get to cannot be compared with.
+    # A position that one step does not reach has no reference.
     crossing = points[body] * (1, 30)
     assert np.isnan(morph(points, F, body, crossing, max_iterations=20).drift())
 
 
-def test_the_start_is_where_the_search_begins(flap):
+def test_the_search_begins_at_the_start(flap):
     points, F, body = flap
     place = turned(points[body], 75)
     plain = morph(points, F, body, place)
     begun = morph(points, F, body, place, start=plain.points)
-    assert begun.result.iterations < plain.result.iterations
+    assert begun.result.n_iterations < plain.result.n_iterations
     assert np.abs(begun.points - plain.points).max() < 1e-4
     again = morph(plain.points, F, body, place, rest=points)
     assert np.abs(again.points - begun.points).max() < 1e-12
 
 
 @pytest.mark.parametrize("name", ["rest", "start"])
-def test_other_meshes_that_are_none(flap, name):
+def test_invalid_start_and_rest_meshes(flap, name):
     points, F, body = flap
     lost = points.copy()
     lost[7] = np.nan
@@ -135,7 +135,7 @@ def test_quadrilaterals_stay_convex(depth, waves):
 
 
 @pytest.mark.parametrize("slide", [False, True])
-def test_both_diagonals_are_minded(slide):
+def test_both_diagonals_are_checked(slide):
     points, F, body = channel(16)
     place = turned(points[body], 120)
     morphed = morph(points, F, body, place, slide=slide)
@@ -165,15 +165,15 @@ def test_concave_quadrilaterals_are_named():
     bad[centre] += (0.1, 0.1)
     with pytest.raises(ValueError, match="quadrilateral 21 not convex: all four corners"):
         morph(bad, F, *dent(bad, 0.2))
-    # They may be so on the way, as long as they are not at rest.
+    # Intermediate positions may be concave, but rest positions must not.
     assert morph(bad, F, *dent(bad, 0.2), rest=points).valid
     with pytest.raises(ValueError, match=r"quadrilaterals 0, 1, .* not convex"):
         morph(points * (1, 0), F, [0], [[0, 0]])
 
 
-def test_quadrilaterals_that_the_boundary_inverts_are_named():
+def test_quadrilaterals_inverted_by_the_boundary_are_named():
     points, F = quadrilaterals(6, 6)
-    # The corner of the square goes past the line between its neighbours.
+    # The corner of the square moves across the line between its neighbours.
     corner = len(points) - 1
     morphed = morph(points, F, [corner], [[0.9, 0.9]])
     assert morphed.inverted.tolist() == morphed.forbidden.tolist() == [len(F) - 1]
@@ -186,24 +186,24 @@ def test_quadrilaterals_that_the_boundary_inverts_are_named():
 
 
 def middles(F):
-    """Mid-side nodes and the ends of their sides, one after the other."""
+    """Return mid-side nodes and the ends of their sides."""
     return F[:, 3:].ravel(), F[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
 def off_straight(points, F):
-    """How far mid-side nodes are from the middles of their sides, by node."""
+    """Return the distance of mid-side nodes from the middles of their sides, by node."""
     middle, ends = middles(F)
     off = np.zeros(len(points))
     off[middle] = np.hypot(*(points[middle] - points[ends].mean(axis=1)).T)
     return off
 
 
-def test_middle_nodes_follow_straight_sides(flap):
+def test_mid_side_nodes_follow_straight_sides(flap):
     flat, three, body = flap
     points, F = second_order(flat, three)
     morphed = morph(points, F, body, turned(flat[body], 60))
     assert morphed.valid
-    # Corners go as they do without them, and what is between stays there.
+    # Corners move as without mid-side nodes, and mid-side nodes stay in the middle.
     assert np.array_equal(morphed.points[: len(flat)], morph(flat, three, body, turned(flat[body], 60)).points)
     assert off_straight(morphed.points, F).max() < 1e-15
     still = np.setdiff1d(boundary_of(three), body)
@@ -211,11 +211,11 @@ def test_middle_nodes_follow_straight_sides(flap):
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_sides_bend_where_a_curved_boundary_needs_it(mirror):
+def test_sides_bend_where_a_curved_boundary_requires_it(mirror):
     points, F = second_order(*surfaces.grid(8, 8))
     if mirror:
         F = F[:, [0, 2, 1, 5, 4, 3]]
-    # Only the middles of the upper sides go down, deeper than half of an element.
+    # Only the mid-side nodes of the upper side move down, by more than half an element.
     moved, positions = dent(points, 0.08, 8)
     morphed = morph(points, F, moved, positions)
     assert morphed.valid
@@ -225,7 +225,7 @@ def test_sides_bend_where_a_curved_boundary_needs_it(mirror):
     inner = ~np.isin(middle, rim(F))
     straight[middle[inner]] = straight[ends[inner]].mean(axis=1)
     assert inverted_elements(morphed.F, straight).size == 8
-    # Far from the boundary none has bent, and a boundary that bulges asks for nothing.
+    # No side bends far from the boundary; an outward bulge requires no bend.
     off = off_straight(morphed.points, F)
     assert off[points[:, 1] < 0.7].max() < 1e-12
     bulging = morph(points, F, moved, positions * (1, -1) + (0, 2))
@@ -233,7 +233,7 @@ def test_sides_bend_where_a_curved_boundary_needs_it(mirror):
     assert off_straight(bulging.points, F)[np.setdiff1d(middle, moved)].max() < 1e-15
 
 
-def test_a_bent_mesh_stays_as_it_is():
+def test_a_bent_mesh_keeps_its_shape():
     points, F = second_order(*surfaces.grid(5, 5))
     rng = np.random.default_rng(0)
     number = np.unique(F[:, 3:])
@@ -242,15 +242,15 @@ def test_a_bent_mesh_stays_as_it_is():
     morphed = morph(points, F, [], np.empty((0, 2)))
     assert morphed.valid
     assert np.abs(morphed.points - points).max() < 1e-12
-    # Turned as a whole, its sides keep their bends: those inside, and those of the boundary that are not given.
+    # Rotated as a whole, its sides keep their bends: interior ones, and boundary ones that are not given.
     corners = np.setdiff1d(rim(F), number)
     whole = morph(points, F, corners, turned(points[corners], 90))
     assert np.abs(whole.points - turned(points, 90)).max() < 1e-6
 
 
-def test_elements_that_cannot_be_righted_are_told():
+def test_elements_that_remain_inverted_are_reported():
     points, F = second_order(*surfaces.grid(4, 4))
-    # A middle node three quarters along its side turns the element over at an end, whatever else moves.
+    # A mid-side node at three quarters of its side inverts the element at an end, wherever the others move.
     side = np.flatnonzero((points[:, 1] == 1) & (points[:, 0] == 0.125))
     morphed = morph(points, F, side, [[0.2, 1]])
     assert not morphed.valid
@@ -259,20 +259,20 @@ def test_elements_that_cannot_be_righted_are_told():
 
 
 @pytest.mark.slow
-def test_what_cannot_be_righted_is_tried_in_silence():
+def test_failed_repair_causes_no_warning():
     points, F = second_order(*surfaces.grid(5, 5))
     side = np.flatnonzero(((points == 0) | (points == 1)).any(axis=1))
     x, y = points[side].T
-    # On the way a system of equations is singular.
+    # A system of equations is singular during the repair.
     across = 0.18889902923018087 * np.sin(2 * np.pi * y + 0.38528662)
     up = 0.11786290113252539 * np.sin(3 * np.pi * x + 4.0750892)
     morphed = morph(points, F, side, np.stack([x + across, y + up], axis=1))
     assert morphed.inverted.size
-    assert morphed.inverted.tolist() == [k for k, row in enumerate(F) if least_jacobian(morphed.points[row]) <= 0]
+    assert morphed.inverted.tolist() == [k for k, row in enumerate(F) if min_jacobian(morphed.points[row]) <= 0]
 
 
 @pytest.mark.parametrize("slide", [True, "rails"])
-def test_middle_nodes_slide_too(flap, slide):
+def test_mid_side_nodes_slide_too(flap, slide):
     points, F = second_order(*flap[:2])
     body = rim(F)[np.abs(points[rim(F)]).max(axis=1) < 0.9]
     square = BoundaryCurves([[(-1, -1), (1, -1), (1, 1), (-1, 1)]])
@@ -283,6 +283,6 @@ def test_middle_nodes_slide_too(flap, slide):
     assert np.abs(np.abs(morphed.points[walls]).max(axis=1) - 1).max() < 1e-12
     assert morphed.result.history[-1].energy < held.result.history[-1].energy
     assert morphed.drift() < 1e-4
-    # Where nothing has moved nothing slides.
+    # Where nothing moves, nothing slides.
     still = morph(points, F, body, points[body], slide=square if slide == "rails" else True)
     assert np.abs(still.points - points).max() < 1e-6

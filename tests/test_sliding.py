@@ -1,4 +1,4 @@
-"""Boundaries that slide: what holds of every map, derivatives against differences, and what is refused."""
+"""Boundaries that slide: properties of every map, derivatives against differences, and errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from quasiharmonic import Status, boundary_loops, certify, injective_map, io, mo
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.energies.newton.sliding import SlidingDescent
+from quasiharmonic.energies.newton.sliding_boundary import SlidingModel
 from quasiharmonic.geometry.curves import BoundaryCurves, Curve
 from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.io.fem.files import read_fem
@@ -35,7 +35,7 @@ def points_of(z):
 
 
 def sheared(n=10):
-    """A grid on the unit square, and a map of it that moves the vertices on its sides along them."""
+    """A grid on the unit square, and a map of it that moves the vertices of its sides along them."""
     V, F = surfaces.grid(n, n)
     x, y = V.T
     uv = np.stack([x + 0.7 * x * (1 - x) * (1 - 0.3 * y), y - 0.3 * y * (1 - y) * x], axis=1)
@@ -44,25 +44,25 @@ def sheared(n=10):
 
 
 def turned(rings=8, angle=0.5):
-    """A disk, and a map of it that turns the boundary against the middle, one side more than the other."""
+    """A disk, and a map of it that rotates the boundary against the centre, one side more than the other."""
     V, F = surfaces.disk(rings)
     z = z_of(V)
     (loop,) = boundary_loops(F, len(V))
     uv = points_of(z * np.exp(1j * angle * np.abs(z) ** 2 * (1 + 0.6 * np.sin(np.angle(z)))))
-    # On the circle to the last bit that counts.
+    # On the circle to the last bit.
     uv[loop] /= np.hypot(*uv[loop].T)[:, None]
     return V, F, uv, loop
 
 
 def lettered(text, **options):
-    """A curved disk onto a letter."""
+    """A curved disk mapped to a letter."""
     V, F = surfaces.random_delaunay(600, seed=4)
     V = lift(V)
     return V, F, *boundary_to(V, F, filled(outline(text))), outline_curves(text)
 
 
 def off_the_glyph(points, character):
-    """Distances from the pieces that the font draws, by SciPy's search on each; (k,)."""
+    """Return distances from the pieces that the font draws, by SciPy's search on each; (k,)."""
     away = np.full(len(points), np.inf)
     for control in [piece for path in glyph_paths(character) for piece in path]:
 
@@ -85,7 +85,7 @@ def off_the_glyph(points, character):
     return away
 
 
-# What comes out
+# Results
 
 
 @pytest.mark.parametrize("character", "GSPH")
@@ -95,13 +95,13 @@ def test_a_letter_is_better_with_its_boundary_sliding(character):
     result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=BoundaryCurves(curves))
     assert result.status is Status.POLISHED
     assert certify(F, result.uv).bijective
-    polishing = [step.energy for step in result.history[-result.stages[-1].iterations - 1 :]]
-    # The barrier may have its thousandth.
+    polishing = [step.energy for step in result.history[-result.stages[-1].n_iterations - 1 :]]
+    # The barrier may take a thousandth.
     assert np.all(np.diff(polishing) < 1e-3 * polishing[-1])
     assert result.history[-1].energy < 0.999 * held.history[-1].energy
-    energies = [distortion(V, F, uv).summary("symmetric_dirichlet").mean for uv in (held.uv, result.uv)]
+    energies = [distortion(V, F, uv).statistics("symmetric_dirichlet").mean for uv in (held.uv, result.uv)]
     assert energies[1] < energies[0]
-    # Corners to the last bit, everything else on the font's own curves, and some of it elsewhere.
+    # Corners are exact; other vertices lie on the font's own curves, and some of them have moved.
     bends = {tuple(p) for curve in curves for p in curve.position(curve.corners(20.0)).tolist()}
     corners = np.array([tuple(p) in bends for p in target.tolist()])
     outer = max(curves, key=lambda curve: curve.length)
@@ -128,27 +128,27 @@ def test_a_word_slides_along_the_curves_of_its_letters():
     outer = max(curves, key=lambda curve: curve.length)
     places = result.uv[fixed]
     assert np.hypot(*(places - target).T).max() > 0.01
-    # Half a rounding of each coordinate, and as much again of the point on the curve that is measured to.
+    # Half a rounding error per coordinate, and as much again for the point on the curve used as reference.
     assert outer.nearest(places)[1].max() <= np.hypot(*np.spacing(np.abs(places).max(axis=0)))
-    # The first letter is where it is alone.
+    # The first letter has the same position as alone.
     first = places[:, 0] < 0.5
     assert first.any()
     assert off_the_glyph(places[first], "O").max() < 1e-8
-    # Held are the corners of the second, and the two where the letters meet.
+    # The corners of the second letter are fixed, and so are the two points where the letters meet.
     held = outer.position(outer.corners(20.0))
     assert np.isin(held @ (1, 1j), places @ (1, 1j)).all()
 
 
-def test_a_boundary_on_a_circle_turns_back():
+def test_a_boundary_on_a_circle_rotates_back():
     V, F, uv, loop = turned()
     held = polish(V, F, uv, fixed=loop)
-    result = polish(V, F, uv, fixed=loop, slide=BoundaryCurves([Curve.circle()]), tolerance=1e-10)
+    result = polish(V, F, uv, fixed=loop, slide=BoundaryCurves([Curve.circle()]), tol=1e-10)
     assert held.history[-1].energy > 0.1
-    # The polygon that the boundary is has grown a little since the start, whose scale it is.
+    # The polygon of the boundary, which sets the scale, has grown slightly since the start.
     assert result.history[-1].energy < 1e-6
-    assert distortion(V, F, result.uv).summary("symmetric_dirichlet").mean < 1e-9
+    assert distortion(V, F, result.uv).statistics("symmetric_dirichlet").mean < 1e-9
     assert np.abs(np.hypot(*result.uv[loop].T) - 1).max() <= np.spacing(1.0)
-    # Nothing is held, so it is the disk again in some position.
+    # Nothing is fixed, so the result is the disk again in some position.
     turn = z_of(result.uv) / np.where(z_of(V) == 0, 1, z_of(V))
     assert np.ptp(np.angle(turn[np.hypot(*V.T) > 0])) < 1e-3
 
@@ -159,20 +159,20 @@ def test_a_boundary_on_a_circle_turns_back():
 def test_sides_of_a_square(slide):
     V, F, uv, loop = sheared()
     before = uv.copy()
-    result = polish(V, F, uv, fixed=loop, slide=slide, tolerance=1e-10)
+    result = polish(V, F, uv, fixed=loop, slide=slide, tol=1e-10)
     np.testing.assert_array_equal(uv, before)
     np.testing.assert_allclose(result.uv, V, atol=1e-7)
-    # Sides along an axis are met to the last bit.
+    # Axis-parallel sides are exact.
     for axis, value in ((0, 0), (0, 1), (1, 0), (1, 1)):
         side = V[:, axis] == value
         assert (result.uv[side, axis] == value).all()
 
 
-def test_kinks_are_passed():
-    """A boundary of many vertices on a polygon of few bends, each less than a corner."""
+def test_vertices_slide_across_small_bends():
+    """A boundary with many vertices on a polygon with few bends, each smaller than a corner."""
     V, F, _, loop = turned(10)
     polygon = Curve.polygon(points_of(np.exp(2j * np.pi * np.arange(24) / 24)))
-    # Vertices spread along it, closer to each other on one side.
+    # Vertices are distributed unevenly along it.
     share = np.arange(loop.size) / loop.size
     share = share + 0.1 * np.sin(2 * np.pi * share)
     target = polygon.position(share * polygon.length)
@@ -184,8 +184,8 @@ def test_kinks_are_passed():
     assert result.certificate.bijective
 
 
-def test_kinks_are_stopped_at():
-    """The surface reaches beyond the polygon's bends, into which it is therefore pushed: to the last bit."""
+def test_vertices_stop_at_bends():
+    """The surface extends beyond the polygon's bends, so vertices are pushed into them, exactly."""
     V, F = surfaces.disk(6)
     (loop,) = boundary_loops(F, len(V))
     bends = points_of(np.exp(1j * (np.angle(z_of(V[loop[0]])) + 2 * np.pi * np.arange(18) / 18)))
@@ -202,7 +202,7 @@ def test_kinks_are_stopped_at():
 
 
 def test_an_edge_does_not_cut_off_a_bend():
-    """Few vertices on a curved letter: without bounds the last two jump across, for less energy."""
+    """A curved letter with few vertices: without bounds, the last two jump across, for a lower energy."""
     V, F, fixed, target, curves = lettered("letter:S")
     result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=BoundaryCurves(curves))
     (curve,) = curves
@@ -216,7 +216,7 @@ def test_an_edge_does_not_cut_off_a_bend():
     assert strays(result.uv) < 1.5 * strays(start)
 
 
-def test_holes_slide_on_their_own():
+def test_holes_slide_independently():
     V, F = surfaces.annulus(12)
     outer, inner = sorted(boundary_loops(F, len(V)), key=lambda loop: -np.abs(V[loop]).max())
     z = z_of(V)
@@ -233,14 +233,14 @@ def test_holes_slide_on_their_own():
     assert result.certificate.bijective
 
 
-def test_nothing_can_slide_where_all_are_corners():
+def test_nothing_can_slide_if_all_vertices_are_corners():
     V, F, _, loop = sheared(2)
     corners = BoundaryCurves([V[loop]], corner_angle=0)
     result = polish(V, F, V, fixed=loop, slide=corners)
     np.testing.assert_array_equal(result.uv[loop], V[loop])
 
 
-def test_some_are_held_and_some_are_told():
+def test_some_vertices_are_fixed_and_some_have_given_curves():
     V, F, uv, loop = sheared()
     lower, right, upper, left = (np.flatnonzero(V[:, axis] == v) for axis, v in ((1, 0), (0, 1), (1, 1), (0, 0)))
     rails = BoundaryCurves([Curve.polyline([(0, 0), (1, 0)]), Curve.polyline([(1, 1), (0, 1)])], fixed=upper[2:4])
@@ -250,7 +250,7 @@ def test_some_are_held_and_some_are_told():
     slid = np.setdiff1d(np.union1d(lower, upper), stays)
     assert (result.uv[slid, 1] == V[slid, 1]).all()
     assert (result.uv[slid, 0] != uv[slid, 0]).all()
-    # Told their pieces, the sides of a smooth outline keep what is theirs: nothing slides past an end.
+    # If their curves are given, vertices stay on their side of a smooth outline: none slides past an end.
     half = [Curve([c]) for c in _half_circles()]
     V, F, uv, loop = turned(6, 0.3)
     on = {int(v): int(uv[v, 1] < 0) for v in loop}
@@ -276,18 +276,18 @@ def laid(straight=False):
     rails = BoundaryCurves([SQUARE]) if straight else BoundaryCurves([Curve.circle()])
     track = rails.lay([loop], uv)
     energy = DeformationEnergy(V, F, SymmetricDirichlet())
-    return track, SlidingDescent(energy, track, loop, [loop], 1, "auto")
+    return track, SlidingModel(energy, track, loop, [loop], 1, "auto")
 
 
 @pytest.mark.parametrize("straight", [False, True])
 def test_first_and_second_derivatives_along_curves(straight, rng):
-    track, descent = laid(straight)
-    system = descent.system
-    energy, unit = descent.energy, 2.0**descent.exponent
+    track, model = laid(straight)
+    system, start = model.system, model.start()
+    energy, unit = model.energy, 2.0**model.coordinates.exponent
 
     def go(step):
-        """The map after a step in the unknowns, in units."""
-        w = descent.w.copy()
+        """Return the map after a step in the unknowns, in the unit of the model."""
+        w = start.w.copy()
         w[system.free] += step
         s = track.advance(track.s, step[system.at].real * unit)
         w[track.vertices] = z_of(track.position(s)) / unit
@@ -295,41 +295,41 @@ def test_first_and_second_derivatives_along_curves(straight, rng):
 
     def merit(step):
         w, s = go(step)
-        return energy.value(w) + descent.weight * descent.deviation_barrier.value(s)
+        return energy.value(w) + model.weight * model.deviation_barrier.value(s)
 
     def random_step():
         step = rng.standard_normal(system.free.size) + 1j * rng.standard_normal(system.free.size)
         step[system.at] = step[system.at].real
         return step * 1e-2
 
-    gradient = descent.gradient()
+    gradient = model.gradient(start)
     assert (gradient[system.at].imag == 0).all()
     for _ in range(3):
         d, h = random_step(), 1e-3
         slope = np.sum(gradient.real * d.real + gradient.imag * d.imag)
         assert (merit(h * d) - merit(-h * d)) / (2 * h) == pytest.approx(slope, rel=1e-4)
-    # The second derivative as it is, the barrier's left out: that one is Gauss and Newton's.
-    system.bend = descent.forces
-    system.assemble(energy.curvature_of(energy.deform(descent.w), negative=1.0))
+    # The exact second derivative, without the barrier's, for which the Gauss–Newton form is used.
+    system.curve_stiffness = model.frame(start).forces
+    system.assemble(energy.curvature_of(start.derivatives, negative=1.0))
     matrix = system.matrix()
     for _ in range(3):
         d, h = random_step(), 1e-2
         x = np.ascontiguousarray(d).view(np.float64)
-        second = (energy.value(go(h * d)[0]) - 2 * energy.value(descent.w) + energy.value(go(-h * d)[0])) / h**2
+        second = (energy.value(go(h * d)[0]) - 2 * energy.value(start.w) + energy.value(go(-h * d)[0])) / h**2
         assert x @ (matrix @ x) == pytest.approx(second, rel=1e-3)
 
 
 def test_the_system_is_that_of_displacements(rng):
-    track, descent = laid()
-    system = descent.system
-    descent.gradient()
-    system.bend = np.zeros(track.vertices.size)
-    form = descent.energy.curvature_of(descent.energy.deform(descent.w))
+    track, model = laid()
+    system, start = model.system, model.start()
+    model.gradient(start)
+    system.curve_stiffness = np.zeros(track.vertices.size)
+    form = model.energy.curvature_of(start.derivatives)
     system.assemble(form)
     found = system.matrix().toarray()
     from quasiharmonic.energies.newton.newton_system import NewtonSystem
 
-    whole = NewtonSystem(descent.energy.F, descent.energy.g, descent.w.size, descent.fixed)
+    whole = NewtonSystem(model.energy.F, model.energy.g, start.w.size, model.coordinates.fixed)
     whole.assemble(form)
     H, size = whole.matrix().toarray(), whole.free.size
     P = np.eye(2 * size)
@@ -338,7 +338,7 @@ def test_the_system_is_that_of_displacements(rng):
     np.testing.assert_allclose(found, csr_array(P.T @ H @ P).toarray(), atol=1e-12 * np.abs(H).max())
 
 
-def test_the_barrier_of_straying(rng):
+def test_the_deviation_barrier(rng):
     V, _, fixed, target, curves = lettered("letter:S")
     places = np.zeros((len(V), 2))
     places[fixed] = target
@@ -357,7 +357,7 @@ def test_the_barrier_of_straying(rng):
         change = [deviation_barrier.value(track.advance(track.s, t * d)) for t in (h, -h)]
         assert (change[0] - change[1]) / (2 * h) == pytest.approx(float(total @ d), rel=2e-2)
     assert np.linalg.eigvalsh(bend).min() > -1e-12 * bend.max()
-    # All the way to the next: the edge between two that part strays too far.
+    # At a full step, the edge between two separating vertices deviates too much.
     far = np.where(np.arange(track.s.size) < track.s.size // 2, -4.0, 4.0) * gap
     assert deviation_barrier.value(track.advance(track.s, far)) == np.inf
 
@@ -366,7 +366,7 @@ def test_the_barrier_of_straying(rng):
 
 
 def channel(n=14):
-    """A channel around a square body, made rectangular, and the body turned."""
+    """Return a channel around a square body, mapped to a rectangle, and the body rotated."""
     V, F = surfaces.annulus(n, hole=(-0.6, -0.6, 0.6, 0.6))
     walls, body = sorted(boundary_loops(F, len(V)), key=lambda loop: -np.abs(V[loop]).max())
     turn = points_of(z_of(V[body]) * np.exp(0.5j))
@@ -374,7 +374,7 @@ def channel(n=14):
 
 
 @pytest.mark.parametrize("slide", [True, BoundaryCurves([np.array(SQUARE) * 2.0 - 1])])
-def test_a_turned_body_takes_the_walls_along(slide):
+def test_a_rotated_body_moves_the_wall_vertices(slide):
     V, F, walls, body, turn = channel()
     held = morph(V, F, body, turn)
     sliding = morph(V, F, body, turn, slide=slide)
@@ -385,7 +385,7 @@ def test_a_turned_body_takes_the_walls_along(slide):
     corners = walls[(np.abs(V[walls]) == 1).all(axis=1)]
     assert len(corners) == 4
     np.testing.assert_array_equal(sliding.points[corners], V[corners])
-    # Everyone on its own side, to the last bit, and not where it was.
+    # All vertices stay on their side, exactly, and have moved.
     for axis in (0, 1):
         side = walls[np.abs(V[walls, axis]) == 1]
         np.testing.assert_array_equal(sliding.points[side, axis], V[side, axis])
@@ -397,7 +397,7 @@ def test_a_turned_body_takes_the_walls_along(slide):
             assert (np.diff(sliding.points[run, 1 - axis]) > 0).all()
 
 
-def test_moved_vertices_slide_where_they_are_told():
+def test_moved_vertices_slide_on_given_curves():
     V, F, _, body, turn = channel()
     square = points_of(z_of(np.array(SQUARE) * 1.2 - 0.6) * np.exp(0.5j))
     on = dict.fromkeys(body.tolist(), 1)
@@ -409,7 +409,7 @@ def test_moved_vertices_slide_where_they_are_told():
     assert np.abs(morphed.points[body] - turn).max() > 0.01
 
 
-def test_vertices_of_no_triangle_are_counted_all_the_same():
+def test_vertices_of_no_triangle_are_numbered_as_well():
     V, F, walls, body, turn = channel(8)
     V, F = np.concatenate([[(9, 9)], V]), F + 1
     on = dict.fromkeys((walls + 1).tolist(), 0)
@@ -420,7 +420,7 @@ def test_vertices_of_no_triangle_are_counted_all_the_same():
         morph(V, F, body + 1, turn, slide=BoundaryCurves([SQUARE], fixed=[0]))
 
 
-# What is refused
+# Errors
 
 
 @pytest.mark.parametrize(
@@ -448,13 +448,13 @@ def test_vertices_of_no_triangle_are_counted_all_the_same():
         (lambda loop: "letter:G", "slide must be True or BoundaryCurves, not 'letter:G'"),
     ],
 )
-def test_rails_that_cannot_be(rails, message):
+def test_invalid_boundary_curves(rails, message):
     V, F, uv, loop = sheared()
     with pytest.raises(ValueError, match=message):
         polish(V, F, uv, fixed=loop, slide=rails(loop))
 
 
-def test_order_violated():
+def test_violated_order():
     V, _, _, loop = sheared()
     lower = np.flatnonzero(V[:, 1] == 0)
     a, b = lower[np.argsort(V[lower, 0])][[3, 4]]
@@ -467,13 +467,13 @@ def test_order_violated():
         BoundaryCurves([SQUARE]).lay([loop], met)
 
 
-def test_a_start_that_is_nowhere_near():
+def test_a_start_far_from_the_curves():
     V, F, uv, loop = sheared()
     broken = uv.copy()
     broken[5] = np.nan
     with pytest.raises(ValueError, match="not finite at vertex 5"):
         polish(V, F, broken, fixed=loop, slide=True)
-    # Putting the boundary onto its curve may invert what lies close to it.
+    # Moving the boundary to its curve may invert triangles close to it.
     thin = uv.copy()
     low = np.flatnonzero(V[:, 1] == 0)[3]
     thin[low, 1] = -5e-4
@@ -491,7 +491,7 @@ def test_sliding_needs_an_energy():
 
 
 def test_a_map_that_overlaps_itself_may_slide():
-    """Injective and no more: the boundary crosses itself, and is not asked to stop."""
+    """The map is only injective: the boundary crosses itself and may continue to."""
     t = np.linspace(0, 1, 61)
     arc = np.exp(2.2j * np.pi * t)
     z = np.concatenate([arc * 1.0, arc * 1.5, arc * 2.0])
@@ -514,7 +514,7 @@ def test_a_map_that_overlaps_itself_may_slide():
     assert result.history[-1].energy < result.history[0].energy
 
 
-# The command line
+# The command
 
 
 def test_map_slides(tmp_path):
@@ -529,12 +529,12 @@ def test_map_slides(tmp_path):
         assert facts["injective"]
         assert facts.get("slide", False) == bool(options)
         mesh = io.read_mesh(tmp_path / f"{name}.obj")
-        energies.append(distortion(mesh.V, mesh.F, io.map_of(mesh)).summary("symmetric_dirichlet").mean)
+        energies.append(distortion(mesh.V, mesh.F, io.map_of(mesh)).statistics("symmetric_dirichlet").mean)
     assert energies[1] < energies[0]
     uv = io.map_of(io.read_mesh(tmp_path / "slid.obj"))
     (loop,) = boundary_loops(F, len(V))
     assert off_the_glyph(uv[loop], "G").max() < 1e-8
-    # On from there, by the outline's name and by the polygon that is there.
+    # Continue from the result, with the outline's name and with the existing polygon.
     for options in (["--to", "letter:G"], []):
         call = ["polish", str(tmp_path / "slid.obj"), "-o", str(tmp_path / "more.obj"), "--slide", *options]
         assert main(call) == 0
@@ -545,7 +545,7 @@ def _write(path, V, F):
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_what_the_command_line_refuses(tmp_path, capsys):
+def test_errors_of_the_command(tmp_path, capsys):
     _write(tmp_path / "in.obj", lift(surfaces.disk(4)[0]), surfaces.disk(4)[1])
     out = ["-o", str(tmp_path / "out.obj")]
     assert main(["map", str(tmp_path / "in.obj"), "--to", "disk", "--slide", "--no-polish", *out]) == 2
@@ -555,7 +555,7 @@ def test_what_the_command_line_refuses(tmp_path, capsys):
     assert "add --slide" in capsys.readouterr().err
 
 
-def test_the_command_line_names_vertices_off_the_outline(tmp_path, capsys):
+def test_the_command_names_vertices_off_the_outline(tmp_path, capsys):
     V, F = surfaces.disk(6)
     source = tmp_path / "in.obj"
     io.write_obj(source, io.MeshData(lift(V), F).with_map(V))
@@ -568,14 +568,15 @@ def test_the_command_line_names_vertices_off_the_outline(tmp_path, capsys):
     assert main(["polish", str(source), "--slide", "--to", "disk", *out]) == 0
     named = ", ".join(map(str, rim[:3]))
     assert (
-        f"of {len(rim)} boundary vertices 3 are off the outline and stay: vertices {named}" in capsys.readouterr().out
+        f"3 of {len(rim)} boundary vertices are off the outline and stay fixed: vertices {named}"
+        in capsys.readouterr().out
     )
 
 
-def test_vertices_are_told_their_sides(tmp_path, capsys):
+def test_vertices_have_given_sides(tmp_path, capsys):
     V, F = surfaces.grid(10, 10)
-    # The diagonal before the corner (1, 0) turned, there is room beside it for the next vertex of the right side, which
-    # is nearer to the lower one.
+    # With the diagonal before the corner (1, 0) flipped, there is space beside it for the next vertex of the right
+    # side, which is closer to the lower one.
     F[18:20] = (9, 10, 21), (9, 21, 20)
     uv, moved = V.copy(), 21
     uv[moved] = 0.9995, 0.0004
@@ -589,7 +590,7 @@ def test_vertices_are_told_their_sides(tmp_path, capsys):
     found = io.map_of(io.read_mesh(out))
     assert found[moved, 0] == 1
     assert found[moved, 1] > 0.05
-    # The same for a map that is made.
+    # The same for a new map.
     right = np.flatnonzero(V[:, 0] == 1)
     pieces.write_text("".join(f"{v} 1\n" for v in right))
     corners = [int(np.flatnonzero((place == V).all(axis=1))[0]) for place in SQUARE]
@@ -632,11 +633,11 @@ def test_morph_slides(tmp_path):
     call = ["morph", str(tmp_path / "in.vtk"), "--field", "displacement", "--slide", "-o", str(tmp_path / "out.vtk")]
     assert main(call) == 0
     after = read_fem(tmp_path / "out.vtk").points
-    # The field moves the walls by nothing, so they slide.
+    # The field moves the walls by zero, so they slide.
     np.testing.assert_array_equal(after, morph(V, F, body, V[body] + shift[body, :2], slide=True).points)
     assert np.abs(after[walls] - V[walls]).max() > 0.03
     assert (np.abs(after[walls]).max(axis=1) == 1).all()
-    assert main([*call, "--energy", "none"]) == 2
+    assert main([*call, "--no-polish"]) == 2
 
 
 @pytest.mark.parametrize(
@@ -646,6 +647,6 @@ def test_morph_slides(tmp_path):
         ({"curves": [SQUARE], "on": [1, 2]}, "on must map vertices to curves"),
     ],
 )
-def test_rails_of_what_is_none(arguments, words):
+def test_invalid_curves(arguments, words):
     with pytest.raises(ValueError, match=words):
         BoundaryCurves(**arguments)

@@ -1,4 +1,4 @@
-"""Curves that vertices slide along: positions to the last bit, lengths, directions, corners."""
+"""Curves on which vertices slide: exact positions, lengths, directions, corners."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def complex_of(points):
 
 
 def bezier(control, t):
-    """De Casteljau's construction in rational numbers."""
+    """Evaluate De Casteljau's construction in rational numbers."""
     points = [tuple(map(Fraction, row)) for row in control]
     t = Fraction(t)
     while len(points) > 1:
@@ -39,7 +39,7 @@ def test_positions_are_rounded_once(control, rng):
     control = np.array(control) * 0.7 + 0.1
     curve = Curve([control])
     s = rng.random(300) * curve.length
-    piece, t = curve.place(s)
+    piece, t = curve.locate(s)
     assert not piece.any()
     for place, parameter in zip(curve.position(s), t, strict=True):
         for got, wanted in zip(place, bezier(control.tolist(), float(parameter)), strict=True):
@@ -47,7 +47,7 @@ def test_positions_are_rounded_once(control, rng):
 
 
 @pytest.mark.parametrize(("radius", "centre"), [(1.0, (0.0, 0.0)), (0.3, (0.0, 0.0)), (3.7, (12.5, -4.0))])
-def test_a_circle_is_met_to_one_rounding(radius, centre, rng):
+def test_positions_on_a_circle_have_one_rounding_error(radius, centre, rng):
     curve = Curve.circle(radius, centre)
     assert curve.closed
     assert curve.corners(0.0).tolist() == [0]
@@ -56,12 +56,12 @@ def test_a_circle_is_met_to_one_rounding(radius, centre, rng):
     x, y, r = (Fraction(c) for c in (*centre, radius))
     for place in curve.position(rng.random(500) * curve.length).tolist():
         u, v = map(Fraction, place)
-        # Half an ulp in each coordinate is what a rounding may cost.
+        # A rounding error is at most half an ulp per coordinate.
         allowed = r * (Fraction(np.spacing(abs(place[0]))) + Fraction(np.spacing(abs(place[1])))) * Fraction(51, 100)
         assert abs((u - x) ** 2 + (v - y) ** 2 - r**2) <= 2 * allowed
 
 
-def test_lengths_against_other_formulas():
+def test_lengths_agree_with_other_formulas():
     ellipse = Curve([Arc((1, 2), (5, 0), (0, 0.3), 0, 2 * np.pi)])
     assert ellipse.length == pytest.approx(4 * 5 * ellipe(1 - (0.3 / 5) ** 2), rel=1e-7)
     control = np.array(MIXED[1])
@@ -73,7 +73,7 @@ def test_lengths_against_other_formulas():
     assert Curve([control]).length == pytest.approx(quad(speed, 0, 1)[0], rel=1e-12)
 
 
-def test_a_step_has_its_length_and_direction_and_curvature(rng):
+def test_a_step_has_the_given_length_direction_and_curvature(rng):
     curve = Curve(MIXED)
     joints = np.append(curve.corners(0.0), curve.length)
     s = rng.random(400) * curve.length
@@ -97,10 +97,10 @@ def test_two_directions_at_a_joint():
     line = Curve.polyline([(0, 0), (1, 0), (1, 1)])
     assert not line.closed
     assert line.corners(20.0).tolist() == [0, 1, 2]
-    assert line.barred(np.array([0.0, 0.0, 2.0]), np.array([True, False, True])).tolist() == [False, True, True]
+    assert line.has_ended(np.array([0.0, 0.0, 2.0]), np.array([True, False, True])).tolist() == [False, True, True]
 
 
-def test_going_around_and_stopping():
+def test_closed_curves_continue_and_open_ones_end():
     square = Curve.polygon([(0, 0), (2, 0), (2, 2), (0, 2)])
     s, step = np.array([0.0, 1.5, 7.5, 2.0, 2.0]), np.array([-3.0, 0.4, 1.0, 0.0, 2.5])
     assert square.advance(s, step) == pytest.approx([5, 1.9, 0.5, 2, 4.5])
@@ -110,7 +110,7 @@ def test_going_around_and_stopping():
     assert line.advance(np.array([0.5, 0.5, 1.5]), np.array([-3.0, 1.0, 1.0]), stop=True).tolist() == [0, 1, 2]
 
 
-def test_handles_drawn_back_have_a_direction():
+def test_coincident_handles_have_a_direction():
     curve = Curve([[(0, 0), (0, 0), (1, 1), (2, 0)], [(2, 0), (2, 0), (2, 0), (0, 0)]])
     tangent, curvature = curve.frame(np.array([0.0]), np.array([True]))
     np.testing.assert_allclose(tangent, np.exp(0.25j * np.pi), atol=1e-4)
@@ -118,16 +118,16 @@ def test_handles_drawn_back_have_a_direction():
     assert curve.corners(20.0).size == 2
 
 
-def test_nearest_places(rng):
+def test_nearest_points(rng):
     for curve in (Curve(MIXED), Curve.circle(0.7, (3, 1)), *outline_curves("letter:R")):
         s = np.sort(rng.random(300)) * curve.length
         found, away = curve.nearest(curve.position(s))
         np.testing.assert_allclose(found, s, atol=1e-13 * curve.length)
         assert away.max() < 1e-15 * 10
-        # Joints are met to the last bit.
+        # Joints are exact.
         joints = curve.corners(0.0)
         assert curve.nearest(curve.position(joints))[0].tolist() == joints.tolist()
-        # Off the curve by a little, along its normal.
+        # Slightly off the curve, along its normal.
         tangent, _ = curve.frame(s, np.ones(s.size, dtype=bool))
         beside = complex_of(curve.position(s)) + 1e-4j * tangent
         assert curve.nearest(np.stack([beside.real, beside.imag], axis=1))[1] == pytest.approx(1e-4, rel=0.1)
@@ -137,10 +137,10 @@ def test_transformed():
     curve = Curve([*MIXED[:2], Arc((2.55, 0), (2.45, 0), (0, -1), 0, np.pi)])
     assert curve.closed
     matrix, shift = np.array([(0.5, -0.2), (0.3, 2.0)]), np.array([3.0, -1.0])
-    there = curve.transformed(matrix, shift)
+    there = curve.transform(matrix, shift)
     places = curve.position(np.linspace(0, curve.length, 500)) @ matrix.T + shift
     assert there.nearest(places)[1].max() < 1e-14
-    assert curve.transformed(10).length == pytest.approx(10 * curve.length)
+    assert curve.transform(10).length == pytest.approx(10 * curve.length)
 
 
 @pytest.mark.parametrize(
@@ -172,12 +172,12 @@ def test_malformed_polygons():
 
 
 @pytest.mark.parametrize("text", ["letter:G", "letter:R", "letter:@", "disk", "ellipse:2x1", "ring:0.5", "star:5"])
-def test_an_outline_is_on_its_curves(text):
+def test_outlines_lie_on_their_curves(text):
     curves = outline_curves(text)
     for contour in outline(text):
         away, curve = min(((c.nearest(contour)[1].max(), c) for c in curves), key=lambda pair: pair[0])
         assert away < 3e-15
-        # Between its points it strays by a chord.
+        # Between its vertices it deviates by the sagitta of a chord.
         middle = (contour + np.roll(contour, -1, axis=0)) / 2
         assert curve.nearest(middle)[1].max() < 1.01e-6 * max(1, np.ptp(contour))
 
@@ -192,11 +192,11 @@ def test_a_word_follows_the_curves_of_its_letters(text):
     assert len(curves) == len(contours)
     for contour in contours:
         away, curve = min(((c.nearest(contour)[1].max(), c) for c in curves), key=lambda pair: pair[0])
-        # Where letters meet, their chords meet a little beside their curves.
+        # Where letters meet, their chords intersect slightly off their curves.
         assert away < 3e-6
         sides = np.hypot(*np.diff(contour, axis=0, append=contour[:1]).T)
         assert curve.length == pytest.approx(sides.sum(), rel=1e-4)
-    # What a letter draws is followed as it is drawn: the first letter stands where it stands alone.
+    # Curves of a letter are unchanged: the first letter has the same position as alone.
     s = np.concatenate([np.linspace(0, curve.length, 5000) for curve in curves])
     points = np.concatenate([c.position(part) for c, part in zip(curves, np.split(s, len(curves)), strict=True)])
     first = outline_curves(f"letter:{text[0]}")
@@ -213,7 +213,7 @@ def test_letters_of_a_word_meet_where_their_curves_do():
     assert len(corners) == 2
     (ring,) = sorted(outline_curves("letter:O"), key=lambda curve: -curve.length)[:1]
     assert ring.nearest(corners)[1].max() < 1e-15
-    # The second letter is the first one moved.
+    # The second letter is the first one, translated.
     right = [c.position(c.corners(0.0))[:, 0].max() for c in (outer, ring)]
     assert ring.nearest(corners - (right[0] - right[1], 0))[1].max() < 1e-14
 
@@ -235,21 +235,21 @@ def test_a_section_is_a_part_of_its_curve(curve, rng):
 @pytest.mark.parametrize(
     ("control", "tips"),
     [
-        # Comes to a point in the middle; the same turned, moved and in other units.
+        # It has a cusp in the middle; the same rotated, translated and scaled.
         ([(0, 0), (1, 1), (0, 1), (1, 0)], [(0.5, 0.75)]),
         (np.array([(0, 0), (1, 1), (0, 1), (1, 0)]) @ [(0.6, 0.8), (-0.8, 0.6)] * 0.3 + 7, None),
-        # Goes there and back along one line.
+        # It goes forward and back along one line.
         ([(0, 0), (2, 0), (0.5, 0)], [(8 / 7, 0)]),
         ([(0, 0), (3, 3), (-2, -2), (1, 1)], None),
     ],
 )
-def test_where_a_piece_turns_on_the_spot_is_a_corner(control, tips):
+def test_a_cusp_is_a_corner(control, tips):
     curve = Curve([control])
     found = curve.position(curve.corners(20.0)[1:-1])
     if tips is not None:
         np.testing.assert_allclose(found, tips, rtol=0, atol=1e-15)
     assert len(found) == (2 if len(control) == 4 and np.linalg.matrix_rank(np.diff(control, axis=0)) == 1 else 1)
-    # Its length is that of many chords, and it goes through the same points.
+    # It has the length of many chords and passes through the same points.
     t = np.linspace(0, 1, 20001)
     rows = [np.outer(1 - t, a) + np.outer(t, b) for a, b in itertools.pairwise(np.array(control, dtype=float))]
     while len(rows) > 1:
@@ -257,7 +257,7 @@ def test_where_a_piece_turns_on_the_spot_is_a_corner(control, tips):
     points = rows[0]
     assert curve.length == pytest.approx(np.hypot(*np.diff(points, axis=0).T).sum(), rel=1e-6)
     assert curve.nearest(points[::50])[1].max() < 1e-13
-    # Held there, and not gone past.
+    # Vertices are fixed there, and none slides past.
     s = curve.corners(20.0)[1]
     before, after = (curve.frame(np.array([s]), np.array([forward]))[0][0] for forward in (False, True))
     assert before == pytest.approx(-after, abs=1e-4)
@@ -285,7 +285,7 @@ def test_sides_lie_between_corners():
     assert around.length == pytest.approx(drop.length)
     half = Curve.polyline([(0, 0), (1, 0), (1, 1)])
     assert [side.length for side in half.sides(20.0)] == [1, 1]
-    # An arc is taken apart for the sake of its length only: no corner is made by that.
+    # An arc is split only to compute its length, which adds no corner.
     arch = Curve([Arc((0, 0), (1, 0), (0, 1), 0, np.pi), [(-1, 0), (1, 0)]])
     assert [side.corners(0.0).size for side in arch.sides(20.0)] == [2, 2]
 
@@ -302,12 +302,12 @@ def test_a_drawing_keeps_its_arcs(tmp_path):
     assert np.abs(np.abs(z + 2j) - 1).max() < 1e-15
     z = complex_of(arch.position(np.linspace(0, arch.length, 999))) / turn
     assert np.abs(np.abs(z[z.imag > 1e-9]) - 6).max() < 1e-14
-    # Where the arc goes over into the sides there is no corner; the last side is drawn by nobody, and closes it.
+    # There is no corner where the arc meets the sides; the last side is implicit and closes the outline.
     assert arch.closed
     assert arch.corners(20.0).size == 2
 
 
-def test_a_drawing_that_cannot_be(tmp_path):
+def test_invalid_drawings(tmp_path):
     path = tmp_path / "drawing.svg"
     path.write_text('<svg xmlns="http://www.w3.org/2000/svg"><circle r="0"/></svg>')
     with pytest.raises(MeshFileError, match="has no path or shape"):

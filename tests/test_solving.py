@@ -1,4 +1,4 @@
-"""`injective_map` from end to end: its verdicts, its promises, and what it does when there is no map."""
+"""`injective_map`: its certificates, its promises, and its result if no map exists."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from quasiharmonic import InverseMap, Problem, Status, boundary_loops, injective
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.solver.methods import LBFGS, Alternating, LocalRepair, Newton, RandomRestarts, Untangling, VectorAdam
-from quasiharmonic.solver.methods.untangling import untangled
-from quasiharmonic.solver.search import stages
-from quasiharmonic.solver.search.stages import CoarseToFine, WhereMany
-from quasiharmonic.solver.search.strategy import soonest, speed
+from quasiharmonic.solver.methods.untangling import untangle
+from quasiharmonic.solver.search import search
+from quasiharmonic.solver.search.stages import CoarseToFine, IfManyInverted
+from quasiharmonic.solver.search.strategy import quick_stages, speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
+from shared.distinct_steps import DistinctSteps
 from shared.exact import inverted
+from shared.infeasible_problems import OBSTRUCTED
 from shared.meshes import bend, boundary_of, lift, signed_areas
-from shared.obstructed import OBSTRUCTED
-from shared.solvable import star_problem, turned_ring
-from shared.told import Told
+from shared.solvable_problems import star_problem, turned_ring
 
 
 class TestFinds:
@@ -39,7 +39,7 @@ class TestFinds:
         np.testing.assert_array_equal(result.uv[fixed], target)
         assert result.history[0].inverted > 0
         assert result.history[-1].inverted == 0
-        assert result.iterations == len(result.history) - 1 == sum(s.iterations for s in result.stages)
+        assert result.n_iterations == len(result.history) - 1 == sum(s.n_iterations for s in result.stages)
         assert result.linear_solver in quasiharmonic.linsolve.available()
 
     @pytest.mark.parametrize("degrees", [90, 180, -135])
@@ -51,7 +51,7 @@ class TestFinds:
         assert inverted(F, result.uv) == 0
 
     def test_two_pins_swapped(self):
-        """Figure 17: without being told which parameterisation to take."""
+        """Figure 17, without a given parameterisation."""
         V, F = grid(20, 20)
         pins = [int(np.argmin(((V - p) ** 2).sum(axis=1))) for p in ((1 / 3, 0.5), (2 / 3, 0.5))]
         fixed = np.append(boundary_of(F), pins)
@@ -83,23 +83,23 @@ class TestFinds:
 
     @pytest.mark.parametrize("functional", ["neumann", "sobolev", "dirichlet"])
     def test_every_functional_turns_the_ring(self, functional):
-        """Figure 6 by an eighth of a turn, nothing but the functional's own descent."""
+        """Figure 6 for an eighth of a turn, by the functional's own descent alone."""
         stages = [VectorAdam(functional=functional, iterations=400)]
         assert injective_map(*turned_ring(45), strategy=stages).injective
 
-    def test_ends_near_the_least_area_where_there_is_no_map(self):
-        """Figure 18: a pin outside the target must be reached and left again; no more area than that is covered."""
+    def test_ends_close_to_the_least_area_if_no_map_exists(self):
+        """Figure 18: the map covers a pin outside the target and little other area."""
         V, F = disk(10)
         rim = boundary_of(F)
         result = injective_map(V, F, np.append(rim, 0), np.vstack([V[rim], [[1.5, 0.0]]]))
         assert result.status is Status.IMPOSSIBLE
         unsigned = np.abs(signed_areas(F, result.uv)).sum() / 2
         assert np.all(np.isfinite(result.uv))
-        # The disk's area, and the spike to the pin twice: a fan of one triangle's width where it leaves the rim.
+        # The disk's area, and twice the spike to the pin, which is one triangle wide at the boundary.
         assert unsigned < 1.15 * np.pi
 
-    def test_locally_injective_where_the_target_crosses_itself(self):
-        """A spiral strip that overlaps itself: every triangle positive, not bijective."""
+    def test_locally_injective_if_the_target_crosses_itself(self):
+        """A spiral strip that overlaps itself: every triangle is positive, but the map is not bijective."""
         V, F = grid(60, 3)
         angle, radius = 2 * np.pi * 1.4 * V[:, 0], 2 - 0.8 * V[:, 1]
         spiral = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -117,22 +117,22 @@ class TestFinds:
 
 class TestTheory:
     def test_tutte_needs_no_iteration(self):
-        """Equilateral triangles onto a convex target: positive weights, Tutte's theorem."""
+        """Equilateral triangles and a convex target: positive weights, Tutte's theorem."""
         V, F = disk(8)
         fixed = boundary_of(F)
         target = V[fixed] / np.abs(V[fixed]).sum(axis=1, keepdims=True)
         result = injective_map(lift(V), F, fixed, target * [3.0, 0.5])
         assert result.injective
-        assert result.iterations == 0
+        assert result.n_iterations == 0
 
     def test_own_boundary_gives_the_identity(self):
         V, F = random_delaunay(300, seed=1)
         fixed = boundary_of(F)
         result = injective_map(V, F, fixed, V[fixed], reference="rest")
-        assert result.iterations == 0
+        assert result.n_iterations == 0
         np.testing.assert_allclose(result.uv, V, atol=1e-13)
 
-    def test_energy_falls_to_nothing_only_at_injective_maps(self):
+    def test_energy_tends_to_zero_only_at_injective_maps(self):
         result = injective_map(*star_problem())
         energies = [step.energy for step in result.history]
         assert 0 < energies[-1] < energies[0]
@@ -166,20 +166,20 @@ class TestPromises:
         for rest, place in ((V * scale, target), (V, target * scale), (V / scale, target * scale)):
             result = injective_map(rest, F, fixed, place, reference=reference)
             assert result.injective
-            assert abs(result.iterations - plain.iterations) <= 2
+            assert abs(result.n_iterations - plain.n_iterations) <= 2
             np.testing.assert_array_equal(result.uv[fixed], place)
 
     def test_vertex_order_of_fixed_does_not_matter(self, rng):
         V, F, fixed, target = star_problem()
         order = rng.permutation(len(fixed))
         a, b = injective_map(V, F, fixed, target), injective_map(V, F, fixed[order], target[order])
-        assert abs(a.iterations - b.iterations) <= 1
+        assert abs(a.n_iterations - b.n_iterations) <= 1
         np.testing.assert_allclose(a.uv, b.uv, atol=1e-6)
 
     def test_tiny_meshes(self):
         one = injective_map(np.eye(3), [[0, 1, 2]], [0, 1, 2], [[0, 0], [1, 0], [0, 1]])
         assert one.injective
-        assert one.iterations == 0
+        assert one.n_iterations == 0
         hub = injective_map([[0, 0], [1, 0], [0, 1], [-1, -1]], [[0, 1, 2], [0, 2, 3], [0, 3, 1]], [1, 2, 3],
                             [[1, 0], [0, 1], [-1, -1]])  # fmt: skip
         assert hub.injective
@@ -190,8 +190,8 @@ class TestPromises:
         assert result.injective
         assert inverted(F, result.uv) == 0
 
-    def test_callback_sees_every_step_and_strategy_can_be_spelled_out(self):
-        seen = Told()
+    def test_callback_receives_every_step_and_strategy_can_be_a_list(self):
+        seen = DistinctSteps()
         stages = [
             LBFGS(parameterisation="si-log", functional="neumann", reference="rest"),
             Newton(resume=True),
@@ -209,7 +209,7 @@ class TestNoMap:
         assert not result.injective
         assert result.status is Status.IMPOSSIBLE
         assert result.diagnosis.forbids_injective
-        assert result.iterations <= 1
+        assert result.n_iterations <= 1
         assert np.all(np.isfinite(result.uv))
         assert len(result.certificate.inverted) > 0
         np.testing.assert_array_equal(result.uv[fixed], target * [1, -1])
@@ -221,11 +221,11 @@ class TestNoMap:
         for shift in (0, 3):
             result = injective_map(V, F, fixed, target * squash + shift, reference=reference)
             assert result.status is not Status.OUT_OF_ITERATIONS
-            # Any area at all will do, as long as the doubles around it are fine enough.
+            # Any area suffices, if the spacing of doubles around it is fine enough.
             assert result.injective == (squash[1] > 0 and not shift)
 
-    def test_the_map_of_least_area_is_handed_back(self):
-        """Onto a lopsided eight, no map covers less than its two lobes."""
+    def test_the_map_of_least_area_is_returned(self):
+        """On an uneven eight, no map covers less area than its two lobes."""
         V, F = disk(12)
         (loop,) = boundary_loops(F, len(V))
         t = 2 * np.pi * np.arange(len(loop)) / len(loop)
@@ -243,21 +243,21 @@ class TestNoMap:
         lobes = abs(density[left].sum()) + abs(density[~left].sum())
         assert 0.5 * np.abs(signed_areas(F, result.uv)).sum() == pytest.approx(lobes, rel=0.02)
         assert result.certificate.inverted.size > 0
-        # Its tensors are this map's, as they are an injective one's.
+        # Its tensors reproduce the map, as for an injective one.
         again = quasi_harmonic_map(Problem(V, F, loop, eight), result.mu, reference=result.reference)
         np.testing.assert_allclose(again, result.uv, atol=1e-9)
 
-    def test_no_vertex_is_free(self):
+    def test_no_free_vertex(self):
         """A reversed corner triangle: two triangles, all four vertices fixed."""
         result = injective_map(
             [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]], range(4), [[0, 0], [1, 0], [-0.2, 0.5], [0, 1]]
         )
         assert result.certificate.inverted.tolist() == [1]
         assert result.status is Status.IMPOSSIBLE
-        assert result.iterations < 300
+        assert result.n_iterations < 300
 
     def test_impossible_pins_are_diagnosed(self):
-        """Two pins of one triangle swapped so that it is inverted whatever the others do."""
+        """Two pins of one triangle are swapped, so that it is always inverted."""
         V, F = random_delaunay(80, seed=3)
         rim = boundary_of(F)
         inner = next(t for t in F if not np.isin(t, rim).any())
@@ -268,15 +268,15 @@ class TestNoMap:
         named = np.concatenate([o.triangles for o in result.diagnosis.obstructions])
         assert any(np.array_equal(np.sort(F[t]), np.sort(inner)) for t in named)
 
-    def test_settles_where_nothing_moves_any_more(self):
-        """Alternation gets stuck at once from afar (§7.1)."""
+    def test_stalls_where_no_vertex_moves(self):
+        """The alternation stalls at once far from a solution (§7.1)."""
         result = injective_map(*turned_ring(180), strategy=[Alternating(iterations=10**6)])
         assert result.status is Status.STALLED
         assert result.history[-1].energy > 1e-3
         assert not result.diagnosis.obstructions
 
-    def test_tries_in_vain_at_patches_have_an_end(self, monkeypatch):
-        """Next to nothing is inverted, and restarts are of no use however often they are tried."""
+    def test_local_repair_has_a_limit(self, monkeypatch):
+        """Almost nothing is inverted, and no number of restarts helps."""
         V, F = disk(2)
         V[15] = V[8]
         steps, factor = [], NewtonSystem.factor
@@ -288,18 +288,18 @@ class TestNoMap:
 
         monkeypatch.setattr(NewtonSystem, "factor", counted)
         loop = boundary_of(F)
-        strategy = [VectorAdam(iterations=50), RandomRestarts(resume=True, in_vain=10**6)]
+        strategy = [VectorAdam(iterations=50), RandomRestarts(resume=True, max_failures=10**6)]
         result = injective_map(np.c_[V, 0 * V[:, 0]], F, loop, V[loop], strategy=strategy, max_iterations=60)
         assert result.status is Status.STALLED
-        assert result.iterations <= 60
+        assert result.n_iterations <= 60
         assert len(steps) > 100
 
     @pytest.mark.parametrize("wrong", [0, -5, 2.5, "many", np.nan])
-    def test_wrong_number_of_iterations(self, wrong):
+    def test_invalid_number_of_iterations(self, wrong):
         with pytest.raises(ValueError, match="max_iterations must be an integer"):
             injective_map(*star_problem(n=60), max_iterations=wrong)
 
-    def test_a_strategy_of_ones_own_that_ends_early_has_not_settled(self):
+    def test_a_given_strategy_that_ends_early_has_not_stalled(self):
         result = injective_map(*turned_ring(180), strategy=[VectorAdam(iterations=3)])
         assert result.status is Status.OUT_OF_ITERATIONS
 
@@ -313,13 +313,13 @@ class TestNoMap:
             (np.full((80, 2), np.inf), "start is not finite at vertices 0, 1"),
         ],
     )
-    def test_wrong_start(self, start, words):
+    def test_invalid_start(self, start, words):
         with pytest.raises(ValueError, match=words):
             injective_map(*star_problem(n=80), start=start)
 
     @pytest.mark.parametrize("size", [1e-320, 1e-200, 1e200, 1e308])
     def test_start_of_any_size(self, size, rng):
-        """Only its shape counts."""
+        """Only the shape matters."""
         problem = Problem(*star_problem(n=80))
         far = size * rng.uniform(-1, 1, (problem.n, 2))
         assert solve(problem, start=far).injective
@@ -327,7 +327,7 @@ class TestNoMap:
     @pytest.mark.parametrize(
         "method", [VectorAdam, LBFGS, Newton, Alternating, Untangling, LocalRepair, RandomRestarts]
     )
-    def test_no_method_takes_more_iterations_than_it_may(self, method):
+    def test_no_method_exceeds_its_iterations(self, method):
         V, F = disk(12)
         (loop,) = boundary_loops(F, len(V))
         t = 2 * np.pi * np.arange(len(loop)) / len(loop)
@@ -336,17 +336,17 @@ class TestNoMap:
         assert len(solve(problem, max_iterations=1).certificate.inverted) > 50, "too few"
         for most in (1, 3):
             result = solve(problem, strategy=[method()], max_iterations=most)
-            assert result.iterations <= most
+            assert result.n_iterations <= most
 
-    def test_l_bfgs_keeps_to_its_iterations_within_a_line_search(self):
-        """Where nothing lowers the energy any more, line searches are long."""
+    def test_l_bfgs_counts_iterations_within_a_line_search(self):
+        """Where nothing lowers the energy, line searches are long."""
         problem, _ = OBSTRUCTED["chord over a notch"]
         for most in range(20, 60, 5):
             result = solve(problem, strategy=[LBFGS(iterations=most)])
-            assert result.stages[0].iterations <= most
+            assert result.stages[0].n_iterations <= most
 
-    def test_untangling_gives_up_on_what_is_exactly_a_point(self, monkeypatch):
-        """There is no ε far below a determinant of zero."""
+    def test_untangling_stops_if_all_vertices_coincide(self, monkeypatch):
+        """No ε is far below a determinant of zero."""
         V, F = grid(4, 4)
         inner = next(t for t in F if not np.isin(t, boundary_of(F)).any())
         w = V[:, :2].ravel().view(np.complex128).copy()
@@ -361,49 +361,49 @@ class TestNoMap:
             factor(system, *shift)
 
         monkeypatch.setattr(NewtonSystem, "factor", counted)
-        assert len(list(untangled(F, w, held, grading=0.0))) < 2000
+        assert len(list(untangle(F, w, held, grading=0.0))) < 2000
         assert steps
 
-    def test_untangling_that_is_cut_short_has_not_settled(self):
+    def test_interrupted_untangling_has_not_stalled(self):
         result = injective_map(*turned_ring(180), strategy=[Untangling(iterations=2)])
         assert result.status is Status.OUT_OF_ITERATIONS
 
     @pytest.mark.parametrize("many", [True, False])
-    def test_a_stage_for_where_many_are_inverted_is_left_out_where_few_are(self, many, monkeypatch):
+    def test_a_stage_for_many_inverted_triangles_is_skipped_if_few_are_inverted(self, many, monkeypatch):
         problem = Problem(*turned_ring(180))
         if not many:
-            monkeypatch.setattr(stages, "MANY_INVERTED", 1.0)
-        strategy = [VectorAdam(iterations=1), WhereMany(Newton(iterations=2, resume=True))]
+            monkeypatch.setattr(search, "MANY_INVERTED", 1.0)
+        strategy = [VectorAdam(iterations=1), IfManyInverted(Newton(iterations=2, resume=True))]
         result = solve(problem, strategy=strategy)
         assert result.stages[0].inverted[1] > 0.02 * len(problem.F)
         assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"] + many * ["newton, tanh"]
 
-    def test_newton_comes_before_repair_on_large_meshes_with_many_inverted(self):
+    def test_newton_precedes_repair_on_large_meshes_with_many_inverted_triangles(self):
         V, F = disk(45)
         stages = speed(Problem(V, F, boundary_of(F), V[boundary_of(F)]))
         words = [type(stage).__name__ for stage in stages]
-        assert words[:4] == ["CoarseToFine", "Composite", "WhereMany", "LineShift"]
-        assert [type(stage).__name__ for stage in soonest(stages)] == [
+        assert words[:4] == ["CoarseToFine", "Composite", "IfManyInverted", "LineShift"]
+        assert [type(stage).__name__ for stage in quick_stages(stages)] == [
             "CoarseToFine",
             "Composite",
             "LineShift",
             "LocalRepair",
         ]
 
-    def test_wide_patches_come_before_the_whole_of_a_large_mesh(self):
+    def test_wide_patches_precede_the_whole_of_a_large_mesh(self):
         for rings, before in (45, "WideRepair"), (27, "WideRepair"), (20, "CoarseToFine"):
             V, F = disk(rings)
             stages = speed(Problem(V, F, boundary_of(F), V[boundary_of(F)]))
             words = [type(stage).__name__ for stage in stages]
             assert words[words.index("Untangling") - 1] == before
 
-    def test_stages_for_a_coarse_mesh_alone_solve_a_small_one_as_it_is(self):
+    def test_stages_for_a_coarse_mesh_alone_also_solve_a_small_mesh(self):
         result = injective_map(*star_problem(n=80), strategy=[CoarseToFine(VectorAdam())])
         assert result.injective
         assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"]
 
-    def test_a_stage_resumes_where_the_energy_was_lowest(self):
-        """Not at ξ = 0, and not at the last iterate."""
+    def test_a_stage_resumes_at_the_lowest_energy(self):
+        """Neither at ξ = 0 nor at the last iterate."""
         stages = [VectorAdam(iterations=100), Newton(iterations=1, resume=True)]
         result = injective_map(*turned_ring(180), strategy=stages)
         first = result.history[:101]
@@ -411,7 +411,7 @@ class TestNoMap:
         assert lowest.energy < 0.2 * first[0].energy
         assert result.history[101].energy == pytest.approx(lowest.energy, rel=1e-6)
 
-    def test_what_makes_it_worse_is_discarded(self):
+    def test_worse_results_are_discarded(self):
         stages = [VectorAdam(iterations=60), Alternating(iterations=2)]
         result = injective_map(*turned_ring(180), strategy=stages)
         assert [stage.kept for stage in result.stages] == [True, False]
@@ -420,7 +420,7 @@ class TestNoMap:
     def test_out_of_iterations(self):
         result = injective_map(*turned_ring(180), max_iterations=3)
         assert result.status is Status.OUT_OF_ITERATIONS
-        assert result.iterations == 3
+        assert result.n_iterations == 3
         assert "more iterations" in result.status.value
 
     def test_interrupted(self):
@@ -433,8 +433,8 @@ class TestNoMap:
         flips = [signed_areas(turned_ring(180)[1], result.uv) <= 0]
         assert np.sum(flips) == min(step.inverted for step in result.history)
 
-    def test_offset_beyond_the_doubles(self):
-        """At an offset of 1e15 sizes no double lies between the boundary's points."""
+    def test_offset_beyond_the_resolution_of_doubles(self):
+        """At an offset of 1e15 sizes, no double lies between the boundary's points."""
         V, F, fixed, target = star_problem(n=2000)
         target = target + 1e15
         result = injective_map(V, F, fixed, target, max_iterations=40)
@@ -449,13 +449,13 @@ class TestLinearSolver:
             injective_map(*star_problem(n=60), linear_solver="magic")
 
     @pytest.mark.parametrize("name", quasiharmonic.linsolve.available())
-    def test_named_one_is_used_and_agrees(self, name):
+    def test_the_named_solver_is_used_and_agrees(self, name):
         best, other = injective_map(*star_problem()), injective_map(*star_problem(), linear_solver=name)
         assert other.linear_solver == name
         assert other.injective
         np.testing.assert_allclose(best.uv, other.uv, atol=1e-6)
 
-    def test_indefinite_matrix_shortens_the_step(self, monkeypatch):
+    def test_an_indefinite_matrix_shortens_the_step(self, monkeypatch):
         problem = Problem(*star_problem())
         solver = problem.domain.laplacian().solver
         factor, calls = solver.factor, []
@@ -470,7 +470,7 @@ class TestLinearSolver:
         assert solve(problem).injective
 
     @pytest.mark.slow
-    def test_indefinite_for_good_is_a_status(self, monkeypatch):
+    def test_permanent_indefiniteness_has_a_status(self, monkeypatch):
         problem = Problem(*turned_ring(180))
         solver = problem.domain.laplacian("superlu").solver
         factor, calls = solver.factor, []
@@ -484,13 +484,13 @@ class TestLinearSolver:
         monkeypatch.setattr(solver, "factor", fail, raising=False)
         result = solve(problem, linear_solver="superlu")
         assert result.status is Status.UNSOLVABLE
-        assert result.stages[0].iterations == 2
-        # Untangling has a matrix of its own, and goes on from the best map.
+        assert result.stages[0].n_iterations == 2
+        # Untangling uses its own matrix and continues from the best map.
         assert np.sum(signed_areas(problem.F, result.uv) <= 0) < result.history[2].inverted
         assert np.all(np.isfinite(result.uv))
 
     @pytest.mark.slow
-    def test_another_backend_takes_over(self, monkeypatch):
+    def test_another_backend_replaces_a_failing_one(self, monkeypatch):
         problem = Problem(*turned_ring(180))
         best, *others = quasiharmonic.linsolve.available(problem.domain.laplacian().solver.nnz)
         if not others:
@@ -505,7 +505,7 @@ class TestLinearSolver:
         assert result.linear_solver == others[0]
 
 
-def test_second_solve_of_a_moved_problem_agrees_with_a_fresh_one():
+def test_second_solve_of_a_moved_problem_agrees_with_a_new_one():
     V, F, fixed, target = star_problem()
     problem = Problem(V, F, fixed, target)
     solve(problem)
@@ -515,14 +515,14 @@ def test_second_solve_of_a_moved_problem_agrees_with_a_fresh_one():
 
 
 @pytest.mark.parametrize("strategy", ["speed", "paper"])
-def test_the_tensors_give_the_map_back(strategy):
+def test_the_tensors_reproduce_the_map(strategy):
     problem = Problem(*star_problem())
     result = solve(problem, strategy=strategy)
     again = quasi_harmonic_map(problem, result.mu, reference=result.reference)
     np.testing.assert_allclose(again, result.uv, atol=1e-9)
 
 
-def test_moved_problems_in_threads_give_what_they_give_alone():
+def test_moved_problems_in_threads_agree_with_single_ones():
     base = Problem(*turned_ring(90))
     targets = [base.target * [1, s] for s in (1, 0.9, 0.8)]
     alone = [solve(base.with_target(target)).uv for target in targets]
@@ -532,7 +532,7 @@ def test_moved_problems_in_threads_give_what_they_give_alone():
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_solve_within_a_callback_disturbs_nothing():
+def test_a_solve_within_a_callback_changes_nothing():
     problem = Problem(*star_problem())
     plain = solve(problem).uv
     nested = solve(problem, callback=lambda step: solve(problem.with_target(2 * problem.target), max_iterations=1)).uv
@@ -557,12 +557,12 @@ def test_public_names_are_lazy_and_complete():
     for name in quasiharmonic.__all__:
         assert getattr(quasiharmonic, name) is not None
     assert set(quasiharmonic.__all__) <= set(dir(quasiharmonic))
-    with pytest.raises(AttributeError, match="no attribute 'magic'"):
+    with pytest.raises(AttributeError, match="attribute magic"):
         quasiharmonic.magic  # noqa: B018
 
 
 @pytest.mark.parametrize("again", [lambda x: pickle.loads(pickle.dumps(x)), copy.deepcopy, copy.copy])
-def test_what_is_read_only_stays_so_when_copied(again):
+def test_read_only_arrays_stay_read_only_in_copies(again):
     problem, _ = OBSTRUCTED["nothing sees all"]
     V, F, fixed, target = star_problem(n=60)
     found = injective_map(V, F, fixed, target)

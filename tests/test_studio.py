@@ -1,4 +1,4 @@
-"""The page's session: what a hand does to a map, what is certain about what is shown, and how it is made again."""
+"""The session of a studio page: dragging, what is certain about the shown map, and how to repeat it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, io
-from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.problem import Problem
-from quasiharmonic.solver.search.solving import quasi_harmonic_map
+from quasiharmonic.problem.certification import is_injective
+from quasiharmonic.solver.mapping import quasi_harmonic_map
 from quasiharmonic.surfaces import annulus, cat, grid, starfish
 from quasiharmonic.ui.cli import main
-from quasiharmonic.ui.studio.falloff import grip
-from quasiharmonic.ui.studio.following import Follower
-from quasiharmonic.ui.studio.outlines import outline_by_hand, outline_drawn, outline_named
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
-from quasiharmonic.ui.studio.setup import first_moment
-from quasiharmonic.ui.studio.surface import MOST_TRIANGLES, sheet_of
+from quasiharmonic.ui.studio.session.drag import Follower
+from quasiharmonic.ui.studio.session.falloff import drag_weights
+from quasiharmonic.ui.studio.session.outlines import make_outline, make_polygon, read_drawing
+from quasiharmonic.ui.studio.session.setup import make_first_state
+from quasiharmonic.ui.studio.session.surface import MAX_TRIANGLES, make_sheet
 from shared.pages import Visitor
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
@@ -32,7 +32,7 @@ def visitor():
     return Visitor()
 
 
-def test_first_map_is_certified_and_told_whole():
+def test_the_first_map_is_certified_and_sent_completely():
     one = Visitor()
     surface, shown = one.last("surface"), one.last("map")
     assert surface.header["triangles"] == 600
@@ -41,13 +41,13 @@ def test_first_map_is_certified_and_told_whole():
     assert shown.header["bijective"]
     assert shown.header["reached"]
     places = shown.arrays["places"] + np.array(shown.header["origin"])
-    assert np.allclose(places, one.session.moment.result.uv, atol=1e-6)
-    assert certify(one.session.moment.problem.F, one.session.moment.result.uv).bijective
+    assert np.allclose(places, one.session.state.result.uv, atol=1e-6)
+    assert certify(one.session.state.problem.F, one.session.state.result.uv).bijective
 
 
-def test_every_map_of_a_drag_is_positive_and_goes_where_the_hand_does():
+def test_every_map_of_a_drag_is_positive_and_follows_the_pointer():
     one = Visitor()
-    corner = one.session.moment.corners[2]
+    corner = one.session.state.corners[2]
     places = [(1 + 0.04 * k, 1 - 0.05 * k) for k in range(1, 15)]
     shown = one.drags(corner, *places)
     F = one.last("surface").arrays["triangles"].astype(np.int64)
@@ -63,9 +63,9 @@ def test_every_map_of_a_drag_is_positive_and_goes_where_the_hand_does():
     assert one.last("map").header["state"] == "settled"
 
 
-def test_a_map_that_follows_is_the_harmonic_map_of_the_last_tensors():
-    """Against the solver that maps are found by, on a triangle's own Beltrami coefficients."""
-    one = Visitor().session.moment
+def test_an_updated_map_is_the_harmonic_map_of_the_last_tensors():
+    """Compare with the library's solver, on the Beltrami coefficients of each triangle."""
+    one = Visitor().session.state
     problem, uv = one.problem, one.result.uv
     target = problem.target * (1.2, 0.9) + 0.1 * problem.target[:, ::-1]
     followed = Follower(problem, uv, one.result.certificate).to(target)
@@ -77,11 +77,11 @@ def test_a_map_that_follows_is_the_harmonic_map_of_the_last_tensors():
 
 
 @pytest.mark.parametrize("across", [(-0.6, 0.5), (-1.5, -1.5)], ids=["crossing", "turned over"])
-def test_what_cannot_be_reached_shows_a_certified_map_and_says_what_forbids_it(across, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.ui.studio.following.PATIENCE", 0.05)
+def test_an_unreachable_position_shows_a_certified_map_and_the_obstruction(across, monkeypatch):
+    monkeypatch.setattr("quasiharmonic.ui.studio.session.drag.PATIENCE", 0.05)
     one = Visitor()
-    corner = one.session.moment.corners[2]
-    # The corner across the far side: the outline crosses itself.
+    corner = one.session.state.corners[2]
+    # The corner is moved across the opposite side, so the outline crosses itself.
     one.does("grab", vertex=corner)
     frame = one.does("drag", seq=1, to=list(across))[-1]
     assert not frame.header["reached"]
@@ -92,26 +92,26 @@ def test_what_cannot_be_reached_shows_a_certified_map_and_says_what_forbids_it(a
     one.does("drop")
     settled = one.last("map").header
     assert not settled["bijective"]
-    told = one.last("obstructions").header["obstructions"]
-    assert told
-    assert all(one["message"] and one["advice"] and (one["edges"] or one["vertices"]) for one in told)
+    obstructions = one.last("obstructions").header["obstructions"]
+    assert obstructions
+    assert all(one["message"] and one["advice"] and (one["edges"] or one["vertices"]) for one in obstructions)
     assert settled["injective"] == (one.last("map").arrays["bad"].size == 0)
-    # Where there is no map to go on from, what searches for one.
+    # If there is no map to continue from, a search runs.
     if not settled["injective"]:
         assert settled["command"].startswith("qhm map ")
 
 
 @pytest.mark.slow
-def test_many_movements_leave_nothing_behind():
+def test_many_movements_leave_no_extra_memory():
     one = Visitor(*cat(6))
-    corner = one.session.moment.corners[2]
+    corner = one.session.state.corners[2]
     one.does("grab", vertex=corner)
 
     def moves(count):
         for k in range(count):
             one.does("drag", seq=k, to=[1 + 0.2 * np.cos(k / 9), 1 + 0.2 * np.sin(k / 9)])
             assert one.last("map").header["injective"]
-            one.told.clear()
+            one.frames.clear()
 
     moves(50)
     tracemalloc.start()
@@ -125,12 +125,12 @@ def test_many_movements_leave_nothing_behind():
     assert grown < 100_000
 
 
-def test_pins_stay_to_the_bit_and_are_dragged():
+def test_pins_stay_exactly_at_their_position_and_can_be_dragged():
     one = Visitor()
     one.does("pin", vertex=5)
     held = one.place(5).copy()
     assert one.last("map").header["pins"] == [5]
-    corner = one.session.moment.corners[0]
+    corner = one.session.state.corners[0]
     one.drags(corner, (-0.1, -0.05))
     assert np.array_equal(one.place(5), held)
     goal = held + 0.05
@@ -141,37 +141,37 @@ def test_pins_stay_to_the_bit_and_are_dragged():
     assert one.last("map").header["pins"] == []
 
 
-def test_undo_and_redo_go_to_the_bit():
+def test_undo_and_redo_are_exact():
     one = Visitor()
-    first = one.session.moment.result.uv
-    one.drags(one.session.moment.corners[1], (1.3, 0.1))
-    second = one.session.moment.result.uv
+    first = one.session.state.result.uv
+    one.drags(one.session.state.corners[1], (1.3, 0.1))
+    second = one.session.state.result.uv
     one.does("undo")
-    assert np.array_equal(one.session.moment.result.uv, first)
+    assert np.array_equal(one.session.state.result.uv, first)
     assert not one.last("map").header["undo"]
     assert one.last("map").header["redo"]
     one.does("redo")
-    assert np.array_equal(one.session.moment.result.uv, second)
+    assert np.array_equal(one.session.state.result.uv, second)
     one.does("undo")
     one.does("pin", vertex=0)
     assert not one.last("map").header["redo"]
 
 
-def test_a_corner_takes_straight_sides_along_and_a_side_bends_between_its_ends():
+def test_a_corner_moves_straight_sides_and_a_side_bends_between_its_ends():
     V, F = grid(8, 8)
     problem = Problem(V, F, loop := boundary(V, F), V[loop])
     corners = [0, 8, 80, 72]
-    share = dict(zip(loop.tolist(), grip(80, loop, V[loop], problem.domain.loops, corners), strict=True))
+    share = dict(zip(loop.tolist(), drag_weights(80, loop, V[loop], problem.domain.loops, corners), strict=True))
     assert share[80] == 1
     assert share[8] == share[72] == share[0] == 0
     assert share[44] == pytest.approx(0.5)
     assert share[76] == pytest.approx(0.5)
-    bent = dict(zip(loop.tolist(), grip(4, loop, V[loop], problem.domain.loops, corners), strict=True))
+    bent = dict(zip(loop.tolist(), drag_weights(4, loop, V[loop], problem.domain.loops, corners), strict=True))
     assert bent[4] == 1
     assert bent[3] == bent[5] == pytest.approx((1 - (0.125 / 0.32) ** 2) ** 2)
     assert bent[0] == bent[8] == 0
     with pytest.raises(ValueError, match="pin it first"):
-        grip(40, loop, V[loop], problem.domain.loops, corners)
+        drag_weights(40, loop, V[loop], problem.domain.loops, corners)
 
 
 def boundary(V, F):
@@ -182,10 +182,10 @@ def boundary(V, F):
 
 
 def made_again(one, folder, monkeypatch):
-    """The maps that the page's command and its Python make of the files that it saves."""
+    """Return the maps that the page's command and Python code make of the files that it saves."""
     for name, content in one.files().items():
         (folder / name).write_bytes(content)
-    sheet = one.session.moment.recipe.sheet
+    sheet = one.session.state.recipe.sheet
     if not (folder / sheet.name).exists():
         io.write_obj(folder / sheet.name, sheet.mesh.with_map(sheet.mesh.V[:, :2]))
     monkeypatch.chdir(folder)
@@ -213,39 +213,39 @@ def made_again(one, folder, monkeypatch):
     ],
     ids=["letter", "as it is", "corner", "by angle", "svg", "polygon", "polish", "slide", "flatten"],
 )
-def test_the_command_and_the_python_make_the_same_map(deed, tmp_path, monkeypatch):
+def test_the_command_and_the_python_code_make_the_same_map(deed, tmp_path, monkeypatch):
     one = Visitor(*cat(8))
     deed(one)
     shown = one.last("map").header
     assert shown["injective"]
     assert shown["anew"]
-    uv = one.session.moment.result.uv
+    uv = one.session.state.result.uv
     by_command, by_python = made_again(one, tmp_path, monkeypatch)
     assert np.allclose(by_command, uv, atol=1e-12)
     assert np.allclose(by_python, uv, atol=1e-12)
 
 
-def test_what_a_hand_has_moved_is_made_again_too(tmp_path, monkeypatch):
+def test_dragged_vertices_are_reproduced(tmp_path, monkeypatch):
     one = Visitor(*cat(8))
     one.does("pin", vertex=3)
-    one.drags(one.session.moment.corners[2], (1.1, 0.8))
+    one.drags(one.session.state.corners[2], (1.1, 0.8))
     by_command, by_python = made_again(one, tmp_path, monkeypatch)
-    uv = one.session.moment.result.uv
+    uv = one.session.state.result.uv
     assert np.allclose(by_command, uv, atol=1e-9)
     assert np.allclose(by_python, uv, atol=1e-9)
 
 
-def test_holes_closed_surfaces_and_planes_are_taken():
+def test_holes_closed_surfaces_and_planes_are_accepted():
     ring = Visitor(*annulus(8))
     assert ring.last("map").header["bijective"]
     assert ring.last("surface").header["loops"] == [32, 16]
     ring.does("outline", to="ring:0.5")
     assert ring.last("map").header["bijective"]
-    assert ring.session.moment.recipe.outline.to == "ring:0.5"
-    star = sheet_of(io.MeshData(*starfish(3, 8), source="star.obj"), "star.obj")
+    assert ring.session.state.recipe.outline.to == "ring:0.5"
+    star = make_sheet(io.MeshData(*starfish(3, 8), source="star.obj"), "star.obj")
     assert star.flags == ("--cut",)
     assert len(star.island.F) == 12 * 64
-    first = first_moment(star)
+    first = make_first_state(star)
     assert first.result.certificate.bijective
     assert first.recipe.command() == "qhm flatten star.obj --cut -o flat.obj"
 
@@ -253,31 +253,33 @@ def test_holes_closed_surfaces_and_planes_are_taken():
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("notes.txt", b"hello", "unsupported mesh format"),
+        ("notes.txt", b"hello", ".txt files cannot be read as a surface"),
         ("a.obj", b"v 0 0 0\nf 1 2 3\n", "a.obj"),
         ("a.obj", b"\x00\xff" * 50, "a.obj"),
         ("a.ply", b"ply\nformat", "a.ply"),
         ("a.glb", b"glTF", "a.glb"),
-        ("../../etc/passwd", b"", "passwd: unsupported mesh format"),
+        ("../../etc/passwd", b"", "passwd: has no suffix"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a.obj"),
     ],
 )
-def test_no_mesh_is_refused_in_words_about_the_visitors_file(name, content, says, visitor):
-    before = visitor.session.moment
+def test_invalid_meshes_are_rejected_with_a_message_about_the_users_file(name, content, says, visitor):
+    before = visitor.session.state
     text = visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name=name)[0].header["text"]
     assert says in text
     assert "/tmp" not in text
     assert "dropped" not in text
-    assert visitor.session.moment is before
+    assert visitor.session.state is before
 
 
-def test_too_many_triangles_and_pieces_are_refused():
+def test_too_many_triangles_and_pieces_are_rejected():
     V, F = grid(4, 4)
-    many = np.broadcast_to(F[:1], (MOST_TRIANGLES + 1, 3))
-    with pytest.raises(ValueError, match=r"1,000,001 triangles, and the page shows 1,000,000 at most"):
-        sheet_of(io.MeshData(V, many, source="big.obj"), "big.obj")
-    with pytest.raises(ValueError, match="in 2 pieces"):
-        sheet_of(io.MeshData(np.concatenate([V, V + 2]), np.concatenate([F, F + len(V)]), source="two.obj"), "two.obj")
+    many = np.broadcast_to(F[:1], (MAX_TRIANGLES + 1, 3))
+    with pytest.raises(ValueError, match=r"1,000,001 triangles, but the page shows at most 1,000,000"):
+        make_sheet(io.MeshData(V, many, source="big.obj"), "big.obj")
+    with pytest.raises(ValueError, match="2 connected parts"):
+        make_sheet(
+            io.MeshData(np.concatenate([V, V + 2]), np.concatenate([F, F + len(V)]), source="two.obj"), "two.obj"
+        )
 
 
 @pytest.mark.parametrize(
@@ -297,19 +299,19 @@ def test_too_many_triangles_and_pieces_are_refused():
         "letter:RR",
     ],
 )
-def test_an_outline_is_a_word_and_never_a_file(word):
+def test_an_outline_is_a_name_and_never_a_file(word):
     with pytest.raises(ValueError, match=r"unknown outline .*: use disk"):
-        outline_named(word)
+        make_outline(word)
 
 
-def test_drawings_are_read_from_their_bytes():
-    assert len(outline_drawn("../../x y.svg", SVG).contours[0]) == 6
-    assert outline_drawn("../../x y.svg", SVG).to == "x_y.svg"
+def test_drawings_are_read_from_their_contents():
+    assert len(read_drawing("../../x y.svg", SVG).contours[0]) == 6
+    assert read_drawing("../../x y.svg", SVG).to == "x_y.svg"
     with pytest.raises(ValueError, match=r"^ä.svg: ") as raised:
-        outline_drawn("ä.svg", b"<svg")
+        read_drawing("ä.svg", b"<svg")
     assert "/tmp" not in str(raised.value)
     with pytest.raises(ValueError, match="3 to"):
-        outline_by_hand(np.zeros((2, 2)))
+        make_polygon(np.zeros((2, 2)))
 
 
 @pytest.mark.parametrize(
@@ -329,16 +331,16 @@ def test_drawings_are_read_from_their_bytes():
         {},
     ],
 )
-def test_messages_that_make_no_sense_are_told_and_change_nothing(words, visitor):
-    before = visitor.session.moment
+def test_invalid_messages_are_reported_and_change_nothing(words, visitor):
+    before = visitor.session.state
     what = words.get("do")
     (note,) = visitor.does(what, **{k: v for k, v in words.items() if k != "do"})
     assert note.header["kind"] == "note"
     assert note.header["level"] == "error"
-    assert visitor.session.moment is before
+    assert visitor.session.state is before
 
 
-def test_frames_come_back_as_they_were():
+def test_frames_are_decoded_unchanged():
     arrays = {"a": np.arange(5, dtype=np.uint8), "b": np.ones((2, 3), np.float32), "c": np.array([[1.5]])}
     frame = decode(encode({"kind": "x", "text": "ä"}, arrays))
     assert frame.header == {"kind": "x", "text": "ä"}
@@ -365,6 +367,6 @@ WHOLE = encode({"do": "x"}, {"a": np.arange(9.0)})
         (200_000).to_bytes(4, "little") + b"[" * 200_000,
     ],
 )
-def test_damaged_frames_are_refused(data):
+def test_damaged_frames_are_rejected(data):
     with pytest.raises(ProtocolError):
         decode(data)

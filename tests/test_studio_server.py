@@ -1,4 +1,4 @@
-"""The page's server: who may ask it for what, and what one page can do to another."""
+"""The studio server: access control, and independence of pages."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from websockets.sync.client import connect
 
 from quasiharmonic.surfaces import cat
 from quasiharmonic.ui.cli import main
-from quasiharmonic.ui.studio import server as served
-from quasiharmonic.ui.studio import worker
 from quasiharmonic.ui.studio.assets import assets, bundle
 from quasiharmonic.ui.studio.protocol import decode, encode
+from quasiharmonic.ui.studio.server import page_worker
+from quasiharmonic.ui.studio.server import server as served
 
 
 class Running:
-    """A server in a thread."""
+    """Run a server in a thread."""
 
     def __init__(self, source):
         self.source = source
@@ -55,7 +55,7 @@ class Running:
         self.thread.join(30)
 
     def get(self, path, **headers):
-        """Status, headers and content of an answer."""
+        """Return status, headers and content of a response."""
         connection = http.client.HTTPConnection("127.0.0.1", self.studio.port, timeout=10)
         connection.putrequest("GET", path, skip_host="Host" in headers)
         for name, value in headers.items():
@@ -67,14 +67,14 @@ class Running:
         return answer.status, dict(answer.getheaders()), content
 
     def page(self, **options):
-        """A socket as the page's own script opens it."""
+        """Open a socket as the page's own script does."""
         at = f"127.0.0.1:{self.studio.port}"
         options = {"origin": f"http://{at}", "token": self.studio.token, "max_size": None, **options}
         return connect(f"ws://{at}/{options.pop('token')}/socket", compression=None, **options)
 
 
 def hear(socket, kind, *, state=None, seconds=60):
-    """The next frame of a kind."""
+    """Return the next frame of a kind."""
     until = time.monotonic() + seconds
     while True:
         frame = decode(socket.recv(timeout=until - time.monotonic()))
@@ -90,12 +90,12 @@ def running(tmp_path_factory):
     lines = [*(f"v {x!r} {y!r} {z!r}" for x, y, z in V.tolist()), *(f"f {a} {b} {c}" for a, b, c in (F + 1).tolist())]
     source.write_text("\n".join(lines) + "\n")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(served, "MOST_BYTES", 4 << 20)
+        patched.setattr(served, "MAX_BYTES", 4 << 20)
         with Running(str(source)) as server:
             yield server
 
 
-def test_files_are_served_to_those_with_the_token_and_to_nobody_else(running):
+def test_files_are_served_only_with_the_token(running):
     token = running.studio.token
     status, headers, content = running.get(f"/{token}/")
     assert status == 200
@@ -118,12 +118,12 @@ def test_files_are_served_to_those_with_the_token_and_to_nobody_else(running):
     "name",
     ["../server.py", "..%2fserver.py", "static/view.js", "%2e%2e/server.py", "/etc/passwd", "view.js%00", "x"],
 )
-def test_no_path_of_the_servers_is_readable(running, name):
+def test_files_of_the_server_cannot_be_read(running, name):
     assert running.get(f"/{running.studio.token}/{name}")[0] == 404
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1:1", ""])
-def test_a_foreign_host_is_refused(running, host):
+def test_a_foreign_host_is_rejected(running, host):
     status, _, content = running.get(f"/{running.studio.token}/", Host=host)
     assert status == 421
     assert b"studio" not in content
@@ -132,13 +132,13 @@ def test_a_foreign_host_is_refused(running, host):
 @pytest.mark.parametrize(
     "options", [{"origin": "http://evil.example"}, {"origin": None}, {"token": "wrong"}, {"origin": "null"}]
 )
-def test_a_socket_of_another_site_is_refused(running, options):
+def test_a_socket_of_another_site_is_rejected(running, options):
     with pytest.raises(InvalidStatus) as refused, running.page(**options):
         pass
     assert refused.value.response.status_code == 403
 
 
-def test_pages_do_not_meet_and_one_that_crashes_takes_no_other(running):
+def test_pages_are_independent_and_a_crash_ends_only_its_page(running):
     with running.page() as one, running.page() as other:
         for socket in (one, other):
             hear(socket, "map", state="settled")
@@ -157,17 +157,17 @@ def test_pages_do_not_meet_and_one_that_crashes_takes_no_other(running):
 
 
 def children():
-    """Processes of pages."""
+    """Return processes of pages."""
     found = []
     for pid in filter(str.isdigit, os.listdir("/proc")):
         with contextlib.suppress(OSError), open(f"/proc/{pid}/cmdline", "rb") as file:
-            if b"quasiharmonic.ui.studio.worker" in file.read() and parent(pid) == os.getpid():
+            if b"quasiharmonic.ui.studio.server.page_worker" in file.read() and parent(pid) == os.getpid():
                 found.append(int(pid))
     return found
 
 
 def nobody_is_left():
-    """Whoever has gone leaves no process."""
+    """Wait until no page process is left."""
     until = time.monotonic() + 20
     while children() and time.monotonic() < until:
         time.sleep(0.05)
@@ -179,7 +179,7 @@ def parent(pid):
         return int(file.read().rpartition(")")[2].split()[1])
 
 
-def test_a_socket_cut_in_mid_drag_leaves_no_process(running):
+def test_a_socket_closed_during_a_drag_leaves_no_process(running):
     with running.page() as page:
         shown = hear(page, "map", state="settled").header
         page.send(encode({"do": "grab", "vertex": shown["corners"][0]}))
@@ -189,7 +189,7 @@ def test_a_socket_cut_in_mid_drag_leaves_no_process(running):
     nobody_is_left()
 
 
-def test_what_is_too_large_or_no_message_closes_that_page_alone(running):
+def test_messages_that_are_too_large_or_invalid_close_only_their_page(running):
     with running.page() as other:
         hear(other, "map", state="settled")
         with running.page() as page:
@@ -204,7 +204,7 @@ def test_what_is_too_large_or_no_message_closes_that_page_alone(running):
             assert closed.value.rcvd.code == 1007
         with running.page() as page:
             with contextlib.suppress(ConnectionClosed):
-                page.send(bytes(served.MOST_BYTES + (2 << 20)))
+                page.send(bytes(served.MAX_BYTES + (2 << 20)))
             with pytest.raises(ConnectionClosed) as closed:
                 hear(page, "never")
             assert closed.value.rcvd.code == 1009
@@ -212,20 +212,20 @@ def test_what_is_too_large_or_no_message_closes_that_page_alone(running):
         assert hear(other, "map").header["injective"]
 
 
-def test_so_many_pages_and_no_more(running, monkeypatch):
+def test_the_number_of_pages_is_limited(running, monkeypatch):
     nobody_is_left()
     time.sleep(0.2)
-    monkeypatch.setattr(served, "MOST_PAGES", 1)
+    monkeypatch.setattr(served, "MAX_PAGES", 1)
     with running.page() as page:
         hear(page, "hello")
         time.sleep(0.2)
         with running.page() as one_more, pytest.raises(ConnectionClosed) as refused:
             hear(one_more, "hello")
         assert refused.value.rcvd.code == served.TRY_LATER
-        assert refused.value.rcvd.reason == "1 pages are open"
+        assert refused.value.rcvd.reason == "1 pages are open, which is the maximum"
 
 
-def test_the_view_is_to_be_had_as_one_module():
+def test_the_view_is_available_as_one_module():
     text = bundle("view")
     assert 'from "./' not in text
     assert text.rstrip().endswith("export const { createView } = qhm_view;")
@@ -235,24 +235,24 @@ def test_the_view_is_to_be_had_as_one_module():
         bundle("nothing")
 
 
-def test_without_websockets_the_command_says_how_to_get_them(monkeypatch, capsys):
+def test_without_websockets_the_command_names_the_extra(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
-    monkeypatch.delitem(sys.modules, "quasiharmonic.ui.studio.server")
+    monkeypatch.delitem(sys.modules, "quasiharmonic.ui.studio.server.server")
     assert main(["studio", "--no-browser"]) == 2
     assert "pip install 'quasiharmonic[studio]'" in capsys.readouterr().err
 
 
-def test_a_file_that_is_no_mesh_is_refused_before_anything_is_served(tmp_path, capsys):
+def test_an_invalid_mesh_file_is_rejected_before_the_server_starts(tmp_path, capsys):
     (tmp_path / "a.obj").write_text("v 0 0 0\nf 1 2 3\n")
     assert main(["studio", str(tmp_path / "a.obj"), "--no-browser"]) == 2
     assert "a.obj" in capsys.readouterr().err
 
 
-# --- many pages at once, and messages without end --------------------------------------------------------------------
+# --- many pages at once, and endless messages -------------------------------------------------------------------------
 
 
 class Stuck:
-    """A page whose process starts late, takes no message, and ends when it is asked to."""
+    """A page whose process starts late, takes no message, and ends on request."""
 
     started = 0
     begins: asyncio.Event
@@ -281,7 +281,7 @@ class Stuck:
 @pytest.fixture
 def stuck(monkeypatch):
     monkeypatch.setattr(served, "Page", Stuck)
-    monkeypatch.setattr(served, "MOST_BYTES", 32 << 20)
+    monkeypatch.setattr(served, "MAX_BYTES", 32 << 20)
     Stuck.started, Stuck.begins, Stuck.ends = 0, asyncio.Event(), asyncio.Event()
     with Running("") as server:
         yield server
@@ -290,20 +290,20 @@ def stuck(monkeypatch):
 
 
 def first_word(page):
-    """What a page receives first: a greeting, or why it is closed."""
+    """Return what a page receives first: a greeting, or a reason why it is closed."""
     try:
         return decode(page.recv(timeout=10)).header["kind"]
     except ConnectionClosed as closed:
         return closed.rcvd.code
 
 
-def test_pages_opened_at_once_are_no_more_than_pages_opened_one_by_one(stuck):
+def test_pages_opened_at_once_count_like_pages_opened_one_by_one(stuck):
     with contextlib.ExitStack() as opened, ThreadPoolExecutor(20) as threads:
         pages = [opened.enter_context(page) for page in threads.map(lambda _: stuck.page(), range(20))]
         words = list(threads.map(first_word, pages))
-        assert words.count("hello") == served.MOST_PAGES
-        assert words.count(served.TRY_LATER) == 20 - served.MOST_PAGES
-        assert Stuck.started == served.MOST_PAGES
+        assert words.count("hello") == served.MAX_PAGES
+        assert words.count(served.TRY_LATER) == 20 - served.MAX_PAGES
+        assert Stuck.started == served.MAX_PAGES
         for event in (Stuck.begins, Stuck.ends):
             stuck.loop.call_soon_threadsafe(event.set)
         for page in pages:
@@ -314,7 +314,7 @@ def test_pages_opened_at_once_are_no_more_than_pages_opened_one_by_one(stuck):
         assert first_word(page) == "hello"
 
 
-def test_a_page_whose_process_cannot_be_started_gets_the_reason(running, monkeypatch, capfd):
+def test_a_page_whose_process_cannot_start_gets_the_reason(running, monkeypatch, capfd):
     def start(source, tell):
         raise OSError(11, "no more processes")
 
@@ -325,8 +325,8 @@ def test_a_page_whose_process_cannot_be_started_gets_the_reason(running, monkeyp
     assert capfd.readouterr().err == ""
 
 
-def test_messages_that_nobody_takes_are_not_read(stuck):
-    """Two of them wait in the server, one or two more on the way to it; the page keeps the others."""
+def test_unprocessed_messages_are_not_read(stuck):
+    """Two of them wait in the server, and one or two more on the way; the page keeps the others."""
     message = encode({"do": "load"}, {"content": np.zeros(16 << 20, dtype=np.uint8)})
     sent = []
 
@@ -349,7 +349,7 @@ def test_messages_that_nobody_takes_are_not_read(stuck):
 
 
 class Endless:
-    """A file of equal messages without an end."""
+    """An endless file of equal messages."""
 
     def __init__(self, message):
         self.message, self.messages, self.head = message, 0, False
@@ -362,14 +362,14 @@ class Endless:
         return self.message
 
 
-def test_a_process_reads_no_more_than_may_wait(monkeypatch):
-    monkeypatch.setattr(worker, "MOST_WAITING", 1 << 20)
+def test_a_process_reads_no_more_than_its_queue_holds(monkeypatch):
+    monkeypatch.setattr(page_worker, "MAX_WAITING", 1 << 20)
     source = Endless(encode({"do": "load"}, {"content": np.zeros(1 << 18, dtype=np.uint8)}))
-    inbox = worker.Inbox(source)
+    inbox = page_worker.Inbox(source)
     for taken in range(1, 20):
         inbox.take()
         time.sleep(0.002)
-        # Three wait, and the next is at hand.
+        # Three wait, and the next is being read.
         assert source.messages <= taken + 4
     assert inbox.waiting()
 
@@ -381,7 +381,7 @@ UPGRADE = (
     b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
 )
 SOCKET = b"GET /TOKEN/socket HTTP/1.1\r\nHOSTORIGIN" + UPGRADE + b"\r\n"
-# HOST, ORIGIN and TOKEN stand for what the server's own page sends; an answer of None is a connection that is closed.
+# HOST, ORIGIN and TOKEN represent the values of the server's own page; None means a closed connection.
 MALFORMED = {
     "brackets": (b"GET //[x HTTP/1.1\r\nHOST\r\n", 403),
     "brackets around the token": (b"GET //[TOKEN/ HTTP/1.1\r\nHOST\r\n", 403),
@@ -418,7 +418,7 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize("name", MALFORMED)
-def test_a_malformed_request_gets_an_error_and_the_terminal_stays_silent(running, capfd, name):
+def test_a_malformed_request_gets_an_error_and_prints_nothing(running, capfd, name):
     request, expected = MALFORMED[name]
     port = running.studio.port
     request = request.replace(b"HOST", b"Host: 127.0.0.1:%d\r\n" % port).replace(
@@ -427,7 +427,7 @@ def test_a_malformed_request_gets_an_error_and_the_terminal_stays_silent(running
     request = request.replace(b"ORIGIN", b"Origin: http://127.0.0.1:%d\r\n" % port)
     answer = b""
     with socket.create_connection(("127.0.0.1", port), timeout=10) as raw, contextlib.suppress(ConnectionError):
-        # The server may close the connection before it has read all of a request.
+        # The server may close the connection before it has read the whole request.
         raw.sendall(request)
         if not request.endswith(b"\n"):
             raw.shutdown(socket.SHUT_WR)
@@ -439,7 +439,7 @@ def test_a_malformed_request_gets_an_error_and_the_terminal_stays_silent(running
     assert capfd.readouterr().err == ""
 
 
-def test_a_defect_of_the_server_is_logged(running, monkeypatch, caplog):
+def test_an_internal_error_of_the_server_is_logged(running, monkeypatch, caplog):
     def broken():
         raise ZeroDivisionError("a defect")
 

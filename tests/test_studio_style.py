@@ -1,4 +1,4 @@
-"""The page's colours: contrast as WCAG 2.2 has it, 4.5 : 1 of text (AA), 3 : 1 of what shows controls and handles."""
+"""The page's colours: contrast by WCAG 2.2, 4.5 : 1 for text (AA), 3 : 1 for controls and handles."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TEXT, SHAPE = 4.5, 3.0
 
 
 def declarations():
-    """(selector, property) -> value of every rule of the style sheet."""
+    """Return (selector, property) -> value of every rule of the style sheet."""
     css = re.sub(r"/\*.*?\*/", "", assets()["style.css"].content.decode(), flags=re.DOTALL)
     return {
         (" ".join(selectors.split()), name.strip()): value.strip()
@@ -25,7 +25,7 @@ SHEET = declarations()
 
 
 def colour(value):
-    """The one colour in a value, as six hexadecimal digits; None where there is none, or several."""
+    """Return the only colour in a value, as six hexadecimal digits; None if there is none, or several."""
     value = re.sub(r"var\((--\w+)\)", lambda found: SHEET[":root", found[1]], value)
     found = re.findall(r"#([0-9a-f]{6})\b", value)
     return found[0] if len(found) == 1 else None
@@ -46,7 +46,7 @@ INK, PAPER, GROUND = (colour(SHEET[":root", name]) for name in ("--ink", "--pape
 
 
 def texts():
-    """Every pair of a text's colour and its ground; of a rule without a ground of its own, both that are there."""
+    """Return every pair of text and background colours; a rule without a background has both of the page."""
     for selector in dict.fromkeys(selector for selector, _ in SHEET):
         own = colour(SHEET.get((selector, "color"), ""))
         ground = colour(SHEET.get((selector, "background"), ""))
@@ -55,24 +55,24 @@ def texts():
 
 
 @pytest.mark.parametrize(("text", "ground"), list(texts()))
-def test_text_is_read_easily(text, ground):
+def test_text_has_enough_contrast(text, ground):
     assert contrast(text, ground) >= TEXT
 
 
-def test_edges_of_controls_and_the_focus_are_seen():
+def test_edges_of_controls_and_the_focus_have_enough_contrast():
     edge, focus = colour(SHEET[":root", "--edge"]), colour(SHEET[":focus-visible", "outline"])
     for one in (edge, focus):
         assert min(contrast(one, PAPER), contrast(one, GROUND)) >= SHAPE
     assert contrast(colour(SHEET["header :focus-visible", "outline-color"]), INK) >= SHAPE
 
 
-def test_what_is_drawn_on_the_map_is_seen():
+def test_drawings_on_the_map_have_enough_contrast():
     drawn = dict(re.findall(r'const (\w+) = "#([0-9a-f]{6})"', assets()["overlay.js"].content.decode()))
     assert set(drawn) == {"INK", "RED", "HANDLE", "PIN", "PAPER"}
     assert all(contrast(drawn[name], drawn["PAPER"]) >= SHAPE for name in set(drawn) - {"PAPER"})
 
 
-def test_contrast_as_others_compute_it():
+def test_contrast_agrees_with_published_values():
     assert contrast("ffffff", "000000") == pytest.approx(21)
     assert contrast("767676", "ffffff") == pytest.approx(4.54, abs=0.005)
     assert contrast("777777", "ffffff") == pytest.approx(4.48, abs=0.005)

@@ -41,7 +41,7 @@ def chords(F, n):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_is_one_oriented_manifold_with_every_vertex_used(name):
+def test_surface_is_one_oriented_manifold_without_unused_vertices(name):
     V, F = ALL[name]
     assert V.dtype == np.float64
     assert F.dtype == np.int64
@@ -78,16 +78,16 @@ def test_grids(nx, ny, alternating):
 
 
 def test_diagonals_alternate():
-    # An interior vertex is met by all four diagonals around it or by none.
+    # All four diagonals around an interior vertex meet it, or none.
     _, F = surfaces.grid(6, 6, alternating=True)
     degrees = np.bincount(F.ravel(), minlength=49).reshape(7, 7)[1:-1, 1:-1]
     i, j = np.indices(degrees.shape)
-    # Next to the two corners whose diagonal was turned the count differs.
+    # Next to the two corners whose diagonal was flipped, the count differs.
     inner = np.s_[1:-1, 1:-1]
     assert np.array_equal(degrees[inner], np.where((i + j) % 2 == 0, 8, 4)[inner])
 
 
-def test_annulus_has_the_hole_it_was_given():
+def test_annulus_has_the_given_hole():
     V, F = surfaces.annulus(7, hole=(-0.9, -0.2, 0.1, 0.95))
     assert area(V, F) == pytest.approx(4 - 1.0 * 1.15)
     outer, inner = (V[loop] for loop in boundary_loops(F, len(V)))
@@ -95,7 +95,7 @@ def test_annulus_has_the_hole_it_was_given():
     assert (inner.min(axis=0), inner.max(axis=0)) == (pytest.approx((-0.9, -0.2)), pytest.approx((0.1, 0.95)))
 
 
-def test_disk_is_a_polygon_of_six_sides_a_ring():
+def test_each_ring_of_a_disk_is_a_polygon_with_six_sides_per_ring_number():
     V, F = surfaces.disk(5)
     assert (len(V), len(F)) == (91, 150)
     assert area(V, F) == pytest.approx(15 * np.sin(2 * np.pi / 30))
@@ -115,7 +115,7 @@ def test_random_disks_have_no_chords_and_no_slivers():
             assert (normals(V, F)[:, 2] / longest**2).min() > 0.1
 
 
-def test_seed_decides():
+def test_the_seed_determines_the_surface():
     V, F = surfaces.random_delaunay(60, seed=1)
     W, G = surfaces.random_delaunay(60, seed=1)
     assert np.array_equal(V, W)
@@ -123,24 +123,24 @@ def test_seed_decides():
     assert not np.array_equal(V, surfaces.random_delaunay(60, seed=2)[0])
 
 
-def test_cat_looks_at_the_viewer():
+def test_the_cat_faces_the_viewer():
     V, F = surfaces.cat()
     assert (len(V), len(F)) == (7651, 15000)
     loop = boundary_loops(F, len(V))[0]
     assert np.array_equal(loop, np.arange(7351, 7651))
     assert np.abs(V[loop, 2]).max() < 1e-12
-    # The vector area is that of the flat opening, to the front, whatever the relief.
+    # The vector area is that of the flat opening, towards the front, for any relief.
     opening = V[loop]
     x, y = opening[:, 0], opening[:, 1]
     assert area(V, F) == pytest.approx((x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
     assert area(V, F) > 3
     assert np.linalg.norm(normals(V, F), axis=1).sum() == pytest.approx(8.137, abs=2e-3)
-    # Ears above, and the same on both sides.
+    # The ears are at the top, and both sides are equal.
     assert V[:, 1].max() > -V[:, 1].min() + 0.2
     assert V[:, 0].max() == pytest.approx(-V[:, 0].min(), rel=0.01)
 
 
-def test_refining_keeps_area_and_quarters_triangles():
+def test_refining_keeps_area_and_splits_triangles_into_four():
     V, F = surfaces.disk(3)
     W, G = surfaces.refine(V, F)
     assert (len(G), len(W)) == (4 * 54, 37 + 90)
@@ -155,15 +155,21 @@ def test_refining_keeps_area_and_quarters_triangles():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: surfaces.grid(1, 5), "at least 2 cells along each axis, not 1 by 5"),
-        (lambda: surfaces.annulus(1), "at least 2 cells across, not 1"),
+        (lambda: surfaces.grid(1, 5), "nx must be an integer of at least 2, not 1"),
+        (lambda: surfaces.annulus(1), "cells must be an integer of at least 2, not 1"),
         (lambda: surfaces.annulus(hole=(0, 0, 1, 0.5)), "not inside the square"),
         (lambda: surfaces.annulus(hole=(0.5, 0, 0.2, 0.5)), "empty"),
-        (lambda: surfaces.disk(0), "at least 1 ring, not 0"),
-        (lambda: surfaces.cat(0), "at least 1 ring, not 0"),
-        (lambda: surfaces.random_delaunay(3), "at least 4 vertices, not 3"),
+        (lambda: surfaces.disk(0), "rings must be an integer of at least 1, not 0"),
+        (lambda: surfaces.cat(0), "rings must be an integer of at least 1, not 0"),
+        (lambda: surfaces.annulus(hole=None), "hole must contain real numbers, not None"),
+        (lambda: surfaces.annulus(hole=(0, 1)), "hole must be four numbers"),
+        (lambda: surfaces.grid(2, 2, alternating="no"), "alternating must be True or False, not 'no'"),
+        (lambda: surfaces.starfish(2.5), "arms must be an integer of at least 1, not 2.5"),
+        (lambda: surfaces.random_delaunay(9, "seed"), "seed must be an integer of at least 0, not 'seed'"),
+        (lambda: surfaces.refine(None, [[0, 1, 2]]), "V must contain real numbers, not None"),
+        (lambda: surfaces.random_delaunay(3), "n must be an integer of at least 4, not 3"),
     ],
 )
-def test_impossible_sizes_are_refused(make, message):
+def test_impossible_sizes_are_rejected(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -1,4 +1,4 @@
-"""Outlines from SVG drawings, files of points, and words that name an outline."""
+"""Outlines from SVG drawings, files of points, and names."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def drawing(body, attributes=""):
 
 @pytest.fixture
 def read(tmp_path):
-    """Read a drawing given as text."""
+    """Read a drawing from a string."""
 
     def run(text, **options):
         path = tmp_path / "drawing.svg"
@@ -37,7 +37,7 @@ def read(tmp_path):
 
 
 def points(d):
-    """End points of all pieces, subpath by subpath."""
+    """Return the end points of all pieces, subpath by subpath."""
     return [[tuple(pieces[0][0]), *(tuple(piece[-1]) for piece in pieces)] for pieces in parse_path(d)]
 
 
@@ -65,7 +65,7 @@ def test_curves_and_their_smooth_continuations():
     (pieces,) = parse_path("M0 0C0 1 1 2 2 2S4 1 4 0T5 0 6 0Q7 1 8 0t2 0")
     assert [len(piece) - 1 for piece in pieces] == [3, 3, 2, 2, 2, 2]
     assert pieces[1].tolist() == [[2, 2], [3, 2], [4, 1], [4, 0]]  # (1, 2) reflected in (2, 2)
-    assert pieces[2][1].tolist() == [4, 0]  # after a cubic there is nothing to reflect
+    assert pieces[2][1].tolist() == [4, 0]  # after a cubic there is no control point to reflect
     assert pieces[3][1].tolist() == [6, 0]
     assert pieces[5][1].tolist() == [9, -1]
     (relative,) = parse_path("M0 0c0 1 1 2 2 2s2 -1 2 -2t1 0 1 0q1 1 2 0t2 0")
@@ -76,7 +76,7 @@ def test_curves_and_their_smooth_continuations():
 @pytest.mark.parametrize("turn", [0, 30, -75])
 @pytest.mark.parametrize(("large", "sweep"), [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_arcs_lie_on_their_ellipse(turn, large, sweep):
-    """Of the two ellipses through both ends, and of its two arcs, the one that the flags choose."""
+    """There are two ellipses through both ends, each with two arcs; the flags choose one."""
     rx, ry, end = 3.0, 1.5, np.array([1.2, 1.7])
     (pieces,) = parse_path(f"M0 0A{rx} {ry} {turn} {large} {sweep} {end[0]} {end[1]}")
     arc = np.concatenate([flatten([piece], 1e-9) for piece in pieces])
@@ -92,14 +92,14 @@ def test_arcs_lie_on_their_ellipse(turn, large, sweep):
     assert arc[-1].tolist() == end.tolist()
 
 
-def test_odd_arcs():
-    # Radii too small grow until they reach; without a radius it is a line; to where the pen is, nothing.
+def test_unusual_arcs():
+    # Radii that are too small grow; without a radius, the arc is a line; an arc to the current point is empty.
     (pieces,) = parse_path("M0 0A1 1 0 0 1 4 0")
     half = np.concatenate([flatten([piece], 1e-9) for piece in pieces])
     assert np.linalg.norm(half - (2, 0), axis=1) == pytest.approx(np.full(len(half), 2), abs=1e-6)
     assert [len(piece) for piece in parse_path("M0 0A0 1 0 0 1 4 0")[0]] == [2]
     assert parse_path("M1 1A1 1 0 0 1 1 1") == []
-    # Flags need nothing between them and what follows.
+    # Flags need no separator after them.
     (packed,), (spaced,) = parse_path("M0 0a1 1 0 01.5.5"), parse_path("M0 0 a 1 1 0 0 1 0.5 0.5")
     assert np.array_equal(packed, spaced)
 
@@ -120,7 +120,7 @@ def test_odd_arcs():
         ("M0 0ſ1 1 2 2", "a command is needed"),
     ],
 )
-def test_broken_path_data(d, message):
+def test_invalid_path_data(d, message):
     with pytest.raises(ValueError, match=message):
         parse_path(d)
 
@@ -168,7 +168,7 @@ def test_shapes(read, body, areas, points):
         assert len(contours[0]) == points
 
 
-def test_drawing_stands_as_it_looks(read):
+def test_transforms_and_viewbox_apply(read):
     (contour,) = read(drawing('<polygon points="0,0 10,0 0,5" transform="translate(1 2)"/>'))
     assert {tuple(p) for p in contour} == {(1, -2), (11, -2), (1, -7)}
 
@@ -231,12 +231,12 @@ def test_tolerance(read, tolerance):
         (b"\x1f\x8b\x08", "compressed by gzip"),
     ],
 )
-def test_broken_drawings(read, text, message):
+def test_invalid_drawings(read, text, message):
     with pytest.raises(ValueError, match=message):
         read(text)
 
 
-def test_entity_bombs_and_files_outside(read, tmp_path):
+def test_entity_bombs_and_external_files(read, tmp_path):
     lines = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "M0 0"}">' for i in range(12))
     with pytest.raises(ValueError, match="declares the entity 'e0', but entities are not supported at line 1"):
         read(f"<!DOCTYPE svg [{lines}]>" + drawing('<path d="&e11;"/>'))
@@ -251,10 +251,10 @@ def test_entity_bombs_and_files_outside(read, tmp_path):
 def test_huge_drawings(read, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="more than 1,000,000 points"):
         read(drawing('<path d="M0 0' + "c1 9 9 1 0 0" * 9000 + 'z"/>'), tolerance=1e-7)
-    monkeypatch.setattr("quasiharmonic.targets.outlines.svgpath.MOST_POINTS", 1000)
+    monkeypatch.setattr("quasiharmonic.targets.outlines.svgpath.MAX_POINTS", 1000)
     with pytest.raises(ValueError, match="more than 1,000 pieces"):
         read(drawing('<path d="M0 0' + "h1v1" * 600 + '"/>'))
-    monkeypatch.setattr("quasiharmonic.targets.outlines.svg.MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("quasiharmonic.targets.outlines.svg.MAX_BYTES", 1 << 20)
     with pytest.raises(ValueError, match="larger than 1 MiB; simplify"):
         read(drawing(" " * (1 << 20)))
     with pytest.raises(ValueError, match="tolerance must be a fraction"):
@@ -280,12 +280,12 @@ def test_huge_drawings(read, tmp_path, monkeypatch):
     ],
     ids=["lines", "curves", "unlettered", "arcs", "closings", "circles", "paths", "blanks", "transforms", "groups"],
 )
-def test_what_is_too_much_is_refused_soon(read, text, message):
+def test_excessive_sizes_are_rejected_quickly(read, text, message):
     text = drawing(text)
     began = time.process_time()
     with pytest.raises(ValueError, match=message):
         read(text)
-    # Two seconds at most where nothing else runs.
+    # At most two seconds on an idle machine.
     assert time.process_time() - began < 6
 
 
@@ -298,7 +298,7 @@ SAMPLE = drawing(
 @pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, len(SAMPLE)), st.integers(0, 6), st.text(max_size=5)), max_size=4))
-def test_damaged_drawings_are_read_or_refused(tmp_path_factory, edits):
+def test_damaged_drawings_are_read_or_rejected(tmp_path_factory, edits):
     text = SAMPLE
     for at, cut, put in edits:
         text = text[:at] + put + text[at + cut :]
@@ -335,7 +335,7 @@ def test_files_of_points(tmp_path, text, areas):
         assert [AREA(c) for c in targets.nested(contours)] == pytest.approx(areas)
 
 
-def test_contours_run_as_they_are_written(tmp_path, read):
+def test_contours_keep_their_direction(tmp_path, read):
     for points in ([(1, 0), (1, 1), (0, 0)], [(1, 0), (0, 0), (1, 1)]):
         (tmp_path / "outline.txt").write_text("".join(f"{x} {y}\n" for x, y in points))
         assert list(map(tuple, targets.read_polylines(tmp_path / "outline.txt")[0])) == points
@@ -364,20 +364,20 @@ def test_contours_run_as_they_are_written(tmp_path, read):
         ("0 0\n0 0\n0 0\n", "a contour of 1 different points"),
     ],
 )
-def test_broken_files_of_points(tmp_path, text, message):
+def test_invalid_files_of_points(tmp_path, text, message):
     (tmp_path / "outline.txt").write_text(text)
     with pytest.raises(ValueError, match=message):
         targets.read_polylines(tmp_path / "outline.txt")
 
 
 def test_too_many_points(tmp_path, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.targets.outlines.polylines.MOST_POINTS", 3)
+    monkeypatch.setattr("quasiharmonic.targets.outlines.polylines.MAX_POINTS", 3)
     (tmp_path / "outline.txt").write_text("0 0\n1 0\n1 1\n0 1\n")
     with pytest.raises(ValueError, match="more than 3 points at line 4; use fewer points"):
         targets.read_polylines(tmp_path / "outline.txt")
 
 
-# --- in a word
+# --- by name
 
 
 @pytest.mark.parametrize(
@@ -395,7 +395,7 @@ def test_too_many_points(tmp_path, monkeypatch):
         ("letter::", [0.0333, 0.0333], 4),
     ],
 )
-def test_outlines_in_a_word(text, areas, points):
+def test_outlines_by_name(text, areas, points):
     contours = targets.outline(text)
     assert [AREA(c) for c in contours] == pytest.approx(areas, rel=2e-3)
     if points:
@@ -441,7 +441,7 @@ def test_outline_files(tmp_path):
         ("none.txt", "there is no such file"),
     ],
 )
-def test_words_that_name_no_outline(text, message):
+def test_names_that_are_not_outlines(text, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         targets.outline(text)
 
@@ -453,7 +453,7 @@ def test_options_of_outlines():
         targets.outline("disk", tolerance=0)
 
 
-def test_the_command_lists_what_the_library_knows():
+def test_the_command_lists_the_outlines_of_the_library():
     from quasiharmonic.targets import specification
     from quasiharmonic.ui.cli.targets import FORMS
 

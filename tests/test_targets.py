@@ -1,22 +1,24 @@
-"""Outlines and the places of boundary vertices on them."""
+"""Outlines, and the target positions of boundary vertices on them."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import subprocess
 import sys
 from pathlib import Path
+from unicodedata import category
 
 import numpy as np
 import pytest
 
 from quasiharmonic import boundary_loops, surfaces, targets
-from quasiharmonic.targets.boundary.correspondence import upright
-from quasiharmonic.targets.outlines import truetype
+from quasiharmonic.targets.boundary.correspondence import viewer_axes
+from quasiharmonic.targets.outlines.letters import glyph_paths
 
 
 def distance(points, contour):
-    """Distance of every point from a closed polyline."""
+    """Return the distance of every point from a closed polyline."""
     a, b = contour, np.roll(contour, -1, axis=0)
     along = ((points[:, None] - a) * (b - a)).sum(axis=2) / ((b - a) ** 2).sum(axis=1)
     foot = a + np.clip(along, 0, 1)[..., None] * (b - a)
@@ -41,7 +43,7 @@ def steps(points):
         (targets.star(5, 0.4), 5 * 0.4 * np.sin(np.pi / 5), 10),
     ],
 )
-def test_shapes_are_counterclockwise_and_have_their_area(contour, area, points):
+def test_shapes_are_counterclockwise_and_have_the_given_area(contour, area, points):
     assert contour.shape == (points, 2)
     assert contour.dtype == np.float64
     assert targets.signed_area(contour) == pytest.approx(area)
@@ -68,7 +70,7 @@ def test_area_far_from_the_origin():
         ("S", [0.2607]),
         ("H", [0.3135]),
         ("R", [0.3433, -0.0323]),
-        ("A", [0.3152, -0.0290]),
+        ("A", [0.3151, -0.0290]),
         ("8", [0.3581, -0.0397, -0.0273]),
         ("%", [0.1262, 0.1258, 0.0818, -0.0279, -0.0276]),
         (",", [0.0516]),
@@ -107,12 +109,12 @@ def test_curves_are_flat_to_tolerance():
 
 
 @pytest.mark.parametrize("character", ["", "GG", " "])
-def test_what_is_no_letter_is_refused(character):
+def test_names_that_are_not_letters_are_rejected(character):
     with pytest.raises(ValueError, match=r"a single character|no outline"):
         targets.letter(character)
 
 
-def test_glyphs_whose_parts_overlap_are_refused_by_name():
+def test_glyphs_with_overlapping_parts_are_rejected_by_name():
     with pytest.raises(ValueError, match="the glyph of 'Ç': contours 0 and 1 of the outline meet"):
         targets.letter("Ç")
 
@@ -144,7 +146,7 @@ def test_missing_glyph_and_missing_font(tmp_path):
         (lambda: targets.word(""), "a word needs at least one letter"),
     ],
 )
-def test_impossible_shapes_are_refused(make, message):
+def test_impossible_shapes_are_rejected(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -157,7 +159,7 @@ def test_fonts_by_name_and_by_file():
         targets.letter("G", "DejaVu Sanz")
 
 
-def test_what_is_no_font(tmp_path):
+def test_files_that_are_not_fonts(tmp_path):
     (tmp_path / "fake.ttf").write_text("not a font")
     with pytest.raises(ValueError, match=r"fake\.ttf is not a readable font"):
         targets.letter("G", tmp_path / "fake.ttf")
@@ -170,20 +172,20 @@ def test_tolerance_of_letters():
 
 
 @pytest.mark.parametrize(("text", "holes"), [("QH", 1), ("LOVE", 1), ("G", 0), ("mesh", 2), ("R8", 3)])
-def test_letters_of_a_word_make_one_piece(text, holes):
+def test_letters_of_a_word_form_one_piece(text, holes):
     pytest.importorskip("shapely")
     outer, *inner = targets.word(text)
     assert targets.signed_area(outer) > 0
     assert all(targets.signed_area(c) < 0 for c in inner)
     assert len(inner) == holes
-    # Overlaps are small, so little of the letters is covered twice.
+    # Overlaps are small, so little area of the letters is covered twice.
     alone = sum(targets.signed_area(c) for character in text for c in targets.letter(character))
     assert 0.9 * alone < sum(map(targets.signed_area, [outer, *inner])) <= alone + 1e-12
     first = targets.letter(text[0])[0]
     assert outer[:, 0].min() == pytest.approx(first[:, 0].min())
 
 
-def test_words_that_fall_apart():
+def test_words_that_are_not_connected():
     pytest.importorskip("shapely")
     with pytest.raises(ValueError, match=r"1 part of 'hi' \(a dot, an accent\) touches no other"):
         targets.word("hi")
@@ -200,7 +202,7 @@ def test_nesting():
     islands = [2 * square, 8 * square[::-1], 4 * square, 6 * square, square / 2 + (3.5, 0)]
     ordered = targets.nested(islands)
     assert [targets.signed_area(c) for c in ordered] == [64, -36, 16, -4, -0.25]
-    # Turned around, a contour keeps its first point.
+    # A reversed contour keeps its first point.
     assert ordered[0][0].tolist() == islands[1][0].tolist()
     assert [targets.signed_area(c) for c in targets.filled(islands)] == [-64]
     assert [targets.signed_area(c) for c in targets.filled([square, square + 2])] == [1, 1]
@@ -229,9 +231,9 @@ def test_nesting():
         ([[(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1e-9), (3, 3e-9)], [(2, 2), (4, 4), (3, 3)]], "contour 2 .* no area"),
     ],
 )
-def test_contours_that_bound_no_region_are_refused(contours, message):
+def test_contours_that_bound_no_region_are_rejected(contours, message):
     contours = [np.array(c, dtype=float) for c in contours]
-    if message is None:  # a hair is room enough, and no more points than they are
+    if message is None:  # a tiny distance suffices, and points are not added
         assert [len(c) for c in targets.nested(contours)] == [4, 3]
         return
     for refuse in (targets.nested, targets.filled):
@@ -255,7 +257,7 @@ def test_nesting_at_any_scale(scale):
 # --- correspondence
 
 
-def test_lengths_are_in_proportion():
+def test_lengths_are_proportional():
     angle = np.cumsum([0.1, 0.2, 0.4, 0.8, 0.7, 0.5, 0.9, 1.1])
     loop = np.stack([np.cos(angle), np.sin(angle), 0.3 * np.sin(2 * angle)], axis=1)
     circle = targets.disk(2.0, 4096)
@@ -266,7 +268,7 @@ def test_lengths_are_in_proportion():
 
 
 @pytest.mark.parametrize("character", "GSRAPH")
-def test_corners_of_a_letter_are_kept(character):
+def test_corners_of_a_letter_are_preserved(character):
     V, F = surfaces.disk(25)
     loop = boundary_loops(F, len(V))[0]
     outline = targets.letter(character)[0]
@@ -278,14 +280,14 @@ def test_corners_of_a_letter_are_kept(character):
     assert len(corners) >= 4
     assert all((placed == corner).all(axis=1).sum() == 1 for corner in corners)
     assert distance(placed, outline).max() < 1e-15
-    # Every edge keeps its share of the length, but for the shift of the nearest vertex to a corner.
+    # Every edge keeps its share of the length, except for the shift of the vertex closest to a corner.
     share = steps(outline).sum() / len(loop)
     assert steps(placed).min() > 0.1 * share
     assert steps(placed).max() < 2.5 * share
     assert targets.signed_area(placed) == pytest.approx(targets.signed_area(outline), rel=0.02)
 
 
-def test_every_corner_takes_its_nearest_vertex():
+def test_every_corner_takes_its_closest_vertex():
     loop = targets.disk(1.0, 40)
     placed = targets.arc_length(loop, targets.star(5, 0.4), start=7)
     where = [int(np.flatnonzero((placed == corner).all(axis=1))[0]) for corner in targets.star(5, 0.4)]
@@ -293,8 +295,8 @@ def test_every_corner_takes_its_nearest_vertex():
     assert steps(placed) == pytest.approx(np.full(40, steps(placed)[0]))
 
 
-def test_crowded_corners_get_vertices_of_their_own():
-    # Five corners on a twentieth of the length, one vertex on each twelfth.
+def test_close_corners_get_separate_vertices():
+    # Five corners lie on a twentieth of the length, with one vertex per twelfth.
     outline = np.array([(0, 0), (1, 0), (1, 0.5), (0.55, 0.5), (0.55, 0.45), (0.45, 0.45), (0.45, 0.5), (0, 0.5)])
     placed = targets.arc_length(targets.disk(1.0, 12), outline, start=3)
     where = [int(np.flatnonzero((placed == corner).all(axis=1))[0]) for corner in outline]
@@ -312,7 +314,7 @@ def test_as_many_vertices_as_corners_and_one_fewer():
     assert steps(relaxed).min() > 0
 
 
-def test_matching_shapes_fit_without_being_told():
+def test_matching_shapes_fit_without_options():
     for V, F in (surfaces.grid(6, 4), surfaces.random_delaunay(150, seed=2), surfaces.disk(6)):
         loop = boundary_loops(F, len(V))[0]
         own = V[loop]
@@ -329,7 +331,7 @@ def test_holes_run_clockwise():
     assert placed == pytest.approx(hole)
 
 
-def test_curved_loop_is_seen_upright():
+def test_a_curved_loop_is_seen_upright():
     V, F = surfaces.cat(20)
     loop = boundary_loops(F, len(V))[0]
     placed = targets.arc_length(V[loop], targets.disk())
@@ -337,7 +339,7 @@ def test_curved_loop_is_seen_upright():
     assert (towards * placed).sum(axis=1).min() > 0.9
 
 
-def test_curved_hole_is_seen_from_the_side_where_it_runs_as_the_contour_does():
+def test_a_curved_hole_is_seen_from_the_side_with_the_contours_direction():
     V, F = surfaces.annulus(8)
     hole = boundary_loops(F, len(V))[1]
     for turn in (0, 1.0):
@@ -348,14 +350,14 @@ def test_curved_hole_is_seen_from_the_side_where_it_runs_as_the_contour_does():
 
 @pytest.mark.parametrize("normal", np.vstack([np.eye(3), -np.eye(3), [(0, 0, 0), (1, 2, 3)]]))
 def test_viewer_frame_is_a_rotation(normal):
-    frame = upright(normal)
+    frame = viewer_axes(normal)
     assert frame @ frame.T == pytest.approx(np.eye(3))
     assert np.linalg.det(frame) == pytest.approx(1)
     assert frame[2] @ normal == pytest.approx(np.linalg.norm(normal))
     assert abs(frame[0, 1]) < 1e-15
 
 
-def test_input_types_and_inputs_untouched():
+def test_input_types_and_unchanged_inputs():
     loop, outline = targets.disk(1.0, 30), targets.star(4)
     want = targets.arc_length(loop, outline, start=2)
     fortran, frozen = np.asfortranarray(loop), outline.copy()
@@ -383,47 +385,67 @@ def test_input_types_and_inputs_untouched():
         (np.array([(0, 0), (1, 0), (0, 1), (0, 0)]), targets.disk(), {"start": 2}, "vertices 3 and 0 of the loop"),
     ],
 )
-def test_what_is_no_curve_is_refused(loop, outline, options, message):
+def test_invalid_curves_are_rejected(loop, outline, options, message):
     with pytest.raises(ValueError, match=message):
         targets.arc_length(loop, outline, **options)
 
 
-FONTS = "DejaVuSans-Bold", "DejaVuSerif-Italic", "DejaVuSansMono", "cmr10", "STIXGeneral"
-LARGE_FONTS = FONTS[:3]
-
-
-@pytest.mark.parametrize(
-    "font", [pytest.param(font, marks=[pytest.mark.slow] if font in LARGE_FONTS else []) for font in FONTS]
-)
-def test_glyphs_are_those_of_freetype_to_the_last_bit(font):
-    """Letters, ligatures, accents put on letters, Greek, Cyrillic, signs: read here, and by way of matplotlib."""
+@pytest.mark.parametrize("font", ["DejaVuSans-Bold", "cmr10", "STIXGeneral"])
+def test_letters_agree_with_freetype_up_to_its_rounding(font):
+    """Letters, ligatures, combined accents, Greek, Cyrillic, symbols: read by this package and by matplotlib."""
     from matplotlib import get_data_path
     from matplotlib.font_manager import FontProperties
-    from matplotlib.ft2font import FT2Font, __freetype_version__
+    from matplotlib.ft2font import FT2Font
     from matplotlib.path import Path as Outline
     from matplotlib.textpath import text_to_path
 
-    # The one that older matplotlib brings rounds some points to another unit of the font.
-    off = 0.5 / 1000 if __freetype_version__ == "2.6.1" else 0
     file = Path(get_data_path(), "fonts", "ttf", f"{font}.ttf")
-    face = FT2Font(str(file))
-    known = face.get_charmap()
+    known = FT2Font(str(file)).get_charmap()
     characters = [chr(code) for code in range(0x21, 0x530, 23) if code in known]
-    read = {character: truetype.glyph(file, character) for character in characters}
-    assert sum(paths is not None for paths in read.values()) > 0.3 * len(characters)
-    for character, paths in read.items():
-        if paths is None:
-            continue
+    # Recent matplotlib puts a mark that stands alone onto a dotted circle.
+    characters = [character for character in characters if category(character)[0] != "M"]
+    assert len(characters) > 3
+    for character in characters:
         points, codes = text_to_path.get_text_path(FontProperties(fname=file), character)
+        if not len(codes):
+            continue
         curves = Outline(np.asarray(points) / text_to_path.FONT_SCALE, codes).iter_segments(simplify=False)
-        drawn = [(flat, code) for flat, code in curves if code not in (Outline.MOVETO, Outline.CLOSEPOLY)]
-        pieces = [piece for path in paths for piece in path]
-        assert len(pieces) == len(drawn), character
-        for piece, (flat, _) in zip(pieces, drawn, strict=True):
-            assert np.abs(piece[1:].ravel() - flat).max() <= off, character
+        drawn = [flat for flat, code in curves if code not in (Outline.MOVETO, Outline.CLOSEPOLY)]
+        ends = np.concatenate([piece[[0, -1]] for path in glyph_paths(character, file) for piece in path])
+        # FreeType rounds to 1/64 of a pixel, of which the font size has 100, and older versions to a unit of the font.
+        expected = np.array([flat[-2:] for flat in drawn])
+        away = np.linalg.norm(ends[:, None] - expected, axis=2)
+        assert away.min(axis=0).max() < 1.1e-3, character
+        assert away.min(axis=1).max() < 1.1e-3, character
 
 
-def test_odd_fonts_are_read_without_a_word():
+def test_fonts_with_cubic_curves(tmp_path):
+    """A font in the format of PostScript (CFF), whose one letter is a circle of four cubic curves."""
+    from fontTools.fontBuilder import FontBuilder
+    from fontTools.pens.t2CharStringPen import T2CharStringPen
+
+    pen = T2CharStringPen(500, None)
+    r, k = 400, 400 * 0.5522847
+    pen.moveTo((r, 0))
+    for turn in (1, 1j, -1, -1j):
+        corners = [(r + 1j * k) * turn, (k + 1j * r) * turn, 1j * r * turn]
+        pen.curveTo(*((z.real, z.imag) for z in corners))
+    pen.closePath()
+    builder = FontBuilder(1000, isTTF=False)
+    builder.setupGlyphOrder([".notdef", "o"])
+    builder.setupCharacterMap({ord("o"): "o"})
+    empty = T2CharStringPen(500, None).getCharString()
+    builder.setupCFF("Circle", {}, {".notdef": empty, "o": pen.getCharString()}, {})
+    builder.setupHorizontalMetrics({".notdef": (500, 0), "o": (500, 0)})
+    builder.setupHorizontalHeader()
+    builder.setupPost()
+    builder.save(tmp_path / "circle.otf")
+    (circle,) = targets.letter("o", tmp_path / "circle.otf", tolerance=1e-5)
+    assert np.hypot(*circle.T) == pytest.approx(np.full(len(circle), 0.4), abs=1e-3)
+    assert targets.signed_area(circle) == pytest.approx(0.16 * np.pi, rel=1e-3)
+
+
+def test_unusual_fonts_cause_no_warning():
     code = """if True:
         import matplotlib
         from quasiharmonic.targets import letter
@@ -431,26 +453,18 @@ def test_odd_fonts_are_read_without_a_word():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stderr == ""
 
 
-def test_no_font_is_asked_for_what_is_laid_out_by_rules_of_its_own(tmp_path):
-    from matplotlib import get_data_path
-
-    file = Path(get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf")
-    assert truetype.glyph(file, "R") is not None
-    for character in "\u0301\u05d0\u0628\ufb01\u00ad":
-        assert truetype.glyph(file, character) is None
-
-
 @pytest.mark.parametrize("cut", [0, 3, 11, 40, 300, 5000, 100_000])
-def test_a_damaged_font_is_left_to_freetype(tmp_path, cut):
+def test_a_damaged_font_is_an_error(tmp_path, cut):
     from matplotlib import get_data_path
 
     data = Path(get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf").read_bytes()
     (tmp_path / "cut.ttf").write_bytes(data[:cut])
-    assert truetype.glyph(tmp_path / "cut.ttf", "R") is None
+    with pytest.raises(ValueError, match=r"cut\.ttf is not a readable font"):
+        targets.letter("R", tmp_path / "cut.ttf")
 
 
-def test_a_damaged_font_hangs_nobody(tmp_path, rng):
-    """Bytes changed at random, in the tables and their directory: an outline, or none."""
+def test_a_damaged_font_causes_no_endless_loop(tmp_path, rng):
+    """Bytes are changed at random, in the tables and their directory: the result is an outline or a ValueError."""
     from matplotlib import get_data_path
 
     data = bytearray(Path(get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf").read_bytes())
@@ -459,4 +473,5 @@ def test_a_damaged_font_hangs_nobody(tmp_path, rng):
         for at in rng.integers(0, 400, 5).tolist() + rng.integers(0, len(data), 50).tolist():
             spoilt[at] = int(rng.integers(256))
         (tmp_path / "spoilt.ttf").write_bytes(spoilt)
-        truetype.glyph(tmp_path / "spoilt.ttf", "R")
+        with contextlib.suppress(ValueError):
+            glyph_paths("R", tmp_path / "spoilt.ttf")

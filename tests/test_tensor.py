@@ -1,4 +1,4 @@
-"""ξ → μ → 𝒜 against eq. 33 written out, and its derivatives against differences."""
+"""ξ → μ → 𝒜 against eq. 33, and its derivatives against differences."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TestField:
         np.testing.assert_array_equal(field.entries(), [[1] * 3, [0] * 3, [1] * 3])
         assert np.all(np.isfinite(field.pull(np.ones(3, dtype=complex))))
 
-    def test_stays_definite_up_to_its_bound(self, parameterisation, rng):
+    def test_stays_positive_definite_up_to_its_bound(self, parameterisation, rng):
         xi = parameterisation.bound * np.exp(2j * np.pi * rng.random(2000))
         for a11, a12, a22 in parameterisation.field(xi).entries().T:
             assert Fraction(a11) * Fraction(a22) > Fraction(a12) ** 2
@@ -78,7 +78,7 @@ class TestField:
 
 
 def test_rotating_xi_rotates_the_gradient_field(rng):
-    """No direction is special: a frame turned by φ turns ξ by 2φ and leaves the tensor what it was."""
+    """All directions are equal: a frame rotated by φ rotates ξ by 2φ and leaves the tensor unchanged."""
     xi = rng.standard_normal(30) + 1j * rng.standard_normal(30)
     for parameterisation in BOTH:
         turned = parameterisation.field(xi * np.exp(0.8j))
@@ -86,12 +86,12 @@ def test_rotating_xi_rotates_the_gradient_field(rng):
         np.testing.assert_allclose(turned.defect, parameterisation.field(xi).defect, rtol=1e-12)
 
 
-def test_defect_keeps_its_digits_where_mu_rounds_to_one():
+def test_determinant_defect_keeps_its_digits_where_mu_rounds_to_one():
     field = TANH.field(np.array([9.0 + 0j]))
     assert field.defect[0] == pytest.approx(1 / np.cosh(9.0) ** 2, rel=1e-13)
     assert SI_LOG.field(np.array([1e90 + 0j])).defect[0] > 0
 
 
-def test_a_derivative_next_to_nothing_divides_nothing():
+def test_an_almost_zero_derivative_causes_no_division_by_zero():
     p, q = np.array([[5e-324, 1e-310j, 1e-300, 2.0, 0], [5e-324, 1e-309, 5e-301, 1j, 0]], dtype=complex)
     np.testing.assert_allclose(own_tensor(p, q), [0, 0, 0.5, 0.5j, 0])

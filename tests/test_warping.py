@@ -1,4 +1,4 @@
-"""Pictures warped without folds."""
+"""Images warped without folds."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from quasiharmonic.energies.bending import Plate, Pull
 
 
 def blobs(height, width, centres):
-    """A picture of small bright spots."""
+    """Return an image of small bright spots."""
     y, x = np.mgrid[:height, :width]
     return sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 8) for a, b in centres)
 
 
-def test_landmarks_arrive_and_the_border_stays():
+def test_landmarks_reach_their_targets_and_the_border_stays():
     before = np.array([(30, 30), (70, 40), (50, 60)], dtype=float)
     after = np.array([(40, 22), (60, 55), (30, 68)], dtype=float)
     image = blobs(90, 100, before)
@@ -37,7 +37,7 @@ def test_landmarks_that_pass_each_other():
     assert warped.result.certificate.bijective
 
 
-def test_no_landmark_moved_is_the_same_picture():
+def test_without_moved_landmarks_the_image_does_not_change():
     rng = np.random.default_rng(5)
     for image in (rng.integers(0, 255, (33, 48, 3), dtype=np.uint8), rng.normal(size=(40, 30)).astype(np.float32)):
         points = [[11.5, 9.25], [20, 20]]
@@ -56,7 +56,7 @@ def test_a_moved_boundary():
     image = np.tile(np.arange(1, 65, dtype=np.int16), (64, 1))
     drawn = warp_along(image, points * 63, F, moved.points * 63)
     assert drawn.dtype == np.int16
-    # What was pushed away is empty, the rest is not, and the lower side is as it was.
+    # The vacated area is empty, the rest is not, and the lower side has not changed.
     assert (drawn[60:, 20:44] == 0).all()
     assert (drawn[:30] > 0).all()
     assert np.array_equal(drawn[0], image[0])
@@ -73,7 +73,7 @@ def test_another_shape():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(30, 1000), (1000, 30)])
-def test_narrow_pictures_leave_a_way(shape):
+def test_narrow_images_can_be_warped(shape):
     size = np.array(shape[::-1]) - 1.0
     along = np.where(size > 100, 0.2, 0.1)
     warped = warp_by_landmarks(np.zeros(shape, np.uint8), [0.5 * size], [(0.5 + along) * size])
@@ -82,9 +82,9 @@ def test_narrow_pictures_leave_a_way(shape):
 
 
 @pytest.mark.slow
-def test_landmarks_on_the_border_take_it_along():
+def test_landmarks_on_the_border_move_it():
     image = np.tile(np.arange(1, 65, dtype=np.int16), (64, 1))
-    # The lower side bends up, the right upper corner comes in; the left side stays.
+    # The lower side bends up, the right upper corner moves in; the left side stays.
     before = [[31.5, 63], [63, 0], [20, 20]]
     after = [[31.5, 40], [50, 5], [22, 20]]
     warped = warp_by_landmarks(image, before, after)
@@ -93,7 +93,7 @@ def test_landmarks_on_the_border_take_it_along():
         assert warped.positions[(warped.points == start).all(axis=1)].tolist() == [end]
     left = warped.points[:, 0] == 0
     assert np.array_equal(warped.positions[left], warped.points[left])
-    # Straight from the corner, which stays, to the landmark.
+    # A straight line from the corner, which stays, to the landmark.
     lower = (warped.points[:, 1] == 63) & (warped.points[:, 0] <= 31.5)
     assert warped.positions[lower, 1] == pytest.approx(63 - 23 * warped.points[lower, 0] / 31.5)
     assert warped.positions[lower, 0] == pytest.approx(warped.points[lower, 0])
@@ -104,7 +104,7 @@ def test_landmarks_on_the_border_take_it_along():
 
 
 @pytest.mark.parametrize("shape", [None, (300, 500)])
-def test_filled_triangles_are_as_located_ones(shape, monkeypatch):
+def test_rasterised_triangles_agree_with_located_points(shape, monkeypatch):
     rng = np.random.default_rng(2)
     image = rng.normal(size=(200, 300))
     points, F = surfaces.grid(4, 4)
@@ -112,13 +112,13 @@ def test_filled_triangles_are_as_located_ones(shape, monkeypatch):
     moved = morph(points, F, upper, points[upper] + [0.1, -0.2]).points
     size = (299, 199)
     quick = warp_along(image, points * size, F, moved * size, shape=shape)
-    monkeypatch.setattr("quasiharmonic.apps.warping.warping.LARGE", np.inf)
+    monkeypatch.setattr("quasiharmonic.apps.warping.image_warp.LARGE", np.inf)
     slow = warp_along(image, points * size, F, moved * size, shape=shape)
     assert np.array_equal(quick == 0, slow == 0)
     assert quick == pytest.approx(slow, abs=1e-9)
 
 
-def test_points_without_a_place_are_named():
+def test_points_without_a_position_are_named():
     points = np.array([[0, 0], [3, 0], [3, 3], [0, 3.0]])
     lost = points.copy()
     lost[2, 1] = np.nan
@@ -128,7 +128,7 @@ def test_points_without_a_place_are_named():
 
 
 @pytest.mark.slow
-def test_a_warp_that_cannot_be_says_what_to_do():
+def test_an_impossible_warp_has_advice():
     with pytest.raises(RuntimeError, match="Move them less, or give more landmarks"):
         warp_by_landmarks(np.zeros((50, 50)), [[31.5, 49], [20, 20]], [[31.5, 30], [31.5, 40]])
 
@@ -148,19 +148,19 @@ def test_a_warp_that_cannot_be_says_what_to_do():
         ((np.zeros((9, 9)), [[1, 1]], [[1, 1], [2, 2]]), "as many rows"),
     ],
 )
-def test_wrong_input(arguments, message):
+def test_invalid_input(arguments, message):
     with pytest.raises(ValueError, match=message):
         warp_by_landmarks(*arguments)
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (5, -1)])
-def test_pictures_without_extent(shape):
+def test_images_without_extent(shape):
     V, F = surfaces.grid(3, 3)
-    with pytest.raises(ValueError, match=rf"shape must be positive, not \({shape[0]}, {shape[1]}\)"):
+    with pytest.raises(ValueError, match=rf"shape must be two positive integers, not \({shape[0]}, {shape[1]}\)"):
         warp_along(np.zeros((9, 9)), V, F, V, shape=shape)
 
 
-def test_a_map_with_folds_is_refused():
+def test_a_map_with_inverted_triangles_is_rejected():
     points = np.array([[0, 0], [3, 0], [3, 3], [0, 3.0]])
     with pytest.raises(ValueError, match="no inverse"):
         warp_along(np.zeros((4, 4)), points, [[0, 1, 2], [0, 2, 3]], points[::-1])
@@ -184,7 +184,7 @@ def test_stretch_does_not_grow_with_the_resolution():
 def test_a_slight_warp_is_a_thin_plate_with_a_pin():
     at, by = np.array([40.0, 60.0]), np.array([0.5, 0.2])
     warped = warp_by_landmarks(np.zeros((101, 101)), [at], [at + by], smoothness=1e4, resolution=48)
-    # Navier's series of a hinged square plate under a force at one point, over its value there.
+    # Navier's series of a hinged square plate under a force at one point, relative to its value there.
     k = np.arange(1, 120)
     modes = np.sin(np.pi * k * warped.points[:, :, None] / 100)
     force = np.sin(np.pi * k * at[:, None] / 100)
@@ -194,7 +194,7 @@ def test_a_slight_warp_is_a_thin_plate_with_a_pin():
     assert warped.positions - warped.points == pytest.approx(lift[:, None] * by, abs=2e-3)
 
 
-def test_soft_landmarks_give_way():
+def test_soft_landmarks_may_miss_their_targets():
     before, after = [[30, 30], [50, 30]], [[45, 30], [32, 33]]
     missed = []
     for weight in (1, 100, 1e4, np.inf):
@@ -203,13 +203,13 @@ def test_soft_landmarks_give_way():
         assert warped.positions[-1].tolist() == after[1]
         missed.append(np.hypot(*(warped.positions[-2] - after[0])))
     assert missed[0] > 1.5 * missed[1] > 20 * missed[2] > missed[3] == 0
-    # Two that want the same place each get near it.
+    # Two landmarks with the same target both come close to it.
     both = warp_by_landmarks(np.zeros((61, 81)), before, [[40, 30], [40, 30]], weights=[1e3, 1e3], resolution=24)
     assert both.result.certificate.bijective
     assert np.abs(both.positions[-2:] - (40, 30)).max() < 3
 
 
-def test_curves_go_to_curves():
+def test_curves_are_mapped_to_curves():
     t = np.linspace(0, 1, 40)
     line = np.stack([20 + 50 * t, 0 * t + 40], axis=1)
     bow = np.stack([25 + 40 * t, 40 - 15 * np.sin(np.pi * t)], axis=1)
@@ -222,21 +222,21 @@ def test_curves_go_to_curves():
     assert warped.positions[(warped.points == (20, 20)).all(axis=1)].tolist() == [[25, 22]]
     on_line = (warped.points[:, 1] == 40) & (np.abs(warped.points[:, 0] - 45) <= 25)
     assert np.count_nonzero(on_line) > 15
-    # Equal parts of the one go to equal parts of the other.
+    # Equal parts of one curve are mapped to equal parts of the other.
     arc = np.append(0, np.cumsum(np.hypot(*np.diff(bow, axis=0).T)))
     part = (warped.points[on_line, 0] - 20) / 50 * arc[-1]
     expected = np.stack([np.interp(part, arc, bow[:, axis]) for axis in (0, 1)], axis=1)
     assert warped.positions[on_line] == pytest.approx(expected, abs=0.05)
 
 
-def test_one_landmark_or_two_are_enough():
+def test_one_or_two_landmarks_suffice():
     for before, after in (([[30, 20]], [[38, 25]]), ([[30, 20], [12, 30]], [[38, 25], [12, 22]])):
         warped = warp_by_landmarks(np.zeros((41, 51)), before, after, resolution=16)
         assert warped.result.certificate.bijective
         assert warped.positions[-len(after) :].tolist() == after
 
 
-def test_the_plate_has_the_gradient_it_says():
+def test_the_plate_energy_has_the_stated_gradient():
     V, F = surfaces.grid(5, 4)
     dice = np.random.default_rng(0)
     plate = Plate(V, F, np.array([7, 8, 13]), 0.3, Pull(np.array([8]), np.array([[0.4, 0.1]]), np.array([2.0])))
@@ -262,11 +262,11 @@ def test_the_plate_has_the_gradient_it_says():
         ({"curves": [([[1, 1], [5, 1]], [[1, 1], [2, 20]])]}, "curve 0, after: points .* not inside the image"),
     ],
 )
-def test_wrong_landmark_options(options, message):
+def test_invalid_landmark_options(options, message):
     with pytest.raises(ValueError, match=message):
         warp_by_landmarks(np.zeros((9, 9)), [[4, 4]], [[5, 4]], **options)
 
 
-def test_soft_landmarks_on_the_border_are_refused():
+def test_soft_landmarks_on_the_border_are_rejected():
     with pytest.raises(ValueError, match="weights: landmark 0 on the border"):
         warp_by_landmarks(np.zeros((9, 9)), [[0, 4]], [[0, 5]], weights=[3])

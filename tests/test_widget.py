@@ -18,7 +18,7 @@ PROBLEM = Problem(V, F, LOOP, V[LOOP] * (1 + 0.3 * V[LOOP, :1]))
 
 
 class Cell:
-    """Where the widget is shown: keeps what it sends, and hands a view's messages over as the kernel does."""
+    """Display of the widget: stores what it sends, and passes a view's messages on like the kernel."""
 
     def __init__(self, monkeypatch):
         pytest.importorskip("anywidget")
@@ -33,7 +33,7 @@ class Cell:
         return self.widget
 
     def hear(self, *buffers):
-        """What a view's message is answered by: the frames."""
+        """Return the frames that answer a view's message."""
         self.frames.clear()
         self._listeners[-1](self.widget, {}, list(buffers))
         return [(content, decode(data)) for content, data in self.frames]
@@ -47,7 +47,7 @@ def cell(monkeypatch):
     return Cell(monkeypatch)
 
 
-def test_a_problem_is_shown_solved(cell):
+def test_a_displayed_problem_is_solved(cell):
     widget = cell.show(PROBLEM)
     assert widget.result.injective
     np.testing.assert_array_equal(widget.vertices, np.arange(len(V)))
@@ -57,7 +57,7 @@ def test_a_problem_is_shown_solved(cell):
     assert "<img" in widget.result._repr_html_()
 
 
-def test_a_view_that_comes_later_is_told_all(cell):
+def test_a_later_view_receives_everything(cell):
     cell.show(PROBLEM)
     for _ in range(2):
         answered = cell.does("show")
@@ -70,7 +70,7 @@ def test_a_view_that_comes_later_is_told_all(cell):
         np.testing.assert_allclose(places, cell.widget.result.uv, atol=1e-6)
 
 
-def test_the_map_follows_the_hand(cell):
+def test_the_map_follows_the_pointer(cell):
     widget = cell.show(PROBLEM)
     before, vertex = widget.result, int(LOOP[4])
     start = before.uv[vertex]
@@ -83,12 +83,12 @@ def test_the_map_follows_the_hand(cell):
         assert frame.header["injective"]
         assert certify(F, uv).injective
         np.testing.assert_allclose(uv[vertex] + frame.header["origin"], to, atol=1e-6)
-    # While the hand moves, the result is the last map at rest.
+    # During a drag, the result is the last map before it.
     np.testing.assert_array_equal(widget.result.uv, before.uv)
     cell.does("drop")
     assert widget.result.certificate.bijective
     np.testing.assert_allclose(widget.result.uv[vertex], to, atol=1e-12)
-    # What is at hand is what anybody else finds.
+    # The result equals that of a separate solve.
     np.testing.assert_array_equal(widget.problem.target, widget.result.uv[widget.problem.fixed])
     assert solve(widget.problem).injective
     widget.undo()
@@ -97,7 +97,7 @@ def test_the_map_follows_the_hand(cell):
     np.testing.assert_allclose(widget.result.uv[vertex], to, atol=1e-12)
 
 
-def test_what_the_kernel_asks_for(cell):
+def test_requests_of_the_kernel(cell):
     widget = cell.show(V, F)
     first = widget.result
     np.testing.assert_allclose(np.ptp(first.uv, axis=0), 1, atol=1e-12)
@@ -112,7 +112,7 @@ def test_what_the_kernel_asks_for(cell):
     assert widget.result.injective, "as it was"
 
 
-def test_what_no_view_would_say(cell):
+def test_invalid_messages(cell):
     cell.show(PROBLEM)
     for buffers in ((), (b"nothing",), (b"\xff" * 40,)):
         ((content, frame),) = cell.hear(*buffers)
@@ -143,12 +143,12 @@ def test_every_kind_of_surface(cell, tmp_path):
         ((np.concatenate([V, V + 9]), np.concatenate([F, F + len(V)])), "2 pieces"),
     ],
 )
-def test_what_is_no_surface(cell, surface, message):
+def test_invalid_surfaces(cell, surface, message):
     with pytest.raises((ValueError, OSError), match=message):
         cell.show(*surface)
 
 
-def test_one_module_with_all_of_the_view_in_it():
+def test_the_view_is_one_module():
     code = bundle("widget")
     assert "import " not in code.replace("// ", "")
     assert code.count("export") == 1

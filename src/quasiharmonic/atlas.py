@@ -1,7 +1,25 @@
 """Maps with seams, island by island: the public names of `quasiharmonic.apps.atlas`."""
 
-from quasiharmonic.apps import atlas as _package
-from quasiharmonic.apps.atlas import *  # noqa: F403
+from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict, IslandVerdict, certify
+from quasiharmonic.apps.atlas.island_functions import flatten, harmonise, injective_map, pack, polish
+from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland
+from quasiharmonic.apps.atlas.packing.pack import Packing, Placement, pack_charts
+from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 
-__all__: list[str] = []
-__all__ += _package.__all__
+__all__ = [
+    "AtlasVerdict",
+    "Island",
+    "IslandVerdict",
+    "MappedAtlas",
+    "MappedIsland",
+    "Packing",
+    "Placement",
+    "SeamedMesh",
+    "certify",
+    "flatten",
+    "harmonise",
+    "injective_map",
+    "pack",
+    "pack_charts",
+    "polish",
+]

@@ -1,4 +1,4 @@
-"""A server of the page and a browser to open it with: Debian's Chromium, driven by Playwright."""
+"""A studio server and a browser to open it with: Debian's Chromium, driven by Playwright."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium")
-# WebGL is drawn by the processor, and nothing is asked of the net.
+# WebGL runs on the CPU, and the network is not used.
 ARGUMENTS = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
     *("--disable-background-networking", "--disable-component-update"),
@@ -21,7 +21,7 @@ ARGUMENTS = [
 
 @contextmanager
 def served(*arguments):
-    """The address of a page of ``qhm studio``."""
+    """Return the address of a page of ``qhm studio``."""
     command = [sys.executable, "-m", "quasiharmonic", "studio", "--no-browser", *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
@@ -46,7 +46,7 @@ def browser():
 
 @pytest.fixture(scope="session")
 def address(browser, tmp_path_factory):
-    """A server of a small surface, so that most of the time goes into the browser."""
+    """A server of a small surface, so that the browser takes most of the time."""
     from quasiharmonic.surfaces import cat
 
     V, F = cat(16)
@@ -59,7 +59,7 @@ def address(browser, tmp_path_factory):
 
 @pytest.fixture
 def opened(browser):
-    """Opens pages, each in a context of its own, and fails where one throws or asks the net for anything."""
+    """Open pages, each in a separate context, and fail if one raises an error or uses the network."""
     contexts, wrong = [], []
 
     def open_page(address, *, settled=True, query=""):
@@ -82,7 +82,7 @@ def opened(browser):
 
 
 def at_rest(page):
-    """Wait until the page shows a map at rest."""
+    """Wait until the page shows the final map."""
     page.wait_for_selector("body[data-state=settled]")
 
 

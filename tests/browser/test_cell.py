@@ -1,4 +1,4 @@
-"""The widget in a browser, a notebook's part played by the test: a hand moves the map by way of the kernel."""
+"""The widget in a browser. The test plays the notebook: dragging moves the map through the kernel."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from quasiharmonic.surfaces import cat
 from quasiharmonic.targets import boundary_to
 from quasiharmonic.ui import notebook
 
-# What anywidget hands to `render`: a model whose messages go to the kernel and back.
+# The argument of anywidget's `render`: a model whose messages go to the kernel and back.
 PAGE = """<!doctype html><meta charset="utf-8"><div id="cell" style="width: 900px"></div><script type="module">
 const listeners = [];
 const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -31,7 +31,7 @@ window.leave = widget.render({ model, el: document.getElementById("cell") });
 </script>"""
 
 
-def test_a_hand_in_a_cell_moves_the_map(browser, monkeypatch):
+def test_dragging_in_a_cell_moves_the_map(browser, monkeypatch):
     pytest.importorskip("anywidget")
     sent, listeners = [], []
     monkeypatch.setattr(
@@ -54,7 +54,7 @@ def test_a_hand_in_a_cell_moves_the_map(browser, monkeypatch):
     line = page.get_by_role("status")
     line.get_by_text("Bijective").wait_for(timeout=60_000)
     picture = page.screenshot()
-    # The square is in the middle of its pane, and 0.84 of its height: this is the middle of its left side.
+    # The square is centred in its pane and has 0.84 of its height; this is the middle of its left side.
     box = page.locator(".qhm-map").bounding_box()
     x, y = box["x"] + box["width"] / 2 - 0.42 * box["height"], box["y"] + box["height"] / 2
     page.mouse.move(x, y)
@@ -69,7 +69,7 @@ def test_a_hand_in_a_cell_moves_the_map(browser, monkeypatch):
             break
     moved = widget.result.uv - before
     assert certify(F, widget.result).bijective
-    # To the right by 48 of the pixels of which 0.84 of the pane's height are one.
+    # Move right by 48 pixels; 0.84 of the pane's height has length one.
     assert moved[:, 0].max() == pytest.approx(48 / (0.84 * box["height"]), rel=0.1)
     assert np.abs(moved[:, 1]).max() < 0.5 * moved[:, 0].max()
     assert page.screenshot() != picture

@@ -1,4 +1,4 @@
-"""The page in a browser: everything that a visitor does with it, and what bad input gets."""
+"""The page in a browser: every action of a visitor, and invalid input."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, io
-from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.problem.certification import is_injective
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
 
-# The maps that the page has shown, with what it said of them at that moment.
+# The maps that the page has shown, and its status text at that time.
 RECORD = """() => {
   const view = studio.view, receive = view.receive.bind(view);
   window.seen = [];
@@ -28,7 +28,7 @@ RECORD = """() => {
 
 
 def until(page, expression, seconds=60):
-    """Wait for something; the page itself is allowed to evaluate no words."""
+    """Wait for a condition; the page's security policy forbids evaluating strings."""
     end = time.monotonic() + seconds
     while not page.evaluate(expression):
         assert time.monotonic() < end, expression
@@ -40,7 +40,7 @@ def triangles(page):
 
 
 def point_of(page, vertex):
-    """Where a vertex of the map is on the screen."""
+    """Return the screen position of a vertex of the map."""
     x, y = page.evaluate("v => studio.view.hands.plane.pointOf(...studio.view.scene.placeOf(v))", vertex)
     box = page.locator("#view").bounding_box()
     return box["x"] + x, box["y"] + y
@@ -51,7 +51,7 @@ def corner(page, number):
 
 
 def drag(page, vertex, path, *, release=True):
-    """Take hold of a vertex and move along a path on the screen, relative to where it is."""
+    """Grab a vertex and move along a path on the screen, relative to its position."""
     x, y = point_of(page, vertex)
     page.mouse.move(x, y)
     page.mouse.down()
@@ -68,7 +68,7 @@ def wait_for_new_rest(page, settled):
 
 
 def deed(page, settled, do):
-    """Do something and wait for the map that comes of it."""
+    """Do something and wait for the resulting map."""
     page.evaluate("document.body.dataset.state = 'asked'")
     do()
     settled(page)
@@ -83,7 +83,7 @@ def first_visit(page):
     assert "no inverted triangle, no overlap" in page.inner_text("#verdict")
     assert "orange corner" in page.inner_text("#hint")
     assert "qhm map cat.obj --to rect:1x1" in page.inner_text("#command")
-    # Something is drawn on both sides.
+    # Both panes contain drawings.
     drawn = page.evaluate("""() => {
       const canvas = studio.view.picture(), context = canvas.getContext("2d");
       return [0.25, 0.75].map(x => {
@@ -94,7 +94,7 @@ def first_visit(page):
     assert min(drawn) > 20
 
 
-def test_the_map_follows_the_hand_without_a_flip_in_any_frame(address, opened, settled):
+def test_the_map_follows_the_pointer_without_inverted_triangles_in_any_frame(address, opened, settled):
     page = opened(address)
     page.evaluate(RECORD)
     vertex = corner(page, 2)
@@ -105,7 +105,7 @@ def test_the_map_follows_the_hand_without_a_flip_in_any_frame(address, opened, s
     assert len(seen) > 30
     assert all(one["injective"] and one["flips"] == 0 and one["reached"] for one in seen)
     uv = [np.array(one["places"]).reshape(-1, 2) for one in seen]
-    # In the single precision that is drawn, and of every picture.
+    # In the single precision of the drawing, and in every picture.
     assert all(is_injective(F, one) for one in uv)
     moved = np.ptp([one[vertex] for one in uv], axis=0)
     assert np.all(moved > 0.1)
@@ -113,12 +113,12 @@ def test_the_map_follows_the_hand_without_a_flip_in_any_frame(address, opened, s
 
 
 def grains(page):
-    """Pixels of the canvas of triangles, and of the one above it, in width."""
+    """Return the width in pixels of the canvas of triangles, and of the one above it."""
     return page.evaluate("Array.from(document.querySelectorAll('#view canvas'), canvas => canvas.width)")
 
 
 @pytest.mark.parametrize("milliseconds", [1000, 1])
-def test_pictures_are_coarser_only_while_the_hand_moves_and_drawing_is_slow(address, opened, settled, milliseconds):
+def test_pictures_are_coarser_only_during_a_drag_with_slow_drawing(address, opened, settled, milliseconds):
     page = opened(address)
     page.evaluate(f"Object.defineProperty(studio.view.clock, 'whole', {{ get: () => {milliseconds}, set() {{}} }})")
     whole = grains(page)
@@ -133,7 +133,7 @@ def test_pictures_are_coarser_only_while_the_hand_moves_and_drawing_is_slow(addr
         page.evaluate("new Promise(drawn => requestAnimationFrame(drawn))")
         seen.append(grains(page))
     assert (min(seen)[0] < whole[0] / 2) == (milliseconds > 100)
-    # What is red is not coarse at any time.
+    # Red triangles are never coarse.
     red = "(view => view.show(view.scene.places, new Uint32Array([0])))(studio.view)"
     picture = "new Promise(drawn => requestAnimationFrame(() => drawn(document.querySelector('#view canvas').width)))"
     assert page.evaluate(f"{red}, {picture}") == whole[0]
@@ -205,7 +205,7 @@ def test_an_svg_dropped_on_the_page_and_a_polygon_drawn_by_hand(address, opened,
     assert "no inverted triangle" in page.inner_text("#verdict")
 
 
-def test_corners_by_hand_free_boundary_polish_and_slide(address, opened, settled):
+def test_dragged_corners_free_boundary_polish_and_slide(address, opened, settled):
     page = opened(address)
     page.check("input[value=corner]")
     box = page.locator(".qhm-surface").bounding_box()
@@ -228,7 +228,7 @@ def test_an_outline_that_crosses_itself_is_explained(address, opened, settled):
     vertex = corner(page, 2)
     x, y = point_of(page, vertex)
     far_x, far_y = point_of(page, corner(page, 0))
-    # Across the left side, which the outline then crosses twice.
+    # Across the left side, so that the outline crosses it twice.
     goal = far_x - x - 120, (far_y - y) / 2
     deed(page, settled, lambda: drag(page, vertex, [(goal[0] * k / 12, goal[1] * k / 12) for k in range(1, 13)]))
     words = page.inner_text("#verdict")
@@ -239,7 +239,7 @@ def test_an_outline_that_crosses_itself_is_explained(address, opened, settled):
     page.locator("#obstructions button").first.click()
     marked = page.evaluate("studio.view.scene.obstruction")
     assert marked["edges"] or marked["vertices"]
-    # What was not certified was never called so.
+    # The page never reported an uncertified map as certified.
     F = triangles(page)
     for one in page.evaluate("seen"):
         uv = np.array(one["places"]).reshape(-1, 2)
@@ -250,7 +250,7 @@ def test_an_outline_that_crosses_itself_is_explained(address, opened, settled):
     assert not page.is_visible("#why")
 
 
-def test_the_keyboard_does_it_too(address, opened, settled):
+def test_the_keyboard_moves_vertices(address, opened, settled):
     page = opened(address)
     page.focus(".qhm-map")
     page.keyboard.press("n")
@@ -258,7 +258,7 @@ def test_the_keyboard_does_it_too(address, opened, settled):
     assert vertex == corner(page, 0)
     before = page.evaluate("v => studio.view.scene.placeOf(v)", vertex)
     deed(page, settled, lambda: [page.keyboard.press("ArrowLeft") for _ in range(3)])
-    # Steps taken faster than maps come are all taken.
+    # Steps that are faster than maps are all applied.
     until(page, f"studio.view.scene.placeOf({vertex})[0] < {before[0] - 0.059}")
     settled(page)
     page.focus(".qhm-surface")
@@ -267,7 +267,7 @@ def test_the_keyboard_does_it_too(address, opened, settled):
 
 
 @pytest.mark.slow
-def test_two_thousand_frames_leave_no_growth(address, opened):
+def test_two_thousand_frames_leak_no_memory(address, opened):
     page = opened(address)
     vertex = corner(page, 2)
     session = page.context.new_cdp_session(page)
@@ -289,7 +289,7 @@ def test_two_thousand_frames_leave_no_growth(address, opened):
             k += 1
         page.mouse.up()
         page.wait_for_timeout(1500)
-        # What is kept for the film is meant to grow, up to its limit.
+        # The memory of the film may grow, up to its limit.
         page.evaluate("studio.film.clear()")
 
     rounds(100)
@@ -313,13 +313,13 @@ def test_the_film_keeps_the_maps(address, opened, settled, tmp_path):
     assert (tmp_path / "map.webm").read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
 
 
-def test_files_that_are_none_or_too_large_are_told_and_the_page_goes_on(address, opened, settled, tmp_path):
+def test_invalid_or_large_files_are_reported_and_the_page_continues(address, opened, settled, tmp_path):
     page = opened(address)
     (tmp_path / "notes.obj").write_text("Dear diary,\n" * 50)
     page.set_input_files("#open", tmp_path / "notes.obj")
     page.wait_for_selector("#note:not([hidden])")
     assert "notes.obj" in page.inner_text("#note")
-    # Four million triangles, as a binary STL has them: refused by their bytes, before they are sent.
+    # Four million triangles, as in a binary STL: rejected by their size before they are sent.
     with (tmp_path / "huge.stl").open("wb") as file:
         file.write(bytes(80) + (4_000_000).to_bytes(4, "little"))
         file.truncate(84 + 50 * 4_000_000)
@@ -330,7 +330,7 @@ def test_files_that_are_none_or_too_large_are_told_and_the_page_goes_on(address,
     assert "no inverted triangle" in page.inner_text("#verdict")
 
 
-def test_a_surface_of_the_visitors(address, opened, settled, tmp_path):
+def test_a_surface_of_the_visitor(address, opened, settled, tmp_path):
     page = opened(address)
     from quasiharmonic.surfaces import starfish
 
@@ -344,17 +344,17 @@ def test_a_surface_of_the_visitors(address, opened, settled, tmp_path):
     assert "--cut" in page.inner_text("#command")
 
 
-def test_two_pages_and_a_server_that_goes(opened, settled, serving):
+def test_two_pages_and_a_server_that_stops(opened, settled, serving):
     with serving() as address:
         one, other = opened(address), opened(address)
         one.select_option("#shape", "disk")
         deed(one, settled, lambda: one.click("#outline button"))
         assert "disk" in one.inner_text("#command")
         assert "rect:1x1" in other.inner_text("#command")
-        # In mid-drag.
+        # During a drag.
         drag(other, corner(other, 0), [(-5, 5), (-9, 9)], release=False)
     other.wait_for_selector("body[data-state=gone]")
-    assert "Cut off" in other.inner_text("#verdict")
+    assert "Disconnected" in other.inner_text("#verdict")
     other.mouse.move(300, 300)
     other.mouse.up()
 

@@ -1,4 +1,4 @@
-"""Maps as functions of JAX: its own check of gradients, jit, vmap, batches, and what is refused."""
+"""Maps as functions of JAX: its own gradient check, jit, vmap, batches, and errors."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from quasiharmonic.apps.gradients.layers import FlattenLayer, PolishedLayer
-from shared.differentiated import flattened_ring, held_ring, tensors
+from quasiharmonic.apps.gradients.layers import FlattenLayer, PolishLayer
+from shared.derivative_problems import flattened_ring, held_ring, tensors
 
 jax = pytest.importorskip("jax")
 layers = pytest.importorskip("quasiharmonic.jax")
@@ -16,7 +16,7 @@ layers = pytest.importorskip("quasiharmonic.jax")
 
 @pytest.fixture(autouse=True)
 def double():
-    """In double precision, as the maps are."""
+    """In double precision, like the maps."""
     jax.config.update("jax_enable_x64", True)
     yield
     jax.config.update("jax_enable_x64", False)
@@ -53,7 +53,7 @@ def test_flat_maps(pins):
         return
 
     def shape(rest):
-        # What does not depend on where the map lies.
+        # A loss that does not depend on the position of the map.
         uv = layers.flatten(rest, F)
         return jax.numpy.sum((uv[..., F, :] - uv[..., np.roll(F, 1, axis=1), :]) ** 2, axis=-1)
 
@@ -78,7 +78,7 @@ def test_vmap_is_a_batch():
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_vmap_over_one_argument_of_a_batch_over_another(count):
-    """Three targets within, tensors outside: as many as there are targets, or another number."""
+    """Three targets inside, and tensors outside: as many as there are targets, or another number."""
     problem = held_ring()
     targets = np.stack([problem.target, 1.1 * problem.target, 0.9 * problem.target])
     mu = np.stack([0.2 * (k + 1) * tensors(len(problem.F)) for k in range(count)])
@@ -93,7 +93,7 @@ def test_vmap_over_one_argument_of_a_batch_over_another(count):
 
 
 def test_programs_are_compiled_once():
-    """Layers that are made anew in each turn of a loop, of the same settings, are the same to JAX."""
+    """Layers that are made in each iteration of a loop with the same settings are equal for JAX."""
     problem = held_ring()
     V, F, _, _, _ = flattened_ring()
     traced = []
@@ -104,15 +104,15 @@ def test_programs_are_compiled_once():
         return 0
 
     for _ in range(3):
-        program(PolishedLayer(problem, "mips", False, 1.0 * V, "auto"))
+        program(PolishLayer(problem, "mips", False, 1.0 * V, "auto"))
         program(FlattenLayer.of(V, F.copy(), None, None, energy="mips", weights=None, start=None, solver="auto"))
     assert len(traced) == 2
-    program(PolishedLayer(problem, "mips", False, 1.1 * V, "auto"))
-    program(PolishedLayer(held_ring(), "mips", False, 1.0 * V, "auto"))
+    program(PolishLayer(problem, "mips", False, 1.1 * V, "auto"))
+    program(PolishLayer(held_ring(), "mips", False, 1.0 * V, "auto"))
     assert len(traced) == 4
 
 
-def test_more_maps_than_derivatives_are_kept():
+def test_more_maps_than_derivatives_are_cached():
     problem = held_ring()
     targets = np.stack([(1 + 0.01 * k) * problem.target for k in range(20)])
     gradient = jax.grad(lambda target: (layers.injective_map(problem, target=target) ** 2).sum())(targets)
@@ -120,7 +120,7 @@ def test_more_maps_than_derivatives_are_kept():
     assert np.allclose(gradient[0], first, rtol=1e-8)
 
 
-def test_what_is_refused():
+def test_errors():
     problem = held_ring()
     with pytest.raises(ValueError, match=r"batch shapes must be broadcastable, not mu \(2,\), target \(3,\)"):
         layers.quasi_harmonic_map(
@@ -141,7 +141,7 @@ def test_what_is_refused():
         layers.injective_map(problem, target=problem.target)
 
 
-def test_a_map_that_is_not_found_says_which():
+def test_the_error_for_a_map_that_is_not_found_names_it():
     problem = held_ring()
     mirrored = np.stack([problem.target, problem.target * [1, -1]])
     with pytest.raises(Exception, match="no injective map was found") as caught:

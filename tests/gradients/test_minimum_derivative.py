@@ -13,7 +13,7 @@ from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Isotropic, SymmetricDirichlet
 from quasiharmonic.geometry.curves import Curve
 from quasiharmonic.surfaces import disk, grid
-from shared.differentiated import (
+from shared.derivative_problems import (
     aligned,
     flattened_ring,
     polished_ring,
@@ -23,7 +23,7 @@ from shared.differentiated import (
 
 
 class NeoHookean(Isotropic):
-    """An energy of a user's own."""
+    """A user's energy."""
 
     barrier = True
 
@@ -73,8 +73,8 @@ def test_flattened_against_differences(energy, pins):
     assert skew < 1e-11
 
 
-def test_a_flat_surface_that_is_given_units():
-    """Rest positions and map in units far from one another, and from 1."""
+def test_a_flat_surface_with_units():
+    """Rest positions and map in very different units, which also differ from 1."""
     V, F = ring()
     derivative = flatten_derivative(1e-7 * V, F, flatten(1e-7 * V, F).uv)
     moved = derivative.jvp(rest=V)
@@ -86,7 +86,7 @@ def test_a_flat_surface_that_is_given_units():
     assert np.allclose(other.vjp(uv).target, one.vjp(uv).target, rtol=1e-9, atol=1e-9)
 
 
-def test_a_free_map_is_the_nearest():
+def test_a_free_map_has_an_aligned_derivative():
     V, F, _, _, uv = flattened_ring()
     derivative = flatten_derivative(V, F, uv)
     moved = derivative.jvp(rest=np.random.default_rng(0).standard_normal(V.shape)) @ (1, 1j)
@@ -95,7 +95,7 @@ def test_a_free_map_is_the_nearest():
     size = np.abs(moved).sum()
     assert abs(moved.sum()) < 1e-12 * size
     assert abs(np.vdot(arms, moved).imag) < 1e-12 * size
-    # A gradient that only says where the map should lie is none.
+    # A gradient for the position of the map only has no effect.
     assert np.abs(derivative.vjp(np.stack([-arms.imag + 3, arms.real - 2], axis=1)).rest).max() < 1e-10
 
 
@@ -110,7 +110,7 @@ def test_conformal_maps_keep_the_surface_area():
 
 @pytest.fixture(scope="module")
 def dome():
-    """A disk that is no flat one, with two pins, mapped into the unit circle."""
+    """A curved disk with two pins, mapped into the unit circle."""
     V, F = disk(6)
     rng = np.random.default_rng(5)
     rim = np.arange(len(V) - 36, len(V))
@@ -140,15 +140,15 @@ def test_sliding_along_straight_sides():
     step[-2:] = 1e-5 * np.random.default_rng(0).standard_normal((2, 2))
     ahead, behind = (make(surface, uv[fixed[-2:]] + way * step[-2:]).uv for way in (1, -1))
     assert np.abs((ahead - behind) / 2 - here.jvp(target=step)).max() < 1e-7 * np.abs(step).max()
-    # Where vertices of the outline were put before they slid does not matter.
+    # The positions of boundary vertices before they slid do not matter.
     assert not here.vjp(here.uv).target[:-2].any()
-    # They have slid, and stay on their sides to the last bit.
+    # They have slid, and lie exactly on their sides.
     assert np.ptp(here.uv[boundary] - V[boundary]) > 1e-3
     assert ((here.uv[boundary] == V.min(axis=0)) | (here.uv[boundary] == V.max(axis=0))).any(axis=1).all()
 
 
 def test_sliding_along_a_circle(dome):
-    """The barrier that keeps edges near the circle has a hundredth of the energy's weight, taken as staying that."""
+    """The barrier that keeps edges near the circle has a hundredth of the energy's weight, treated as constant."""
     surface, F, fixed, uv = dome
     rails = BoundaryCurves([Curve.circle()])
     uv = polish(surface, F, uv, fixed=fixed, slide=rails).uv
@@ -162,17 +162,17 @@ def test_sliding_along_a_circle(dome):
 
 
 @pytest.mark.parametrize("width", [1.3, 1.5])
-def test_sliding_along_an_ellipse_comes_to_rest(dome, width):
-    """Parameters do not go evenly along it: the barrier's slopes are those of its values only if they are exact."""
+def test_sliding_along_an_ellipse_converges(dome, width):
+    """The parameters are uneven along it: gradients of the barrier match its values only if they are exact."""
     surface, F, fixed, _ = dome
     V, _ = disk(6)
     found = injective_map(surface, F, fixed, V[fixed] * [width, 0.8], polish="symmetric-dirichlet")
-    rails = BoundaryCurves([Curve.circle().transformed([[width, 0], [0, 0.8]])])
+    rails = BoundaryCurves([Curve.circle().transform([[width, 0], [0, 0.8]])])
     uv = polish(surface, F, found.uv, fixed=fixed, slide=rails).uv
     assert Doubt.NOT_AT_REST not in polish_derivative(surface, F, uv, fixed=fixed, slide=rails).doubts
 
 
-def test_the_map_is_at_rest_and_injective(dome):
+def test_the_map_is_converged_and_injective(dome):
     surface, F, fixed, uv = dome
     derivative = polish_derivative(surface, F, uv, fixed=fixed)
     assert certify(F, derivative.uv).injective
@@ -195,8 +195,8 @@ def test_a_map_that_was_not_found_has_no_derivative():
         polish_derivative(problem.V, problem.F, uv, fixed=problem.fixed).jvp(mu=np.zeros(len(problem.F)))
 
 
-def test_two_maps_that_are_as_good_make_it_doubtful():
-    """A strip pushed together a little gives way to either side; straight it is at rest, but not for long."""
+def test_two_equally_good_maps_make_the_derivative_doubtful():
+    """A slightly compressed strip buckles to either side; the straight strip is an unstable equilibrium."""
     V, F = grid(20, 4)
     V = (V - V.mean(axis=0)) * [1, 0.1]
     straight = V * [0.8, 1]
@@ -204,12 +204,12 @@ def test_two_maps_that_are_as_good_make_it_doubtful():
     derivative = flatten_derivative(V, F, straight, fixed=ends)
     assert Doubt.NOT_LEAST in derivative.doubts
     assert not derivative.reliable
-    # It is a derivative all the same.
+    # It is still a derivative.
     assert np.allclose(derivative.jvp(target=np.ones((ends.size, 2))), 1, atol=1e-6)
 
 
-def test_where_a_map_is_about_to_leap():
-    """Where a strip begins to give way straight and bent are the same; and a disk may turn in a circle."""
+def test_near_a_bifurcation_of_the_map():
+    """At the onset of buckling, straight and bent strips coincide; and a disk may rotate in a circle."""
     V, F = grid(20, 4)
     V = (V - V.mean(axis=0)) * [1, 0.1]
     ends = np.flatnonzero(np.abs(V[:, 0]) > 0.49)
@@ -228,8 +228,8 @@ def test_where_a_map_is_about_to_leap():
     assert Doubt.NEAR_SINGULAR in turning.doubts
 
 
-def test_vertices_that_rest_at_a_kink_are_doubtful():
-    """The bent sides of the outline are polygons that turn at each vertex, by less than a corner does."""
+def test_vertices_at_a_bend_are_doubtful():
+    """The bent sides of the outline are polygons whose bends are smaller than a corner."""
     problem, uv = polished_ring(curved=True)
     derivative = polish_derivative(problem.V, problem.F, uv, fixed=problem.fixed, slide=True)
     assert Doubt.SLIDING in derivative.doubts
@@ -237,7 +237,7 @@ def test_vertices_that_rest_at_a_kink_are_doubtful():
 
 
 class Creased(Isotropic):
-    """An energy with a crease where areas are kept, at which Newton's steps come to no rest."""
+    """An energy with a kink where areas are preserved, at which Newton's steps do not converge."""
 
     barrier = True
 
@@ -255,13 +255,13 @@ class Creased(Isotropic):
         )
 
 
-def test_a_map_that_comes_to_no_rest_is_doubtful():
+def test_a_map_that_does_not_converge_is_doubtful():
     V, F, _, _, uv = flattened_ring()
     assert Doubt.NOT_AT_REST in flatten_derivative(V, F, uv, energy=Creased()).doubts
 
 
-def test_a_boundary_that_leans_on_itself_is_doubtful():
-    """A strip around more than the full circle of a cone that is flatter than the plane has room for."""
+def test_a_boundary_in_contact_with_itself_is_doubtful():
+    """A strip around more than the full circle of a cone that is flatter than the plane allows."""
     square, F = grid(60, 3)
     angle, radius = 7.2 * square[:, 0], 1 + square[:, 1] / square[:, 1].max() * 0.5
     V = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0.02 * angle])
@@ -273,7 +273,7 @@ def test_a_boundary_that_leans_on_itself_is_doubtful():
     assert np.isfinite(derivative.jvp(rest=V)).all()
 
 
-def test_a_triangle_next_to_collapse_is_doubtful():
+def test_an_almost_collapsed_triangle_is_doubtful():
     V, F = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
     thin = np.array([[0, 0], [0.5, 0.5 - 1e-10], [1, 1], [0, 1]])
     assert polish_derivative(V, F, thin, fixed=[0, 1, 2, 3]).doubts == (Doubt.NEAR_COLLAPSE,)

@@ -9,7 +9,7 @@ import pytest
 
 from quasiharmonic import Problem, quasi_harmonic_derivative, quasi_harmonic_map
 from quasiharmonic.apps.gradients import Doubt
-from shared.differentiated import held_ring, tensors, worst_difference
+from shared.derivative_problems import held_ring, tensors, worst_difference
 
 
 @pytest.mark.parametrize("curved", [False, True], ids=["flat", "curved"])
@@ -41,27 +41,27 @@ def test_a_clockwise_mesh():
     assert skew < 1e-12
 
 
-def test_the_map_is_the_map():
+def test_the_map_equals_that_of_the_library():
     problem, mu = held_ring(), tensors(len(held_ring().F))
     derivative = quasi_harmonic_derivative(problem, mu)
     assert np.array_equal(derivative.uv, quasi_harmonic_map(problem, mu))
     assert not derivative.uv.flags.writeable
-    # Equilateral triangles do not know the surface.
+    # Equilateral triangles do not depend on the surface.
     assert not derivative.jvp(rest=problem.V).any()
     assert not derivative.vjp(derivative.uv).rest.any()
 
 
-def test_tensors_that_are_clipped_are_doubtful():
+def test_clipped_tensors_are_doubtful():
     problem = held_ring()
     mu = tensors(len(problem.F))
     mu[0] = 1 - 1e-10
     assert quasi_harmonic_derivative(problem, mu).doubts == (Doubt.CLIPPED,)
 
 
-def test_threads_get_the_same():
+def test_threads_get_equal_results():
     problem = held_ring()
     cotangents = np.random.default_rng(4).standard_normal((8, problem.n, 2))
-    # Two derivatives of one problem share the memory of one factor, by turns.
+    # Two derivatives of one problem alternate in the memory of one factor.
     derivatives = [quasi_harmonic_derivative(problem, mu) for mu in (None, tensors(len(problem.F)))]
     wanted = [[d.vjp(c).target for c in cotangents] for d in derivatives]
     found = [[None] * len(cotangents) for _ in derivatives]
@@ -78,7 +78,7 @@ def test_threads_get_the_same():
     assert np.array_equal(found, wanted)
 
 
-def test_what_is_refused():
+def test_errors():
     problem = held_ring()
     derivative = quasi_harmonic_derivative(problem, tensors(len(problem.F)))
     with pytest.raises(ValueError, match=r"target must have shape \(\d+, 2\)"):

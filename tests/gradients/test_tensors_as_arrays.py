@@ -1,4 +1,4 @@
-"""Tensors on the CPU where arrays are asked for: numbers go over, gradients do not."""
+"""Tensors on the CPU in place of arrays: values are converted, gradients are not."""
 
 from __future__ import annotations
 

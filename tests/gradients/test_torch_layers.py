@@ -1,4 +1,4 @@
-"""Maps as functions of PyTorch: gradcheck, batches, compilation, and what is refused."""
+"""Maps as functions of PyTorch: gradcheck, batches, compilation, and errors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import pytest
 
 from quasiharmonic import injective_map, polish_derivative
 from quasiharmonic.apps.gradients import Doubt
-from shared.differentiated import flattened_ring, held_ring, tensors
+from shared.derivative_problems import flattened_ring, held_ring, tensors
 
 torch = pytest.importorskip("torch")
 layers = pytest.importorskip("quasiharmonic.torch")
 
-# PyTorch's own, about its own.
+# A warning of PyTorch about itself.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 
 
@@ -50,14 +50,14 @@ def test_flat_maps(pins):
         return
 
     def shape(rest):
-        # What does not depend on where the map lies.
+        # A loss that does not depend on the position of the map.
         uv = layers.flatten(rest, F)
         return torch.linalg.vector_norm(uv[..., F, :] - uv[..., np.roll(F, 1, axis=1), :], dim=-1)
 
     check(shape, np.stack([V, 1.2 * V]))
 
 
-def test_batches_go_together():
+def test_batches_are_evaluated_together():
     problem = held_ring()
     targets = leaf(np.stack([[problem.target, 1.1 * problem.target], [1.2 * problem.target, 0.9 * problem.target]]))
     mu = leaf(np.stack([tensors(len(problem.F)), tensors(len(problem.F)).conj()]))
@@ -69,14 +69,14 @@ def test_batches_go_together():
     (one**3).sum().backward()
     assert torch.equal(one, maps[1, 0])
     assert torch.allclose(targets.grad[1, 0], mine[0].grad)
-    # Gradients by what all of a batch have in common are sums.
+    # Gradients in quantities shared by a batch are sums.
     other = leaf(mu.detach()[0].numpy())
     (layers.quasi_harmonic_map(problem, other, target=targets.detach()[:, 0]) ** 3).sum().backward()
     assert torch.allclose(mu.grad[0], other.grad)
 
 
-def test_tensors_that_are_conjugates_in_name_only():
-    """PyTorch conjugates when it must, and says of a tensor until then that it is to be read so."""
+def test_lazily_conjugated_tensors():
+    """PyTorch conjugates when necessary, and until then marks a tensor as conjugated."""
     problem = held_ring()
     mu = leaf(tensors(len(problem.F)))
     maps = layers.quasi_harmonic_map(problem, mu.conj())
@@ -87,7 +87,7 @@ def test_tensors_that_are_conjugates_in_name_only():
     assert torch.allclose(mu.grad, other.grad.conj())
 
 
-def test_the_map_is_the_library_s_brought_to_rest():
+def test_the_map_is_the_converged_map_of_the_library():
     problem = held_ring()
     maps = layers.injective_map(problem, target=leaf(problem.target))
     found = injective_map(problem.V, problem.F, problem.fixed, problem.target, polish="symmetric-dirichlet")
@@ -96,7 +96,7 @@ def test_the_map_is_the_library_s_brought_to_rest():
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_compiled_programs_break_around_it():
+def test_compiled_programs_break_the_graph_around_it():
     problem = held_ring()
     target = torch.tensor(problem.target)
 
@@ -109,7 +109,7 @@ def test_compiled_programs_break_around_it():
     assert torch.equal(scale.grad, other.grad)
 
 
-def test_compiled_as_one_it_says_why_not():
+def test_full_graph_compilation_names_the_reason_of_failure():
     problem = held_ring()
     target = torch.tensor(problem.target)
     whole = torch.compile(lambda t: layers.quasi_harmonic_map(problem, target=t), backend="eager", fullgraph=True)
@@ -117,7 +117,7 @@ def test_compiled_as_one_it_says_why_not():
         whole(target)
 
 
-def test_a_second_derivative_is_refused():
+def test_a_second_derivative_is_rejected():
     problem = held_ring()
     target = leaf(problem.target)
     maps = layers.quasi_harmonic_map(problem, target=target)
@@ -126,7 +126,7 @@ def test_a_second_derivative_is_refused():
         first.sum().backward()
 
 
-def test_what_is_refused():
+def test_errors():
     problem = held_ring()
     target = leaf(problem.target)
     with pytest.raises(TypeError, match=r"target must be a tensor, not ndarray"):
@@ -147,7 +147,7 @@ def test_what_is_refused():
         torch.func.grad(lambda target: layers.quasi_harmonic_map(problem, target=target).sum())(target)
 
 
-def test_a_map_that_is_not_found_says_which():
+def test_the_error_for_a_map_that_is_not_found_names_it():
     problem = held_ring()
     mirrored = np.stack([problem.target, problem.target * [1, -1]])
     with pytest.raises(layers.MapNotFound, match="no injective map was found") as caught:

@@ -10,7 +10,7 @@ import pytest
 from quasiharmonic.ui.cli import main
 
 # Replaces `quasiharmonic.ui.batch.supervisor.COMMAND`.
-TROUBLED = [sys.executable, "-P", str(Path(__file__).with_name("troubled_worker.py"))]
+FAILING_WORKER = [sys.executable, "-P", str(Path(__file__).with_name("failing_worker.py"))]
 linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks into /proc")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic import boundary_loops
-from quasiharmonic.geometry.coarsening.removal import remove_vertices, room_for_round
+from quasiharmonic.geometry.coarsening.removal import allocate_round, remove_vertices
 from quasiharmonic.surfaces import disk
 from shared.meshes import tangled
 
@@ -433,7 +433,7 @@ def _(rng):
 
 
 def stirred_disks(rng, stirred: list[int]) -> Arguments:
-    """Copies of a disk, in each of which a given number of interior vertices is moved far."""
+    """Copies of a disk; in each copy, a given number of interior vertices is moved far."""
     V, F = disk(6)
     n, count = len(V), len(stirred)
     w = np.tile((V[:, 0] + 1j * V[:, 1]) + 0.01 * rng.normal(size=n), count)
@@ -555,7 +555,7 @@ def _(rng):
 def round_of_coarsening(rng: np.random.Generator, size: int) -> Arguments:
     """Arguments of `remove_vertices`: a mesh from which no vertex has been removed yet."""
     T, free = tangled(rng, size)
-    return T, free, 12 * rng.random(free.size), *(np.zeros_like(each) for each in room_for_round(T))
+    return T, free, 12 * rng.random(free.size), *(np.zeros_like(each) for each in allocate_round(T))
 
 
 for size in (0, 1, 60, 300):
@@ -566,7 +566,7 @@ for size in (0, 1, 60, 300):
 def _(rng):
     """A vertex, and no triangle."""
     T = np.empty((3, 0), dtype=np.int64)
-    return T, np.ones(1, dtype=bool), rng.random(1), *(np.zeros_like(each) for each in room_for_round(T))
+    return T, np.ones(1, dtype=bool), rng.random(1), *(np.zeros_like(each) for each in allocate_round(T))
 
 
 @arguments_of("fill_rings")

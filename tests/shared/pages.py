@@ -10,28 +10,28 @@ import numpy as np
 from quasiharmonic import io
 from quasiharmonic.surfaces import cat
 from quasiharmonic.ui.studio.protocol import Frame, decode, encode
-from quasiharmonic.ui.studio.session import Session
-from quasiharmonic.ui.studio.surface import sheet_of
+from quasiharmonic.ui.studio.session.session import Session
+from quasiharmonic.ui.studio.session.surface import make_sheet
 
 
 class Visitor:
     """A client with a session, which records every frame that the session sends."""
 
     def __init__(self, V=None, F=None, name="surface.obj", waiting=lambda: False):
-        self.told: list[Frame] = []
+        self.frames: list[Frame] = []
         self.session = Session(self._hear, waiting)
         V, F = cat(10) if V is None else (V, F)
-        self.session.open(sheet_of(io.MeshData(V, F, source=name), name))
+        self.session.open(make_sheet(io.MeshData(V, F, source=name), name))
 
     def _hear(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         # Encode to bytes and back, as a socket would.
-        self.told.append(decode(encode(header, arrays)))
+        self.frames.append(decode(encode(header, arrays)))
 
     def does(self, what: str, arrays: Mapping[str, np.ndarray] | None = None, **words: Any) -> list[Frame]:
         """Send a message; return the frames received since."""
-        before = len(self.told)
+        before = len(self.frames)
         self.session.handle(decode(encode({"do": what, **words}, arrays)))
-        return self.told[before:]
+        return self.frames[before:]
 
     def drags(self, vertex: int, *places: tuple[float, float]) -> list[Frame]:
         """Grab a vertex, drag it along positions and drop it; return the map frames in between."""
@@ -42,11 +42,11 @@ class Visitor:
 
     def last(self, kind: str) -> Frame:
         """The last received frame of a kind."""
-        return next(frame for frame in reversed(self.told) if frame.header["kind"] == kind)
+        return next(frame for frame in reversed(self.frames) if frame.header["kind"] == kind)
 
     def place(self, vertex: int) -> np.ndarray:
         """The position of a vertex in the map."""
-        return self.session.moment.result.uv[vertex]
+        return self.session.state.result.uv[vertex]
 
     def files(self) -> dict[str, bytes]:
         """The saved files, by name."""

@@ -41,7 +41,7 @@ def turned(points, degrees):
     return points @ np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
 
 
-def least_jacobian(nodes):
+def min_jacobian(nodes):
     """The minimum Jacobian determinant of a six-node triangle (6, 2), as a fraction, from its shape functions.
 
     The determinant is a quadratic polynomial of (s, t), determined by its values at six points. Its minimum is at a

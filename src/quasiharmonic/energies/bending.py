@@ -22,24 +22,24 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, dia_array, kron, triu
 
-from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy, QuadraticForm
+from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, in_units
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
-from quasiharmonic.energies.polishing import at_own_scale, energy_named
-from quasiharmonic.geometry.exact.certificate import certify, is_injective
+from quasiharmonic.energies.polishing import find_energy, scale_energy
+from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Stage, Status, Step
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-_STEPS, _TOLERANCE = 200, 1e-6
+_MAX_STEPS = 200
+_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,72 +49,56 @@ class Pull:
     Attributes
     ----------
     vertices : (k,) int64
-    places : (k, 2) float64
+    positions : (k, 2) float64
         Target positions.
     weights : (k,) float64
         ω: a deviation d costs as much as an energy density ω on an area |d|².
     """
 
     vertices: IntArray
-    places: FloatArray
+    positions: FloatArray
     weights: FloatArray
 
 
 class Plate:
     """The second-order term and the pulls, a quadratic function of the positions.
 
-    Parameters
-    ----------
-    V : (n, 2) float64
-        Rest positions.
-    F : (f, 3) int64
-    inside : (m,) int64
-        Vertices at which the second derivatives are evaluated.
-    length : float
-        ℓ.
-    pull : Pull
+    ``V`` (n, 2) are the rest positions. The second derivatives are evaluated at the vertices ``inside`` (m,).
+    ``length`` is ℓ.
     """
 
     def __init__(self, V: FloatArray, F: IntArray, inside: IntArray, length: float, pull: Pull) -> None:
         n = len(V)
-        laid = operators(V, F)
-        L = laid.laplacian()[inside]
-        corner_area = np.repeat(laid.m / 3, 3)
+        rest_operators = operators(V, F)
+        L = rest_operators.laplacian()[inside]
+        corner_area = np.repeat(rest_operators.m / 3, 3)
         mass = np.bincount(F.ravel(), corner_area, minlength=n)[inside]
-        area = float(laid.m.sum())
+        area = float(rest_operators.m.sum())
         weight = np.bincount(pull.vertices, pull.weights, minlength=n) / area
         self.rest: ComplexArray = V.view(np.complex128).ravel()
         towards = np.zeros((n, 2))
-        towards[pull.vertices] = pull.places
-        self.bent: csr_array = csr_array(L.T @ (L * (length**2 / area / mass)[:, None]))
+        towards[pull.vertices] = pull.positions
+        self.second_order: csr_array = csr_array(L.T @ (L * (length**2 / area / mass)[:, None]))
         self.weight, self.towards = weight, towards.view(np.complex128).ravel()
 
     def matrix(self) -> csr_array:
         """Matrix K (n, n) of the quadratic form ``Re xᴴ K x`` in displacements x."""
         n = len(self.weight)
         pulls = dia_array((self.weight[None], [0]), shape=(n, n))
-        return csr_array(self.bent + pulls)
+        return csr_array(self.second_order + pulls)
 
     def value(self, w: ComplexArray) -> float:
         """Value of the term for a map (n,) complex128."""
-        u, away = w - self.rest, w - self.towards
-        return float(np.vdot(u, self.bent @ u).real + np.sum(self.weight * np.abs(away) ** 2))
+        u, deviation = w - self.rest, w - self.towards
+        return float(np.vdot(u, self.second_order @ u).real + np.sum(self.weight * np.abs(deviation) ** 2))
 
     def gradient(self, w: ComplexArray) -> ComplexArray:
         """Derivative of the term, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
-        return 2 * (self.bent @ (w - self.rest) + self.weight * (w - self.towards))
+        return 2 * (self.second_order @ (w - self.rest) + self.weight * (w - self.towards))
 
 
 class PlateSystem(NewtonSystem):
-    """Newton system with an added constant matrix, which has a larger sparsity pattern.
-
-    Parameters
-    ----------
-    F, g, n, fixed, linear_solver
-        As of `NewtonSystem`.
-    constant : (n, n) csr_array
-        Symmetric; added for each coordinate.
-    """
+    """Newton system with an added symmetric matrix (n, n) for each coordinate, and with its larger sparsity pattern."""
 
     def __init__(
         self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str, constant: csr_array
@@ -125,8 +109,8 @@ class PlateSystem(NewtonSystem):
         # Compute the pattern with ones as values, so that no entries cancel.
         pattern = csr_array(own + csr_array((np.ones(added.nnz), added.indices, added.indptr), shape=added.shape))
         pattern.sort_indices()
-        self._own_slots, self._constant = _places(own, pattern), np.zeros(pattern.nnz)
-        self._constant[_places(csr_array(added), pattern)] = added.data
+        self._own_slots, self._constant = _entry_indices(own, pattern), np.zeros(pattern.nnz)
+        self._constant[_entry_indices(csr_array(added), pattern)] = added.data
         self._starts = pattern.indptr[:-1]
         self.solver = make_solver(pattern.indptr, pattern.indices, name=linear_solver)
 
@@ -144,45 +128,22 @@ class PlateSystem(NewtonSystem):
         self.solver.factor(values)
 
 
-class BendingDescent(NewtonDescent):
-    """`NewtonDescent` with an added `Plate` term.
+class PlateTerm:
+    """A `Plate` as a `Term` for maps in multiples of ``unit``; `PlateSystem` has its second derivatives."""
 
-    Parameters
-    ----------
-    energy, uv, fixed, exponent, linear_solver
-        As of `NewtonDescent`.
-    plate : Plate
-        Defined for positions in their original unit.
-    """
+    def __init__(self, plate: Plate, unit: float) -> None:
+        self._plate, self._unit = plate, unit
 
-    def __init__(
-        self,
-        energy: DeformationEnergy,
-        uv: FloatArray,
-        fixed: IntArray,
-        exponent: int,
-        linear_solver: str,
-        plate: Plate,
-    ) -> None:
-        self.plate, self._unit = plate, float(np.ldexp(1.0, exponent))
-        super().__init__(energy, uv, fixed, exponent, linear_solver)
-        self.value = self.first = self.value + plate.value(self._unit * self.w)
+    def value(self, w: ComplexArray) -> float:
+        """See `Term`."""
+        return self._plate.value(self._unit * w)
 
-    def _system(self, n: int, linear_solver: str) -> NewtonSystem:
-        constant = csr_array(2 * self._unit**2 * self.plate.matrix())
-        return PlateSystem(self.energy.F, self.energy.g, n, self.fixed, linear_solver, constant)
+    def gradient(self, w: ComplexArray) -> ComplexArray:
+        """See `Term`."""
+        return self._unit * self._plate.gradient(self._unit * w)
 
-    def gradient(self) -> ComplexArray:
-        """Gradient of the energy plus the plate term."""
-        bent = self._unit * self.plate.gradient(self._unit * self.w)
-        return super().gradient() + bent[self.system.free]
-
-    def evaluate_trial(self, w: ComplexArray, bound: float) -> tuple[float, tuple[ComplexArray, Any] | None]:
-        """Like `NewtonDescent.evaluate_trial`, for the energy plus the plate term."""
-        deformation = self.energy.deform(w)
-        value = self.energy.value_of(deformation) + self.plate.value(self._unit * w)
-        accepted = value < bound and is_injective(self.energy.F, self.positions(w))
-        return value, (w, deformation) if accepted else None
+    def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
+        """See `Term`; nothing, because the system contains the constant matrix."""
 
 
 def bend_map(
@@ -195,26 +156,10 @@ def bend_map(
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
 ) -> MapResult:
-    """Lower the energy with its second-order term, appending to the stages and history of a result.
+    """Lower the energy of an injective map with its second-order term; append to the stages and history of its result.
 
-    Parameters
-    ----------
-    domain : Domain
-        Planar, with its fixed vertices.
-    result : MapResult
-        An injective map of the domain.
-    energy : str or Energy
-        As in `quasiharmonic.polish`.
-    length : float
-        ℓ, in the unit of the domain.
-    pull : Pull
-    linear_solver, callback
-        As in `quasiharmonic.polish`.
-
-    Returns
-    -------
-    MapResult
-        Certified, with a status as returned by `polish`.
+    The domain is planar, and ``length`` is ℓ in its unit. The status is one of `quasiharmonic.polish`, as are the
+    options.
     """
     began = time.perf_counter()
     inside = np.ones(domain.n, dtype=bool)
@@ -224,24 +169,29 @@ def bend_map(
     status = Status.STILL_FALLING
     # As in `polish`, steps to inf or NaN are never accepted.
     with np.errstate(all="ignore"):
-        deformation, exponent = at_own_scale(domain, result.uv, energy_named(energy))
-        descent = BendingDescent(deformation, result.uv, domain.fixed, exponent, linear_solver, plate)
+        deformation, exponent = scale_energy(domain, result.uv, find_energy(energy))
+        unit = float(np.ldexp(1.0, exponent))
+        constant = csr_array(2 * unit**2 * plate.matrix())
+        system = PlateSystem(deformation.F, deformation.g, domain.n, domain.fixed, linear_solver, constant)
+        coordinates = Coordinates.of(result.uv, domain.fixed, exponent)
+        model = MapModel(deformation, coordinates, system, [PlateTerm(plate, unit)])
+        descent = NewtonDescent(model, model.evaluate(in_units(result.uv, exponent)))
     try:
-        for number, outcome in enumerate(descent.descend(_STEPS, _TOLERANCE), start=1):
+        for number, outcome in enumerate(descent.descend(_MAX_STEPS, _TOLERANCE), start=1):
             history.append(Step(number, 0, descent.value))
             if callback is not None:
                 callback(history[-1])
             status = outcome or status
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
-    uv = descent.positions(descent.w)
+    uv = model.positions(descent.w)
     seconds = time.perf_counter() - began
     stage = Stage(
         name="bending",
-        iterations=len(history) - len(result.history),
+        n_iterations=len(history) - len(result.history),
         seconds=seconds,
         inverted=(0, 0),
-        energy=descent.energies,
+        energy=(descent.first, descent.value),
         kept=descent.value < descent.first,
     )
     return replace(
@@ -251,12 +201,12 @@ def bend_map(
         certificate=certify(domain.F, uv, loops=domain.loops),
         stages=[*result.stages, stage],
         history=history,
-        linear_solver=descent.system.solver.name,
+        linear_solver=system.solver.name,
         seconds=result.seconds + seconds,
     )
 
 
-def _places(part: csr_array, whole: csr_array) -> IntArray:
+def _entry_indices(part: csr_array, whole: csr_array) -> IntArray:
     """Indices of the entries of ``part`` in ``whole``, whose pattern contains them; rows are sorted in both."""
     rows = [np.repeat(np.arange(one.shape[0]), np.diff(one.indptr)) for one in (part, whole)]
     keys = [row * whole.shape[1] + one.indices for row, one in zip(rows, (part, whole), strict=True)]

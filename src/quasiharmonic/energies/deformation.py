@@ -6,18 +6,28 @@ The value is the mean density, weighted by area and optionally by triangle, afte
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.energies.energies import Deformation, Energy, QuadraticForm
 from quasiharmonic.energies.mixtures import curvature_of_mixture, mixed_energy, mixed_slopes, mixture_of
 from quasiharmonic.geometry.mesh.reference import blocks
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_range, named, own_triangles, real_array
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.util.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    check_range,
+    names_of,
+    own_triangles,
+    real_array,
+)
 from quasiharmonic.util.kernels import compiled
 
 # For singular values between this and its inverse, no energy should overflow.
-_ORDINARY = 1e20
+_EXTREME_STRETCH = 1e20
 
 
 class DeformationEnergy:
@@ -66,12 +76,12 @@ class DeformationEnergy:
     ) -> None:
         self.energy = energy
         self.F = own_triangles(F)
-        self._least_places = int(self.F.max(initial=-1)) + 1
-        check_range("F", self.F, self._least_places)
+        self._vertex_count = int(self.F.max(initial=-1)) + 1
+        check_range("F", self.F, self._vertex_count)
         shapes = rest_shapes(V, self.F if rest_F is None else np.asarray(rest_F, dtype=np.int64))
         if shapes.flat.size:
             raise ValueError(
-                f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
+                f"{names_of('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
                 "distortion is undefined there"
             )
         if area is not None and not 0 < area < np.inf:
@@ -81,8 +91,22 @@ class DeformationEnergy:
         self.g: ComplexArray = scale * shapes.half_gradients()
         self.share: FloatArray = shapes.m / total
         if weights is not None:
-            self.share = self.share * _weights(weights, len(self.F))
+            self.share = self.share * _check_weights(weights, len(self.F))
         self._det_per_area = scale**2 / shapes.m
+
+    def with_references(
+        self, energy: Energy, s: ComplexArray, c: ComplexArray, det: FloatArray, share: FloatArray
+    ) -> DeformationEnergy:
+        """Return an energy of the same triangles with weights ``share`` (f,), measured against other rest shapes.
+
+        The new rest shape of each triangle is the image of the old one under ``s z + c z̄``, s and c (f,) complex128.
+        It has ``det`` (f,) times the old area.
+        """
+        other = copy(self)
+        other.energy, other.share = energy, share
+        other.g = (s * self.g - c * self.g.conj()) / det
+        other._det_per_area = self._det_per_area / det
+        return other
 
     def deform(self, w: ComplexArray) -> Deformation:
         """Jacobian of a map ``w = u + i v`` (n,) complex128 on every triangle.
@@ -91,7 +115,7 @@ class DeformationEnergy:
         replaced by that error. The determinant is then positive and a barrier energy is huge; the caller must certify
         the map.
         """
-        self._check_places(w.size)
+        self._check_positions(w.size)
         f = len(self.F)
         p, q, det = np.empty(f, dtype=np.complex128), np.empty(f, dtype=np.complex128), np.empty(f)
         jacobians(w, self.F, self.g, self._det_per_area, p, q, det)
@@ -121,20 +145,13 @@ class DeformationEnergy:
         else:
             by_p, by_q = np.empty_like(d.p), np.empty_like(d.q)
             mixed_slopes(mixture, d.p, d.q, d.det, by_p, by_q)
-        self._check_places(n)
+        self._check_positions(n)
         gradient = np.empty(n, dtype=np.complex128)
         pulls(by_p, by_q, self.share, self.F, self.g, gradient)
         return gradient
 
     def curvature_of(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivatives by (p, q) on every triangle, weights and areas included.
-
-        Parameters
-        ----------
-        d : Deformation
-        negative : float
-            Factor for negative eigenvalues; see `Energy.curvature`.
-        """
+        """Second derivatives by (p, q) on every triangle, weighted; ``negative`` as in `Energy.curvature`."""
         mixture = mixture_of(self.energy, "density_gradient", "density_hessian", "curvature")
         if mixture is None:
             return self.energy.curvature(d, negative=negative).scaled(self.share)
@@ -143,19 +160,10 @@ class DeformationEnergy:
     def check_numbers(self, d: Deformation, *, second: bool = True) -> None:
         """Raise a ValueError if the energy or a derivative is NaN or infinite on triangles without extreme stretch.
 
-        Parameters
-        ----------
-        d : Deformation
-        second : bool
-            Check second derivatives too.
-
-        Raises
-        ------
-        ValueError
-            The message names the quantity and the triangles.
+        The message names the quantity and the triangles. Second derivatives are checked if ``second``.
         """
         larger, det = np.abs(d.p) + np.abs(d.q), d.det if self.energy.barrier else np.abs(d.det)
-        ordinary = (larger < _ORDINARY) & (larger > 1 / _ORDINARY) & (det > larger / _ORDINARY)
+        ordinary = (larger < _EXTREME_STRETCH) & (larger > 1 / _EXTREME_STRETCH) & (det > larger / _EXTREME_STRETCH)
         with np.errstate(all="ignore"):
             found = {"energy": (self.energy.density(d),), "first derivative": self.energy.gradient(d)}
             if second:
@@ -168,36 +176,32 @@ class DeformationEnergy:
                 not_a_number |= np.isnan(part)
             bad = np.flatnonzero(wrong & ordinary)
             if bad.size:
-                where = named("triangle", "triangles", bad)
-                how = "NaN" if not_a_number[bad[0]] else "infinite"
+                where = names_of("triangle", "triangles", bad)
+                kind = "NaN" if not_a_number[bad[0]] else "infinite"
                 raise ValueError(
-                    f"{type(self.energy).__name__}: the {what} is {how} at {where}, "
+                    f"{type(self.energy).__name__}: the {what} is {kind} at {where}, "
                     f"where |p| = {abs(d.p[bad[0]]):.6g} and |q| = {abs(d.q[bad[0]]):.6g} at the first; "
                     "check an energy with quasiharmonic.energies.derivatives.check_energy"
                 )
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
-        """Smallest positive step along a direction at which each triangle's area vanishes.
+        """Smallest positive step along a direction at which each triangle's area vanishes; (f,) float64.
 
         The area of ``w + t · direction`` is a quadratic in t. Its first positive root is computed with the form of the
-        quadratic formula that avoids cancellation.
-
-        Returns
-        -------
-        (f,) float64
-            Positive. ``inf`` where the area never vanishes, and where the computed area of ``w`` is not positive
-            because of rounding. In the latter case only the exact test detects an inversion.
+        quadratic formula that avoids cancellation. The step is ``inf`` where the area never vanishes, and where the
+        computed area of ``w`` is not positive because of rounding. In the latter case only the exact test detects an
+        inversion.
         """
-        self._check_places(min(w.size, direction.size))
+        self._check_positions(min(w.size, direction.size))
         first = np.empty(len(self.F))
         collapses(w, direction, self.F, first)
         return first
 
-    def _check_places(self, n: int) -> None:
+    def _check_positions(self, n: int) -> None:
         """Raise a ValueError unless ``n`` positions cover all vertices of the triangles."""
-        if n < self._least_places:
+        if n < self._vertex_count:
             raise ValueError(
-                f"the triangles refer to vertex {self._least_places - 1}, but there are only {n} positions"
+                f"the triangles refer to vertex {self._vertex_count - 1}, but there are only {n} positions"
             )
 
 
@@ -271,28 +275,25 @@ def _edges(corners: NDArray[np.integer], w: ComplexArray) -> tuple[ComplexArray,
     return w[corners[1]] - w0, w[corners[2]] - w0
 
 
-def _weights(weights: ArrayLike, f: int) -> FloatArray:
+def _check_weights(weights: ArrayLike, f: int) -> FloatArray:
     array = real_array("weights", weights)
     if array.shape != (f,):
         raise ValueError(f"weights must have shape ({f},), one for each triangle, not {array.shape}")
     bad = np.flatnonzero(~((array >= 0) & (array < np.inf)))
     if bad.size:
-        raise ValueError(f"the weight is negative or not finite at {named('triangle', 'triangles', bad)}")
+        raise ValueError(f"the weight is negative or not finite at {names_of('triangle', 'triangles', bad)}")
     return array
 
 
 def positive_weights(weights: ArrayLike, f: int) -> FloatArray:
     """Return positive weights of ``f`` triangles as a new (f,) float64 array.
 
-    Raises
-    ------
-    ValueError
-        When the shape is wrong or a weight is not positive; the message lists the first triangles.
+    Raise a ValueError if the shape is wrong or a weight is not positive; the message names the first triangles.
     """
     array = real_array("weights", weights)
     if array.shape != (f,):
         raise ValueError(f"weights must have shape ({f},), one for each triangle, not {array.shape}")
     bad = np.flatnonzero(~(array > 0))
     if bad.size:
-        raise ValueError(f"the weight is not positive at {named('triangle', 'triangles', bad)}")
+        raise ValueError(f"the weight is not positive at {names_of('triangle', 'triangles', bad)}")
     return array

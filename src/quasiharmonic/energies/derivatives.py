@@ -124,18 +124,18 @@ def check_energy(energy: Energy, d: Deformation | None = None) -> EnergyCheck:
     def density(x: Array) -> ArrayLike:
         return energy.density(Deformation.of(x[0], x[1]))
 
-    def slope(x: Array, dx: Array) -> ArrayLike:
+    def gradient_along(x: Array, dx: Array) -> ArrayLike:
         return np.sum((np.conj(gradient(x)) * dx).real, axis=0)
 
     def gradient(x: Array) -> ComplexArray:
         return np.stack(energy.gradient(Deformation.of(x[0], x[1])))
 
-    def bend(x: Array, dx: Array) -> ArrayLike:
+    def curvature_along(x: Array, dx: Array) -> ArrayLike:
         return np.stack(energy.curvature(Deformation.of(x[0], x[1]), negative=1.0).apply(dx[0], dx[1]))
 
-    by_gradient = derivative_error(density, slope, x)
+    by_gradient = derivative_error(density, gradient_along, x)
     try:
-        by_curvature = derivative_error(gradient, bend, x)
+        by_curvature = derivative_error(gradient, curvature_along, x)
         eigenvalues = np.linalg.eigvalsh(energy.curvature(at).matrices())
     except NotImplementedError:
         return EnergyCheck(by_gradient, np.nan, np.nan)
@@ -144,19 +144,7 @@ def check_energy(energy: Energy, d: Deformation | None = None) -> EnergyCheck:
 
 
 def random_deformation(f: int, seed: int = 0) -> Deformation:
-    """Draw random Jacobians with positive determinants and singular values around 1.
-
-    Parameters
-    ----------
-    f : int
-        Number of triangles.
-    seed : int
-        Seed of the random generator.
-
-    Returns
-    -------
-    Deformation
-    """
+    """Draw random Jacobians of ``f`` triangles, with positive determinants and singular values around 1."""
     rng = np.random.default_rng(seed)
     turns = np.exp(2j * np.pi * rng.random((2, f)))
     p = np.exp(0.4 * rng.standard_normal(f))

@@ -30,11 +30,11 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_finite,
+    check_integer,
     check_range,
     index_array,
     map_array,
     real_array,
-    whole_number,
 )
 from quasiharmonic.util.progress import heartbeat
 
@@ -42,8 +42,8 @@ from quasiharmonic.util.progress import heartbeat
 _REACH = 1.3
 # Cells of the space-filling curve that orders the sources: 2^BITS along the longest side of their bounding box.
 _BITS = 10
-# Approximate number of pairs that `_some_of_each` processes at a time.
-_AT_ONCE = 1 << 20
+# Approximate number of pairs that `_sample_each_row` processes at a time.
+_PAIRS_PER_CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -149,21 +149,11 @@ class SurfaceDistances:
     sampling: Sampling
 
     def error(self, uv: ArrayLike) -> DistanceError:
-        """Compare the distances with those in the plane.
-
-        Parameters
-        ----------
-        uv : (n, 2) array
-            A map, injective or not.
-
-        Returns
-        -------
-        DistanceError
-        """
-        places = map_array("uv", uv)
-        check_range("a pair", np.concatenate([self.source, self.target]), len(places))
-        apart = places[self.source] - places[self.target]
-        ratio = np.hypot(apart[:, 0], apart[:, 1]) / self.length
+        """Compare the distances with those in the plane, for a map (n, 2) that need not be injective."""
+        positions = map_array("uv", uv)
+        check_range("a pair", np.concatenate([self.source, self.target]), len(positions))
+        difference = positions[self.source] - positions[self.target]
+        ratio = np.hypot(difference[:, 0], difference[:, 1]) / self.length
         scale = _best_scale(ratio)
         return DistanceError(scale, scale * ratio - 1, self.sampling)
 
@@ -217,15 +207,15 @@ def surface_distances(
     check_range("F", F, len(V))
     check_finite("V", "vertex", "vertices", V)
     for name, value in (("rings", rings), ("sources", sources)):
-        whole_number(name, value, least=1)
+        check_integer(name, value, minimum=1)
     for name, value in (("crossings", crossings), ("seed", seed)):
-        whole_number(name, value, least=0)
+        check_integer(name, value, minimum=0)
     if targets is not None:
-        whole_number("targets", targets, least=1)
-    return sampled(V, F, Sampling(rings, sources, targets, crossings), seed=seed)
+        check_integer("targets", targets, minimum=1)
+    return sample_distances(V, F, Sampling(rings, sources, targets, crossings), seed=seed)
 
 
-def sampled(
+def sample_distances(
     V: FloatArray,
     F: IntArray,
     sampling: Sampling,
@@ -236,29 +226,20 @@ def sampled(
 ) -> SurfaceDistances:
     """Sample distances as `surface_distances` does, without checking the arguments.
 
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) float64
-    F : (f, 3) int64
-    sampling : Sampling
-        ``sources`` is the maximum number of sources.
-    seed : int
-    among : (m,) int64, optional
-        Vertices from which pairs are formed, ascending; by default all vertices of triangles.
-    lowest : float
-        Passed to `straight_segments`.
+    Pairs are formed from the vertices ``among`` (m,), ascending; by default from all vertices of triangles. ``lowest``
+    is passed to `straight_segments`.
     """
-    dice = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     used = np.unique(F) if among is None else among
-    source = used if sampling.sources >= used.size else np.sort(dice.choice(used, sampling.sources, replace=False))
-    source = source[_along_curve(V[source])]
+    source = used if sampling.sources >= used.size else np.sort(rng.choice(used, sampling.sources, replace=False))
+    source = source[_morton_order(V[source])]
     edges = edge_graph(F, len(V))
     row, target = neighbours_within(edges, source, sampling.rings)
     if among is not None:
         own = np.isin(target, among)
         row, target = row[own], target[own]
     if sampling.targets is not None:
-        kept = _some_of_each(row, sampling.targets, dice)
+        kept = _sample_each_row(row, sampling.targets, rng)
         row, target = row[kept], target[kept]
     segments = straight_segments(V, F, sampling.crossings, lowest=lowest)
     mean_edge = (segments * edges).sum() / edges.nnz
@@ -267,7 +248,7 @@ def sampled(
     return SurfaceDistances(source[row][order], target[order], length[order], replace(sampling, sources=source.size))
 
 
-def _along_curve(points: FloatArray) -> IntArray:
+def _morton_order(points: FloatArray) -> IntArray:
     """Order of points (n, d) along Morton's curve, so that consecutive points are close to each other."""
     low = points.min(axis=0)
     size = float((points.max(axis=0) - low).max())
@@ -279,18 +260,18 @@ def _along_curve(points: FloatArray) -> IntArray:
     return np.argsort(code, kind="stable")
 
 
-def _some_of_each(row: IntArray, most: int, dice: np.random.Generator) -> IntArray:
-    """Indices of at most ``most`` random entries of each row; ``row`` is ascending."""
-    key = row + dice.random(row.size)
+def _sample_each_row(row: IntArray, limit: int, rng: np.random.Generator) -> IntArray:
+    """Indices of at most ``limit`` random entries of each row; ``row`` is ascending."""
+    key = row + rng.random(row.size)
     kept = []
     begin = 0
     while begin < row.size:
         heartbeat()
-        end = int(np.searchsorted(row, row[min(begin + _AT_ONCE, row.size) - 1], side="right"))
+        end = int(np.searchsorted(row, row[min(begin + _PAIRS_PER_CHUNK, row.size) - 1], side="right"))
         part = row[begin:end]
         order = np.argsort(key[begin:end])
-        place = np.arange(part.size) - np.searchsorted(part, part)
-        kept.append(begin + np.sort(order[place < most]))
+        rank = np.arange(part.size) - np.searchsorted(part, part)
+        kept.append(begin + np.sort(order[rank < limit]))
         begin = end
     return np.concatenate([np.empty(0, dtype=np.int64), *kept])
 

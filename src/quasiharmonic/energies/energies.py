@@ -226,9 +226,9 @@ class Isotropic(Energy):
         aa, ab, bb = self.density_hessian(d)
         turn_p, turn_q = 2 * slope_a, 2 * slope_b
         along_p, along_q = turn_p + 4 * d.a * aa, turn_q + 4 * d.b * bb
-        turn_p, turn_q = damped(turn_p, negative), damped(turn_q, negative)
-        along_p, kept, along_q = _filtered(along_p, 4 * np.sqrt(d.a * d.b) * ab, along_q, negative)
-        mixed = 4 * kept * ab
+        turn_p, turn_q = damp(turn_p, negative), damp(turn_q, negative)
+        along_p, off_diagonal, along_q = _damp_matrices(along_p, 4 * np.sqrt(d.a * d.b) * ab, along_q, negative)
+        mixed = 4 * off_diagonal * ab
         # Where p or q vanishes, the two eigenvalues are equal, so its direction does not matter.
         to_p: ComplexArray = np.conj(d.p)
         to_q: ComplexArray = np.conj(d.q)
@@ -242,12 +242,12 @@ class Isotropic(Energy):
         )
 
 
-def damped(eigenvalue: FloatArray, negative: float) -> FloatArray:
+def damp(eigenvalue: FloatArray, negative: float) -> FloatArray:
     """Multiply the negative eigenvalues by ``negative``."""
     return np.where(eigenvalue < 0, negative * eigenvalue, eigenvalue)
 
 
-def _filtered(
+def _damp_matrices(
     xx: FloatArray, xy: FloatArray, yy: FloatArray, negative: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Multiply the negative eigenvalues of symmetric 2×2 matrices by ``negative``.
@@ -257,10 +257,10 @@ def _filtered(
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     radius = np.sqrt(half**2 + xy**2)
     # Eigenvalues mean ± radius, projectors ½ (1 ± K/radius) with K the traceless part.
-    upper, lower = damped(mean + radius, negative), damped(mean - radius, negative)
+    upper, lower = damp(mean + radius, negative), damp(mean - radius, negative)
     centre = 0.5 * (upper + lower)
-    kept = 0.5 * (upper - lower) * inverse(radius)
-    return centre + kept * half, kept, centre - kept * half
+    off_diagonal = 0.5 * (upper - lower) * inverse(radius)
+    return centre + off_diagonal * half, off_diagonal, centre - off_diagonal * half
 
 
 class MIPS(Isotropic):
@@ -343,15 +343,15 @@ class UnsignedARAP(Isotropic):
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``2 − 2/√c`` by the larger of a and b, and 2 by the smaller. At a = b, a counts as the larger."""
-        upright = d.a >= d.b
+        a_is_larger = d.a >= d.b
         slope = 2 - 2 * inverse(np.sqrt(np.maximum(d.a, d.b)))
-        return np.where(upright, slope, 2.0), np.where(upright, 2.0, slope)
+        return np.where(a_is_larger, slope, 2.0), np.where(a_is_larger, 2.0, slope)
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``c^(−3/2)`` by the larger of a and b, otherwise zeros."""
-        upright = d.a >= d.b
-        bend = inverse(np.sqrt(np.maximum(d.a, d.b))) ** 3
-        return np.where(upright, bend, 0.0), np.zeros(d.b.shape), np.where(upright, 0.0, bend)
+        a_is_larger = d.a >= d.b
+        second = inverse(np.sqrt(np.maximum(d.a, d.b))) ** 3
+        return np.where(a_is_larger, second, 0.0), np.zeros(d.b.shape), np.where(a_is_larger, 0.0, second)
 
 
 class AreaPreserving(Isotropic):
@@ -389,8 +389,8 @@ class AreaBarrier(Isotropic):
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``2/D³, −2/D³, 2/D³``."""
-        bend = 2 * _positive(d.det) ** -3.0
-        return bend, -bend, bend
+        second = 2 * _positive(d.det) ** -3.0
+        return second, -second, second
 
 
 class Combination(Isotropic):

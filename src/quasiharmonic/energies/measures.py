@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.distances import DistanceError, surface_distances
 from quasiharmonic.energies.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
     ComplexArray,
@@ -19,16 +19,18 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_choice,
     check_range,
-    counted,
+    count_of,
     map_array,
     triangle_array,
     triangle_rows,
     vertex_array,
 )
 from quasiharmonic.util.display import Displayable
+from quasiharmonic.util.tables import make_dataframe
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 #: Per-triangle measures of `Distortion`, in the order of reports.
 MEASURES = (
@@ -45,7 +47,7 @@ MEASURES = (
 
 
 @dataclass(frozen=True)
-class Summary:
+class Statistics:
     """Statistics of one measure over the surface; mean and quantiles are weighted by rest area.
 
     Attributes
@@ -144,29 +146,26 @@ class Distortion(Displayable):
         """Every measure by name, each (f,) float64."""
         return {name: getattr(self, name) for name in MEASURES}
 
-    @overload
-    def summary(self, measure: None = None) -> str: ...
-    @overload
-    def summary(self, measure: str) -> Summary: ...
-    def summary(self, measure: str | None = None) -> str | Summary:
-        """Summarise one measure, or all measures in a text table.
+    def to_dataframe(self) -> DataFrame:
+        """Return one row per triangle: its share of the rest area, and every measure; needs pandas.
+
+        Write it with ``to_csv`` or ``to_parquet`` of the DataFrame.
+        """
+        return make_dataframe({"share": self.share, **self.per_triangle()}, "triangle")
+
+    def statistics(self, measure: str) -> Statistics:
+        """Return mean, quantiles and extremes of one measure.
 
         Parameters
         ----------
-        measure : str, optional
-            One of `MEASURES`. By default, all.
-
-        Returns
-        -------
-        Summary or str
+        measure : str
+            One of `MEASURES`.
 
         Raises
         ------
         ValueError
             When the measure is unknown, or not defined on any triangle.
         """
-        if measure is None:
-            return self._table()
         check_choice("measure", measure, MEASURES)
         values = self.per_triangle()[measure]
         defined = np.flatnonzero(~np.isnan(values))
@@ -178,7 +177,7 @@ class Distortion(Displayable):
         median, p95 = value[order[np.searchsorted(below, [0.5 * below[-1], 0.95 * below[-1]])]].tolist()
         with np.errstate(invalid="ignore"):  # values with infinities of both signs have no mean
             mean = float(np.sum(share / below[-1] * value))
-        return Summary(
+        return Statistics(
             mean=mean,
             median=median,
             p95=p95,
@@ -188,12 +187,12 @@ class Distortion(Displayable):
             highest=int(defined[order[-1]]),
         )
 
-    def _table(self) -> str:
-        """Text table with one line per measure."""
+    def summary(self) -> str:
+        """Return a table of all measures as text, one line per measure."""
         lines = [f"{'':>19} {'median':>10} {'95 %':>10} {'max':>10}"]
         for name, values in self.per_triangle().items():
             if not np.isnan(values).all():
-                one = self.summary(name)
+                one = self.statistics(name)
                 lines.append(f"{name:>19} {one.median:>10.4g} {one.p95:>10.4g} {one.maximum:>10.4g}")
         for found, what in ((self.inverted, "inverted or degenerate"), (self.flat, "degenerate in the rest mesh")):
             if found.size:
@@ -201,12 +200,12 @@ class Distortion(Displayable):
         return "\n".join(lines)
 
     def short_repr(self) -> str:
-        triangles = counted("triangle", "triangles", len(self.F))
+        triangles = count_of("triangle", "triangles", len(self.F))
         if self.inverted.size:
             return f"{triangles}, {self.inverted.size:,} inverted or degenerate"
         if np.isnan(self.isometric).all():
             return f"{triangles}, all degenerate in the rest mesh"
-        one = self.summary("isometric")
+        one = self.statistics("isometric")
         return f"{triangles}, stretch max(σ₁, 1/σ₂) {one.median:.3g} in the median, {one.maximum:.3g} at most"
 
     def plot(self, measure: str = "isometric") -> Figure:
@@ -217,7 +216,7 @@ class Distortion(Displayable):
     def to_dict(self) -> dict[str, Any]:
         """Return counts and the summaries of all measures for JSON, with None for undefined summaries."""
         summaries = {
-            name: None if np.isnan(values).all() else self.summary(name).to_dict()
+            name: None if np.isnan(values).all() else self.statistics(name).to_dict()
             for name, values in self.per_triangle().items()
         }
         return {
@@ -251,7 +250,7 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None =
     Returns
     -------
     Distortion
-        Every measure per triangle; `Distortion.summary` and `Distortion.to_dict` summarise them.
+        Every measure per triangle; see `Distortion.statistics`, `Distortion.summary` and `Distortion.to_dataframe`.
 
     Raises
     ------
@@ -270,7 +269,7 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None =
     ([3.0, 3.0], [1.5, 1.5])
     >>> found.conformal.round(12).tolist(), found.mips.round(12).tolist()
     ([2.0, 2.0], [0.5, 0.5])
-    >>> round(found.summary("isometric").maximum, 6)
+    >>> round(found.statistics("isometric").maximum, 6)
     1.414214
     """
     V = vertex_array(V)
@@ -278,7 +277,7 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None =
     off = None if rings is None else surface_distances(V, F, rings=rings).error(uv)
     # In extreme maps, overflow and underflow give inf, 0 or NaN, as the formulas imply.
     with np.errstate(all="ignore"):
-        return replace(_measured(V, F, uv), distances=off)
+        return replace(_measure(V, F, uv), distances=off)
 
 
 def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
@@ -301,9 +300,9 @@ def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
         When an array has the wrong shape or dtype, an index in ``F`` is out of range, or a triangle's corner is not
         finite.
     """
-    places, triangles = map_array("points", points, finite=False), triangle_rows(F)
-    check_range("F", triangles, len(places))
-    corners = places[triangles]
+    positions, triangles = map_array("points", points, finite=False), triangle_rows(F)
+    check_range("F", triangles, len(positions))
+    corners = positions[triangles]
     sign = orientation(*(corners[:, k] for k in range(3)))
     sides = corners - np.roll(corners, 1, axis=1)
     longest = np.abs(sides).max(axis=(1, 2), initial=0.0)
@@ -314,7 +313,7 @@ def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
     return np.asarray(sign * 4 * np.sqrt(3) * area / np.where(squares > 0, squares, 1.0))
 
 
-def _measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
+def _measure(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
     shapes = rest_shapes(V, F)
     exponent = int(np.frexp(np.abs(uv).max(initial=0))[1]) - 1
     unit = float(np.ldexp(1.0, exponent))

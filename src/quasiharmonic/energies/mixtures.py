@@ -22,18 +22,18 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 from quasiharmonic.util.kernels import compiled
 
 #: The energies of a mixture, in the order of its factors.
-OWN: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier()
+TERMS: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier()
 
 
 def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
-    """The factors (4,) float64 that express an energy as a sum of `OWN`, or None if it is not one.
+    """The factors (4,) float64 that express an energy as a sum of `TERMS`, or None if it is not one.
 
-    ``parts`` are the methods that the caller uses. A subclass of one of `OWN` that does not override them counts as
+    ``parts`` are the methods that the caller uses. A subclass of one of `TERMS` that does not override them counts as
     that energy.
     """
     if type(energy) is not Combination:
         return _factors(type(energy), parts)
-    factors = np.zeros(len(OWN))
+    factors = np.zeros(len(TERMS))
     for factor, term in energy.terms:
         part = mixture_of(term, *parts)
         if part is None:
@@ -44,7 +44,7 @@ def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
 
 @cache
 def _factors(kind: type[Energy], parts: tuple[str, ...]) -> FloatArray | None:
-    for energy, factors in zip(OWN, np.eye(len(OWN)), strict=True):
+    for energy, factors in zip(TERMS, np.eye(len(TERMS)), strict=True):
         own = type(energy)
         if issubclass(kind, own) and all(getattr(kind, part) is getattr(own, part) for part in parts):
             return factors
@@ -52,8 +52,8 @@ def _factors(kind: type[Energy], parts: tuple[str, ...]) -> FloatArray | None:
 
 
 def energy_of(mixture: FloatArray) -> Isotropic:
-    """The energy with the factors ``mixture`` of `OWN`; the inverse of `mixture_of`."""
-    terms = [(float(factor), energy) for factor, energy in zip(mixture, OWN, strict=True) if factor]
+    """The energy with the factors ``mixture`` of `TERMS`; the inverse of `mixture_of`."""
+    terms = [(float(factor), energy) for factor, energy in zip(mixture, TERMS, strict=True) if factor]
     return terms[0][1] if len(terms) == 1 and terms[0][0] == 1 else Combination(*terms)
 
 
@@ -105,6 +105,6 @@ def mixed_curvature(
 def curvature_of_mixture(mixture: FloatArray, d: Deformation, share: FloatArray, negative: float) -> QuadraticForm:
     """Second derivatives of the densities times ``share``, as a quadratic form per triangle."""
     f = d.det.size
-    reals, numbers = np.empty((2, f)), np.empty((4, f), dtype=np.complex128)
-    mixed_curvature(mixture, d.p, d.q, d.det, share, negative, *reals, *numbers)
-    return QuadraticForm(*reals, *numbers)
+    reals, complexes = np.empty((2, f)), np.empty((4, f), dtype=np.complex128)
+    mixed_curvature(mixture, d.p, d.q, d.det, share, negative, *reals, *complexes)
+    return QuadraticForm(*reals, *complexes)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.energies.energies import Deformation, Energy, QuadraticForm, damped, inverse
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
+from quasiharmonic.energies.energies import Deformation, Energy, QuadraticForm, damp, inverse
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, named, own_triangles
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, names_of, own_triangles
 
 
 class MassSpring(Energy):
@@ -35,7 +35,7 @@ class MassSpring(Energy):
         shapes = rest_shapes(V, F)
         if shapes.flat.size:
             raise ValueError(
-                f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
+                f"{names_of('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
                 "spring constants depend on the areas"
             )
         self._sides, self._lengths = shapes.sides, np.abs(shapes.sides)
@@ -59,7 +59,7 @@ class MassSpring(Energy):
         """Second derivative; the negative eigenvalues are those of compressed springs, across their direction."""
         side, length = self._images(d)
         along, across = 2 * self._stiffness, 2 * self._stiffness * (1 - self._lengths * inverse(length))
-        across = damped(across, negative)
+        across = damp(across, negative)
         # With ds = dp z + dq z̄, ``along`` weights the part of ds along the side and ``across`` the part across it.
         z, zz = self._sides, self._lengths**2
         both, turn = 0.5 * (along + across), 0.5 * (along - across) * (np.conj(side) * inverse(length)) ** 2

@@ -12,11 +12,19 @@ Without chords and ears, no choice of the boundary excludes an injective map by 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import Delaunay
 
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_bool,
+    check_integer,
+    real_array,
+    triangle_array,
+    vertex_array,
+)
 
 __all__ = ["annulus", "cat", "disk", "grid", "random_delaunay", "refine", "starfish"]
 
@@ -52,8 +60,9 @@ def grid(nx: int, ny: int, *, alternating: bool = False) -> tuple[FloatArray, In
     ValueError
         If there are fewer than 2 cells along an axis; such a grid has chords.
     """
-    if nx < 2 or ny < 2:
-        raise ValueError(f"a grid needs at least 2 cells along each axis, not {nx} by {ny}")
+    check_integer("nx", nx, minimum=2)
+    check_integer("ny", ny, minimum=2)
+    check_bool("alternating", alternating)
     return _rectangles(np.arange(nx + 1) / nx, np.arange(ny + 1) / ny, None, alternating)
 
 
@@ -80,9 +89,11 @@ def annulus(
     ValueError
         If there are fewer than 2 cells, or the hole is empty or not inside the square.
     """
-    left, bottom, right, top = hole
-    if cells < 2:
-        raise ValueError(f"a ring needs at least 2 cells across, not {cells}")
+    check_integer("cells", cells, minimum=2)
+    corners = real_array("hole", hole)
+    if corners.shape != (4,):
+        raise ValueError(f"hole must be four numbers, not an array of shape {corners.shape}")
+    left, bottom, right, top = corners.tolist()
     if not (-1 < left < right < 1 and -1 < bottom < top < 1):
         raise ValueError(f"the hole {hole} is empty or not inside the square [-1, 1]²")
 
@@ -119,8 +130,7 @@ def disk(rings: int = 12) -> tuple[FloatArray, IntArray]:
     ValueError
         If ``rings`` is not positive.
     """
-    if rings < 1:
-        raise ValueError(f"a disk needs at least 1 ring, not {rings}")
+    check_integer("rings", rings, minimum=1)
     V, F = [np.zeros((1, 2))], []
     inner, m = 0, 1  # the first vertex of the previous ring, and its number of vertices
     for k in range(1, rings + 1):
@@ -137,7 +147,7 @@ def disk(rings: int = 12) -> tuple[FloatArray, IntArray]:
     return np.concatenate(V), np.concatenate(F)
 
 
-def random_delaunay(n: int, seed: int = 0) -> tuple[FloatArray, IntArray]:
+def random_delaunay(n: int, seed: int | np.random.Generator = 0) -> tuple[FloatArray, IntArray]:
     """Triangulate the unit disk irregularly but with well-shaped triangles.
 
     The points are random. Four rounds then move each interior point to the centroid of its triangles.
@@ -146,8 +156,8 @@ def random_delaunay(n: int, seed: int = 0) -> tuple[FloatArray, IntArray]:
     ----------
     n : int
         Number of vertices, at least 4.
-    seed : int
-        Seed of the random points.
+    seed : int or numpy.random.Generator
+        Seed of the random points, or their generator.
 
     Returns
     -------
@@ -160,8 +170,9 @@ def random_delaunay(n: int, seed: int = 0) -> tuple[FloatArray, IntArray]:
     ValueError
         If there are fewer than 4 vertices.
     """
-    if n < 4:
-        raise ValueError(f"a disk with a vertex inside needs at least 4 vertices, not {n}")
+    check_integer("n", n, minimum=4)
+    if not isinstance(seed, np.random.Generator):
+        check_integer("seed", seed, minimum=0)
     # The number of boundary vertices of a disk of equilateral triangles.
     k = int(np.sqrt(12 * n - 3) - 3 + 1e-9)
     angle = np.arange(k) * (2 * np.pi / k)
@@ -263,8 +274,8 @@ def starfish(arms: int = 5, rings: int = 40) -> tuple[FloatArray, IntArray]:
     ValueError
         If there is no arm, or there are fewer than 2 rings.
     """
-    if arms < 1 or rings < 2:
-        raise ValueError(f"a starfish needs at least 1 arm and 2 rings, not {arms} and {rings}")
+    check_integer("arms", arms, minimum=1)
+    check_integer("rings", rings, minimum=2)
     flat, upper = disk(rings)
     inside = len(flat) - 6 * rings
     r = np.hypot(*flat.T)[:, None]
@@ -276,12 +287,12 @@ def starfish(arms: int = 5, rings: int = 40) -> tuple[FloatArray, IntArray]:
     return np.concatenate([V, V[:inside] * (1, 1, -1)]), np.concatenate([upper, lower[upper[:, ::-1]]])
 
 
-def refine(V: NDArray[np.floating], F: NDArray[np.integer]) -> tuple[FloatArray, IntArray]:
+def refine(V: ArrayLike, F: ArrayLike) -> tuple[FloatArray, IntArray]:
     """Split every triangle into four at the midpoints of its edges.
 
     Parameters
     ----------
-    V : (n, d) float
+    V : (n, 2) or (n, 3) float
     F : (f, 3) int
 
     Returns
@@ -290,9 +301,14 @@ def refine(V: NDArray[np.floating], F: NDArray[np.integer]) -> tuple[FloatArray,
         The given vertices, then the midpoint of each of the ``e`` edges.
     F : (4 f, 3) int64
         Triangle ``t`` becomes ``4 t … 4 t + 3``: three corner triangles, then the middle triangle.
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape or contents.
     """
-    V = np.asarray(V, dtype=np.float64)
-    F = np.asarray(F, dtype=np.int64)
+    V = vertex_array(V)
+    F = triangle_array(F, len(V))
     sides = np.sort(np.stack([F, F[:, [1, 2, 0]]], axis=2).reshape(-1, 2), axis=1)
     pairs, which = np.unique(sides, axis=0, return_inverse=True)
     # Corners a, b, c and the midpoints of ab, bc, ca are columns 0 to 5.

@@ -5,13 +5,19 @@ from __future__ import annotations
 import os
 
 # Longest description of a fault, in characters. A file may have very long text in place of a number.
-_MOST = 300
+_MAX_LENGTH = 300
 
 
 def printable(path: str | bytes | os.PathLike[str]) -> str:
     """Return a file name for messages, with unprintable characters escaped."""
     text = os.fsdecode(path)
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in text)
+
+
+def check_path(name: str, value: object) -> None:
+    """Raise a ValueError unless the value of the parameter ``name`` is text or a path."""
+    if not isinstance(value, str | os.PathLike):
+        raise ValueError(f"{name} must be the name of a file, not {repr(value)[:80]}")
 
 
 class MeshFileError(ValueError):
@@ -31,8 +37,8 @@ class MeshFileError(ValueError):
 
     def __init__(self, path: str | os.PathLike[str], what: str, line: int | None = None, remedy: str = "") -> None:
         # Pickling between processes needs all arguments in the base class.
-        if len(what) > _MOST:
-            what = f"{what[: _MOST // 2]} … {what[-_MOST // 2 :]}"
+        if len(what) > _MAX_LENGTH:
+            what = f"{what[: _MAX_LENGTH // 2]} … {what[-_MAX_LENGTH // 2 :]}"
         super().__init__(path, what, line, remedy)
         self.path = path
         self.what = what

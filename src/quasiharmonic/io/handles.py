@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.formats.obj import read_obj
-from quasiharmonic.io.meshdata import MeshData, vertex_places
-from quasiharmonic.io.textual import integer, read_text
-from quasiharmonic.util.arrays import FloatArray, IntArray, named
+from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.lowlevel.textual import integer, read_text
+from quasiharmonic.io.mesh_files import read_mesh
+from quasiharmonic.io.models.meshdata import MeshData, vertex_places
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, names_of
 
 
 class ProblemArrays(NamedTuple):
@@ -49,7 +49,7 @@ def read_problem(source: str | os.PathLike[str], fixed: str | os.PathLike[str] |
     Parameters
     ----------
     source : str or path-like
-        A folder with ``input.obj`` and, optionally, ``handles.txt``; or an OBJ file alone.
+        A folder with ``input.obj`` and, optionally, ``handles.txt``; or a mesh file alone.
     fixed : str or path-like, optional
         A list of fixed vertices that replaces the folder's list. Without any list, the boundary is fixed.
 
@@ -64,7 +64,7 @@ def read_problem(source: str | os.PathLike[str], fixed: str | os.PathLike[str] |
         If a file cannot be read, or a fixed vertex has no target position.
     """
     mesh_path, fixed_path = problem_files(source, fixed)
-    mesh = read_obj(mesh_path)
+    mesh = read_mesh(mesh_path)
     return problem_arrays(mesh, None if fixed_path is None else read_handles(fixed_path, len(mesh.V)))
 
 
@@ -76,7 +76,7 @@ def problem_files(
     Parameters
     ----------
     source : path
-        An OBJ file, or a folder with ``input.obj`` and optionally ``handles.txt``.
+        A mesh file, or a folder with ``input.obj`` and optionally ``handles.txt``.
     fixed : path, optional
         A list of fixed vertices that replaces the folder's list.
 
@@ -86,6 +86,9 @@ def problem_files(
     fixed : Path or None
         The files may be missing; reading them then raises an error.
     """
+    check_path("source", source)
+    if fixed is not None:
+        check_path("fixed", fixed)
     mesh_path = Path(source)
     if mesh_path.is_dir():
         folder, mesh_path = mesh_path, mesh_path / "input.obj"
@@ -130,13 +133,16 @@ def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArra
                 "has no boundary to fix",
                 remedy="cut it open, or give fixed vertices",
             )
+    else:
+        fixed = index_array("fixed", fixed).ravel()
+        check_range("fixed", fixed, len(mesh.V))
     uv, seam = vertex_places(mesh)
     for wrong, what, remedy in (
         (np.isnan(uv[fixed, 0]), "no texture coordinates", "give every fixed vertex a vt"),
         (seam[fixed], "more than one pair of texture coordinates", "cut the mesh along its seams first"),
     ):
         if wrong.any():
-            which = named("vertex", "vertices", fixed[wrong])
+            which = names_of("vertex", "vertices", fixed[wrong])
             raise MeshFileError(mesh.source, f"{what} for the fixed {which} (0-based)", remedy=remedy)
     return ProblemArrays(mesh.V, mesh.F, fixed, uv[fixed])
 

@@ -21,12 +21,13 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.util.arrays import describe
 
 __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver", "takes_order"]
 
 # Fastest first: the order in which "auto" tries the backends. Each entry is the module and the class in it.
 BACKENDS = {
-    "pardiso": ("mkl", "Pardiso"),
+    "mkl": ("mkl", "MKL"),
     "cholmod": ("cholmod", "Cholmod"),
     "rslab": ("rslab", "Rslab"),
     "qdldl": ("qdldl", "Qdldl"),
@@ -52,13 +53,20 @@ def available(entries: int | None = None) -> tuple[str, ...]:
     """
     present = [name for name in BACKENDS if _backend(name).present()]
     if entries is not None and entries <= QDLDL_UP_TO and {"qdldl", "rslab"} <= set(present):
-        young = present.index("rslab")
-        present[young : young + 2] = "qdldl", "rslab"
+        rslab = present.index("rslab")
+        present[rslab : rslab + 2] = "qdldl", "rslab"
     return tuple(present)
+
+
+def check_name(name: object) -> None:
+    """Raise a ValueError if the name of a linear solver is not a text."""
+    if not isinstance(name, str):
+        raise ValueError(f"linear_solver must be a name, not {describe(name)}")
 
 
 def takes_order(name: str = "auto") -> bool:
     """Whether `make_solver` with this name and a large system uses a given elimination order."""
+    check_name(name)
     chosen = available()[0] if name == "auto" else name
     return chosen in BACKENDS and _backend(chosen).takes_order
 
@@ -71,7 +79,7 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
     indptr, indices : (n+1,) and (nnz,) integer arrays
         Upper triangle of the pattern in compressed sparse rows: columns ascending within each row, every row starting
         with its diagonal entry.
-    name : {"auto", "pardiso", "cholmod", "rslab", "qdldl", "superlu"}
+    name : {"auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"}
         Backend to use. "auto" uses the first of `available` for this number of entries that can be loaded.
     ordered : bool
         Whether the unknowns are numbered such that elimination in this order gives a sparse factor, as
@@ -89,6 +97,7 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
     ImportError
         If the named backend is not installed or its library does not load.
     """
+    check_name(name)
     if name == "auto":
         for candidate in available(np.size(indices)):
             try:

@@ -58,7 +58,7 @@ class LinearSolver(ABC):
 
     def __init__(self, indptr: ArrayLike, indices: ArrayLike, *, ordered: bool = False) -> None:
         self._ordered = ordered
-        self._indptr, self._indices = _checked_pattern(indptr, indices)
+        self._indptr, self._indices = _check_pattern(indptr, indices)
         self.n = len(self._indptr) - 1
         self.nnz = len(self._indices)
         # The backend reads only from this buffer. So the caller may reuse its array, and a backend that stores
@@ -128,21 +128,21 @@ class LinearSolver(ABC):
         RuntimeError
             If there is no factor: `factor` was not called or failed.
         """
-        given = np.asarray(rhs, dtype=np.float64)
-        if given.ndim not in (1, 2) or given.shape[0] != self.n:
-            raise ValueError(f"right-hand side has shape {given.shape}; expected ({self.n},) or ({self.n}, k)")
+        array = np.asarray(rhs, dtype=np.float64)
+        if array.ndim not in (1, 2) or array.shape[0] != self.n:
+            raise ValueError(f"right-hand side has shape {array.shape}; expected ({self.n},) or ({self.n}, k)")
         heartbeat()
-        b = np.asfortranarray(given.reshape(self.n, -1) if given.size else np.zeros((self.n, 0)))
+        b = np.asfortranarray(array.reshape(self.n, -1) if array.size else np.zeros((self.n, 0)))
         with self._lock:
             self._require_open()
             if not self._ready:
                 raise RuntimeError("the matrix has no factorisation: factor() was not called or failed")
-            if not given.size:
-                return np.zeros(given.shape)
+            if not array.size:
+                return np.zeros(array.shape)
             x = self._solve(b)
             if not self._test.plausible(b, x):
-                x = self._examine(b, x)
-        return x[:, 0] if given.ndim == 1 else x
+                x = self._check_residual(b, x)
+        return x[:, 0] if array.ndim == 1 else x
 
     def close(self) -> None:
         """Release the factor and the memory of the library. Repeated calls have no effect."""
@@ -165,7 +165,7 @@ class LinearSolver(ABC):
         if self._closed:
             raise ValueError("the solver is closed")
 
-    def _examine(self, b: FloatArray, x: FloatArray) -> FloatArray:
+    def _check_residual(self, b: FloatArray, x: FloatArray) -> FloatArray:
         """Check the true residual, refine once if it is too large, and raise if it is still too large."""
         excess = self._test.excess(b, x)
         if excess > 1:
@@ -200,7 +200,7 @@ class LinearSolver(ABC):
         """Release the factor and the memory of the library."""
 
 
-def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pattern]:
+def _check_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pattern]:
     """Check the pattern of an upper triangle and return private int32 copies."""
     starts, columns = np.array(indptr), np.array(indices)
     if starts.ndim != 1 or columns.ndim != 1 or starts.size == 0 or starts[0] != 0 or starts[-1] != columns.size:
@@ -213,17 +213,21 @@ def _checked_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pa
         columns = np.clip(columns, -1, n).astype(np.int32)
     pattern = starts.astype(np.int32, copy=False), columns
     wrong = wrong_pattern(*pattern)
-    if wrong == _EMPTY_ROW:
+    if wrong == _PATTERN_EMPTY_ROW:
         raise ValueError(f"row {int(np.argmin(np.diff(starts)))} has no entries; every row needs its diagonal entry")
-    if wrong == _NO_DIAGONAL:
+    if wrong == _PATTERN_NO_DIAGONAL:
         row = np.flatnonzero(columns[starts[:-1]] != np.arange(n))[0]
         raise ValueError(f"row {row} does not start with its diagonal entry")
-    if wrong == _NOT_ASCENDING:
+    if wrong == _PATTERN_NOT_ASCENDING:
         raise ValueError("column indices must be ascending within each row and smaller than the number of rows")
     return pattern
 
 
-_RIGHT, _EMPTY_ROW, _NO_DIAGONAL, _NOT_ASCENDING = range(4)
+# Results of `wrong_pattern`.
+_PATTERN_RIGHT = 0
+_PATTERN_EMPTY_ROW = 1
+_PATTERN_NO_DIAGONAL = 2
+_PATTERN_NOT_ASCENDING = 3
 
 
 @compiled
@@ -231,9 +235,9 @@ def wrong_pattern(indptr: Pattern, indices: Pattern) -> int:
     """Check rows of an upper triangle, from 0 to the number of entries; return one of the constants above."""
     n = indptr.size - 1
     if n and np.diff(indptr).min() < 1:
-        return _EMPTY_ROW
+        return _PATTERN_EMPTY_ROW
     if not np.array_equal(indices[indptr[:-1]], np.arange(n)):
-        return _NO_DIAGONAL
+        return _PATTERN_NO_DIAGONAL
     ascending = indices[1:] > indices[:-1]
     ascending[indptr[1:-1] - 1] = True
-    return _RIGHT if ascending.all() and indices.max(initial=-1) < n else _NOT_ASCENDING
+    return _PATTERN_RIGHT if ascending.all() and indices.max(initial=-1) < n else _PATTERN_NOT_ASCENDING

@@ -42,8 +42,8 @@ class Cholmod(LinearSolver):
         mode, ordering = ("simplicial", "amd") if small else ("auto", "default")
         if self._ordered:
             ordering = "natural"
-        self._old = hasattr(cholmod, "analyze")
-        if self._old:
+        self._has_old_interface = hasattr(cholmod, "analyze")
+        if self._has_old_interface:
             self._symbolic: Any = cholmod.analyze(self._matrix, mode=mode, ordering_method=ordering)
         else:
             self._symbolic = cholmod.CholeskyFactor(self._matrix, lower=True, order=ordering, supernodal_mode=mode)
@@ -51,7 +51,7 @@ class Cholmod(LinearSolver):
 
     def _factor(self) -> None:
         try:
-            if self._old:
+            if self._has_old_interface:
                 self._numeric = self._symbolic
                 self._numeric.cholesky_inplace(self._matrix)
                 # The simplicial code computes LDLᵀ, which exists for indefinite matrices as well.
@@ -69,7 +69,7 @@ class Cholmod(LinearSolver):
 
     def _solve(self, b: FloatArray) -> FloatArray:
         x: FloatArray
-        if self._old:
+        if self._has_old_interface:
             x = self._numeric(b)
         elif self._numeric.rcond >= self.n * np.finfo(np.float64).eps:
             x = self._numeric.solve(b)

@@ -38,38 +38,27 @@ BITS = 4
 # Limit on the sum of the cubes of the separator sizes over n^(3/2), which is proportional to the work of a
 # factorisation. It is 2.2 to 3.4 for planar and gently curved meshes. At 8 (a scanned hand) a factorisation takes twice
 # as long as with METIS's ordering, and ten factorisations lose the time gained in ordering.
-_WORST = 4.0
+_MAX_WORK = 4.0
 
 
 def nested_dissection(points: FloatArray, tail: IntArray, head: IntArray) -> NDArray[np.int64] | None:
-    """Order the vertices of a mesh for elimination.
+    """Order the vertices of a mesh for elimination, (n,) int64; ``tail`` and ``head`` (e,) are the ends of its edges.
 
-    Parameters
-    ----------
-    points : (n, d) float64
-        Positions of the vertices.
-    tail, head : (e,) int
-        The ends of the edges, each edge once.
-
-    Returns
-    -------
-    (n,) int64 or None
-        The vertices in elimination order. None if planes make poor cuts, because the surface is folded or the
-        points coincide.
+    The result is None if planes make poor cuts, because the surface is folded or the points coincide.
     """
     n = len(points)
     levels = max(0, int(np.ceil(np.log2(max(n / _PART, 1)))))
-    part = _halves(points, levels)
-    code = (part << 2 * BITS) | _cells(points, part, 1 << levels)
+    part = _bisect(points, levels)
+    code = (part << 2 * BITS) | _grid_cells(points, part, 1 << levels)
     rank = separators(code, levels, tail, head)
-    if _work(code, rank) > _WORST * n**1.5:
+    if _factor_work(code, rank) > _MAX_WORK * n**1.5:
         return None
     # A part of rank k is a range of 2^k codes. Its separator follows the last code and the separators of its own parts.
     end = ((code >> rank) + 1) << rank
     return np.argsort(end.astype(np.int64) << 5 | rank, kind="stable")
 
 
-def _halves(points: FloatArray, levels: int) -> Codes:
+def _bisect(points: FloatArray, levels: int) -> Codes:
     """Part of each point after ``levels`` bisections; the first cut is the highest bit."""
     n, d = points.shape
     sample = points[np.random.default_rng(0).integers(n, size=_SAMPLES << levels)][None]
@@ -87,7 +76,7 @@ def _halves(points: FloatArray, levels: int) -> Codes:
     return part
 
 
-def _cells(points: FloatArray, part: Codes, parts: int) -> Codes:
+def _grid_cells(points: FloatArray, part: Codes, parts: int) -> Codes:
     """Cell of each point in a grid over its part, with the bits of row and column interleaved (Morton order)."""
     n, d = points.shape
     order = np.argsort(part.astype(np.min_scalar_type(parts - 1)), kind="stable")  # radix sort for 16 bits or less
@@ -165,20 +154,20 @@ def smallest_cover(u: IntArray, v: IntArray) -> tuple[IntArray, IntArray]:
     mate = maximum_bipartite_matching(edges, perm_type="row")  # of each v, -1 if unmatched
     reached_u, reached_v = np.ones(us.size, dtype=bool), np.zeros(vs.size, dtype=bool)
     reached_u[mate[mate >= 0]] = False
-    fresh = reached_u.copy()
-    while fresh.any():
-        met = j[fresh[i]]
-        met = met[~reached_v[met]]
-        reached_v[met] = True
+    new = reached_u.copy()
+    while new.any():
+        reached = j[new[i]]
+        reached = reached[~reached_v[reached]]
+        reached_v[reached] = True
         # Every v that is reached is matched; otherwise the matching would not be maximum.
-        fresh[:] = False
-        fresh[mate[met]] = True
-        fresh &= ~reached_u
-        reached_u |= fresh
+        new[:] = False
+        new[mate[reached]] = True
+        new &= ~reached_u
+        reached_u |= new
     return us[~reached_u], vs[reached_v]
 
 
-def _work(code: Codes, rank: NDArray[np.uint8]) -> float:
+def _factor_work(code: Codes, rank: NDArray[np.uint8]) -> float:
     """Sum of the cubes of the sizes of the separators and of the remaining parts."""
     end = ((code >> rank) + 1) << rank
     _, size = np.unique(end.astype(np.int64) << 5 | rank, return_counts=True)

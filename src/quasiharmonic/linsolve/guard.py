@@ -18,17 +18,11 @@ FORWARD = 1e-4
 
 
 class ResidualTest:
-    """Test solutions of A x = b, with A given by its upper triangle.
+    """Test solutions of A x = b, with A given by its upper triangle in compressed sparse rows.
 
-    Sizes are compared after scaling A to a unit diagonal, S A S with S = diag(a_ii)^-1/2. Then Cholesky's error bound,
-    |ΔA_ij| <= c n ε √(a_ii a_jj), is the same in every row for any units of A.
-
-    Parameters
-    ----------
-    indptr, indices : (n+1,) and (nnz,) int32 arrays
-        Upper triangle in compressed sparse rows, the diagonal entry first in each row.
-    values : (nnz,) float64 array
-        Entries of the matrix. The array is kept; `read` reads it again.
+    Each row has its diagonal entry first. `read` reads the array ``values`` again. Sizes are compared after scaling A
+    to a unit diagonal, S A S with S = diag(a_ii)^-1/2. Then Cholesky's error bound, |ΔA_ij| <= c n ε √(a_ii a_jj), is
+    the same in every row for any units of A.
     """
 
     def __init__(self, indptr: NDArray[np.int32], indices: NDArray[np.int32], values: FloatArray) -> None:
@@ -40,10 +34,7 @@ class ResidualTest:
     def read(self) -> None:
         """Read the current values.
 
-        Raises
-        ------
-        NotPositiveDefinite
-            If a diagonal entry is not positive, or an entry is not finite.
+        Raises NotPositiveDefinite if a diagonal entry is not positive or an entry is not finite.
         """
         indptr, indices, values = self._matrix
         with np.errstate(all="ignore"):

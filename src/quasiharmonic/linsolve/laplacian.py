@@ -64,13 +64,13 @@ class Laplacian:
         order = None
         if points is not None and self.free.size >= DISSECT_FROM and takes_order(linear_solver):
             # Half-edge e·f + t is edge e of triangle t, the layout of ReferenceMesh.edge_stiffness.
-            tail = self._place()[F.T]
+            tail = self._find_unknowns()[F.T]
             tail, head = tail.ravel(), tail[(1, 2, 0), :].ravel()
             once = np.flatnonzero((tail >= 0) & (tail < head))
             order = nested_dissection(points[self.free], tail[once], head[once])
         if order is not None:
             self.free = self.free[order]
-        self._pattern = pattern = stiffness_pattern(F, self._place(), self.free.size)
+        self._pattern = pattern = stiffness_pattern(F, self._find_unknowns(), self.free.size)
         self._values = np.empty(pattern.indices.size)
         self.solver = make_solver(pattern.indptr, pattern.indices, name=linear_solver, ordered=order is not None)
         # The lock prevents another thread from replacing the factor between its check and the solve.
@@ -78,59 +78,47 @@ class Laplacian:
         self._factored: FactoredLaplacian | None = None
         self._F = F
 
-    def _place(self) -> NDArray[np.int32]:
+    def _find_unknowns(self) -> NDArray[np.int32]:
         """Index of the unknown of each vertex, -1 at fixed vertices; (n,)."""
-        place = np.full(self.n, -1, dtype=np.int32)
-        place[self.free] = np.arange(self.free.size, dtype=np.int32)
-        return place
+        unknown = np.full(self.n, -1, dtype=np.int32)
+        unknown[self.free] = np.arange(self.free.size, dtype=np.int32)
+        return unknown
 
     @cached_property
-    def _rim(self) -> tuple[IntArray, IntArray, IntArray]:
+    def _border(self) -> tuple[IntArray, IntArray, IntArray]:
         """Half-edges with at least one fixed end, and their tails and heads."""
         corner = np.ascontiguousarray(self._F.T)
         tail, head = corner.ravel(), corner[(1, 2, 0), :].ravel()
-        held = self._place() < 0
-        rim = np.flatnonzero(held[tail] | held[head])
-        return rim, tail[rim], head[rim]
+        is_fixed = self._find_unknowns() < 0
+        border = np.flatnonzero(is_fixed[tail] | is_fixed[head])
+        return border, tail[border], head[border]
 
     def factor(self, stiffness: FloatArray) -> FactoredLaplacian:
         """Assemble and factor the Laplacian for one tensor field.
 
-        Parameters
-        ----------
-        stiffness : (3, f) float64
-            Off-diagonal entries of every triangle's ``Gᵀ A G``, from `ReferenceMesh.edge_stiffness`.
-
-        Returns
-        -------
-        FactoredLaplacian
-            Operator for these tensors; it stays valid when other tensors are factored later.
-
-        Raises
-        ------
-        quasiharmonic.linsolve.NotPositiveDefinite
-            If the matrix is not positive definite because of rounding.
+        ``stiffness`` (3, f) comes from `ReferenceMesh.edge_stiffness`. The result stays valid when other tensors are
+        factored later. Raises NotPositiveDefinite if the matrix is not positive definite because of rounding.
         """
         if stiffness.size != self._F.size:
             raise ValueError(f"stiffness must have shape (3, {len(self._F)}), not {stiffness.shape}")
-        made = FactoredLaplacian(self, stiffness.ravel())
+        operator = FactoredLaplacian(self, stiffness.ravel())
         with self._lock:
-            self._refactor(made)
-        return made
+            self._refactor(operator)
+        return operator
 
     def _refactor(self, operator: FactoredLaplacian) -> None:
         """Make the solver's factor that of ``operator``. The caller holds the lock."""
         self._factored = None
-        of = self._pattern
+        pattern = self._pattern
         assemble(
             operator.stiffness,
-            of.indptr,
-            of.row,
-            of.column,
-            of.halves,
-            of.offsets,
-            of.border,
-            of.border_row,
+            pattern.indptr,
+            pattern.row,
+            pattern.column,
+            pattern.halves,
+            pattern.offsets,
+            pattern.border,
+            pattern.border_row,
             self._values,
         )
         self.solver.factor(self._values)
@@ -146,78 +134,43 @@ class Laplacian:
 
 
 class FactoredLaplacian:
-    """``Gᵀ A G`` for one A, made by `Laplacian.factor`.
+    """``Gᵀ A G`` for one A, made by `Laplacian.factor`; ``stiffness`` (3 f,) is half-edge by half-edge.
 
     A solver holds one factor at a time. If a later operator has replaced the factor, the next solve factors again. This
     costs time and does not change the result.
-
-    Parameters
-    ----------
-    pattern : Laplacian
-    stiffness : (3 f,) float64
-        Off-diagonal entries of every triangle's ``Gᵀ A G``, half-edge by half-edge.
     """
 
-    def __init__(self, pattern: Laplacian, stiffness: FloatArray) -> None:
-        self.pattern = pattern
+    def __init__(self, laplacian: Laplacian, stiffness: FloatArray) -> None:
+        self.laplacian = laplacian
         self.stiffness = stiffness
 
     def extend(self, w: ComplexArray) -> ComplexArray:
-        """Compute the quasi-harmonic map that equals ``w`` at the fixed vertices (eq. 12).
-
-        Parameters
-        ----------
-        w : (n,) complex128
-            ``u + i v``; only the values at the fixed vertices are used.
-
-        Returns
-        -------
-        (n,) complex128
-            Equal to ``w`` at the fixed vertices in every bit.
-        """
-        of, pattern, out = self.pattern, self.pattern._pattern, w.copy()
-        if w.shape != (of.n,):
-            raise ValueError(f"w must have shape ({of.n},), one position for each vertex, not {w.shape}")
-        load = np.empty((2, of.free.size))
+        """Compute the quasi-harmonic map that equals ``w`` (n,) at the fixed vertices in every bit (eq. 12)."""
+        laplacian, pattern, out = self.laplacian, self.laplacian._pattern, w.copy()
+        if w.shape != (laplacian.n,):
+            raise ValueError(f"w must have shape ({laplacian.n},), one position for each vertex, not {w.shape}")
+        load = np.empty((2, laplacian.free.size))
         boundary_load(self.stiffness, pattern.border, pattern.border_row, pattern.border_fixed, w, load)
-        of._solve(self, load, out)
+        laplacian._solve(self, load, out)
         return out
 
     def respond(self, load: ComplexArray) -> ComplexArray:
-        """Solve ``Sᵀ Gᵀ A G S x = Sᵀ load``; the solution is zero at the fixed vertices.
-
-        Parameters
-        ----------
-        load : (n,) complex128
-
-        Returns
-        -------
-        (n,) complex128
-        """
-        of, out = self.pattern, np.zeros(load.shape, dtype=np.complex128)
-        given = load[of.free]
-        of._solve(self, np.stack([given.real, given.imag]), out)
+        """Solve ``Sᵀ Gᵀ A G S x = Sᵀ load``; the solution (n,) is zero at the fixed vertices."""
+        laplacian, out = self.laplacian, np.zeros(load.shape, dtype=np.complex128)
+        given = load[laplacian.free]
+        laplacian._solve(self, np.stack([given.real, given.imag]), out)
         return out
 
     def flux(self, w: ComplexArray) -> ComplexArray:
-        """Compute ``Gᵀ A G w`` at the fixed vertices, the discrete Neumann data (§6.2); zero elsewhere.
-
-        Parameters
-        ----------
-        w : (n,) complex128
-
-        Returns
-        -------
-        (n,) complex128
-        """
-        of = self.pattern
-        rim, tail, head = of._rim
+        """Compute ``Gᵀ A G w`` at the fixed vertices, the discrete Neumann data (§6.2); zero elsewhere."""
+        laplacian = self.laplacian
+        border, tail, head = laplacian._border
         # Rows sum to zero, so an off-diagonal entry k of edge (i, j) adds k (wⱼ − wᵢ) to row i.
-        pull = self.stiffness[rim] * (w[head] - w[tail])
-        out = np.zeros(of.n, dtype=np.complex128)
+        pull = self.stiffness[border] * (w[head] - w[tail])
+        out = np.zeros(laplacian.n, dtype=np.complex128)
         np.add.at(out, tail, pull)
         np.subtract.at(out, head, pull)
-        out[of.free] = 0
+        out[laplacian.free] = 0
         return out
 
 
@@ -255,8 +208,8 @@ def boundary_load(
 ) -> None:
     """Fill in both coordinates of the right-hand side (2, n - k), the load from half-edges to fixed vertices."""
     pull = -stiffness[border] * w[border_fixed]
-    for coordinate, some in zip(load, (pull.real, pull.imag), strict=True):
-        coordinate[:] = np.bincount(border_row, some, load.shape[1])
+    for coordinate, part in zip(load, (pull.real, pull.imag), strict=True):
+        coordinate[:] = np.bincount(border_row, part, load.shape[1])
 
 
 @compiled

@@ -19,9 +19,18 @@ from quasiharmonic.linsolve.base import LinearSolver, Pattern
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.util.arrays import FloatArray
 
-_ANALYSE, _FACTOR, _SOLVE, _FORWARD_ONLY, _RELEASE = 11, 22, 33, 331, -1
-_MINIMUM_DEGREE, _PARALLEL_DISSECTION = 0, 3
-_CLASSIC_TWO_LEVEL, _IMPROVED_TWO_LEVEL = 1, 10
+# PARDISO's phases.
+_ANALYSE = 11
+_FACTOR = 22
+_SOLVE = 33
+_FORWARD_ONLY = 331
+_RELEASE = -1
+# Values of iparm[1]: the elimination order.
+_MINIMUM_DEGREE = 0
+_PARALLEL_DISSECTION = 3
+# Values of iparm[23]: the parallel factorisation.
+_CLASSIC_TWO_LEVEL = 1
+_IMPROVED_TWO_LEVEL = 10
 _INTEL_THREADS = 0
 
 # Below this number of unknowns: minimum degree ordering and one thread. Above: dissection and all threads. For 10,000
@@ -29,10 +38,12 @@ _INTEL_THREADS = 0
 # all threads are also slow on a busy machine, because MKL's threads spin while they wait for each other.
 SEQUENTIAL_BELOW = 30_000
 
-# From 10,000 unknowns the improved two-level algorithm is more than twice as fast. For a planar mesh (MKL 2024.2 and
-# 2026.2), 9,801 unknowns take 9.8 ms to analyse and 7.6 ms to factor; 10,201 take 4.8 and 3.0 ms. So slightly smaller
-# matrices are padded to 10,000 unknowns with ones on the diagonal. The 9,801 unknowns then take 5.0 and 2.9 ms.
-FAST_FROM, FILL_UP_FROM = 10_000, 2_500
+#: From this number of unknowns the improved two-level algorithm is more than twice as fast. For a planar mesh (MKL
+#: 2024.2 and 2026.2), 9,801 unknowns take 9.8 ms to analyse and 7.6 ms to factor; 10,201 take 4.8 and 3.0 ms.
+FAST_FROM = 10_000
+#: From this number of unknowns, matrices are padded to FAST_FROM unknowns with ones on the diagonal. 9,801 unknowns
+#: then take 5.0 and 2.9 ms.
+PAD_FROM = 2_500
 
 _NOT_POSITIVE_DEFINITE = {-4, -7}
 _OUT_OF_MEMORY = {-2, -9}
@@ -47,10 +58,10 @@ _ERRORS = {
 }
 
 
-class Pardiso(LinearSolver):
+class MKL(LinearSolver):
     """Supernodal Cholesky factorisation of the upper triangle, multi-threaded for large matrices."""
 
-    name = "pardiso"
+    name = "mkl"
     requirement = "pip install mkl (x86-64 Linux and Windows)"
 
     @classmethod
@@ -60,7 +71,7 @@ class Pardiso(LinearSolver):
 
     def _analyse(self) -> None:
         indptr, indices, values = self._indptr, self._indices, self._values
-        self._size = FAST_FROM if FILL_UP_FROM <= self.n < FAST_FROM else self.n
+        self._size = FAST_FROM if PAD_FROM <= self.n < FAST_FROM else self.n
         if self._size > self.n:
             extra = np.arange(self.n, self._size, dtype=np.int32)
             indptr = np.append(indptr, self.nnz + 1 + extra - self.n)
@@ -68,14 +79,14 @@ class Pardiso(LinearSolver):
             values = np.ones(indices.size)
         self._entries = values[: self.nnz]
         sequential = self.n < SEQUENTIAL_BELOW
-        self.handle = self._begun(indptr, indices, values, sequential)
+        self.handle = self._begin(indptr, indices, values, sequential)
         # With several threads and any ordering except METIS's, the improved two-level algorithm solves a single
         # right-hand side incorrectly; two or more are correct. A solve on one thread then corrupts or crashes the next
         # factorisation on several threads (MKL 2026.2). So at least two right-hand sides are always passed.
-        self._fewest = 1 if sequential or not self.handle.improved else 2
-        self._ones = np.ones((self._size, self._fewest), order="F")
+        self._min_columns = 1 if sequential or not self.handle.improved else 2
+        self._ones = np.ones((self._size, self._min_columns), order="F")
 
-    def _begun(self, indptr: Pattern, indices: Pattern, values: FloatArray, sequential: bool) -> Handle:
+    def _begin(self, indptr: Pattern, indices: Pattern, values: FloatArray, sequential: bool) -> Handle:
         """Analyse a pattern with the number of threads that is currently allowed."""
         handle = Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
         self._release_once = weakref.finalize(self, handle.release)
@@ -87,7 +98,7 @@ class Pardiso(LinearSolver):
             # An instance crashes if the number of threads changes (MKL 2026.2), so a new one is made.
             self._release_once()
             self.handle.threads = 0  # if memory runs out now, the next call analyses again
-            self.handle = self._begun(*self.handle.pattern, self.handle.sequential)
+            self.handle = self._begin(*self.handle.pattern, self.handle.sequential)
         if self._size > self.n:
             self._entries[:] = self._values
         self.handle.check(_FACTOR)
@@ -103,8 +114,8 @@ class Pardiso(LinearSolver):
         if self._size > self.n:
             b = np.asfortranarray(np.concatenate([b, np.zeros((self._size - self.n, b.shape[1]))]))
         columns = b.shape[1]
-        if columns < self._fewest:
-            b = np.asfortranarray(np.repeat(b, self._fewest, axis=1))
+        if columns < self._min_columns:
+            b = np.asfortranarray(np.repeat(b, self._min_columns, axis=1))
         x = np.empty_like(b, order="F")
         self.handle.check(_SOLVE, b, x)
         return np.asfortranarray(x[: self.n, :columns])
@@ -249,14 +260,17 @@ def candidates() -> Iterator[str]:
     """Yield candidate paths of MKL's runtime library, likeliest first, newer versions before older ones."""
     for prefix in (sys.prefix, site.getuserbase()):
         found = [
-            path for folder in ("lib", "Library/bin") for path in Path(prefix, folder).glob("*mkl_rt*") if _fits(path)
+            path
+            for folder in ("lib", "Library/bin")
+            for path in Path(prefix, folder).glob("*mkl_rt*")
+            if _is_runtime_library(path)
         ]
         yield from map(str, sorted(found, key=_version, reverse=True))
     # Environments that use the packages of another environment.
     from importlib.metadata import PackageNotFoundError, files
 
     try:
-        found = [Path(str(file.locate())) for file in files("mkl") or () if _fits(Path(file.name))]
+        found = [Path(str(file.locate())) for file in files("mkl") or () if _is_runtime_library(Path(file.name))]
         yield from map(str, sorted((path for path in found if path.exists()), key=_version, reverse=True))
     except PackageNotFoundError:
         pass
@@ -267,7 +281,7 @@ def candidates() -> Iterator[str]:
             yield path
 
 
-def _fits(path: Path) -> bool:
+def _is_runtime_library(path: Path) -> bool:
     """Whether the file name is that of a runtime library: libmkl_rt.so.3, libmkl_rt.2.dylib or mkl_rt.3.dll."""
     return re.fullmatch(r"(lib)?mkl_rt(\.\d+)?\.(so(\.\d+)*|dylib|dll)", path.name) is not None
 

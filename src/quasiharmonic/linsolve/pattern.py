@@ -40,47 +40,40 @@ class StiffnessPattern(NamedTuple):
     border_fixed: IntArray
 
 
-def stiffness_pattern(F: IntArray, place: NDArray[np.int32], size: int) -> StiffnessPattern:
-    """Find the pattern of the Laplacian of a mesh among its free vertices.
+def stiffness_pattern(F: IntArray, unknown: NDArray[np.int32], size: int) -> StiffnessPattern:
+    """Find the pattern of the Laplacian of a mesh among its ``size`` free vertices.
 
-    Parameters
-    ----------
-    F : (f, 3) int64
-        Triangles.
-    place : (n,) int32
-        Row of every free vertex, -1 at fixed ones.
-    size : int
-        Number of free vertices.
+    ``unknown`` (n,) int32 has the row of every free vertex, and -1 at fixed ones.
     """
     F = own_triangles(F)
-    check_range("F", F, place.size)
-    most = F.size
-    made = StiffnessPattern(
+    check_range("F", F, unknown.size)
+    capacity = F.size
+    pattern = StiffnessPattern(
         indptr=np.empty(size + 1, dtype=np.int32),
-        indices=np.empty(size + most, dtype=np.int32),
-        row=np.empty(most, dtype=np.int64),
-        column=np.empty(most, dtype=np.int64),
-        halves=np.empty(most, dtype=np.int32),
-        offsets=np.empty(most + 1, dtype=np.int32),
-        border=np.empty(most, dtype=np.int64),
-        border_row=np.empty(most, dtype=np.int64),
-        border_fixed=np.empty(most, dtype=np.int64),
+        indices=np.empty(size + capacity, dtype=np.int32),
+        row=np.empty(capacity, dtype=np.int64),
+        column=np.empty(capacity, dtype=np.int64),
+        halves=np.empty(capacity, dtype=np.int32),
+        offsets=np.empty(capacity + 1, dtype=np.int32),
+        border=np.empty(capacity, dtype=np.int64),
+        border_row=np.empty(capacity, dtype=np.int64),
+        border_fixed=np.empty(capacity, dtype=np.int64),
     )
     sizes = np.empty(3, dtype=np.int64)
-    find_pattern(F, place, *made, sizes)
+    find_pattern(F, unknown, *pattern, sizes)
     entries, inner, border = sizes.tolist()
     # Release the unused memory, which was never touched.
     lengths = size + 1, size + entries, entries, entries, inner, entries + 1, border, border, border
-    arrays: list[NDArray[Any]] = list(made)
+    arrays: list[NDArray[Any]] = list(pattern)
     for array, length in zip(arrays, lengths, strict=True):
         array.resize(length, refcheck=False)
-    return made
+    return pattern
 
 
 @compiled
 def find_pattern(
     F: IntArray,
-    place: NDArray[np.int32],
+    unknown: NDArray[np.int32],
     indptr: NDArray[np.int32],
     indices: NDArray[np.int32],
     row: IntArray,
@@ -94,7 +87,7 @@ def find_pattern(
 ) -> None:
     """Fill in a `StiffnessPattern`, in arrays of sufficient length, and the numbers e, m and b (3,)."""
     size = indptr.size - 1
-    tail = place[F.T]
+    tail = unknown[F.T]
     tail, head = tail.ravel(), tail[(1, 2, 0), :].ravel()
     inner = np.flatnonzero((tail >= 0) & (head >= 0))
     key = edge_keys(tail[inner], head[inner], size)

@@ -34,18 +34,20 @@ from quasiharmonic.util.arrays import FloatArray
 _ORDERING = "amf"
 # Supernodes with fewer columns are merged. Half of rslab's default saves up to a tenth of factor and solve times.
 _NEMIN = 8
-# Number of unknowns below which threads are of no use, and number of threads above which there is no more gain.
-SEQUENTIAL_BELOW, _MOST_THREADS = 30_000, 4
+#: Number of unknowns below which threads do not help.
+SEQUENTIAL_BELOW = 30_000
+# More threads bring no gain.
+_MAX_THREADS = 4
 # Variables that limit the threads of other libraries also limit rslab's factorisation, which accepts a number of
 # threads. Its solves take a tenth of the time and obey only RAYON_NUM_THREADS (rslab 1.7).
 _LIMITS = "OMP_NUM_THREADS", "RAYON_NUM_THREADS"
 # Part of rslab's message for a zero pivot; the exception has no class of its own.
 _SINGULAR = "rank-deficient"
 
-_Made = TypeVar("_Made")
+_Result = TypeVar("_Result")
 # The process in which rslab ran first. After a fork rslab waits forever for threads that do not exist (1.7).
-_home: list[int] = []
-# The thread that loads rslab, and the loaded module: at most one entry. A forked process uses neither, see `_home`.
+_first_process: list[int] = []
+# The thread that loads rslab, and the loaded module: at most one entry. A forked process uses neither.
 _LOADER = "quasiharmonic: loads rslab"
 _loading: list[Future[Any]] = []
 _lock = threading.Lock()
@@ -70,61 +72,61 @@ class Rslab(LinearSolver):
         # The upper triangle by rows is the lower triangle by columns, which rslab reads.
         pattern = csc_matrix((np.ones(self.nnz), self._indices, self._indptr), shape=(self.n, self.n))
         threads = 1 if self.n < SEQUENTIAL_BELOW else _threads()
-        self._symbolic: Any = self._tried(
+        self._symbolic: Any = self._try(
             lambda: library().analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=_NEMIN, threads=threads)
         )
         self._numeric: Any = None
-        self._second: LinearSolver | None = None
+        self._fallback: LinearSolver | None = None
 
     def _factor(self) -> None:
         self._numeric = None  # releases memory for the next factor
-        self._numeric = self._tried(lambda: self._symbolic.factor(self._values)) if self._symbolic else None
+        self._numeric = self._try(lambda: self._symbolic.factor(self._values)) if self._symbolic else None
         if self._numeric is None:
-            self._factor_by_another()
+            self._factor_by_fallback()
         elif self._numeric.inertia != (self.n, 0, 0):
             raise NotPositiveDefinite("the matrix is not positive definite: rslab found a pivot that is not positive")
 
     def _solve(self, b: FloatArray) -> FloatArray:
         if self._numeric is not None:
-            x = self._tried(
+            x = self._try(
                 lambda: self._numeric.solve_many(b) if b.shape[1] > 1 else self._numeric.solve(b[:, 0])[:, None]
             )
             if x is not None:
                 return np.asfortranarray(x)
-            self._factor_by_another()
-        assert self._second is not None
-        return np.asfortranarray(self._second.solve(b))
+            self._factor_by_fallback()
+        assert self._fallback is not None
+        return np.asfortranarray(self._fallback.solve(b))
 
-    def _examine(self, b: FloatArray, x: FloatArray) -> FloatArray:
+    def _check_residual(self, b: FloatArray, x: FloatArray) -> FloatArray:
         try:
-            return super()._examine(b, x)
+            return super()._check_residual(b, x)
         except NotPositiveDefinite:
             if self._numeric is None:
                 raise
-        self._factor_by_another()
-        return super()._examine(b, self._solve(b))
+        self._factor_by_fallback()
+        return super()._check_residual(b, self._solve(b))
 
     def _release(self) -> None:
         self._symbolic = self._numeric = None
-        if self._second is not None:
-            self._second.close()
+        if self._fallback is not None:
+            self._fallback.close()
 
-    def _factor_by_another(self) -> None:
+    def _factor_by_fallback(self) -> None:
         """Factor the current matrix with the fallback backend.
 
         If that fails too, rslab's factor is kept, so that later solves fail in the same way.
         """
-        if self._second is None:
+        if self._fallback is None:
             other = Qdldl if Qdldl.present() else SuperLU
-            self._second = other(self._indptr, self._indices)
-        self._second.factor(self._values)
+            self._fallback = other(self._indptr, self._indices)
+        self._fallback.factor(self._values)
         self._numeric = None
 
-    def _tried(self, step: Callable[[], _Made]) -> _Made | None:
+    def _try(self, step: Callable[[], _Result]) -> _Result | None:
         """Run a step of rslab; return None if it fails for a reason other than the matrix."""
-        if not _home:
-            _home.append(os.getpid())
-        if os.getpid() != _home[0]:
+        if not _first_process:
+            _first_process.append(os.getpid())
+        if os.getpid() != _first_process[0]:
             return None
         try:
             return step()
@@ -143,10 +145,8 @@ class Rslab(LinearSolver):
 def library() -> Any:
     """Return the package rslab, loaded by a thread that lives as long as the process.
 
-    Raises
-    ------
-    ImportError
-        If rslab cannot be loaded, or if other code loaded it before, perhaps in a thread that has ended.
+    Raises an ImportError if rslab cannot be loaded, or if other code loaded it before, perhaps in a thread that has
+    ended.
     """
     with _lock:
         if not _loading:
@@ -162,11 +162,11 @@ def _load() -> Future[Any]:
             "a later thread may crash in it. Solve with quasiharmonic before rslab is imported, or with another solver"
         )
     loaded: Future[Any] = Future()
-    threading.Thread(target=_import_and_stay, args=(loaded,), name=_LOADER, daemon=True).start()
+    threading.Thread(target=_import_and_wait, args=(loaded,), name=_LOADER, daemon=True).start()
     return loaded
 
 
-def _import_and_stay(loaded: Future[Any]) -> None:
+def _import_and_wait(loaded: Future[Any]) -> None:
     """Import rslab and wait forever."""
     try:
         import rslab
@@ -180,5 +180,5 @@ def _import_and_stay(loaded: Future[Any]) -> None:
 def _threads() -> int:
     """Number of threads that the machine and the environment allow, up to the useful maximum."""
     given = [os.environ.get(name, "").strip() for name in _LIMITS]
-    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(_MOST_THREADS, here, *(int(text) for text in given if text.isdecimal())))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(_MAX_THREADS, cores, *(int(text) for text in given if text.isdecimal())))

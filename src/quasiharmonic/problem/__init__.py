@@ -7,7 +7,6 @@ result, and `diagnosis` reports obstructions to a map.
 from __future__ import annotations
 
 from quasiharmonic.problem.domain import Domain
-from quasiharmonic.problem.frame import Frame
-from quasiharmonic.problem.problem import Problem
+from quasiharmonic.problem.problem import Frame, Problem, check_problem
 
-__all__ = ["Domain", "Frame", "Problem"]
+__all__ = ["Domain", "Frame", "Problem", "check_problem"]

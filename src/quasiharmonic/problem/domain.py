@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.reference import Reference, ReferenceMesh, flat_triangles
-from quasiharmonic.geometry.mesh.surface import surface_edges
-from quasiharmonic.geometry.mesh.topology import trace_loops
+from quasiharmonic.geometry.mesh.surface_checks import surface_edges
+from quasiharmonic.geometry.mesh.topology import Edges, trace_loops
+from quasiharmonic.linsolve import check_name
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     ReadOnly,
-    held_vertices,
-    named,
+    fixed_vertices,
+    names_of,
     triangle_array,
     unchangeable,
     vertex_array,
@@ -35,8 +36,8 @@ class Domain(ReadOnly):
         Rest positions, planar or curved; any real dtype.
     F : (f, 3) array of int
         Triangles, 0-based and consistently oriented. Their order is kept.
-    fixed : (k,) array of int
-        Vertices with prescribed positions.
+    fixed : (k,) array of int or None
+        Vertices with prescribed positions; None for all vertices of the boundary, ascending.
 
     Raises
     ------
@@ -60,12 +61,22 @@ class Domain(ReadOnly):
     repeated factorisations, see `exclusive`.
     """
 
-    def __init__(self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike) -> None:
-        self.V = vertex_array(V)
-        self.F = unchangeable(triangle_array(F, len(self.V)))
-        self.edges = surface_edges(self.F, len(self.V))
-        self.loops = trace_loops(self.edges.boundary)
-        self.fixed = held_vertices(fixed, len(self.V))
+    def __init__(self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike | None) -> None:
+        V = vertex_array(V)
+        F = unchangeable(triangle_array(F, len(V)))
+        edges = surface_edges(F, len(V))
+        fixed = fixed_vertices(np.unique(edges.boundary) if fixed is None else fixed, len(V))
+        self._assemble(V, F, fixed, edges, trace_loops(edges.boundary))
+
+    @classmethod
+    def from_parts(cls, V: FloatArray, F: IntArray, fixed: IntArray, edges: Edges, loops: list[IntArray]) -> Domain:
+        """Return a domain of checked arrays, which it owns, with their edges and boundary loops."""
+        domain = object.__new__(cls)
+        domain._assemble(V, F, fixed, edges, loops)
+        return domain
+
+    def _assemble(self, V: FloatArray, F: IntArray, fixed: IntArray, edges: Edges, loops: list[IntArray]) -> None:
+        self.V, self.F, self.fixed, self.edges, self.loops = V, F, fixed, edges, loops
         self._seal()
         self._empty_caches()
 
@@ -93,9 +104,7 @@ class Domain(ReadOnly):
         Without the copy, two threads, or a solve inside another solve's callback, would refactor alternately.
         """
         if not self._lock.acquire(blocking=False):
-            twin = object.__new__(Domain)
-            twin.__setstate__(self.__getstate__())
-            yield twin
+            yield Domain.from_parts(self.V, self.F, self.fixed, self.edges, self.loops)
             return
         try:
             yield self
@@ -123,7 +132,7 @@ class Domain(ReadOnly):
         missing = np.flatnonzero(marked)
         if missing.size:
             raise ValueError(
-                f"the boundary {named('vertex', 'vertices', missing)} not in fixed: "
+                f"the boundary {names_of('vertex', 'vertices', missing)} not in fixed: "
                 "every boundary vertex needs a target position"
             )
 
@@ -132,30 +141,17 @@ class Domain(ReadOnly):
         flat = flat_triangles(self.V, self.F)
         if flat.size:
             raise ValueError(
-                f"{named('triangle', 'triangles', flat)} of zero area in the rest mesh; "
+                f"{names_of('triangle', 'triangles', flat)} of zero area in the rest mesh; "
                 "choose the reference 'equilateral', or repair the mesh"
             )
 
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
         """Return the Laplacian of this mesh and these fixed vertices; it is analysed once and cached (§6.2, eq. 12).
 
-        Parameters
-        ----------
-        linear_solver : str
-            ``"auto"`` or one of `quasiharmonic.linsolve.available`.
-
-        Returns
-        -------
-        Laplacian
-            The same object for all callers.
-
-        Raises
-        ------
-        ValueError
-            If the solver is unknown.
-        ImportError
-            If the solver's library is not installed.
+        All callers get the same object. Raise a ValueError if the solver is unknown, an ImportError if it is not
+        installed.
         """
+        check_name(linear_solver)
         if linear_solver not in self._laplacians:
             made = Laplacian(self.F, self.n, self.fixed, linear_solver, self.V)
             # "auto" and the solver that it selects share one analysis.
@@ -165,16 +161,6 @@ class Domain(ReadOnly):
     def mesh(self, kind: Reference) -> ReferenceMesh:
         """Return the mesh with reference triangles of one kind; it is built once and cached (§9.3).
 
-        Parameters
-        ----------
-        kind : {"equilateral", "rest", "corrected"}
-
-        Returns
-        -------
-        ReferenceMesh
-
-        Notes
-        -----
         Positions are scaled by a power of two to magnitude one, so that no area overflows or underflows. The
         functionals are scale-invariant.
         """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -14,12 +15,26 @@ from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.accepts_mesh import init_accepts_mesh
 from quasiharmonic.io.adapters.objects import MeshLike
 from quasiharmonic.problem.domain import Domain
-from quasiharmonic.problem.frame import Frame
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, ReadOnly, check_choice, counted, held_places
+from quasiharmonic.util.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    ReadOnly,
+    check_choice,
+    count_of,
+    describe,
+    target_positions,
+)
 from quasiharmonic.util.display import Displayable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+def check_problem(function: str, problem: object, remedy: str = "") -> None:
+    """Raise a TypeError unless a function of the given name was passed a Problem."""
+    if not isinstance(problem, Problem):
+        raise TypeError(f"{function} takes a Problem, not {describe(problem)}{remedy}")
 
 
 class Problem(ReadOnly, Displayable):
@@ -86,13 +101,15 @@ class Problem(ReadOnly, Displayable):
         *,
         reference: Reference | None = None,
     ) -> None:
+        if fixed is None:
+            raise ValueError("fixed must list the vertices with target positions, not None")
         domain = Domain(V, F, fixed)
         domain.check_boundary_fixed()
         if reference is not None:
             check_choice("reference", reference, get_args(Reference))
         if reference is None or reference == "rest":
             domain.check_areas()
-        self._pose(domain, target, reference)
+        self._initialise(domain, target, reference)
 
     @classmethod
     def on(cls, domain: Domain, target: ArrayLike, *, reference: Reference | None = None) -> Problem:
@@ -113,12 +130,12 @@ class Problem(ReadOnly, Displayable):
             If the number of target positions differs from the number of fixed vertices, or one is not finite.
         """
         problem = object.__new__(cls)
-        problem._pose(domain, target, reference)
+        problem._initialise(domain, target, reference)
         return problem
 
-    def _pose(self, domain: Domain, target: ArrayLike, reference: Reference | None) -> None:
+    def _initialise(self, domain: Domain, target: ArrayLike, reference: Reference | None) -> None:
         self.domain = domain
-        self.target = held_places(target, len(domain.fixed))
+        self.target = target_positions(target, len(domain.fixed))
         self.reference = reference
         self._seal()
 
@@ -172,19 +189,19 @@ class Problem(ReadOnly, Displayable):
         return self.domain.fixed
 
     def short_repr(self) -> str:
-        loops = counted("boundary loop", "boundary loops", len(self.domain.loops))
+        loops = count_of("boundary loop", "boundary loops", len(self.domain.loops))
         return f"{self.n:,} vertices, {len(self.F):,} triangles, {loops}, {len(self.fixed):,} fixed"
 
     def summary(self) -> str:
         """Return a few lines of text about the mesh and the extent of its target positions."""
         (left, lower), (right, upper) = self.target.min(axis=0), self.target.max(axis=0)
         curved = self.V.shape[1] == 3 and np.ptp(self.V[:, 2]) > 0
-        loops = counted("boundary loop", "boundary loops", len(self.domain.loops))
+        loops = count_of("boundary loop", "boundary loops", len(self.domain.loops))
         lengths = ", ".join(f"{len(loop):,}" for loop in self.domain.loops)
         return "\n".join(
             (
                 f"{'A curved surface' if curved else 'A planar mesh'}: {self.n:,} vertices, {len(self.F):,} triangles.",
-                f"{loops}, of {lengths} vertices; {counted('pin', 'pins', len(self.domain.pins))} inside.",
+                f"{loops}, of {lengths} vertices; {count_of('pin', 'pins', len(self.domain.pins))} inside.",
                 f"The targets of its fixed vertices span [{left:.4g}, {right:.4g}] × [{lower:.4g}, {upper:.4g}].",
             )
         )
@@ -217,7 +234,7 @@ class Problem(ReadOnly, Displayable):
         return uv
 
     @cached_property
-    def held(self) -> ComplexArray:
+    def fixed_positions(self) -> ComplexArray:
         """Target positions of the fixed vertices in the frame, zero elsewhere (n,) complex128; do not write to it."""
         w = np.zeros(self.n, dtype=np.complex128)
         w[self.fixed] = self.frame.inward(self.target)
@@ -231,7 +248,33 @@ class Problem(ReadOnly, Displayable):
         """
         area = 0.0
         for loop in self.domain.loops:
-            x, y = self.held[loop].view(np.float64).reshape(-1, 2).T
+            x, y = self.fixed_positions[loop].view(np.float64).reshape(-1, 2).T
             area += 0.5 * float((x[:-1] * y[1:] - y[:-1] * x[1:]).sum() + (x[-1] * y[0] - y[-1] * x[0]))
         # The frame has unit size, so rounding errors are far below this tolerance.
         return area > -1e-12 and bool(np.any(self.target != self.target[0]))
+
+
+class Frame:
+    """Coordinates of unit size around target positions (k, 2), and the conversion back.
+
+    The scale is a power of two, so scaling loses no digits. `Problem.positions` then sets the fixed vertices to their
+    exact target positions.
+    """
+
+    def __init__(self, target: FloatArray) -> None:
+        # Halving first avoids overflow in the extent of coordinates near the largest double.
+        low, high = target.min(axis=0) / 2, target.max(axis=0) / 2
+        self.centre = low + high
+        self._exponent = math.frexp((high - low).max())[1]
+
+    def inward(self, uv: FloatArray) -> ComplexArray:
+        """Return positions (n, 2) as complex numbers in the frame; (n,) complex128."""
+        return np.ldexp(uv - self.centre, -self._exponent).view(np.complex128).ravel()
+
+    def lengths(self, x: FloatArray) -> FloatArray:
+        """Return lengths or displacements in the frame's unit, without translation; an array of the same shape."""
+        return np.ldexp(x, -self._exponent)
+
+    def outward(self, w: ComplexArray) -> FloatArray:
+        """Return complex numbers of the frame (n,) as positions; (n, 2) float64."""
+        return np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent) + self.centre

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum
-from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,17 +12,20 @@ from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.io.adapters.trimesh import make_trimesh
 from quasiharmonic.util.arrays import ReadOnly
 from quasiharmonic.util.display import Displayable
+from quasiharmonic.util.outcome import Outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from trimesh import Trimesh
 
     from quasiharmonic.problem.diagnosis import Diagnosis
 
 
 class Status(Enum):
-    """Outcome of a solve; the value is a message for the user with the outcome and the next action."""
+    """Why a call ended; the value is a message for the user with the outcome and the next action."""
 
     INJECTIVE = "Every triangle is strictly positive, verified exactly."
     STALLED = (
@@ -81,6 +84,19 @@ class Status(Enum):
         "Another linear solver or reference triangle may help."
     )
 
+    @property
+    def acceptable(self) -> bool:
+        """Whether a result with this status is a success if its map is injective.
+
+        A collapsed map is not usable, and an interrupted call may have changed only a part of the map.
+        """
+        return self not in (Status.COLLAPSED, Status.INTERRUPTED)
+
+    @property
+    def converged(self) -> bool:
+        """Whether no small change of the map lowers the minimised energy noticeably."""
+        return self in (Status.INJECTIVE, Status.POLISHED, Status.NEARBY)
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -90,7 +106,7 @@ class Stage:
     ----------
     name : str
         Name of the stage, for logs.
-    iterations : int
+    n_iterations : int
         Evaluations of the objective. The evaluation of the initial map is not counted.
     seconds : float
         Wall time.
@@ -103,26 +119,26 @@ class Stage:
     """
 
     name: str
-    iterations: int
+    n_iterations: int
     seconds: float
     inverted: tuple[int, int]
     energy: tuple[float, float]
     kept: bool = True
 
     def __str__(self) -> str:
-        before, after = (f"{flips:,}" for flips in self.inverted)
+        before, after = (f"{count:,}" for count in self.inverted)
         kept = "" if self.kept else ", discarded"
-        return f"{self.name}: {self.iterations} iterations, {self.seconds:.3g} s, {before} → {after} inverted{kept}"
+        return f"{self.name}: {self.n_iterations} iterations, {self.seconds:.3g} s, {before} → {after} inverted{kept}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the stage as a dictionary for JSON."""
         return {
             "name": self.name,
-            "iterations": self.iterations,
+            "n_iterations": self.n_iterations,
             "seconds": self.seconds,
             "inverted": list(self.inverted),
             # JSON has no infinity, and the energy before the first stage is infinite.
-            "energy": [e if isfinite(e) else None for e in self.energy],
+            "energy": [e if math.isfinite(e) else None for e in self.energy],
             "kept": self.kept,
         }
 
@@ -188,7 +204,7 @@ class RefinementAttempt:
 
 
 @dataclass(frozen=True, repr=False)
-class MapResult(ReadOnly, Displayable):
+class MapResult(ReadOnly, Displayable, Outcome):
     """A map of the mesh into the plane, with its certificate.
 
     Attributes
@@ -270,12 +286,38 @@ class MapResult(ReadOnly, Displayable):
         return self.certificate.injective
 
     @property
-    def iterations(self) -> int:
+    def success(self) -> bool:
+        """Whether the map is injective (certified), has not collapsed, and the call was not interrupted."""
+        return self.injective and self.status.acceptable
+
+    @property
+    def message(self) -> str:
+        """The message of `status`."""
+        return self.status.value
+
+    @property
+    def converged(self) -> bool:
+        """Whether the minimised energy has converged; see `Status`. A search without polish converges at 0."""
+        return self.injective and self.status.converged
+
+    @property
+    def energy(self) -> float:
+        """The minimised energy of the map: a mean over the rest area, 0 at isometries; NaN if none was computed.
+
+        After a search without polish it is V₃ divided by the target's area, which is 0 only at injective maps. After
+        `harmonise` it is the energy plus the conformal term. The energy of a class of the caller is reported unchanged.
+        """
+        kept = [stage.energy[1] for stage in self.stages if stage.kept]
+        before = [stage.energy[0] for stage in self.stages[:1]] or [step.energy for step in self.history[-1:]]
+        return (kept or before or [math.nan])[-1]
+
+    @property
+    def n_iterations(self) -> int:
         """Iterations over all stages."""
-        return sum(stage.iterations for stage in self.stages)
+        return sum(stage.n_iterations for stage in self.stages)
 
     def short_repr(self) -> str:
-        steps = f"{self.iterations} iteration{'' if self.iterations == 1 else 's'}"
+        steps = f"{self.n_iterations} iteration{'' if self.n_iterations == 1 else 's'}"
         return f"{self.certificate.short_repr()}, {steps}, {self.seconds:.3g} s"
 
     def summary(self) -> str:
@@ -310,13 +352,26 @@ class MapResult(ReadOnly, Displayable):
         figure: Figure = self._draw(kind, measure=measure)
         return figure
 
+    def to_trimesh(self) -> Trimesh:
+        """Return the mesh as a trimesh.Trimesh with ``uv`` as texture coordinates; needs trimesh.
+
+        Raises
+        ------
+        ValueError
+            If ``V`` is None.
+        """
+        if self.V is None:
+            raise ValueError("the result has no rest positions (V): the caller passed no surface")
+        return make_trimesh(self.V, self.F, self.uv)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the report of ``--json``: all data except the map itself, in plain Python types."""
         return {
+            "success": self.success,
             "injective": self.injective,
             "status": self.status.name.lower(),
-            "message": self.status.value,
-            "iterations": self.iterations,
+            "message": self.message,
+            "n_iterations": self.n_iterations,
             "seconds": self.seconds,
             "linear_solver": self.linear_solver,
             "stages": [stage.to_dict() for stage in self.stages],
@@ -329,6 +384,6 @@ class MapResult(ReadOnly, Displayable):
         """Return the part of the report about refinement."""
         return {
             "added_vertices": self.added,
-            "refinement_attempts": [rung.to_dict() for rung in self.refinement_attempts],
+            "refinement_attempts": [attempt.to_dict() for attempt in self.refinement_attempts],
             "crowded": self.crowded.tolist(),
         }

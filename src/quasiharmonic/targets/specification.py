@@ -6,13 +6,14 @@ import math
 from os import PathLike, fspath
 from pathlib import Path
 
+from quasiharmonic.io.errors import check_path
 from quasiharmonic.targets.outlines import shapes as outlines
-from quasiharmonic.targets.outlines.contours import MOST_POINTS
+from quasiharmonic.targets.outlines.contours import MAX_POINTS
 from quasiharmonic.targets.outlines.letters import Font, letter
 from quasiharmonic.targets.outlines.polylines import read_polylines
 from quasiharmonic.targets.outlines.svg import read_svg
 from quasiharmonic.targets.outlines.words import word
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, check_numbers
 
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
 _POINT_FILES = ".txt", ".csv"
@@ -58,6 +59,8 @@ def outline(
     >>> [contour.tolist() for contour in outline("rect:2x1")]
     [[[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]]]
     """
+    check_path("specification", specification)
+    check_numbers(tolerance=tolerance)
     text = fspath(specification)
     name, colon, argument = text.partition(":")
     if not 0 < tolerance < 1:
@@ -72,7 +75,7 @@ def outline(
     if suffix in _POINT_FILES:
         return read_polylines(text)
     # On a circle of diameter 1 divided into n chords, the chords deviate by (π / n)² / 4.
-    points = min(MOST_POINTS, max(64, math.ceil(math.pi / math.sqrt(4 * tolerance))))
+    points = min(MAX_POINTS, max(64, math.ceil(math.pi / math.sqrt(4 * tolerance))))
     match name, colon:
         case "disk", "":
             return [outlines.disk(points=points)]
@@ -106,6 +109,6 @@ def _pair(text: str, argument: str) -> tuple[float, float]:
 def _count(text: str, argument: str) -> int:
     if not (argument.isascii() and argument.isdigit()):
         raise ValueError(f"{text!r}: {argument!r} is not a whole number")
-    if len(argument) > 6 or int(argument) > MOST_POINTS // 2:
+    if len(argument) > 6 or int(argument) > MAX_POINTS // 2:
         raise ValueError(f"{text!r}: {argument} is too many")
     return int(argument)

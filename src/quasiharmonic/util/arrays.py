@@ -1,6 +1,7 @@
 """Array types, conversion and checks of arguments, and names of elements in messages.
 
-All functions that accept ``V``, ``F`` or rows of coordinates use this module, so that each error has one wording.
+All functions that accept ``V``, ``F`` or rows of coordinates use this module, so that each error has one wording. Its
+functions raise a ValueError that names the argument and the first elements that are not valid.
 """
 
 from __future__ import annotations
@@ -39,16 +40,10 @@ class ReadOnly:
 
 
 def real_array(name: str, values: ArrayLike) -> FloatArray:
-    """Convert real numbers of any type to float64; always returns a copy. Numbers out of range become infinite.
-
-    Raises
-    ------
-    ValueError
-        If the values are not real numbers or do not form an array.
-    """
+    """Convert real numbers of any type to float64; always returns a copy. Numbers out of range become infinite."""
     array = _array(name, values)
     if array.dtype.kind not in "iufb":
-        raise ValueError(f"{name} must contain real numbers, not {_held(values, array)}")
+        raise ValueError(f"{name} must contain real numbers, not {_describe_elements(values, array)}")
     if array.dtype == np.float64:
         return np.array(array, order="C")
     # A signalling NaN is invalid in a conversion. It is reported later as not finite.
@@ -57,13 +52,7 @@ def real_array(name: str, values: ArrayLike) -> FloatArray:
 
 
 def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
-    """Convert integers of any type to int64; returns a copy unless ``copy`` is False. Empty input of any type is valid.
-
-    Raises
-    ------
-    ValueError
-        If the values are not integers, do not form an array, or exceed 64 bits.
-    """
+    """Convert integers of any type to int64; returns a copy unless ``copy`` is False. Empty input may have any type."""
     array = _array(name, values)
     if array.size == 0:
         array = np.empty(array.shape, dtype=np.int64)
@@ -75,7 +64,7 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
             advice = f": pass numpy.flatnonzero({name})"
         elif array.dtype.kind == "f" and array.ndim == 2:
             advice = "; check the order of the arguments: these may be positions"
-        raise ValueError(f"{name} must contain integer indices, not {_held(values, array)}{advice}")
+        raise ValueError(f"{name} must contain integer indices, not {_describe_elements(values, array)}{advice}")
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which is not a valid index")
     return np.array(array, dtype=np.int64, order="C") if copy else np.require(array, np.int64, ["C", "A"])
@@ -96,7 +85,7 @@ def _in_range(name: str, integers: NDArray[np.object_]) -> IntArray:
     """Convert integers of any size to int64, or raise a ValueError that names the first one that does not fit."""
     for value in integers.flat:
         if not -(2**63) <= int(value) < 2**63:
-            raise ValueError(f"{name} refers to vertex {kind_of(value)}, which is not a valid index")
+            raise ValueError(f"{name} refers to vertex {describe(value)}, which is not a valid index")
     return integers.astype(np.int64)
 
 
@@ -128,13 +117,7 @@ def own_triangles(F: ArrayLike) -> IntArray:
 
 
 def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> FloatArray:
-    """Convert positions (n, 2) or (n, 3) to float64, finite unless ``finite`` is False; returns a copy.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or a vertex is not finite; the message names the first ones.
-    """
+    """Convert positions (n, 2) or (n, 3) to float64, finite unless ``finite`` is False; returns a copy."""
     array = real_array(name, V)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
         raise ValueError(f"{name} must have shape (n, 2) or (n, 3), not {array.shape}")
@@ -144,13 +127,7 @@ def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> Float
 
 
 def triangle_array(F: ArrayLike, n: int) -> IntArray:
-    """Convert triangles (f, 3) among ``n`` vertices to int64; returns a copy.
-
-    Raises
-    ------
-    ValueError
-        If there are no triangles, the shape is wrong, or a vertex does not exist.
-    """
+    """Convert triangles (f, 3) among ``n`` vertices, at least one, to int64; returns a copy."""
     array = triangle_rows(F)
     if array.size == 0:
         raise ValueError("the mesh has no triangles")
@@ -159,13 +136,7 @@ def triangle_array(F: ArrayLike, n: int) -> IntArray:
 
 
 def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArray:
-    """Convert any number of triangles (f, 3), also zero, to int64 without a check of the index range.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or the values are not integers.
-    """
+    """Convert any number of triangles (f, 3), also zero, to int64 without a check of the index range."""
     array = index_array(name, F, copy=copy)
     if array.size == 0:
         return np.empty((0, 3), dtype=np.int64)
@@ -177,19 +148,7 @@ def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArr
 def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = True) -> FloatArray:
     """Convert positions in the plane to (n, 2) float64, finite unless ``finite`` is False; returns a copy.
 
-    Parameters
-    ----------
-    name : str
-    uv : (n, 2) array, or an object with an attribute ``uv``, such as a result
-    n : int, optional
-        Required number of rows, one for each vertex; any number by default.
-    finite : bool
-        Whether the positions must be finite.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or a vertex is not finite; the message names the first ones.
+    ``uv`` may be an object with an attribute ``uv``, such as a result. ``n`` is the required number of rows.
     """
     array = real_array(name, getattr(uv, "uv", uv))
     if array.ndim != 2 or array.shape[1] != 2 or n not in (None, len(array)):
@@ -200,32 +159,20 @@ def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = 
     return array
 
 
-def held_vertices(fixed: ArrayLike, n: int) -> IntArray:
-    """Convert indices of fixed vertices among ``n`` vertices to (k,) int64 without repetition; returns a copy.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong, a vertex does not exist, or a vertex occurs twice; the message names the first ones.
-    """
+def fixed_vertices(fixed: ArrayLike, n: int) -> IntArray:
+    """Convert indices of fixed vertices among ``n`` vertices to (k,) int64 without repetition; returns a copy."""
     array = index_array("fixed", fixed)
     if array.ndim != 1:
         raise ValueError(f"fixed must have shape (k,), not {array.shape}")
     check_range("fixed", array, n)
     times = np.bincount(array, minlength=n)
     if times.max(initial=0) > 1:
-        raise ValueError(f"{named('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
+        raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
     return array
 
 
-def held_places(target: ArrayLike, k: int) -> FloatArray:
-    """Convert the target positions of ``k`` fixed vertices to (k, 2) float64; returns a copy.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or a row is not finite; the message names the first ones.
-    """
+def target_positions(target: ArrayLike, k: int) -> FloatArray:
+    """Convert the target positions of ``k`` fixed vertices to finite (k, 2) float64; returns a copy."""
     array = real_array("target", target)
     if array.shape != (k, 2):
         raise ValueError(f"target must have shape ({k}, 2), one position for each fixed vertex, not {array.shape}")
@@ -234,16 +181,9 @@ def held_places(target: ArrayLike, k: int) -> FloatArray:
 
 
 def loop_arrays(loops: Iterable[ArrayLike], n: int) -> list[IntArray]:
-    """Convert boundary loops of at least three vertices each, among ``n`` vertices, to (l,) int64; returns copies.
-
-    Raises
-    ------
-    ValueError
-        If a loop is not valid; the message names it.
-    """
-    if isinstance(loops, str | bytes) or not isinstance(loops, Iterable):
-        raise ValueError(f"loops must be a sequence of boundary loops, not {kind_of(loops)}")
-    taken = []
+    """Convert boundary loops of at least three vertices each, among ``n`` vertices, to (l,) int64; returns copies."""
+    check_sequence("loops", loops, "boundary loops")
+    arrays = []
     for k, loop in enumerate(loops):
         array = index_array(f"loops[{k}]", loop)
         if array.ndim != 1:
@@ -251,38 +191,39 @@ def loop_arrays(loops: Iterable[ArrayLike], n: int) -> list[IntArray]:
             raise ValueError(f"loops[{k}] must have shape (l,), the vertices of one loop, not {array.shape}{advice}")
         check_range(f"loops[{k}]", array, n)
         if len(array) < 3:
-            vertices = counted("vertex", "vertices", len(array))
+            vertices = count_of("vertex", "vertices", len(array))
             raise ValueError(f"loops[{k}] has {vertices}, but a boundary loop has three or more")
-        taken.append(array)
-    return taken
+        arrays.append(array)
+    return arrays
 
 
 def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
     """Raise a ValueError that names the first rows with NaN or infinite numbers; ``one``, ``many`` name a row."""
     finite = np.isfinite(rows)
     if not finite.all():
-        raise ValueError(f"{name} is not finite at {named(one, many, np.flatnonzero(~finite.all(axis=1)))}")
+        raise ValueError(f"{name} is not finite at {names_of(one, many, np.flatnonzero(~finite.all(axis=1)))}")
 
 
 def check_range(
-    name: str, indices: IntArray, n: int, one: str = "vertex", many: str = "vertices", *, least: int = 0
+    name: str, indices: IntArray, n: int, one: str = "vertex", many: str = "vertices", *, minimum: int = 0
 ) -> None:
-    """Raise a ValueError that names the first indices outside ``least … n - 1``; ``one``, ``many`` name an element.
+    """Raise a ValueError that names the first indices outside ``minimum … n - 1``; ``one``, ``many`` name an element.
 
-    ``least`` is -1 if -1 is allowed as a mark.
+    ``minimum`` is -1 if -1 is allowed as a mark.
     """
-    if indices.size and (indices.min() < least or indices.max() >= n):
-        bad = np.unique(indices[(indices < least) | (indices >= n)])
+    if indices.size and (indices.min() < minimum or indices.max() >= n):
+        bad = np.unique(indices[(indices < minimum) | (indices >= n)])
         there = f"only {many} 0 … {n - 1}" if n else f"no {many}"
         from_one = name == "F" and indices.min() == 1 and indices.max() == n
         advice = "; if its indices count from 1, pass F - 1" if from_one else ""
-        raise ValueError(f"{name} refers to {named(one, many, bad)}, but there are {there}{advice}")
+        raise ValueError(f"{name} refers to {names_of(one, many, bad)}, but there are {there}{advice}")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     """Raise a ValueError that lists the choices, unless the value is one of them."""
-    if value not in tuple(choices):
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
+    if not isinstance(value, str) or value not in tuple(choices):
+        given = repr(value) if isinstance(value, str) else describe(value)
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given}")
 
 
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:
@@ -295,10 +236,10 @@ def _array(name: str, values: ArrayLike) -> NDArray[Any]:
     except ValueError as error:
         raise ValueError(f"{name} is not an array: its rows differ in length") from error
     except (TypeError, RuntimeError, BufferError) as error:
-        raise ValueError(f"{name} is {kind_of(values)} {_withheld(name, values, error)}") from error
+        raise ValueError(f"{name} is {describe(values)} {_explain_failure(name, values, error)}") from error
 
 
-def _withheld(name: str, values: Any, error: Exception) -> str:
+def _explain_failure(name: str, values: Any, error: Exception) -> str:
     """Explain why an array of another library cannot be converted, and what to do."""
     if getattr(values, "requires_grad", False):
         return (
@@ -313,16 +254,16 @@ def _withheld(name: str, values: Any, error: Exception) -> str:
     return f"that NumPy cannot convert: {str(error).partition(chr(10))[0]}"
 
 
-def _held(values: object, array: NDArray[Any]) -> str:
+def _describe_elements(values: object, array: NDArray[Any]) -> str:
     """Describe the elements of an array that should be numbers."""
     if not array.ndim:
-        return kind_of(values)
+        return describe(values)
     if array.dtype == object and array.size:
-        return f"objects, the first of them {kind_of(array.flat[0])}"
+        return f"objects, the first of them {describe(array.flat[0])}"
     return str(array.dtype)
 
 
-def kind_of(value: object) -> str:
+def describe(value: object) -> str:
     """Describe a value for messages: ``a Trimesh``, ``None``, ``'letter:R'``."""
     if isinstance(value, PathLike):
         value = fspath(value)
@@ -332,32 +273,62 @@ def kind_of(value: object) -> str:
     if value is None or isinstance(value, str | bytes | Number):
         text = str(value) if isinstance(value, Number) else repr(value)
         return text if len(text) <= 80 else f"{text[:77]}…"
-    name = type(value).__name__
+    return _with_article(type(value).__name__)
+
+
+def _with_article(name: str) -> str:
     return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
 
 
-def whole_number(name: str, value: Any, *, least: int) -> None:
-    """Raise a ValueError unless the value is an integer of at least ``least``."""
-    if not isinstance(value, Integral) or value < least:
-        raise ValueError(f"{name} must be an integer of at least {least}, not {kind_of(value)}")
+def check_integer(name: str, value: Any, *, minimum: int) -> None:
+    """Raise a ValueError unless the value is an integer of at least ``minimum``."""
+    if not isinstance(value, Integral) or value < minimum:
+        raise ValueError(f"{name} must be an integer of at least {minimum}, not {describe(value)}")
 
 
-def true_or_false(name: str, value: Any) -> None:
+def check_bool(name: str, value: Any) -> None:
     """Raise a ValueError unless the value is a boolean; a non-empty string such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} must be True or False, not {kind_of(value)}")
+        raise ValueError(f"{name} must be True or False, not {describe(value)}")
 
 
-def not_negative(name: str, value: Any) -> None:
+def check_non_negative(name: str, value: Any) -> None:
     """Raise a ValueError unless the value is a finite number of at least zero."""
     if not isinstance(value, Real) or not 0 <= float(value) < np.inf:
-        raise ValueError(f"{name} must be a finite number of at least 0, not {kind_of(value)}")
+        raise ValueError(f"{name} must be a finite number of at least 0, not {describe(value)}")
+
+
+def check_numbers(**values: Any) -> None:
+    """Raise a ValueError that names the first value that is not a real number; the keywords are the names."""
+    for name, value in values.items():
+        if not isinstance(value, Real) or isinstance(value, bool):
+            raise ValueError(f"{name} must be a number, not {describe(value)}")
+
+
+def check_positive(**values: Any) -> None:
+    """Raise a ValueError unless all values are positive finite numbers; the keywords are the names."""
+    check_numbers(**values)
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} must be positive and finite, not {value}")
+
+
+def check_instance(name: str, value: object, kind: type) -> None:
+    """Raise a ValueError unless the value is of the given class."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} must be {_with_article(kind.__name__)}, not {describe(value)}")
+
+
+def check_sequence(name: str, value: object, of: str) -> None:
+    """Raise a ValueError unless the value can be iterated over and is not text; ``of`` describes its elements."""
+    if isinstance(value, str | bytes) or not isinstance(value, Iterable):
+        raise ValueError(f"{name} must be a sequence of {of}, not {describe(value)}")
 
 
 def check_callback(callback: Any) -> None:
     """Raise a ValueError unless the callback is callable or None. Called before any work that reports to it."""
     if callback is not None and not callable(callback):
-        raise ValueError(f"callback must be callable, or None, not {kind_of(callback)}")
+        raise ValueError(f"callback must be callable, or None, not {describe(callback)}")
 
 
 def work(force: ComplexArray, displacement: ComplexArray) -> float:
@@ -365,20 +336,20 @@ def work(force: ComplexArray, displacement: ComplexArray) -> float:
     return float((force.real * displacement.real + force.imag * displacement.imag).sum())
 
 
-def counted(one: str, many: str, count: int) -> str:
+def count_of(one: str, many: str, count: int) -> str:
     """Give the number of some elements in words: ``1 vertex``, ``7 vertices``."""
     return f"{count} {one if count == 1 else many}"
 
 
-def named(one: str, many: str, indices: NDArray[np.integer], most: int = 5) -> str:
+def names_of(one: str, many: str, indices: NDArray[np.integer], limit: int = 5) -> str:
     """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``."""
-    listed = ", ".join(str(int(i)) for i in indices[:most])
-    rest = f", … ({len(indices)} in all)" if len(indices) > most else ""
+    listed = ", ".join(str(int(i)) for i in indices[:limit])
+    rest = f", … ({len(indices)} in all)" if len(indices) > limit else ""
     return f"{one if len(indices) == 1 else many} {listed}{rest}"
 
 
-def named_edges(pairs: IntArray, most: int = 5) -> str:
+def edge_names(pairs: IntArray, limit: int = 5) -> str:
     """Name the first few of some edges: ``edges (1, 2), (4, 7), … (9 in all)``."""
-    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:most].tolist())
-    rest = f", … ({len(pairs)} in all)" if len(pairs) > most else ""
+    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:limit].tolist())
+    rest = f", … ({len(pairs)} in all)" if len(pairs) > limit else ""
     return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"

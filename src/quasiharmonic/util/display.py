@@ -21,11 +21,7 @@ _loader: Callable[[], Any] | None = None
 def register_renderer(loader: Callable[[], Any]) -> None:
     """Set the function that imports the drawing package.
 
-    Parameters
-    ----------
-    loader : callable
-        Called without arguments. It returns an object with ``html(result) -> str`` and
-        ``draw(result, kind, **options) -> Figure``.
+    It returns an object with ``html(result) -> str`` and ``draw(result, kind, **options) -> Figure``.
     """
     global _loader
     _loader = loader

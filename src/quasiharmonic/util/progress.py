@@ -22,55 +22,55 @@ R = TypeVar("R")
 INTERVAL = 0.25
 
 
-class _Hearing:
+class _Reporter:
     """A callback and the time of its last call."""
 
     def __init__(self, callback: Callable[[Any], object]) -> None:
         self._callback = callback
         self._errors = np.geterr()
-        self._told: list[Any] = []
-        self._when = 0.0
+        self._last: list[Any] = []
+        self._time = 0.0
 
-    def tell(self, step: Any) -> None:
+    def report(self, step: Any) -> None:
         """Call the callback."""
         # If the callback raises, do not call it again while the exception propagates.
-        self._told = []
+        self._last = []
         # Work that the callback does itself must not report to this callback.
-        token = _HEARING.set(None)
+        token = _REPORTER.set(None)
         try:
             with np.errstate(**self._errors):
                 self._callback(step)
-            self._told = [step]
+            self._last = [step]
         finally:
-            _HEARING.reset(token)
-            self._when = time.monotonic()
+            _REPORTER.reset(token)
+            self._time = time.monotonic()
 
-    def remind(self) -> None:
+    def repeat_if_due(self) -> None:
         """Report the last step again if the last call was at least `INTERVAL` ago."""
-        if self._told and time.monotonic() - self._when >= INTERVAL:
-            self.tell(self._told[0])
+        if self._last and time.monotonic() - self._time >= INTERVAL:
+            self.report(self._last[0])
 
 
-_HEARING: ContextVar[_Hearing | None] = ContextVar("hearing", default=None)
+_REPORTER: ContextVar[_Reporter | None] = ContextVar("reporter", default=None)
 
 
 def reports_progress(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function with a ``callback`` argument so that `heartbeat` repeats its last step during long work."""
 
     @wraps(function)
-    def hearing(*args: P.args, **kwargs: P.kwargs) -> R:
+    def report_progress(*args: P.args, **kwargs: P.kwargs) -> R:
         callback = cast("Callable[[Any], object] | None", kwargs.get("callback"))
         if not callable(callback):
             return function(*args, **kwargs)
-        one = _Hearing(callback)
-        kwargs["callback"] = one.tell
-        token = _HEARING.set(one)
+        reporter = _Reporter(callback)
+        kwargs["callback"] = reporter.report
+        token = _REPORTER.set(reporter)
         try:
             return function(*args, **kwargs)
         finally:
-            _HEARING.reset(token)
+            _REPORTER.reset(token)
 
-    return hearing
+    return report_progress
 
 
 def heartbeat() -> None:
@@ -78,6 +78,6 @@ def heartbeat() -> None:
 
     Exceptions raised by the callback propagate to the caller.
     """
-    one = _HEARING.get()
-    if one is not None:
-        one.remind()
+    reporter = _REPORTER.get()
+    if reporter is not None:
+        reporter.repeat_if_due()

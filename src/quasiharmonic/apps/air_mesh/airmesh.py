@@ -19,19 +19,21 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP, AreaBarrier, Combination
-from quasiharmonic.energies.newton.newton_descent import NewtonDescent, in_units
+from quasiharmonic.energies.newton.map_model import in_units, newton_descent
 from quasiharmonic.geometry.exact.certificate import Certificate, certify, is_injective
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.solver.refine.mapping import injective_map
+from quasiharmonic.solver.mapping import injective_map
 from quasiharmonic.targets.outlines.contours import signed_area
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_finite,
-    kind_of,
+    check_numbers,
+    check_positive,
+    describe,
     map_array,
-    named,
+    names_of,
     real_array,
     triangle_array,
 )
@@ -114,23 +116,23 @@ class AirMesh:
         self._F = triangle_array(F, len(self._rest))
         idle = np.setdiff1d(np.arange(len(self._rest)), self._F)
         if idle.size:
-            raise ValueError(f"no triangle uses {named('vertex', 'vertices', idle)}: remove unused vertices")
+            raise ValueError(f"no triangle uses {names_of('vertex', 'vertices', idle)}: remove unused vertices")
         turned = np.flatnonzero(orientation(*(self._rest[self._F[:, k]] for k in range(3))) <= 0)
         if turned.size:
-            raise ValueError(f"{named('triangle', 'triangles', turned)} not counterclockwise")
+            raise ValueError(f"{names_of('triangle', 'triangles', turned)} not counterclockwise")
+        check_numbers(air_weight=air_weight)
         if not 0 < air_weight <= 1:
             raise ValueError(f"air_weight must be above 0 and at most 1, not {air_weight}")
         self._air_weight = air_weight
         sides = self._rest[self._F] - np.roll(self._rest[self._F], 1, axis=1)
-        self._gap = 1e-2 * float(np.linalg.norm(sides, axis=2).mean()) if gap is None else float(gap)
-        if not 0 < self._gap < np.inf:
-            raise ValueError(f"gap must be positive, not {gap}")
+        self._gap = 1e-2 * float(np.linalg.norm(sides, axis=2).mean()) if gap is None else gap
+        check_positive(gap=self._gap)
         self._loops = boundary_loops(self._F, len(self._rest))
-        around = _loops_of(frame)
+        around = _check_loops(frame)
         self._sizes = [len(loop) for loop in around]
         if min(self._sizes) < 3:
             raise ValueError(f"each loop of the frame needs at least 3 points, not {self._sizes}")
-        self.moment = self._at_rest(np.concatenate([self._rest, self._stacked(around)]))
+        self.moment = self._converge(np.concatenate([self._rest, self._stack(around)]))
         if not self.moment.certificate.bijective:
             raise ValueError(f"shapes, container and obstacles overlap. {self.moment.certificate.summary()}")
 
@@ -159,7 +161,7 @@ class AirMesh:
         RuntimeError
             If the move fails: the frame leaves no space, or crosses itself or a shape. The state is then unchanged.
         """
-        there = self._stacked(frame)
+        there = self._stack(frame)
         n, present = len(self._rest), self.moment
         here, done, step = present.points[n:], 0.0, 1.0
         try:
@@ -184,14 +186,14 @@ class AirMesh:
     def _step(self, frame: FloatArray, max_iterations: int) -> AirMeshState | None:
         """The converged state with a moved frame; None if there is none."""
         try:
-            moved = self._moved(frame, max_iterations)
-            reached = None if moved is None else self._at_rest(moved)
+            moved = self._move(frame, max_iterations)
+            reached = None if moved is None else self._converge(moved)
         except ValueError:
             # Only the frame's shape and values were checked, so the moved frame may cross itself or the shapes.
             return None
         return reached if reached is not None and reached.certificate.bijective else None
 
-    def _moved(self, frame: FloatArray, max_iterations: int) -> FloatArray | None:
+    def _move(self, frame: FloatArray, max_iterations: int) -> FloatArray | None:
         """The points with a moved frame and without inverted triangles; None if no such map was found."""
         n, then = len(self._rest), self.moment
         everything = np.concatenate([then.F, then.air])
@@ -202,41 +204,41 @@ class AirMesh:
         result = injective_map(then.points, everything, fixed, frame, max_iterations=max_iterations)
         return result.uv if result.injective else None
 
-    def _at_rest(self, points: FloatArray) -> AirMeshState:
+    def _converge(self, points: FloatArray) -> AirMeshState:
         """Converge the shapes from a valid state, with new air before and after."""
         n = len(self._rest)
         fixed = np.arange(n, len(points))
         last = np.inf
         while True:
-            air = self._triangulated(points)
+            air = self._triangulate(points)
             everything = np.concatenate([self._F, air])
             # Rest triangles of the shapes are those at the start. Those of the air are the current ones, thickened if
             # too thin.
             energy = DeformationEnergy(
-                np.concatenate([self._rest, thickened(points[air], self._gap).reshape(-1, 2)]),
+                np.concatenate([self._rest, thicken(points[air], self._gap).reshape(-1, 2)]),
                 everything,
                 _ELASTIC,
                 weights=np.concatenate([np.ones(len(self._F)), np.full(len(air), self._air_weight)]),
                 rest_F=np.concatenate([self._F, n + np.arange(air.size).reshape(-1, 3)]),
             )
-            descent = NewtonDescent(energy, points, fixed, 0, "auto")
+            descent, model = newton_descent(energy, points, fixed, 0, "auto")
             for _ in descent.descend(60, _AT_REST):
                 pass
-            points = descent.positions(descent.w)
+            points = model.positions(descent.w)
             elastic = self._elastic(points)
             # New air may let shapes slide further.
             if elastic > (1 - 1e-2) * last:
                 break
             last = elastic
-        air = self._triangulated(points)
+        air = self._triangulate(points)
         return AirMeshState(points, self._F, air, certify(np.concatenate([self._F, air]), points), elastic)
 
     def _elastic(self, points: FloatArray) -> float:
         return DeformationEnergy(self._rest, self._F, _ELASTIC).value(in_units(points[: len(self._rest)], 0))
 
-    def _stacked(self, frame: Sequence[ArrayLike]) -> FloatArray:
+    def _stack(self, frame: Sequence[ArrayLike]) -> FloatArray:
         """Check the frame's points, and return them loop by loop."""
-        loops = _loops_of(frame)
+        loops = _check_loops(frame)
         sizes = [len(loop) for loop in loops]
         if sizes != self._sizes:
             raise ValueError(
@@ -246,16 +248,16 @@ class AirMesh:
             check_finite(f"loop {k} of the frame", "point", "points", loop)
         return np.concatenate(loops)
 
-    def _triangulated(self, points: FloatArray) -> IntArray:
+    def _triangulate(self, points: FloatArray) -> IntArray:
         """Triangulate the space outside shapes and obstacles, without new points."""
-        return air_between(points, self._loops, self._sizes)
+        return triangulate_between(points, self._loops, self._sizes)
 
 
-def _loops_of(frame: Iterable[ArrayLike]) -> list[FloatArray]:
+def _check_loops(frame: Iterable[ArrayLike]) -> list[FloatArray]:
     """Convert the loops of a frame, one or more, to new arrays (k, 2) of real numbers."""
     if isinstance(frame, str | bytes) or not isinstance(frame, Iterable):
         raise ValueError(
-            f"frame must be a list of loops (k, 2), the container first, then obstacles, not {kind_of(frame)}"
+            f"frame must be a list of loops (k, 2), the container first, then obstacles, not {describe(frame)}"
         )
     loops = [real_array(f"loop {k} of the frame", loop) for k, loop in enumerate(frame)]
     if not loops:
@@ -268,29 +270,13 @@ def _loops_of(frame: Iterable[ArrayLike]) -> list[FloatArray]:
     return loops
 
 
-def air_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[int]) -> IntArray:
+def triangulate_between(points: FloatArray, loops: Sequence[IntArray], frame: Sequence[int]) -> IntArray:
     """Triangulate the space between shapes, a container and obstacles by constrained Delaunay, without new points.
 
-    Parameters
-    ----------
-    points : (n, 2) float64
-        All vertices; the last ``sum(frame)`` belong to the frame, loop by loop.
-    loops : list of (l,) int64
-        Boundary loops of the shapes, with the shape on the left.
-    frame : sequence of int
-        Sizes of the frame's loops, with the container first.
-
-    Returns
-    -------
-    (a, 3) int64
-        Triangles, counterclockwise.
-
-    Raises
-    ------
-    ValueError
-        If loops cross or touch, or one is not inside the container; the message names them.
-    ImportError
-        If Shapely is not installed.
+    The last ``sum(frame)`` of the ``points`` (n, 2) belong to the frame, loop by loop; ``frame`` has the sizes of its
+    loops, the container first. ``loops`` are boundary loops of the shapes, with the shape on the left. Return triangles
+    (a, 3), counterclockwise. Raises ValueError if loops cross or touch, or one is not inside the container, and names
+    them. Raises ImportError if Shapely is not installed.
     """
     shapely = _shapely()
     ends = len(points) - sum(frame) + np.cumsum(frame)
@@ -333,21 +319,11 @@ def _check_apart(loops: Sequence[FloatArray], names: Sequence[str]) -> None:
             raise ValueError(f"{names[i]} and {names[j]} meet at ({x:.6g}, {y:.6g}): leave a gap between them")
 
 
-def thickened(corners: FloatArray, gap: float) -> FloatArray:
-    """Lay triangles on their longest sides, and raise heights below a gap to it.
+def thicken(corners: FloatArray, gap: float) -> FloatArray:
+    """Lay triangles (a, 3, 2) on their longest sides, and raise heights below a gap to it.
 
-    Otherwise, air whose rest triangles are its current ones would become thinner at each step and vanish.
-
-    Parameters
-    ----------
-    corners : (a, 3, 2) float64
-        Corners of counterclockwise triangles.
-    gap : float
-
-    Returns
-    -------
-    (a, 3, 2) float64
-        Congruent to the given triangles if their height exceeds the gap.
+    The result is congruent to triangles whose height exceeds the gap. Without it, air whose rest triangles are its
+    current ones would become thinner at each step and vanish.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     first = sides.argmax(axis=1)
@@ -355,10 +331,10 @@ def thickened(corners: FloatArray, gap: float) -> FloatArray:
     start, base = corners[row, first], corners[row, (first + 1) % 3] - corners[row, first]
     length = sides[row, first]
     apex = (corners[row, (first + 2) % 3] - start) @ (1, 1j) / (base @ (1, 1j)) * length
-    laid = np.zeros((len(corners), 3, 2))
-    laid[row, (first + 1) % 3, 0] = length
-    laid[row, (first + 2) % 3] = np.stack([apex.real, np.maximum(apex.imag, gap)], axis=1)
-    return laid
+    layout = np.zeros((len(corners), 3, 2))
+    layout[row, (first + 1) % 3, 0] = length
+    layout[row, (first + 2) % 3] = np.stack([apex.real, np.maximum(apex.imag, gap)], axis=1)
+    return layout
 
 
 def _shapely() -> Any:

@@ -1,4 +1,4 @@
 """Sequences of targets, and a certified map for every frame.
 
-The package builds on `solver` and `energies`. Start reading in `animated`.
+The package builds on `solver` and `energies`. Start reading in `frame_sequence`.
 """

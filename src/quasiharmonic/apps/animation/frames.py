@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.problem.result import MapResult
-from quasiharmonic.util.arrays import BoolArray, FloatArray, check_finite, counted, kind_of, named, real_array
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    check_finite,
+    count_of,
+    describe,
+    names_of,
+    real_array,
+)
+from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.tables import make_dataframe
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True)
@@ -37,8 +50,8 @@ class FrameStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Animation:
-    """A sequence of maps.
+class Animation(Outcome, Sequence[MapResult]):
+    """A sequence of maps: ``animation[t]`` is the `MapResult` of frame t.
 
     Attributes
     ----------
@@ -66,8 +79,31 @@ class Animation:
     interrupted: bool = False
 
     def __repr__(self) -> str:
-        frames = counted("frame", "frames", len(self.frames))
+        frames = count_of("frame", "frames", len(self.frames))
         return f"<Animation: {frames}, {np.count_nonzero(self.found)} injective, largest move {self.largest_move:.3g}>"
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[MapResult]:
+        return iter(self.frames)
+
+    @overload
+    def __getitem__(self, index: int) -> MapResult: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[MapResult]: ...
+    def __getitem__(self, index: int | slice) -> MapResult | list[MapResult]:
+        return self.frames[index]
+
+    @property
+    def success(self) -> bool:
+        """Whether every frame is a success and the work was not interrupted."""
+        return not self.interrupted and bool(self.frames) and all(frame.success for frame in self.frames)
+
+    @property
+    def message(self) -> str:
+        """The first line of `summary`."""
+        return self.summary().partition("\n")[0]
 
     @property
     def uv(self) -> FloatArray:
@@ -96,9 +132,9 @@ class Animation:
         found = self.found
         ratio = np.full(max(len(self.frames) - 1, 0), np.nan)
         for t in np.flatnonzero(found[1:] & found[:-1]):
-            boundary = farthest(self.targets[t + 1] - self.targets[t])
+            boundary = find_longest(self.targets[t + 1] - self.targets[t])
             if boundary > 0:
-                ratio[t] = farthest(self.frames[t + 1].uv - self.frames[t].uv) / boundary
+                ratio[t] = find_longest(self.frames[t + 1].uv - self.frames[t].uv) / boundary
         return ratio
 
     @property
@@ -107,30 +143,48 @@ class Animation:
         moves = self.moves
         return float(moves[np.isfinite(moves)].max(initial=0.0))
 
+    def to_dataframe(self) -> DataFrame:
+        """Return one row per frame: success, status, bijective, bridged, energy, and the move from the frame before.
+
+        Needs pandas. Columns are as the attributes of the same names; ``move`` is NaN for the first frame.
+        """
+        return make_dataframe(
+            {
+                "success": [frame.success for frame in self.frames],
+                "status": [frame.status.name.lower() for frame in self.frames],
+                "bijective": self.bijective,
+                "bridged": self.bridged[: len(self.frames)],
+                "energy": self.energies[: len(self.frames)],
+                "move": np.concatenate([np.full(min(len(self.frames), 1), np.nan), self.moves]),
+            },
+            "frame",
+        )
+
     def summary(self) -> str:
         """Return a text with the number of certified frames, the reasons for missing ones, and the largest move."""
-        found, count = self.found, counted("frame", "frames", len(self.frames))
+        found, count = self.found, count_of("frame", "frames", len(self.frames))
         lines = [f"{count}: {np.count_nonzero(found)} with every triangle strictly positive, verified exactly"]
         if self.interrupted:
             lines.append("interrupted before the last frame")
         if self.bridged.any():
-            lines.append(f"between their neighbours: {named('frame', 'frames', np.flatnonzero(self.bridged))}")
+            lines.append(f"between their neighbours: {names_of('frame', 'frames', np.flatnonzero(self.bridged))}")
         overlapping = np.flatnonzero(found & ~self.bijective)
         if overlapping.size:
-            lines.append(f"overlapping: {named('frame', 'frames', overlapping)}")
+            lines.append(f"overlapping: {names_of('frame', 'frames', overlapping)}")
         for t in np.flatnonzero(~found)[:5]:
             diagnosis = self.frames[t].diagnosis
             known = diagnosis.obstructions if diagnosis is not None else ()
             lines.append(f"frame {t}: {known[0].message if known else self.frames[t].status.value}")
         more = int(np.count_nonzero(~found)) - 5
         if more > 0:
-            lines.append(f"and {counted('frame', 'frames', more)} more without a map")
+            lines.append(f"and {count_of('frame', 'frames', more)} more without a map")
         lines.append(f"no vertex moves more than {self.largest_move:.3g} times as far as the boundary")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all data except the maps, for JSON."""
         return {
+            "success": self.success,
             "frames": len(self.frames),
             "certified": int(np.count_nonzero(self.found)),
             "overlapping": np.flatnonzero(self.found & ~self.bijective).tolist(),
@@ -149,23 +203,18 @@ class Animation:
         }
 
 
-def farthest(moved: FloatArray) -> float:
+def find_longest(moved: FloatArray) -> float:
     """Return the length of the longest displacement (k, 2)."""
     return float(np.hypot(*moved.T).max(initial=0.0))
 
 
-def checked_targets(targets: Iterable[ArrayLike], count: int) -> FloatArray:
+def check_targets(targets: Iterable[ArrayLike], count: int) -> FloatArray:
     """Check a sequence of targets with ``count`` rows each and return it as one array (t, k, 2).
 
-    Raises
-    ------
-    TypeError
-        If the targets are not iterable.
-    ValueError
-        If there are no targets, or one has another shape, is not real or is not finite; names the first such frame.
+    Raises TypeError or ValueError; the message names the first bad frame.
     """
     if not isinstance(targets, Iterable) or isinstance(targets, str | bytes):
-        raise TypeError(f"targets must be a sequence of arrays ({count}, 2), not {kind_of(targets)}")
+        raise TypeError(f"targets must be a sequence of arrays ({count}, 2), not {describe(targets)}")
     checked = []
     for t, target in enumerate(targets):
         name = f"targets: frame {t}"

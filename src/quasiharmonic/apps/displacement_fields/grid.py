@@ -36,17 +36,10 @@ _TRIANGLES = np.array([[0, 1, 2], [1, 3, 0], [2, 0, 3], [3, 2, 1]])
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of pixels.
+    """A grid of pixels."""
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Numbers of rows and columns, at least two each.
-    spacing : (float, float)
-        Distances between columns, along x, and between rows, along y.
-    """
-
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # Numbers of rows and columns, at least two each
+    # Distances between columns, along x, and between rows, along y
     spacing: tuple[float, float] = (1.0, 1.0)
 
     @property
@@ -90,14 +83,8 @@ class Grid:
             return np.stack([x.real * y.imag - x.imag * y.real for x, y in sides], axis=-1)
 
 
-def checked_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:
-    """Return the grid of a field with a given shape.
-
-    Raises
-    ------
-    ValueError
-        If the spacing is not one or two positive numbers.
-    """
+def check_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:
+    """Return the grid of a field with a given shape; ValueError if the spacing is not one or two positive numbers."""
     sides = real_array("spacing", spacing)
     if sides.shape not in ((), (2,)) or not (np.isfinite(sides) & (sides > 0)).all():
         raise ValueError(f"spacing must be a positive number, or two (along x and along y), not {spacing!r}")
@@ -105,14 +92,8 @@ def checked_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:
     return Grid((shape[0], shape[1]), (x, y))
 
 
-def checked_field(field: ArrayLike) -> FloatArray:
-    """Check a displacement field, and return a copy as (h, w, 2) float64.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or the field is not finite; the message names the first pixels by row and column.
-    """
+def check_field(field: ArrayLike) -> FloatArray:
+    """Check a displacement field, and return a copy as (h, w, 2) float64; a ValueError names the first bad pixels."""
     array = real_array("field", field)
     if array.ndim != 3 or array.shape[2] != 2 or min(array.shape[:2]) < 2:
         advice = ""
@@ -126,11 +107,11 @@ def checked_field(field: ArrayLike) -> FloatArray:
         )
     bad = np.asarray(~np.isfinite(array).all(axis=2))
     if bad.any():
-        raise ValueError(f"field is not finite at {named_pixels(bad)}")
+        raise ValueError(f"field is not finite at {name_pixels(bad)}")
     return array
 
 
-def named_pixels(mask: BoolArray, most: int = 5) -> str:
+def name_pixels(mask: BoolArray, most: int = 5) -> str:
     """Name the first pixels of a mask (h, w): ``pixels (0, 3), (2, 7), … (17 in all), row and column``."""
     where = np.argwhere(mask)
     listed = ", ".join(f"({y}, {x})" for y, x in where[:most].tolist())

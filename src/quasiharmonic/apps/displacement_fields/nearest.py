@@ -9,21 +9,30 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.displacement_fields.approach import approach
-from quasiharmonic.apps.displacement_fields.grid import Grid, checked_field, checked_grid, named_pixels
-from quasiharmonic.apps.displacement_fields.patches import NoRoomError, filled_in, folded, grown, labelled
+from quasiharmonic.apps.displacement_fields.grid import Grid, check_field, check_grid, name_pixels
+from quasiharmonic.apps.displacement_fields.patch_descent import descend_patches
+from quasiharmonic.apps.displacement_fields.patches import (
+    FixedPixelsError,
+    fill_patches,
+    find_folds,
+    grow,
+    label_patches,
+)
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, counted
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, count_of
+from quasiharmonic.util.outcome import Outcome
 
 # Pixels closer than this to their original position, in pixels, return to it.
-_THERE = 1e-6
-# Patches whose border moved grow by this number of pixels, at most this number of times.
-_WIDER, _ROUNDS = 4, 12
+_RETURN_DISTANCE = 1e-6
+# Patches whose border moved grow by this number of pixels.
+_MARGIN = 4
+# Maximum number of times that patches grow.
+_MAX_ROUNDS = 12
 
 
-@dataclass(frozen=True, eq=False)
-class InvertibleField:
+@dataclass(frozen=True, eq=False, repr=False)
+class InvertibleField(Outcome):
     """A displacement field without folds, and its distance from the given one.
 
     Attributes
@@ -52,13 +61,23 @@ class InvertibleField:
     distance: float
     seconds: float
 
+    @property
+    def success(self) -> bool:
+        """Whether the field is injective (certified)."""
+        return self.certificate.injective
+
+    @property
+    def message(self) -> str:
+        """The text of `summary`."""
+        return self.summary()
+
     def summary(self) -> str:
         """Describe the field in one or two sentences."""
         if not self.folds:
             return f"The field does not fold and is unchanged. {self.certificate.summary()}"
         moved = int(np.count_nonzero(self.moved_mask))
         return (
-            f"{counted('cell', 'cells', self.folds)} folded; {counted('pixel', 'pixels', moved)} moved, "
+            f"{count_of('cell', 'cells', self.folds)} folded; {count_of('pixel', 'pixels', moved)} moved, "
             f"root mean square change {self.distance:.3g}. {self.certificate.summary()}"
         )
 
@@ -115,70 +134,57 @@ def nearest_invertible(
     >>> import numpy as np
     >>> y, x = np.mgrid[:40, :40]
     >>> bump = np.exp(-((x - 20) ** 2 + (y - 20) ** 2) / 18)
-    >>> mended = nearest_invertible(np.stack([6 * bump, 0 * bump], axis=-1))
-    >>> mended.certificate.bijective, mended.folds, bool(mended.moved_mask.mean() < 0.1)
+    >>> repaired = nearest_invertible(np.stack([6 * bump, 0 * bump], axis=-1))
+    >>> repaired.certificate.bijective, repaired.folds, bool(repaired.moved_mask.mean() < 0.1)
     (True, 8, True)
     """
     began = time.perf_counter()
-    given = checked_field(field)
-    grid = checked_grid(given.shape, spacing)
+    given = check_field(field)
+    grid = check_grid(given.shape, spacing)
     if not isinstance(min_jacobian, Real) or not 0 <= min_jacobian < 1:
         raise ValueError(f"min_jacobian must be at least 0 and less than 1, not {min_jacobian!r}")
-    kept = _fixed_mask(fixed, grid)
+    mask = _check_mask(fixed, grid)
     w = _map(grid, given)
-    min_jacobian = max(min_jacobian, _rounding(w))
-    wrong = folded(grid, w, min_jacobian)
-    mended = given.copy()
+    min_jacobian = max(min_jacobian, _bound_rounding(w))
+    wrong = find_folds(grid, w, min_jacobian)
+    repaired = given.copy()
     if wrong.any():
-        _check_fixed(wrong, kept)
-        here = _descended(grid, w, kept, min_jacobian)
+        _check_fixed(wrong, mask)
+        here = _descend(grid, w, mask, min_jacobian)
         moved = here != w
-        places = np.stack([here.real, here.imag], axis=-1) * grid.unit
-        mended[moved] = (places - grid.points)[moved]
-        if not _fold_free(grid, mended).all():
+        positions = np.stack([here.real, here.imag], axis=-1) * grid.unit
+        repaired[moved] = (positions - grid.points)[moved]
+        if not _is_fold_free(grid, repaired).all():
             raise RuntimeError("rounding folds the new field: its displacements are too large for its spacing")
-    certificate = certify(grid.triangles(), (grid.points + mended).reshape(-1, 2))
-    moved = (mended != given).any(axis=2)
-    away = np.hypot(*np.moveaxis(mended - given, 2, 0))
+    certificate = certify(grid.triangles(), (grid.points + repaired).reshape(-1, 2))
+    moved = (repaired != given).any(axis=2)
+    away = np.hypot(*np.moveaxis(repaired - given, 2, 0))
     farthest = float(away.max())
     return InvertibleField(
-        field=mended,
+        field=repaired,
         moved_mask=moved,
         certificate=certificate,
         folds=int(np.count_nonzero(wrong)),
-        patches=int(labelled(moved).max()),
+        patches=int(label_patches(moved).max()),
         distance=farthest * float(np.sqrt(((away / (farthest or 1.0)) ** 2).mean())),
         seconds=time.perf_counter() - began,
     )
 
 
 def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> BoolArray:
-    """Decide exactly for each cell of a displacement field whether it does not fold.
+    """Decide exactly for each cell of a displacement field (h, w, 2) whether it does not fold; (h − 1, w − 1) bool.
 
-    Parameters
-    ----------
-    field : (h, w, 2) array
-    spacing : float or (float, float)
-        As for `nearest_invertible`.
-
-    Returns
-    -------
-    (h − 1, w − 1) bool
-        Whether all four corner triangles of the mapped pixels, as stored in doubles, are positive.
-
-    Raises
-    ------
-    ValueError
-        As `nearest_invertible`.
+    All four corner triangles of the mapped pixels, as stored in doubles, must be positive. Arguments and errors are
+    those of `nearest_invertible`.
     """
-    given = checked_field(field)
-    return _fold_free(checked_grid(given.shape, spacing), given)
+    given = check_field(field)
+    return _is_fold_free(check_grid(given.shape, spacing), given)
 
 
-def _fold_free(grid: Grid, field: FloatArray) -> BoolArray:
-    places = (grid.points + field).reshape(-1, 2)
+def _is_fold_free(grid: Grid, field: FloatArray) -> BoolArray:
+    positions = (grid.points + field).reshape(-1, 2)
     rows, columns = np.indices((grid.shape[0] - 1, grid.shape[1] - 1)).reshape(2, -1)
-    a, b, c = places[grid.corner_triangles(grid.cells(rows, columns))].swapaxes(0, 1)
+    a, b, c = positions[grid.corner_triangles(grid.cells(rows, columns))].swapaxes(0, 1)
     positive = (orientation(a, b, c) > 0).reshape(grid.shape[0] - 1, grid.shape[1] - 1, 4)
     return np.asarray(positive.all(axis=2))
 
@@ -188,13 +194,13 @@ def _map(grid: Grid, field: FloatArray) -> ComplexArray:
     return np.ascontiguousarray((grid.points + field) / grid.unit).view(np.complex128)[..., 0]
 
 
-def _rounding(w: ComplexArray) -> float:
+def _bound_rounding(w: ComplexArray) -> float:
     """A bound on the rounding error of a determinant of a map (h, w), from medians, so that outliers do not count."""
     side = max(float(np.median(np.abs(np.diff(w, axis=axis)))) for axis in (0, 1))
     return 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))) * max(side, 1)
 
 
-def _fixed_mask(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
+def _check_mask(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
     if fixed is None:
         return np.zeros(grid.shape, dtype=bool)
     mask = np.asarray(fixed)
@@ -205,40 +211,40 @@ def _fixed_mask(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
 
 def _check_fixed(wrong: BoolArray, fixed: BoolArray) -> None:
     """Raise ValueError for folds whose pixels are all fixed."""
-    stuck = wrong & fixed[:-1, :-1] & fixed[1:, :-1] & fixed[:-1, 1:] & fixed[1:, 1:]
-    if stuck.any():
+    unrepairable = wrong & fixed[:-1, :-1] & fixed[1:, :-1] & fixed[:-1, 1:] & fixed[1:, 1:]
+    if unrepairable.any():
         raise ValueError(
-            f"fixed: cells fold whose four pixels are all fixed; the first of each is {named_pixels(stuck)}"
+            f"fixed: cells fold whose four pixels are all fixed; the first of each is {name_pixels(unrepairable)}"
         )
 
 
-def _descended(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> ComplexArray:
+def _descend(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> ComplexArray:
     """Find the nearest map, starting from one without folds; patches grow until nothing moves at their borders."""
     try:
-        w, patch = filled_in(grid, given, fixed, min_jacobian)
-    except NoRoomError as none:
+        w, patch = fill_patches(grid, given, fixed, min_jacobian)
+    except FixedPixelsError as none:
         raise RuntimeError(
             "no field without folds was found that keeps the fixed pixels; folds remain at "
-            f"{named_pixels(none.mask)}. Fix fewer pixels around these"
+            f"{name_pixels(none.mask)}. Fix fewer pixels around these"
         ) from none
     moving = patch
-    for _ in range(_ROUNDS):
-        approach(grid, w, given, moving, min_jacobian)
-        _put_back(grid, w, given, min_jacobian)
-        rim = (w != given) & (moving > 0) & grown(patch == 0, 1, fixed)
+    for _ in range(_MAX_ROUNDS):
+        descend_patches(grid, w, given, moving, min_jacobian)
+        _return_near_pixels(grid, w, given, min_jacobian)
+        rim = (w != given) & (moving > 0) & grow(patch == 0, 1, fixed)
         pressing = np.isin(moving, np.unique(moving[rim])) & rim.any() & (moving > 0)
-        free = (patch > 0) | grown(pressing, _WIDER, fixed)
+        free = (patch > 0) | grow(pressing, _MARGIN, fixed)
         if np.array_equal(free, patch > 0):
             break
-        patch = labelled(free)
+        patch = label_patches(free)
         moving = np.where(np.isin(patch, np.unique(patch[pressing])), patch, 0)
     return w
 
 
-def _put_back(grid: Grid, w: ComplexArray, given: ComplexArray, min_jacobian: float) -> None:
+def _return_near_pixels(grid: Grid, w: ComplexArray, given: ComplexArray, min_jacobian: float) -> None:
     """Return pixels that are nearly at their original positions to them, unless this makes a fold."""
-    there = (w != given) & (np.abs(w - given) < _THERE)
-    before = w[there]
-    w[there] = given[there]
-    if folded(grid, w, min_jacobian).any():
-        w[there] = before
+    close = (w != given) & (np.abs(w - given) < _RETURN_DISTANCE)
+    before = w[close]
+    w[close] = given[close]
+    if find_folds(grid, w, min_jacobian).any():
+        w[close] = before

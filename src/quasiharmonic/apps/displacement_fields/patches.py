@@ -18,14 +18,16 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
 if TYPE_CHECKING:
     from scipy.sparse import dia_array
 
-# Distance in pixels around folded cells that becomes free, and growth factor of patches that still fold.
-_REACH, _GROWTH = 2, 2
+# Distance in pixels around folded cells that becomes free.
+_MARGIN = 2
+# Factor of that distance for patches that still fold.
+_GROWTH = 2
 # Growth factor of the smoothing's standard deviation in pixels.
 _SMOOTHER = 1.2
 _EIGHT = np.ones((3, 3), dtype=bool)
 
 
-class NoRoomError(Exception):
+class FixedPixelsError(Exception):
     """Because of fixed pixels, no map without folds was found; ``mask`` (h, w) marks the pixels of the folds."""
 
     def __init__(self, mask: BoolArray) -> None:
@@ -33,12 +35,12 @@ class NoRoomError(Exception):
         self.mask = mask
 
 
-def folded(grid: Grid, w: ComplexArray, min_jacobian: float) -> BoolArray:
+def find_folds(grid: Grid, w: ComplexArray, min_jacobian: float) -> BoolArray:
     """The cells (h − 1, w − 1) with a corner whose determinant is not above ``min_jacobian``."""
     return np.asarray(~(grid.jacobians(w) > min_jacobian).all(axis=2))
 
 
-def corners_of(cells: BoolArray) -> BoolArray:
+def find_pixels(cells: BoolArray) -> BoolArray:
     """The pixels (h, w) of cells (h − 1, w − 1)."""
     pixels = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=bool)
     for y in (0, 1):
@@ -47,14 +49,14 @@ def corners_of(cells: BoolArray) -> BoolArray:
     return pixels
 
 
-def labelled(free: BoolArray) -> IntArray:
+def label_patches(free: BoolArray) -> IntArray:
     """Number the patches of free pixels (h, w) from 1 on; no cell has pixels of two patches."""
     from scipy.ndimage import label
 
     return np.asarray(label(free, structure=_EIGHT)[0], dtype=np.int64)
 
 
-def grown(pixels: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
+def grow(pixels: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
     """Add all pixels within a number of steps, by rows, columns or both, except fixed ones."""
     from scipy.ndimage import maximum_filter
 
@@ -62,45 +64,29 @@ def grown(pixels: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
     return around
 
 
-def filled_in(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> tuple[ComplexArray, IntArray]:
-    """Find a map without folds that agrees with the given one outside some patches.
+def fill_patches(
+    grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float
+) -> tuple[ComplexArray, IntArray]:
+    """Find a map without folds that agrees with the given one (h, w), in the grid's unit, outside some patches.
 
-    Parameters
-    ----------
-    grid : Grid
-    given : (h, w) complex128
-        A map in the grid's unit.
-    fixed : (h, w) bool
-        Fixed pixels.
-    min_jacobian : float
-        Lower bound of all determinants.
-
-    Returns
-    -------
-    w : (h, w) complex128
-    patch : (h, w) int64
-        Patch of each free pixel, from 1 on; 0 for all others.
-
-    Raises
-    ------
-    NoRoomError
-        If no such map was found, which can only happen with fixed pixels.
+    Return the map and the patch (h, w) of each free pixel, from 1 on; 0 for all others. Raise FixedPixelsError if no
+    such map was found, which can only happen with fixed pixels.
     """
-    w, steps = given.copy(), _REACH
-    free = grown(corners_of(folded(grid, given, min_jacobian)), steps, fixed)
+    w, steps = given.copy(), _MARGIN
+    free = grow(find_pixels(find_folds(grid, given, min_jacobian)), steps, fixed)
     while not free.all():
-        patch = labelled(free)
+        patch = label_patches(free)
         _fill(grid, w, given, free)
-        wrong = folded(grid, w, min_jacobian)
+        wrong = find_folds(grid, w, min_jacobian)
         if not wrong.any():
             return w, patch
         steps *= _GROWTH
-        failed = np.unique(patch[corners_of(wrong)])
-        larger = grown(np.isin(patch, failed[failed > 0]) | corners_of(wrong), steps, fixed) | free
+        failed = np.unique(patch[find_pixels(wrong)])
+        larger = grow(np.isin(patch, failed[failed > 0]) | find_pixels(wrong), steps, fixed) | free
         if np.array_equal(larger, free):
-            raise NoRoomError(corners_of(wrong))
+            raise FixedPixelsError(find_pixels(wrong))
         free = larger
-    return _smoothed(grid, given, min_jacobian), labelled(free)
+    return _smooth(grid, given, min_jacobian), label_patches(free)
 
 
 def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
@@ -132,7 +118,7 @@ def _path(count: int) -> dia_array:
     return dia_array((bands, [-1, 0, 1]), shape=(count, count))
 
 
-def _smoothed(grid: Grid, given: ComplexArray, min_jacobian: float) -> ComplexArray:
+def _smooth(grid: Grid, given: ComplexArray, min_jacobian: float) -> ComplexArray:
     """Smooth the displacements by the smallest tried Gaussian that leaves no fold."""
     from scipy.ndimage import gaussian_filter
 
@@ -140,7 +126,7 @@ def _smoothed(grid: Grid, given: ComplexArray, min_jacobian: float) -> ComplexAr
     while deviation < max(grid.shape):
         smooth = [gaussian_filter(part, deviation, mode="nearest") for part in (moved.real, moved.imag)]
         w: ComplexArray = grid.rest + smooth[0] + 1j * smooth[1]
-        if not folded(grid, w, min_jacobian).any():
+        if not find_folds(grid, w, min_jacobian).any():
             return w
         deviation *= _SMOOTHER
     return grid.rest + moved.mean()

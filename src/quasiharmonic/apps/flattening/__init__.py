@@ -1,5 +1,5 @@
 """Maps with a free boundary that does not overlap itself.
 
-The package builds on `energies` and `solver.methods`. Start reading in `flattened`, which calls the steps in order:
+The package builds on `energies` and `solver.methods`. Start reading in `free_boundary`, which calls the steps in order:
 initial map, free descent, guarded descent, layout.
 """

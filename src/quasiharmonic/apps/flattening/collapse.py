@@ -14,7 +14,7 @@ import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -22,7 +22,7 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 # their own boundary, 10 to 10¹² for collapsed maps.
 _TIMES = 10.0
 # A triangle whose longest side is so many times its height: rounding of its corners changes its stretch by one or more.
-_THIN = 2.0**52
+_MAX_ASPECT = 2.0**52
 
 
 def worst_stretch(V: FloatArray, F: IntArray, uv: FloatArray, *, angles_alone: bool) -> float:
@@ -39,13 +39,13 @@ def thin_triangles(V: FloatArray, F: IntArray) -> BoolArray:
     """Which triangles (f,) are so thin at rest that doubles cannot express their stretch."""
     z1, z2 = rest_frames(V, F)
     with np.errstate(all="ignore"):
-        return _sides(z1, z2).max(axis=0) ** 2 >= _THIN * z1 * np.abs(z2.imag)
+        return _sides(z1, z2).max(axis=0) ** 2 >= _MAX_ASPECT * z1 * np.abs(z2.imag)
 
 
 def _stretch_of_sides(V: FloatArray, F: IntArray, uv: FloatArray, *, angles_alone: bool) -> FloatArray:
-    """How much, or how unevenly, a map of the surface's area stretches the sides of each triangle; (f,).
+    """The maximum stretch (f,) of each triangle's sides by a map of the surface's area, or how uneven it is.
 
-    Never more than the stretch of the triangle, and right to rounding however thin it is.
+    It never exceeds the stretch of the triangle, and is accurate to rounding however thin the triangle is.
     """
     z1, z2 = rest_frames(V, F)
     w = in_units(uv, 0)
@@ -82,21 +82,9 @@ def has_collapsed(
 ) -> bool:
     """Whether the final map of a descent is stretched far more than its surface requires.
 
-    Parameters
-    ----------
-    V : (n, 3) float64
-        Rest positions, of about unit size.
-    F : (f, 3) int64
-    loops : sequence of (l,) int64
-        Boundary loops.
-    area : float
-        Area of the surface.
-    uv : (n, 2) float64
-        The map.
-    overlapping : (n, 2) float64 or None
-        The final map of a descent in which the boundary may overlap itself.
-    angles_alone : bool
-        Whether the energy does not depend on the map's scale.
+    ``V`` (n, 3) is of about unit size and ``area`` is the surface's. ``overlapping`` is the final map (n, 2) of a
+    descent in which the boundary may overlap itself. ``angles_alone`` means that the energy does not depend on the
+    map's scale.
     """
     asked = 1.0 if angles_alone else stretch_of_boundary(V, loops, area)
     if overlapping is not None:

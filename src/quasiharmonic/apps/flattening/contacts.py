@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quasiharmonic.energies.energies import QuadraticForm
-from quasiharmonic.geometry.exact.loops import contacts, judge_loops
+from quasiharmonic.geometry.exact.loops import check_loops, contacts
 from quasiharmonic.geometry.exact.predicates import box_pairs_between
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -33,32 +33,24 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 _REACH = 1.0
 # Pairs up to this many times the reach are also tracked during a step, which may bring them closer.
 _LOOKOUT = 2.0
-_MOST_MEETINGS = 1000
+_MAX_MEETINGS = 1000
 #: Half the gradients of the hat functions of a triangle v, a, b with a right angle at a and legs of length 1.
 HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Pairs of a boundary vertex and a boundary edge that may touch.
+    """Pairs of a boundary vertex and a boundary edge that may touch."""
 
-    Attributes
-    ----------
-    corners : (3, c) int64
-        Vertex, and start and end of the edge.
-    reach : (c,) float64
-        Distance below which they repel each other, in the map's units; 0 for pairs that do not.
-    """
-
-    corners: IntArray
-    reach: FloatArray
+    corners: IntArray  # (3, c): vertex, and start and end of the edge
+    reach: FloatArray  # (c,): distance below which they repel each other, in the map's units; 0 for pairs that do not
 
     @classmethod
     def none(cls) -> Contacts:
         """Return an empty set of contacts."""
         return cls(np.zeros((3, 0), dtype=np.int64), np.zeros(0))
 
-    def room(self, w: ComplexArray) -> float:
+    def smallest_gap(self, w: ComplexArray) -> float:
         """The smallest ratio of distance to reach; ``inf`` without contacts."""
         d, _, _ = _nearest(*w[self.corners])
         return float(np.min(d[self.reach > 0] / self.reach[self.reach > 0], initial=np.inf))
@@ -101,11 +93,11 @@ class Contacts:
         bound = 3 * self._stiffness(d) * np.stack([np.ones(s.shape), (1 - s) ** 2, s**2])
         at = self.corners.ravel()
 
-        def summed(part: FloatArray) -> FloatArray:
+        def sum_parts(part: FloatArray) -> FloatArray:
             # For empty input bincount returns integers.
             return np.bincount(at, (bound * part).ravel(), minlength=w.size).astype(np.float64, copy=False)
 
-        return summed(normal.real**2), summed(normal.real * normal.imag), summed(normal.imag**2)
+        return sum_parts(normal.real**2), sum_parts(normal.real * normal.imag), sum_parts(normal.imag**2)
 
     def split(self, known: IntArray, n: int) -> tuple[Contacts, Contacts]:
         """Split into contacts in a known set (3, k), with reach 0 for its other pairs, and the remaining contacts."""
@@ -118,10 +110,10 @@ class Contacts:
         reach[order[place[found]]] = self.reach[found]
         return Contacts(known, reach), Contacts(self.corners[:, ~found], self.reach[~found])
 
-    def within(self, w: ComplexArray, most: float) -> Contacts:
-        """Return the contacts whose distance is below ``most`` times their reach."""
+    def within(self, w: ComplexArray, max_ratio: float) -> Contacts:
+        """Return the contacts whose distance is below ``max_ratio`` times their reach."""
         d, _, _ = _nearest(*w[self.corners])
-        near = d < most * self.reach
+        near = d < max_ratio * self.reach
         return Contacts(self.corners[:, near], self.reach[near])
 
     def _stiffness(self, d: FloatArray) -> FloatArray:
@@ -134,13 +126,7 @@ class Contacts:
 
 
 class Rim:
-    """The boundary of a surface.
-
-    Parameters
-    ----------
-    loops : sequence of (l,) int64
-        Boundary loops, with the surface on their left.
-    """
+    """The boundary of a surface: loops (l,) with the surface on their left."""
 
     def __init__(self, loops: Sequence[IntArray]) -> None:
         self._loops = list(loops)
@@ -160,36 +146,30 @@ class Rim:
         intersections is not sufficient: if triangles wind around a boundary vertex by more than a full turn, a loop
         can be simple but wound the wrong way.
         """
-        return bool(judge_loops(self._loops, uv)[1])
+        return bool(check_loops(self._loops, uv)[1])
 
     def meetings(self, uv: FloatArray) -> IntArray:
         """Return the end vertices (k,) of the first 1,000 pairs of intersecting boundary edges."""
         tail, head = uv[self._edges[:, 0]], uv[self._edges[:, 1]]
         short = self._edges[(tail == head).all(axis=1)]
-        pairs = contacts(uv, self._edges, _MOST_MEETINGS).pairs
+        pairs = contacts(uv, self._edges, _MAX_MEETINGS).pairs
         return np.unique(np.concatenate([short.ravel(), self._edges[pairs].ravel()]))
 
-    def tangled(self, uv: FloatArray) -> float:
+    def tangled_fraction(self, uv: FloatArray) -> float:
         """The fraction of the boundary's vertices at intersecting edges, from the first 1,000 pairs."""
         return self.meetings(uv).size / self._vertex.size
 
     def contacts(self, w: ComplexArray) -> Contacts:
-        """Return pairs that are close to each other across the outside of the surface.
-
-        Parameters
-        ----------
-        w : (n,) complex128
-            A map whose boundary is simple.
-        """
+        """Return pairs that are close to each other across the outside of the surface; the map's boundary is simple."""
         p = w[self._vertex]
         q = p[self._next]
         length = np.abs(q - p)
         around = 0.5 * (length + length[self._previous])
         # Most candidates are the vertex's own and neighbouring edges, so they are removed first.
         radius = (_LOOKOUT * _REACH * around)[:, None]
-        here, there = _planar(p), _planar(q)
+        here, there = _to_rows(p), _to_rows(q)
         boxes = here - radius, here + radius, np.minimum(here, there), np.maximum(here, there)
-        found = [self._apart(*pairs) for pairs in box_pairs_between(*boxes)]
+        found = [self._exclude_own_edges(*pairs) for pairs in box_pairs_between(*boxes)]
         i, j = np.concatenate(found, axis=1) if found else np.zeros((2, 0), dtype=np.int64)
         reach = _REACH * np.minimum(around[i], length[j])
         d, normal, s = _nearest(p[i], p[j], q[j])
@@ -208,7 +188,7 @@ class Rim:
         corners = self._vertex[np.stack([i[kept], j[kept], head[kept]])]
         return Contacts(corners, reach[kept])
 
-    def _apart(self, i: IntArray, j: IntArray) -> IntArray:
+    def _exclude_own_edges(self, i: IntArray, j: IntArray) -> IntArray:
         """Remove pairs of a vertex and one of its own edges; (2, k)."""
         apart = np.flatnonzero((i != j) & (i != self._next[j]))
         return np.stack([i[apart], j[apart]])
@@ -222,7 +202,7 @@ class Rim:
         return inside
 
 
-def _planar(w: ComplexArray) -> FloatArray:
+def _to_rows(w: ComplexArray) -> FloatArray:
     return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
 
 

@@ -13,22 +13,11 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 _GAP = 0.05
 
 
-def laid_along_axis(F: IntArray, uv: FloatArray) -> FloatArray:
-    """Rotate a map so that its principal axis is the x axis, with its bounding box at the origin.
+def align_with_axis(F: IntArray, uv: FloatArray) -> FloatArray:
+    """Rotate a map (n, 2) so that its principal axis is the x axis, with its bounding box at the origin.
 
-    The axis is that of the image's moments of inertia. Its direction is chosen so that the longer tail of the image's
-    area points to the right.
-
-    Parameters
-    ----------
-    F : (f, 3) int64
-    uv : (n, 2) float64
-        A map with positive triangles, of about unit size.
-
-    Returns
-    -------
-    (n, 2) float64
-        The rotated and shifted map, with new rounding errors.
+    The map is of about unit size, and the axis is that of the image's moments of inertia. The longer tail of the
+    image's area points to the right. The result has new rounding errors.
     """
     w = np.ascontiguousarray(uv).view(np.complex128).ravel()
     area = signed_areas(F, w)
@@ -41,19 +30,15 @@ def laid_along_axis(F: IntArray, uv: FloatArray) -> FloatArray:
     along = turned[F].mean(axis=1).real
     if (area * along**3).sum() < 0:
         turned = -turned
-    laid = turned.view(np.float64).reshape(-1, 2)
-    return laid - laid.min(axis=0)
+    aligned = turned.view(np.float64).reshape(-1, 2)
+    return aligned - aligned.min(axis=0)
 
 
-def side_by_side(parts: Sequence[FloatArray], gap: float = 0.0) -> list[FloatArray]:
+def place_in_row(parts: Sequence[FloatArray], gap: float = 0.0) -> list[FloatArray]:
     """Shift maps (n, 2) whose bounding boxes start at the origin so that they stand in a row.
 
-    The space between them is ``gap``, but at least a fixed fraction of the largest side of all.
-
-    Raises
-    ------
-    ValueError
-        If the row exceeds the range of doubles.
+    The space between them is ``gap``, but at least a fixed fraction of the largest side of all. Raises ValueError if
+    the row exceeds the range of doubles.
     """
     gap = max(gap, _GAP * max(float(part.max()) for part in parts))
     shifted, right = [], 0.0
@@ -61,35 +46,23 @@ def side_by_side(parts: Sequence[FloatArray], gap: float = 0.0) -> list[FloatArr
         for part in parts:
             shifted.append(part + np.array([right, 0.0]))
             right = float(shifted[-1][:, 0].max()) + gap
-    return [in_range(places) for places in shifted]
+    return [check_in_range(positions) for positions in shifted]
 
 
-def in_range(uv: FloatArray) -> FloatArray:
-    """Return a map unchanged if it is finite.
-
-    Raises
-    ------
-    ValueError
-        If positions exceed the range of doubles.
-    """
+def check_in_range(uv: FloatArray) -> FloatArray:
+    """Return a map unchanged if it is finite; otherwise raise ValueError."""
     if not np.isfinite(uv).all():
         raise ValueError("the map is outside the range of doubles (1e308): scale the surface or the pins down")
     return uv
 
 
-def in_given_unit(uv: FloatArray, exponent: int) -> FloatArray:
-    """Convert a map from units of ``2 ** exponent`` to the original unit.
-
-    Raises
-    ------
-    ValueError
-        As `in_range`.
-    """
+def to_given_unit(uv: FloatArray, exponent: int) -> FloatArray:
+    """Convert a map from units of ``2 ** exponent`` to the original unit; ValueError as `check_in_range`."""
     with np.errstate(over="ignore"):
-        return in_range(np.ldexp(uv, exponent))
+        return check_in_range(np.ldexp(uv, exponent))
 
 
-def in_unit_square(uv: FloatArray) -> FloatArray:
+def fit_unit_square(uv: FloatArray) -> FloatArray:
     """Scale a map uniformly, and centre it in the unit square."""
     low, high = uv.min(axis=0), uv.max(axis=0)
     size = float((high - low).max())

@@ -15,34 +15,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.topology import components
-from quasiharmonic.io.adapters.objects import mesh_triangles
-from quasiharmonic.io.atomic import check_writable, write_whole
-from quasiharmonic.util.arrays import FloatArray, index_array, map_array, not_negative
+from quasiharmonic.io.errors import check_path
+from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
+from quasiharmonic.problem.certification import certify
+from quasiharmonic.util.arrays import FloatArray, check_choice, check_non_negative, map_array
 
 #: Millimetres per unit of the map.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 # Sides of the polygon that replaces a quarter circle; its error is 0.03 % of the allowance.
 _QUARTER = 32
-# Margin around the drawing, and line width, in millimetres.
-_MARGIN, _WIDTH = 5.0, 0.2
+# Margin around the drawing in millimetres.
+_MARGIN = 5.0
+# Line width in millimetres.
+_LINE_WIDTH = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Closed lines in millimetres; first points are not repeated.
+    """Closed lines (k, 2) in millimetres; first points are not repeated."""
 
-    Attributes
-    ----------
-    seam : list of (k, 2) float64
-        Boundary loops of the map, with the material on the left.
-    cut : list of (k, 2) float64
-        The seam with its allowance; the seam itself without allowance.
-    """
-
-    seam: list[FloatArray]
-    cut: list[FloatArray]
+    seam: list[FloatArray]  # each (k, 2): boundary loops of the map, with the material on the left
+    cut: list[FloatArray]  # each (k, 2): the seam with its allowance; the seam itself without allowance
 
 
 def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float = 0.0) -> Pattern:
@@ -81,24 +75,23 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     >>> [(float(line[0].min()), float(line[0].max())) for line in (lines.seam, lines.cut)]
     [(0.0, 40.0), (-10.0, 50.0)]
     """
-    if unit not in UNITS:
-        raise ValueError(f"unit must be one of {', '.join(UNITS)}, not {unit!r}")
-    not_negative("allowance", allowance)
-    triangles, places = index_array("F", mesh_triangles(F)), map_array("uv", uv)
-    judged = certify(triangles, places)
-    if not judged.bijective:
-        raise ValueError(f"the map overlaps itself, so its pattern cannot be cut out. {judged.summary()}")
+    check_choice("unit", unit, UNITS)
+    check_non_negative("allowance", allowance)
+    positions = map_array("uv", uv)
+    certificate = certify(F, positions)
+    if not certificate.bijective:
+        raise ValueError(f"the map overlaps itself, so its pattern cannot be cut out. {certificate.summary()}")
     with np.errstate(over="ignore"):
-        seam = [places[loop] * UNITS[unit] for loop in judged.loops]
+        seam = [positions[loop] * UNITS[unit] for loop in certificate.loops]
     if not all(np.isfinite(line).all() for line in seam):
         raise ValueError(f"the map's coordinates in mm are outside the range of doubles: check the unit {unit}")
     if not allowance:
         return Pattern(seam, seam)
-    label = components(triangles, len(places))
+    label = components(certificate.F, len(positions))
     of_piece: dict[int, list[FloatArray]] = {}
-    for loop, line in zip(judged.loops, seam, strict=True):
+    for loop, line in zip(certificate.loops, seam, strict=True):
         of_piece.setdefault(int(label[loop[0]]), []).append(line)
-    return Pattern(seam, _widened(list(of_piece.values()), allowance * UNITS[unit]))
+    return Pattern(seam, _widen(list(of_piece.values()), allowance * UNITS[unit]))
 
 
 def write_pattern(
@@ -124,17 +117,17 @@ def write_pattern(
     """
     check_pattern(path, unit=unit, allowance=allowance)
     lines = pattern(F, uv, unit=unit, allowance=allowance)
-    write_whole(path, _dxf(lines) if _ending(path) == ".dxf" else _svg(lines))
+    write_whole(path, _dxf(lines) if _find_ending(path) == ".dxf" else _svg(lines))
 
 
 def check_pattern(path: str | os.PathLike[str], *, unit: str = "mm", allowance: float = 0.0) -> None:
     """Check before mapping whether a pattern can be written; raises the same errors as `write_pattern`."""
-    ending = _ending(path)
+    check_path("path", path)
+    ending = _find_ending(path)
     if ending not in (".svg", ".dxf"):
         raise ValueError(f"a pattern must be .svg or .dxf, not {ending or 'without a suffix'}: {path}")
-    if unit not in UNITS:
-        raise ValueError(f"unit must be one of {', '.join(UNITS)}, not {unit!r}")
-    not_negative("allowance", allowance)
+    check_choice("unit", unit, UNITS)
+    check_non_negative("allowance", allowance)
     check_writable(path)
     if ending == ".dxf":
         _ezdxf()
@@ -142,11 +135,11 @@ def check_pattern(path: str | os.PathLike[str], *, unit: str = "mm", allowance: 
         _shapely()
 
 
-def _ending(path: str | os.PathLike[str]) -> str:
+def _find_ending(path: str | os.PathLike[str]) -> str:
     return os.path.splitext(os.fspath(path))[1].lower()
 
 
-def _widened(pieces: list[list[FloatArray]], allowance: float) -> list[FloatArray]:
+def _widen(pieces: list[list[FloatArray]], allowance: float) -> list[FloatArray]:
     """The outlines of pieces, each given by its loops, with an allowance around them."""
     shapely = _shapely()
     wide = []
@@ -179,7 +172,7 @@ def _svg(lines: Pattern) -> bytes:
     width, height = (high - low).tolist()
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width!r}mm" height="{height!r}mm" '
-        f'viewBox="0 0 {width!r} {height!r}" fill="none" stroke="black" stroke-width="{_WIDTH}">'
+        f'viewBox="0 0 {width!r} {height!r}" fill="none" stroke="black" stroke-width="{_LINE_WIDTH}">'
     ]
     for name, loops in _groups(lines):
         dashes = ' stroke-dasharray="3 2"' if name == "seam" else ""

@@ -14,35 +14,38 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.collapse import has_collapsed, thin_triangles
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.descent import FreeDescent, GuardedDescent, descend
-from quasiharmonic.apps.flattening.layout import in_given_unit
-from quasiharmonic.apps.flattening.multilevel.start import coarse_start
-from quasiharmonic.apps.flattening.start import disk_start
+from quasiharmonic.apps.flattening.disk_start import map_to_disk
+from quasiharmonic.apps.flattening.layout import to_given_unit
+from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Energy
-from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
+from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, is_injective
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
-from quasiharmonic.util.arrays import FloatArray, check_callback, counted
+from quasiharmonic.util.arrays import FloatArray, check_callback, check_integer, check_non_negative, count_of
 
 #: Surfaces with at least this number of triangles are flattened with coarse meshes.
 COARSE_FROM = 50_000
-# Newton steps are used directly if the mean energy is below this,
-_NEAR = 1.0
-# or with a guarded boundary, which makes all steps short, if it is below this. From higher energies, Newton steps that
-# at best halve the energy would be too many.
-_FAR = 1e4
+# Below this mean energy, Newton steps start from the given map.
+_DIRECT_ENERGY = 1.0
+# The same bound for a guarded boundary, which makes all steps short. From higher energies, in which a step at best
+# halves the energy, there would be too many steps.
+_DISTANT_ENERGY = 1e4
 # Energies with a relative difference of at most this are equal.
-_SAME = 1e-6
-# After an overlap, the latest bijective map among this number of last maps is used if its energy is at most this many
-# times the last one's. Otherwise the initial map is a better start.
-_RECENT, _NOT_FAR = 12, 10.0
-# Every _LOOK_EVERY steps, a free descent stops if edges at this fraction of the boundary's vertices intersect, because
-# such boundaries do not separate again.
-_LOOK_EVERY, _TANGLED = 8, 0.1
+_EQUAL_ENERGY = 1e-6
+# After an overlap, the latest bijective map among this number of last maps may be the start of the guarded descent.
+_RECENT = 12
+# It is the start if its energy is at most this many times the last one's; otherwise the initial map is better.
+_MAX_ENERGY_RATIO = 10.0
+# A free descent checks its boundary every so many steps.
+_CHECK_EVERY = 8
+# It stops if edges at this fraction of the boundary vertices intersect: such boundaries do not separate again.
+_TANGLED = 0.1
 # Descents from different initial maps agree if their energies differ by at most this fraction.
 _AGREE = 0.1
 # A descent that has not converged after this number of steps is checked for collapse.
@@ -51,44 +54,37 @@ _MANY = 100
 
 @dataclass(frozen=True)
 class Settings:
-    """The checked options of a call of `flatten`.
+    """The options of a call of `flatten`; ValueError or TypeError if one is invalid."""
 
-    Attributes
-    ----------
-    density : Energy
-    name : str
-        Name of the energy.
-    tolerance : float
-    max_iterations : int
-    linear_solver : str
-    callback : callable or None
-    record_every : int
-    """
-
-    density: Energy
-    name: str
-    tolerance: float
+    energy: str | Energy
+    tol: float
     max_iterations: int
     linear_solver: str
     callback: Callable[[Step], object] | None
     record_every: int
 
     def __post_init__(self) -> None:
+        check_integer("max_iterations", self.max_iterations, minimum=0)
+        check_integer("record_every", self.record_every, minimum=0)
+        check_non_negative("tol", self.tol)
         check_callback(self.callback)
+        find_energy(self.energy)
+
+    @property
+    def density(self) -> Energy:
+        """The energy to minimise."""
+        return find_energy(self.energy)
+
+    @property
+    def name(self) -> str:
+        """The energy's name."""
+        return self.energy if isinstance(self.energy, str) else type(self.energy).__name__
 
 
 class Piece:
     """A connected surface that can be flattened, in a unit near its size.
 
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) array
-    F : (f, 3) array of int
-
-    Raises
-    ------
-    ValueError
-        As `Domain`. If the surface has handles, or a triangle has no area.
+    Raises ValueError as `Domain`, or if the surface has handles or a triangle has no area.
 
     Attributes
     ----------
@@ -105,10 +101,10 @@ class Piece:
     def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
         domain = Domain(V, F, [])
         self.F, self.loops = domain.F, domain.loops
-        handles, odd = divmod(self._missing(domain), 2)
+        handles, odd = divmod(self._count_missing(domain), 2)
         if handles or odd:
             raise ValueError(
-                f"the surface has {counted('handle', 'handles', handles)} and cannot be flattened: "
+                f"the surface has {count_of('handle', 'handles', handles)} and cannot be flattened: "
                 "cut it open first (cut_open; --cut of qhm map and qhm flatten)"
             )
         self.exponent = int(np.frexp(np.abs(domain.V).max())[1])
@@ -120,7 +116,7 @@ class Piece:
         self.area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
 
     @classmethod
-    def united(cls, pieces: Sequence[Piece]) -> Piece:
+    def unite(cls, pieces: Sequence[Piece]) -> Piece:
         """Combine several pieces into one that is not connected, with elements in order, in the largest one's unit."""
         made = object.__new__(cls)
         first = np.cumsum([0, *(len(piece.V) for piece in pieces)])[:-1].tolist()
@@ -133,13 +129,13 @@ class Piece:
         return made
 
     @staticmethod
-    def _missing(domain: Domain) -> int:
+    def _count_missing(domain: Domain) -> int:
         """How much the Euler characteristic is below that of a disk with as many loops: two for each handle."""
         found = domain.edges
         euler = domain.n - len(found.interior) - len(found.boundary) + len(domain.F)
         return 2 - len(domain.loops) - euler
 
-    def as_it_lies(self) -> FloatArray | None:
+    def planar_map(self) -> FloatArray | None:
         """Return the surface itself if it is planar and does not overlap itself, as no map is better."""
         if np.ptp(self.V[:, 2]) > 0:
             return None
@@ -147,9 +143,9 @@ class Piece:
         uv = self.V[:, :2] * [np.sign(signed_areas(self.F, in_units(self.V[:, :2], 0)).sum()) or 1.0, 1.0]
         return uv if certify(self.F, uv, loops=self.loops).bijective else None
 
-    def only_as_it_lies(self) -> FloatArray | None:
-        """Return `as_it_lies` if all triangles are so thin that energies are dominated by rounding errors."""
-        return self.as_it_lies() if thin_triangles(self.V, self.F).all() else None
+    def thin_planar_map(self) -> FloatArray | None:
+        """Return `planar_map` if all triangles are so thin that energies are dominated by rounding errors."""
+        return self.planar_map() if thin_triangles(self.V, self.F).all() else None
 
     def energy(self, density: Energy, weights: FloatArray | None) -> DeformationEnergy:
         """Return the energy of the piece's maps."""
@@ -168,14 +164,7 @@ class _Attempt:
 
 
 class Flattening:
-    """The flattening of one surface, with its record for the result.
-
-    Parameters
-    ----------
-    piece : Piece
-    settings : Settings
-    weights : (f,) float64 or None
-    """
+    """The flattening of one surface, with its record for the result; ``weights`` is (f,) or None."""
 
     def __init__(self, piece: Piece, settings: Settings, weights: FloatArray | None) -> None:
         self._piece, self._settings, self._weights = piece, settings, weights
@@ -185,7 +174,7 @@ class Flattening:
         # Whether a free descent ended with an overlap, and the map, if it had converged.
         self._overlaps = False
         self._overlapping: FloatArray | None = None
-        self._starts = self._own_starts()
+        self._starts = self._default_starts()
         # Solver and initial energy of the initial maps already used.
         self._begun: set[tuple[str, float]] = set()
         # Number of steps of the last descent.
@@ -198,27 +187,24 @@ class Flattening:
     def run(self, start: FloatArray | None) -> MapResult:
         """Flatten the piece from an injective map (n, 2) in the piece's unit, or from a default initial map.
 
-        Raises
-        ------
-        KeyboardInterrupt
-            If Ctrl-C comes before there is a bijective map.
+        Ctrl-C before there is a bijective map raises KeyboardInterrupt.
         """
         began = time.perf_counter()
         try:
-            if (flat := self._piece.only_as_it_lies()) is not None:
-                status = self._kept(flat)
+            if (flat := self._piece.thin_planar_map()) is not None:
+                status = self._keep(flat)
             else:
-                status = self._descended(start)
-                if self._collapsed(status):
-                    status = self._begun_otherwise(status)
+                status = self._descend(start)
+                if self._has_collapsed(status):
+                    status = self._restart(status)
         except KeyboardInterrupt:
             if self._bijective is None:
                 raise
             status = Status.INTERRUPTED
         assert self._bijective is not None
         uv = self._bijective
-        if self._blind_to_scale(uv):
-            uv = self._in_scale(uv)
+        if self._is_scale_free(uv):
+            uv = self._fit_scale(uv)
         return MapResult(
             uv=uv,
             status=status,
@@ -230,38 +216,38 @@ class Flattening:
             seconds=time.perf_counter() - began,
         )
 
-    def _kept(self, uv: FloatArray) -> Status:
+    def _keep(self, uv: FloatArray) -> Status:
         """Use a bijective map without descending."""
         self._settings = replace(self._settings, max_iterations=0)
-        self._descent(self._in_scale(uv), guarded=False, near=True)
+        self._run_descent(self._fit_scale(uv), guarded=False, near=True)
         return Status.EXHAUSTED
 
-    def _descended(self, start: FloatArray | None) -> Status:
+    def _descend(self, start: FloatArray | None) -> Status:
         """Descend with a free boundary; if the result overlaps itself, descend again with a guarded boundary."""
         if start is not None:
-            start = self._in_scale(start)
+            start = self._fit_scale(start)
             if not self._rim.meets_itself(start):
                 self._bijective = start
-            status = self._descent(start, guarded=False, near=False)
+            status = self._run_descent(start, guarded=False, near=False)
             if status is not None:
                 return status
         if self._bijective is None:
             # There was no start, or both the start and the map that it led to overlap themselves.
-            own, near = self._own_start()
-            status = self._descent(own, guarded=False, near=near)
+            own, near = self._first_default_start()
+            status = self._run_descent(own, guarded=False, near=near)
             if status is not None:
                 return status
-        return self._guarded()
+        return self._descend_guarded()
 
-    def _guarded(self) -> Status:
+    def _descend_guarded(self) -> Status:
         """Descend from the current bijective map with a guarded boundary."""
         assert self._bijective is not None
-        near = self._measure.value(in_units(self._bijective, 0)) < _FAR
-        status = self._descent(self._bijective, guarded=True, near=near)
+        near = self._measure.value(in_units(self._bijective, 0)) < _DISTANT_ENERGY
+        status = self._run_descent(self._bijective, guarded=True, near=near)
         assert status is not None
         return status
 
-    def _collapsed(self, status: Status) -> bool:
+    def _has_collapsed(self, status: Status) -> bool:
         """Whether a descent that ended with this status stalled at a collapsed map."""
         # A converged map is a minimum. Only the barriers of a cramped boundary can imitate convergence, and then there
         # is an overlapping map to compare with.
@@ -271,31 +257,31 @@ class Flattening:
             return False
         assert self._bijective is not None
         piece, uv = self._piece, self._bijective
-        angles_alone = self._blind_to_scale(uv)
+        angles_alone = self._is_scale_free(uv)
         return has_collapsed(
             piece.V, piece.F, piece.loops, piece.area, uv, self._overlapping, angles_alone=angles_alone
         )
 
-    def _begun_otherwise(self, status: Status) -> Status:
+    def _restart(self, status: Status) -> Status:
         """Descend from other initial maps until one result has not collapsed; otherwise use the best result."""
-        attempts, first = [self._attempt(status, 0)], len(self._stages)
+        attempts, first = [self._record_attempt(status, 0)], len(self._stages)
         try:
-            while (own := self._next_start()) is not None:
-                found = self._descent(own[0], guarded=False, near=own[1]) if not self._overlaps else None
-                status = found or self._guarded()
-                attempts.append(self._attempt(status, first))
-                if not self._collapsed(status):
-                    return self._chosen(attempts, attempts[-1])
-                if self._agreed(attempts):
-                    return self._chosen(attempts)
+            while (own := self._next_default_start()) is not None:
+                found = self._run_descent(own[0], guarded=False, near=own[1]) if not self._overlaps else None
+                status = found or self._descend_guarded()
+                attempts.append(self._record_attempt(status, first))
+                if not self._has_collapsed(status):
+                    return self._choose(attempts, attempts[-1])
+                if self._agree(attempts):
+                    return self._choose(attempts)
                 first = len(self._stages)
         except KeyboardInterrupt:
-            self._chosen([*attempts, self._attempt(Status.INTERRUPTED, first)])
+            self._choose([*attempts, self._record_attempt(Status.INTERRUPTED, first)])
             raise
-        self._chosen(attempts)
+        self._choose(attempts)
         return Status.COLLAPSED
 
-    def _agreed(self, attempts: Sequence[_Attempt]) -> bool:
+    def _agree(self, attempts: Sequence[_Attempt]) -> bool:
         """Whether another initial map led to the same energy, so that the surface requires the stretch."""
         *others, last = attempts
         least = min(attempt.energy for attempt in attempts)
@@ -308,13 +294,13 @@ class Flattening:
             for other in others
         )
 
-    def _attempt(self, status: Status, first: int) -> _Attempt:
+    def _record_attempt(self, status: Status, first: int) -> _Attempt:
         """Record the current map, the result of the stages from ``first`` on."""
         assert self._bijective is not None
         energy = self._measure.value(in_units(self._bijective, 0))
         return _Attempt(energy, self._bijective, status, self._solver, range(first, len(self._stages)))
 
-    def _chosen(self, attempts: Sequence[_Attempt], best: _Attempt | None = None) -> Status:
+    def _choose(self, attempts: Sequence[_Attempt], best: _Attempt | None = None) -> Status:
         """Use the result of one attempt, by default the one with the least energy, and mark the others as discarded."""
         best = best or min(attempts, key=lambda attempt: attempt.energy)
         for attempt in attempts:
@@ -323,9 +309,9 @@ class Flattening:
         self._bijective, self._solver = best.uv, best.solver
         return best.status
 
-    def _own_start(self) -> tuple[FloatArray, bool]:
+    def _first_default_start(self) -> tuple[FloatArray, bool]:
         """Return the first default initial map that exists, and whether it is already near the minimum."""
-        own = self._next_start()
+        own = self._next_default_start()
         if own is None:
             raise ValueError(
                 "no initial bijective map was found in double precision: the triangles differ too much in "
@@ -333,14 +319,14 @@ class Flattening:
             )
         return own
 
-    def _next_start(self) -> tuple[FloatArray, bool] | None:
+    def _next_default_start(self) -> tuple[FloatArray, bool] | None:
         """The next default initial map that exists, and whether it is near the minimum already; None at the end."""
         began = time.perf_counter()
         for name, start in self._starts:
             uv = start()
             if uv is None:
                 continue
-            uv = self._in_scale(uv)
+            uv = self._fit_scale(uv)
             energy = self._measure.value(in_units(uv, 0))
             if (self._settings.linear_solver, energy) in self._begun:
                 # The coarse mesh of a small surface is the surface itself.
@@ -349,33 +335,33 @@ class Flattening:
             self._bijective = uv
             what = f"start again, {name}" if self._stages else "start"
             self._stages.append(Stage(what, 0, time.perf_counter() - began, (0, 0), (energy, energy)))
-            return uv, energy < _NEAR
+            return uv, energy < _DIRECT_ENERGY
         return None
 
-    def _own_starts(self) -> Iterator[tuple[str, Callable[[], FloatArray | None]]]:
+    def _default_starts(self) -> Iterator[tuple[str, Callable[[], FloatArray | None]]]:
         """Initial bijective maps, the most promising first; each is computed on demand and may not exist."""
         piece, solver = self._piece, self._settings.linear_solver
         surface = piece.V, piece.F, piece.loops
-        disk = "disk", partial(disk_start, *surface, solver)
+        disk = "disk", partial(map_to_disk, *surface, solver)
         large = len(piece.F) >= COARSE_FROM
-        yield "as it lies", piece.as_it_lies
+        yield "as it lies", piece.planar_map
         if not large:
             yield disk
-        yield "coarse mesh", partial(coarse_start, *surface, solver)
-        yield "coarse mesh, guarded", partial(coarse_start, *surface, solver, guarded=True)
+        yield "coarse mesh", partial(flatten_coarse, *surface, solver)
+        yield "coarse mesh, guarded", partial(flatten_coarse, *surface, solver, guarded=True)
         if large:
             yield disk
         for other in [name for name in available() if name != self._solver][:1]:
             self._settings = replace(self._settings, linear_solver=other)
-            yield f"coarse mesh, {other}", partial(coarse_start, *surface, other)
+            yield f"coarse mesh, {other}", partial(flatten_coarse, *surface, other)
 
-    def _blind_to_scale(self, uv: FloatArray) -> bool:
+    def _is_scale_free(self, uv: FloatArray) -> bool:
         """Whether the energy does not depend on the map's scale."""
         w = in_units(uv, 0)
         here, doubled = self._measure.value(w), self._measure.value(2 * w)
-        return abs(doubled - here) <= _SAME * here
+        return abs(doubled - here) <= _EQUAL_ENERGY * here
 
-    def _in_scale(self, uv: FloatArray) -> FloatArray:
+    def _fit_scale(self, uv: FloatArray) -> FloatArray:
         """Scale a map to the surface's area; if this inverts a triangle, scale exactly by a power of two."""
         unit = np.ldexp(uv, -int(np.frexp(np.abs(uv).max())[1]))
         centred = unit - unit.mean(axis=0)
@@ -384,24 +370,24 @@ class Flattening:
         scaled = centred * factor
         return scaled if is_injective(self._piece.F, scaled) else np.ldexp(unit, round(np.log2(factor)))
 
-    def _descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
+    def _run_descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
         """Descend from a map, which must be bijective if ``guarded``; return None if the result overlaps itself."""
         began = time.perf_counter()
         settings, solver = self._settings, self._settings.linear_solver
         energy = self._piece.energy(settings.density if near else ReweightedDirichlet(), self._weights)
-        descent = GuardedDescent(energy, uv, solver, self._rim) if guarded else FreeDescent(energy, uv, solver)
-        self._solver = descent.system.solver.name
+        descent = SurfaceDescent(energy, uv, solver, rim=self._rim if guarded else None)
+        self._solver = descent.linear_solver
         first = self._measure.value(descent.w)
         apart, status, steps = guarded, Status.STILL_FALLING, 0
         recent: deque[tuple[float, FloatArray]] = deque(maxlen=_RECENT)
         try:
             self._report(descent)
-            course = descend(descent, settings.density, settings.tolerance)
+            course = descend(descent, settings.density, settings.tol)
             for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):
                 status = outcome or status
                 recent.append((self._measure.value(descent.w), descent.uv))
                 self._report(descent)
-                if not guarded and steps % _LOOK_EVERY == 0 and self._rim.tangled(descent.uv) > _TANGLED:
+                if not guarded and steps % _CHECK_EVERY == 0 and self._rim.tangled_fraction(descent.uv) > _TANGLED:
                     break
         finally:
             # After Ctrl-C too, the current map may be better than the previous one.
@@ -412,7 +398,7 @@ class Flattening:
             else:
                 self._overlaps = True
                 self._overlapping = descent.uv if status is not Status.STILL_FALLING else None
-                self._bijective = self._latest_bijective(recent, _NOT_FAR * last)
+                self._bijective = self._latest_bijective(recent, _MAX_ENERGY_RATIO * last)
             self._steps = steps
             seconds = time.perf_counter() - began
             name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
@@ -426,10 +412,10 @@ class Flattening:
                 return uv
         return self._bijective
 
-    def _report(self, descent: FreeDescent) -> None:
+    def _report(self, descent: SurfaceDescent) -> None:
         settings, number = self._settings, len(self._history)
         self._history.append(Step(number, 0, self._measure.value(descent.w)))
         if settings.record_every and number % settings.record_every == 0:
-            self._path.append(Snapshot(number, in_given_unit(descent.uv, self._piece.exponent)))
+            self._path.append(Snapshot(number, to_given_unit(descent.uv, self._piece.exponent)))
         if settings.callback is not None:
             settings.callback(self._history[-1])

@@ -1,7 +1,7 @@
 """The derivative of a map; the class that all kinds of maps share.
 
 A map w of a surface with rest positions z, tensors μ and fixed vertices at t solves ``R(w, t, z, μ) = 0``: the forces
-at the free vertices vanish. With K the derivative of R by the unknowns,
+at the free vertices vanish. With K the derivative of R with respect to the unknowns,
 
     dw = −K⁻¹ (∂R/∂t dt + ∂R/∂z dz + ∂R/∂μ dμ).
 
@@ -19,19 +19,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.forces import Felt, Forces
+from quasiharmonic.apps.gradients.forces import Forces, TensorForces, TriangleResponse
 from quasiharmonic.apps.gradients.gauge import Gauge
 from quasiharmonic.apps.gradients.strain import Strain
-from quasiharmonic.apps.gradients.tensor_forces import TensorForces
 from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,
     IntArray,
     check_finite,
-    held_places,
     map_array,
-    named,
+    names_of,
     real_array,
+    target_positions,
     work,
 )
 
@@ -103,14 +102,9 @@ class Inverse(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """A factor s between the scales of a map and its surface, which depends on both.
+    """A factor s between the scales of a map and its surface.
 
-    Attributes
-    ----------
-    by_places : (n,) complex128
-        Derivative of log s with respect to the map.
-    by_rest : (n, d) float64
-        Derivative of log s with respect to the rest positions.
+    Its fields are the derivatives of log s by the map, (n,) complex128, and by the rest positions, (n, d) float64.
     """
 
     by_places: ComplexArray
@@ -198,8 +192,8 @@ class Derivative:
         load = np.zeros(n, dtype=np.complex128)
         moved = np.zeros(self._rest_shape)
         if target is not None:
-            places = as_complex(held_places(target, self._fixed.size)) / self._unit
-            held[self._fixed[self._follows]] = places[self._follows]
+            positions = to_complex(target_positions(target, self._fixed.size)) / self._unit
+            held[self._fixed[self._follows]] = positions[self._follows]
             load += forces.by_places(held)
         if rest is not None:
             moved = self._rest_positions(rest)
@@ -214,8 +208,8 @@ class Derivative:
             load += more * forces.by_scale
         dw = held - self._inverse.solve(load)
         if self._gauge is not None:
-            dw = self._gauge.fixed(dw, held, more)
-        return as_rows(self._unit * dw)
+            dw = self._gauge.select(dw, held, more)
+        return to_rows(self._unit * dw)
 
     def vjp(self, cotangent: ArrayLike) -> Gradients:
         """Return the gradients of a function of the map with respect to the map's inputs.
@@ -234,18 +228,18 @@ class Derivative:
         ValueError
             If the cotangent has the wrong shape or is not finite.
         """
-        pull = self._unit * as_complex(map_array("cotangent", cotangent, len(self.uv)))
+        pull = self._unit * to_complex(map_array("cotangent", cotangent, len(self.uv)))
         on_pin, on_scale = 0j, 0.0
         if self._gauge is not None:
-            pull, on_pin, on_scale = self._gauge.pulled(pull)
-        response = self._inverse.solve(pull)
-        felt = self._forces.felt(response)
+            pull, on_pin, on_scale = self._gauge.pull_back(pull)
+        adjoint = self._inverse.solve(pull)
+        response = self._forces.respond(adjoint)
         if self._scaled:
-            on_scale -= work(self._forces.by_scale, response)
+            on_scale -= work(self._forces.by_scale, adjoint)
         return Gradients(
-            partial(self._by_target, pull, felt, on_pin, on_scale),
-            partial(self._by_rest, felt, on_scale),
-            partial(self._by_mu, felt),
+            partial(self._by_target, pull, response, on_pin, on_scale),
+            partial(self._by_rest, response, on_scale),
+            partial(self._by_mu, response),
         )
 
     @property
@@ -253,26 +247,28 @@ class Derivative:
         """Whether the forces depend on the scale between map and surface."""
         return self._scale is not None and self._gauge is None
 
-    def _by_target(self, pull: ComplexArray, felt: Felt, on_pin: complex, on_scale: float) -> FloatArray:
-        by_places = pull - self._forces.gathered(felt.hp, felt.hq)
+    def _by_target(
+        self, pull: ComplexArray, response: TriangleResponse, on_pin: complex, on_scale: float
+    ) -> FloatArray:
+        by_places = pull - self._forces.gather(response.hp, response.hq)
         if self._scale is not None:
             by_places += on_scale * self._scale.by_places
         if self._gauge is not None and self._gauge.pin is not None:
             by_places[self._gauge.pin] += on_pin
         by_held = by_places[self._fixed] / self._unit
         by_held[~self._follows] = 0
-        return as_rows(by_held)
+        return to_rows(by_held)
 
-    def _by_rest(self, felt: Felt, on_scale: float) -> FloatArray:
+    def _by_rest(self, response: TriangleResponse, on_scale: float) -> FloatArray:
         out = np.zeros(self._rest_shape)
         if self._strain is not None:
-            out -= self._strain.pull(*self._forces.strain_of(felt))
+            out -= self._strain.pull(*self._forces.pull_strain(response))
         if self._scale is not None:
             out += on_scale * self._scale.by_rest
         return out
 
-    def _by_mu(self, felt: Felt) -> ComplexArray | None:
-        return None if self._tensors is None else -self._tensors.of(self._forces, felt)
+    def _by_mu(self, response: TriangleResponse) -> ComplexArray | None:
+        return None if self._tensors is None else -self._tensors.of(self._forces, response)
 
     def _rest_positions(self, rest: ArrayLike) -> FloatArray:
         moved = real_array("rest", rest)
@@ -289,16 +285,16 @@ class Derivative:
             )
         if not np.isfinite(array).all():
             raise ValueError(
-                f"mu is not finite at {named('triangle', 'triangles', np.flatnonzero(~np.isfinite(array)))}"
+                f"mu is not finite at {names_of('triangle', 'triangles', np.flatnonzero(~np.isfinite(array)))}"
             )
         return array.astype(np.complex128)
 
 
-def as_complex(rows: FloatArray) -> ComplexArray:
+def to_complex(rows: FloatArray) -> ComplexArray:
     """Return positions (n, 2) as complex numbers (n,)."""
     return np.ascontiguousarray(rows).view(np.complex128).ravel()
 
 
-def as_rows(w: ComplexArray) -> FloatArray:
+def to_rows(w: ComplexArray) -> FloatArray:
     """Return complex numbers (n,) as positions (n, 2)."""
     return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)

@@ -12,14 +12,14 @@ from functools import cached_property
 import numpy as np
 
 from quasiharmonic.energies.deformation import DeformationEnergy
-from quasiharmonic.energies.newton.newton_descent import in_units
-from quasiharmonic.energies.newton.sliding import SlidingSystem
+from quasiharmonic.energies.newton.map_model import in_units
+from quasiharmonic.energies.newton.sliding_boundary import SlidingSystem
 from quasiharmonic.geometry.curves.boundary_curves import Track
 from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 # Weight of the barrier that keeps the boundary near its curves, relative to the energy; as in
-# `energies.newton.sliding`.
+# `energies.newton.sliding_boundary`.
 _WEIGHT = 1e-2
 # Step for differences of the barrier's gradient, relative to the curve's length.
 _STEP = 1e-6
@@ -28,25 +28,8 @@ _STEP = 1e-6
 class Freedom:
     """Fixed vertices, vertices on lines through their positions, and free vertices.
 
-    Parameters
-    ----------
-    energy : DeformationEnergy
-    n : int
-        Number of vertices.
-    fixed : (k,) int64
-        Fixed vertices.
-    linear_solver : str
-    sliding : (l,) int64
-        Vertices that move along lines.
-    tangent : (l,) complex128
-        Unit directions of the lines.
-
-    Attributes
-    ----------
-    system : SlidingSystem
-        The linear system of the unknowns.
-    resting : bool
-        Whether a sliding vertex is kept at its position, at a kink or an end of its curve.
+    ``tangent`` (l,) are unit directions of the lines of the ``sliding`` vertices (l,). ``system`` is the linear system
+    of the unknowns. ``resting`` tells whether a sliding vertex stays at its position, at a kink or an end of its curve.
     """
 
     resting = False
@@ -70,19 +53,19 @@ class Freedom:
         """The value of additional terms of the objective at the current positions."""
         return 0.0
 
-    def aim(self, pull: ComplexArray) -> None:
+    def prepare(self, pull: ComplexArray) -> None:
         """Prepare the system for the forces (n,) at the current map."""
 
-    def gathered(self, load: ComplexArray) -> ComplexArray:
+    def gather(self, load: ComplexArray) -> ComplexArray:
         """Loads (n,) on the unknowns; a sliding vertex uses the real part, and its imaginary part is zero."""
         system = self.system
         out = load[system.free]
         out[system.at] = (system.tangent.conj() * out[system.at]).real
         return out
 
-    def slopes(self, pull: ComplexArray) -> ComplexArray:
-        """The gradient of the objective by the unknowns, from the forces (n,)."""
-        return self.gathered(pull)
+    def gradient(self, pull: ComplexArray) -> ComplexArray:
+        """The gradient of the objective with respect to the unknowns, from the forces (n,)."""
+        return self.gather(pull)
 
     def spread(self, step: ComplexArray) -> ComplexArray:
         """Displacements (n,) of the vertices under a step of the unknowns, to first order."""
@@ -100,22 +83,10 @@ class Freedom:
 
 
 class OnCurves(Freedom):
-    """Boundary vertices that slide along curves, as in `quasiharmonic.polish`.
+    """Boundary vertices that slide along curves, as in `quasiharmonic.polish`; fixed vertices may be among them.
 
     A barrier keeps the boundary's edges near the curves. Its bounds and weight are those of a polish started here, and
-    stay constant.
-
-    Parameters
-    ----------
-    energy : DeformationEnergy
-    track : Track
-    fixed : (k,) int64
-        Fixed vertices; may include those that slide.
-    loops : sequence of (l,) int64
-        Boundary loops.
-    exponent : int
-        The map is in units of ``2 ** exponent``.
-    linear_solver : str
+    stay constant. The map is in units of ``2 ** exponent``.
     """
 
     def __init__(
@@ -130,22 +101,22 @@ class OnCurves(Freedom):
         held = np.setdiff1d(fixed, track.vertices)
         super().__init__(energy, len(track.uv), held, linear_solver, track.vertices)
         self._track, self._s, self._there = track, track.s, track.s
-        self._straying, self._unit = DeviationBarrier(track, loops, exactly=True), 2.0**exponent
+        self._deviation, self._unit = DeviationBarrier(track, loops, exactly=True), 2.0**exponent
         self._weight = _WEIGHT * energy.value(in_units(track.uv, exponent))
-        self._both = (self._straying.pairs >= 0).all(axis=1)
-        self.system.couple(self._straying.pairs[self._both])
+        self._both = (self._deviation.pairs >= 0).all(axis=1)
+        self.system.couple(self._deviation.pairs[self._both])
 
     def extra(self) -> float:
         """The barrier's value at the positions of the last step that was evaluated."""
-        return self._weight * self._straying.value(self._there)
+        return self._weight * self._deviation.value(self._there)
 
-    def aim(self, pull: ComplexArray) -> None:
+    def prepare(self, pull: ComplexArray) -> None:
         s, at, system = self._s, pull[self.sliding], self.system
         kink = self._track.at_kink(s)
         ahead, curvature = self._track.frame(s, np.ones(s.size, dtype=bool))
         back, curvature_back = self._track.frame(s, ~kink)
-        self._slopes = self._barrier_slopes(s)
-        slope, slope_back = (_along(tangent, at) + self._slopes for tangent in (ahead, back))
+        self._by_arc = self._barrier_gradient(s)
+        slope, slope_back = (_along(tangent, at) + self._by_arc for tangent in (ahead, back))
         turned = kink & (slope_back > np.maximum(-slope, 0))
         rests: BoolArray = kink & (slope >= 0) & (slope_back <= 0)
         self.resting = bool(rests.any())
@@ -153,17 +124,17 @@ class OnCurves(Freedom):
         system.tangent = tangent
         # A vertex may leave a kink only on the side on which the objective decreases.
         self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
-        system.bend = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * self._unit
-        bends = self._barrier_bends(s)
+        system.curve_stiffness = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * self._unit
+        bends = self._barrier_hessian(s)
         for end in (0, 1):
-            number = self._straying.pairs[:, end]
-            np.add.at(system.bend, number[number >= 0], bends[number >= 0, end, end])
-        both = (tangent[self._straying.pairs[self._both]] != 0).all(axis=1)
+            number = self._deviation.pairs[:, end]
+            np.add.at(system.curve_stiffness, number[number >= 0], bends[number >= 0, end, end])
+        both = (tangent[self._deviation.pairs[self._both]] != 0).all(axis=1)
         system.coupling = np.where(both, bends[self._both, 0, 1], 0)
 
-    def slopes(self, pull: ComplexArray) -> ComplexArray:
-        out = self.gathered(pull)
-        out[self.system.at] += np.where(self.system.tangent == 0, 0, self._slopes)
+    def gradient(self, pull: ComplexArray) -> ComplexArray:
+        out = self.gather(pull)
+        out[self.system.at] += np.where(self.system.tangent == 0, 0, self._by_arc)
         return out
 
     def advance(self, w: ComplexArray, step: ComplexArray) -> ComplexArray | None:
@@ -183,13 +154,13 @@ class OnCurves(Freedom):
 
     def _by_edges(self, s: FloatArray) -> FloatArray:
         """The barrier's derivatives by the arc lengths at each edge's ends, in units; (e, 2)."""
-        return self._weight * self._unit * self._straying.derivatives(s)[0]
+        return self._weight * self._unit * self._deviation.derivatives(s)[0]
 
-    def _barrier_slopes(self, s: FloatArray) -> FloatArray:
+    def _barrier_gradient(self, s: FloatArray) -> FloatArray:
         """The barrier's derivatives by the arc lengths of the sliding vertices, in units; (l,)."""
         out, by_edges = np.zeros(s.size), self._by_edges(s)
         for end in (0, 1):
-            number = self._straying.pairs[:, end]
+            number = self._deviation.pairs[:, end]
             np.add.at(out, number[number >= 0], by_edges[number >= 0, end])
         return out
 
@@ -197,13 +168,13 @@ class OnCurves(Freedom):
     def _colours(self) -> IntArray:
         """A colouring of the sliding vertices with three colours; no edge joins two of the same colour."""
         colours = np.arange(self._s.size) % 2
-        one, other = self._straying.pairs[self._both].T
+        one, other = self._deviation.pairs[self._both].T
         colours[other[colours[one] == colours[other]]] = 2
         return colours
 
-    def _barrier_bends(self, s: FloatArray) -> FloatArray:
+    def _barrier_hessian(self, s: FloatArray) -> FloatArray:
         """The barrier's second derivatives by edge, (e, 2, 2), by differences; `DeviationBarrier` omits some terms."""
-        pairs = self._straying.pairs
+        pairs = self._deviation.pairs
         out = np.zeros((len(pairs), 2, 2))
         lengths = np.array([chain.curve.length for chain in self._track.chains for _ in range(chain.sliding.sum())])
         step = _STEP * lengths / max(s.size, 1)

@@ -21,16 +21,8 @@ from quasiharmonic.util.arrays import ComplexArray, IntArray, work
 class Gauge:
     """The transformations of a map that do not change its energy.
 
-    Attributes
-    ----------
-    w : (n,) complex128
-        The map.
-    pin : int or None
-        The fixed vertex, if there is one.
-    scales : bool
-        Whether the energy is independent of the map's scale.
-    loops : sequence of (l,) int64
-        Boundary loops of the map.
+    ``pin`` is the fixed vertex, if there is one. ``scales`` says whether the energy is independent of the map's scale.
+    ``loops`` are the map's boundary loops.
     """
 
     w: ComplexArray
@@ -44,14 +36,8 @@ class Gauge:
         centre = self.w.mean() if self.pin is None else self.w[self.pin]
         return np.asarray(self.w - centre)
 
-    def fixing(self) -> tuple[IntArray, IntArray, ComplexArray]:
-        """Vertices to fix, and one to keep on a line, that exclude these transformations.
-
-        Returns
-        -------
-        held, sliding : (1 or 2,) and (1 or 0,) int64
-        tangent : (1 or 0,) complex128
-        """
+    def constraints(self) -> tuple[IntArray, IntArray, ComplexArray]:
+        """Return the constraints that exclude these transformations: fixed and sliding vertices, unit directions."""
         first = int(np.argmax(np.abs(self.arms))) if self.pin is None else self.pin
         apart = self.w - self.w[first]
         second = int(np.argmax(np.abs(apart)))
@@ -59,7 +45,7 @@ class Gauge:
             return np.array([first, second]), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.complex128)
         return np.array([first]), np.array([second]), apart[[second]] / abs(apart[second])
 
-    def projected(self, dw: ComplexArray) -> ComplexArray:
+    def project(self, dw: ComplexArray) -> ComplexArray:
         """Remove the part of a displacement or gradient (n,) that lies along these transformations."""
         out = dw - dw.mean() if self.pin is None else dw
         arms = self.arms
@@ -73,38 +59,34 @@ class Gauge:
         """Whether a map with a free scale is scaled to the surface's area, as in `quasiharmonic.flatten`."""
         return self.scales and self.pin is None
 
-    def fixed(self, dw: ComplexArray, held: ComplexArray, more: float) -> ComplexArray:
+    def select(self, dw: ComplexArray, held: ComplexArray, more: float) -> ComplexArray:
         """Return the displacement (n,) that defines the derivative, from any equivalent one.
 
-        Parameters
-        ----------
-        dw, held : (n,) complex128
-            An equivalent displacement, and the displacements of fixed vertices only.
-        more : float
-            The change of the logarithm of the surface's size.
+        ``held`` (n,) has the displacements of fixed vertices only. ``more`` is the change of the logarithm of the
+        surface's size.
         """
         # A moving fixed vertex shifts the others, and they rotate about it.
         along = 0j if self.pin is None else held[self.pin]
-        out = self.projected(dw - along) + along
+        out = self.project(dw - along) + along
         if self.keeps_area:
             out = out + (more - work(self._by_area, out)) * self.arms
         return out
 
-    def pulled(self, pull: ComplexArray) -> tuple[ComplexArray, complex, float]:
-        """The transpose of `fixed`: gradients by the displacement (n,), by the pin's position and by ``more``."""
-        out = self.projected(pull)
+    def pull_back(self, pull: ComplexArray) -> tuple[ComplexArray, complex, float]:
+        """The transpose of `select`: gradients by the displacement (n,), by the pin's position and by ``more``."""
+        out = self.project(pull)
         if not self.keeps_area:
             return out, complex((pull - out).sum()), 0.0
         on_scale = work(self.arms, pull)
-        return out - on_scale * self.projected(self._by_area), 0j, on_scale
+        return out - on_scale * self.project(self._by_area), 0j, on_scale
 
     @cached_property
     def _by_area(self) -> ComplexArray:
         """The derivative (n,) of the logarithm of the map's size by its positions."""
-        return log_size(self.w, self.loops)
+        return differentiate_map_size(self.w, self.loops)
 
 
-def log_size(w: ComplexArray, loops: Sequence[IntArray]) -> ComplexArray:
+def differentiate_map_size(w: ComplexArray, loops: Sequence[IntArray]) -> ComplexArray:
     """The derivative (n,) of half the logarithm of the map's area by its positions; only the boundary contributes."""
     by_area, area = np.zeros_like(w), 0.0
     for loop in loops:

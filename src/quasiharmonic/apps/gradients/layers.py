@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic.apps.flattening.free_boundary import flatten
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.flattened import flatten_derivative
-from quasiharmonic.apps.gradients.polished import polish_derivative
+from quasiharmonic.apps.gradients.flatten_gradient import flatten_derivative
+from quasiharmonic.apps.gradients.polish_gradient import polish_derivative
 from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
-from quasiharmonic.solver.search.solving import solve
+from quasiharmonic.solver.mapping import solve
 from quasiharmonic.util.arrays import FloatArray, IntArray, index_array, real_array
 
 #: An argument, converted to NumPy.
@@ -34,13 +34,7 @@ Array = NDArray[Any]
 
 
 class MapNotFound(ValueError):  # noqa: N818  what it says is what happened
-    """No injective map was found, so there is no derivative.
-
-    Attributes
-    ----------
-    result : MapResult
-        The result found, with its status and diagnosis.
-    """
+    """No injective map was found, so there is no derivative; ``result`` is the `MapResult`."""
 
     def __init__(self, result: MapResult) -> None:
         super().__init__(f"no injective map was found ({result.status.name.lower()}): {result.status.value}")
@@ -79,28 +73,16 @@ class Layer(ABC):
         """The shapes of one problem's arguments, by name."""
 
     @property
-    def places(self) -> tuple[int, int]:
+    def map_shape(self) -> tuple[int, int]:
         """The shape (n, 2) of one problem's map."""
         return self.shapes["rest"][0], 2
 
     @abstractmethod
     def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        """Return the derivative of one problem's map; the map is computed unless ``uv`` is given.
-
-        Raises
-        ------
-        MapNotFound
-            If no injective map was found.
-        """
+        """Return the derivative of one problem's map, computed unless ``uv`` is given; MapNotFound if there is none."""
 
     def batch(self, arrays: Mapping[str, Array]) -> tuple[int, ...]:
-        """Return the common batch axes of the arguments.
-
-        Raises
-        ------
-        ValueError
-            If the batch axes cannot be broadcast.
-        """
+        """Return the common batch axes of the arguments; ValueError if they cannot be broadcast."""
         leads = {name: array.shape[: array.ndim - len(self.shapes[name])] for name, array in arrays.items()}
         try:
             return np.broadcast_shapes(*leads.values())
@@ -133,14 +115,14 @@ class TensorLayer(Layer):
         return {"mu": (len(problem.F),), "target": problem.target.shape, "rest": problem.V.shape}
 
     def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        problem = posed(self.problem, arrays)
+        problem = pose_problem(self.problem, arrays)
         return quasi_harmonic_derivative(
             problem, arrays.get("mu"), reference=self.reference, linear_solver=self.linear_solver
         )
 
 
 @dataclass(frozen=True, eq=False)
-class PolishedLayer(Layer):
+class PolishLayer(Layer):
     """`quasiharmonic.solve` with a polish, as a function of ``target`` and ``rest``."""
 
     problem: Problem
@@ -154,12 +136,12 @@ class PolishedLayer(Layer):
         return {"target": self.problem.target.shape, "rest": self.problem.V.shape}
 
     def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        problem = posed(self.problem, arrays)
+        problem = pose_problem(self.problem, arrays)
         if uv is None:
             found = solve(
                 problem, polish=self.polish, slide=self.slide, start=self.start, linear_solver=self.linear_solver
             )
-            uv = _found(found)
+            uv = _check_found(found)
         return polish_derivative(
             problem.V,
             problem.F,
@@ -214,8 +196,8 @@ class FlattenLayer(Layer):
 
     @cached_property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        held = {} if self.fixed is None else {"target": (self.fixed.size, 2)}
-        return {"rest": self.vertices, **held}
+        target = {} if self.fixed is None else {"target": (self.fixed.size, 2)}
+        return {"rest": self.vertices, **target}
 
     def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
         options: dict[str, Any] = {
@@ -225,12 +207,11 @@ class FlattenLayer(Layer):
         }
         V, target = arrays["rest"], arrays.get("target")
         if uv is None:
-            uv = _found(flatten(V, self.F, fixed=self.fixed, target=target, start=self.start, **options))
-        held = () if self.fixed is None else self.fixed
-        return flatten_derivative(V, self.F, uv, fixed=held, **options)
+            uv = _check_found(flatten(V, self.F, fixed=self.fixed, target=target, start=self.start, **options))
+        return flatten_derivative(V, self.F, uv, fixed=() if self.fixed is None else self.fixed, **options)
 
 
-def posed(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
+def pose_problem(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
     """Return the problem with the target and rest positions of a batch item, where given."""
     target, V = arrays.get("target", problem.target), arrays.get("rest", problem.V)
     if np.array_equal(V, problem.V):
@@ -238,22 +219,13 @@ def posed(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
     return Problem(V, problem.F, problem.fixed, target, reference=problem.reference)
 
 
-def forth(layer: Layer, arrays: Mapping[str, Array]) -> tuple[FloatArray, list[Derivative]]:
+def compute_maps(layer: Layer, arrays: Mapping[str, Array]) -> tuple[FloatArray, list[Derivative]]:
     """Compute the maps (…, n, 2) of a batch of problems, and their derivatives.
 
-    Parameters
-    ----------
-    layer : Layer
-    arrays : mapping of str to array
-        The given arguments, by name.
-
-    Raises
-    ------
-    MapNotFound, ValueError
-        If one of the problems raises it; a note names the batch item.
+    If a problem raises an error, such as MapNotFound, a note names the batch item.
     """
     lead = layer.batch(arrays)
-    uv, derivatives = np.empty((*lead, *layer.places)), []
+    uv, derivatives = np.empty((*lead, *layer.map_shape)), []
     for item in np.ndindex(lead):
         try:
             derivative = layer.derivative(layer.item(arrays, item))
@@ -266,16 +238,10 @@ def forth(layer: Layer, arrays: Mapping[str, Array]) -> tuple[FloatArray, list[D
     return uv, derivatives
 
 
-def back(
+def compute_gradients(
     layer: Layer, derivatives: Sequence[Derivative], cotangent: FloatArray, wanted: Sequence[str]
 ) -> dict[str, Array]:
-    """Return the gradients of a function of the maps (…, n, 2), by name, each with all batch axes.
-
-    Warns
-    -----
-    DoubtfulDerivative
-        If a derivative has doubts.
-    """
+    """Return the gradients of a function of the maps (…, n, 2), by name, each with all batch axes; warn of doubts."""
     lead = cotangent.shape[:-2]
     out: dict[str, Array] = {
         name: np.empty((*lead, *layer.shapes[name]), dtype=np.complex128 if name == "mu" else np.float64)
@@ -289,31 +255,31 @@ def back(
     return out
 
 
-def along(
+def compute_changes(
     layer: Layer, derivatives: Sequence[Derivative], lead: tuple[int, ...], tangents: Mapping[str, Array]
 ) -> FloatArray:
     """Return the change of the maps of a batch (…, n, 2) for changes of the arguments."""
-    out = np.empty((*lead, *layer.places))
+    out = np.empty((*lead, *layer.map_shape))
     for item, derivative in zip(np.ndindex(lead), derivatives, strict=True):
         _warn(derivative, item)
         out[item] = derivative.jvp(**layer.item(tangents, item))
     return out
 
 
-def summed(gradient: Array, shape: tuple[int, ...]) -> Array:
-    """Sum a gradient over the batch axes that the argument lacks or has with length 1."""
+def sum_to_shape(gradient: Any, shape: tuple[int, ...]) -> Any:
+    """Sum a gradient, a NumPy or JAX array, over the batch axes that the argument lacks or has with length 1."""
     gradient = gradient.sum(axis=tuple(range(gradient.ndim - len(shape))))
     short = tuple(i for i, size in enumerate(shape) if size == 1 and gradient.shape[i] != 1)
-    return np.asarray(gradient.sum(axis=short, keepdims=True) if short else gradient)
+    return gradient.sum(axis=short, keepdims=True) if short else gradient
 
 
-def expected(name: str, shape: tuple[int, ...], one: tuple[int, ...]) -> None:
+def check_shape(name: str, shape: tuple[int, ...], one: tuple[int, ...]) -> None:
     """Raise ValueError if an argument has neither one problem's shape nor that with batch axes in front."""
     if len(shape) < len(one) or shape[len(shape) - len(one) :] != one:
         raise ValueError(f"{name} must have shape {one}, or batch axes before it, not {tuple(shape)}")
 
 
-def _found(result: MapResult) -> FloatArray:
+def _check_found(result: MapResult) -> FloatArray:
     if not result.injective:
         raise MapNotFound(result)
     return result.uv

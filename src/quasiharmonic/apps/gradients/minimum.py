@@ -18,40 +18,42 @@ from quasiharmonic.apps.gradients.forces import Forces
 from quasiharmonic.apps.gradients.freedom import Freedom
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation
+from quasiharmonic.energies.newton.line_search import backtrack
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.util.arrays import ComplexArray
 from quasiharmonic.util.progress import heartbeat
 
-# Maximum numbers of steps, and of halvings of one step.
-_STEPS, _HALVINGS = 100, 40
+# Maximum number of steps.
+_MAX_STEPS = 100
+# Maximum number of lengths of one step.
+_MAX_HALVINGS = 40
 # If the matrix is not positive definite, these fractions of the triangles' negative curvature are removed in turn.
 _CLAMPED = 1 / 64, 1 / 16, 1 / 4, 1.0
-# Steps with a strain of at most _NOTHING on every triangle count as zero. Exact steps below _SHORT that are more than
-# half as long as the step before are limited by rounding. If the last step strains more than _AT_REST, the map has not
-# converged.
-_NOTHING, _SHORT, _AT_REST = 1e-12, 1e-6, 1e-6
+# Steps with a strain of at most this on every triangle count as zero.
+_ZERO_STRAIN = 1e-12
+# Exact steps below this that are more than half as long as the step before are limited by rounding.
+_ROUNDING_STRAIN = 1e-6
+# If the last step strains more than this, the map has not converged.
+_CONVERGED = 1e-6
 # After a step this short, second derivatives have the same leading digits, and are not factored again.
-_NEAR = 1e-8
+_REUSE_STRAIN = 1e-8
 # Relative increase of the energy that counts as rounding.
 _ROUNDING = 1e-13
-# With a unit diagonal, an eigenvalue below this counts as zero; and the number of power iterations.
-_SINGULAR, _ITERATIONS = 1e-10, 2
+# With a unit diagonal, an eigenvalue below this counts as zero.
+_SINGULAR = 1e-10
+# Number of power iterations.
+_POWER_ITERATIONS = 2
 # A triangle whose ratio of smaller to larger singular value is below this counts as nearly collapsed.
-_THIN = 1e-8
+_COLLAPSED_RATIO = 1e-8
 
 
 class Minimum:
     """A stationary point of an energy, and the inverse of its second derivative.
 
-    Parameters
-    ----------
-    energy : DeformationEnergy
-    w : (n,) complex128
-        An injective map near the stationary point; sliding vertices of ``freedom`` are on their curves.
-    freedom : Freedom
-    settle : bool
-        Converge first. Otherwise keep the map, and treat the remaining forces as constant.
+    The map ``w`` (n,) complex128 is injective and near the stationary point; sliding vertices of ``freedom`` are on
+    their curves. Without ``converge``, keep the map, and treat the remaining forces as constant. Raises ValueError if
+    the energy or a derivative is NaN or infinite at the map, or its second derivative is singular.
 
     Attributes
     ----------
@@ -60,62 +62,57 @@ class Minimum:
     forces : Forces
         Forces at ``w``.
     doubts : list of Doubt
-
-    Raises
-    ------
-    ValueError
-        When the energy or a derivative of it is NaN or infinite at the map, or its second derivative is singular.
     """
 
-    def __init__(self, energy: DeformationEnergy, w: ComplexArray, freedom: Freedom, *, settle: bool = True) -> None:
+    def __init__(self, energy: DeformationEnergy, w: ComplexArray, freedom: Freedom, *, converge: bool = True) -> None:
         self._energy, self._freedom, self.w = energy, freedom, w
         self._lock = Lock()
         self._lu: Any = None
         self._clamped = 0.0
         self.doubts: list[Doubt] = []
         with np.errstate(all="ignore"):
-            left = self._settle(_STEPS if settle else 0)
+            left = self._converge(_MAX_STEPS if converge else 0)
             self.forces = self._forces(self._deformation)
             self._check_numbers()
             if not self._exact:
-                self._by_lu()
-            self._judge(left)
+                self._factor_by_lu()
+            self._record_doubts(left)
 
     def solve(self, load: ComplexArray) -> ComplexArray:
         """Return the displacement (n,) of the vertices under a load (n,) on them."""
         freedom = self._freedom
-        on_unknowns = freedom.gathered(load)
+        on_unknowns = freedom.gather(load)
         if self._lu is None:
             return freedom.spread(freedom.system.solve(on_unknowns))
         with self._lock:
             return freedom.spread(self._lu.solve(on_unknowns.view(np.float64)).view(np.complex128))
 
-    def _settle(self, steps: int) -> float:
+    def _converge(self, steps: int) -> float:
         """Take steps until converged, leave the system factored, and return the strain of the step not taken."""
         last = np.inf
         for left in range(steps, -1, -1):
             heartbeat()
-            gradient = self._at()
+            gradient = self._evaluate()
             step, self._exact = self._direction(gradient)
             size = self._strain(step)
-            if size <= _NOTHING or (self._exact and size <= _SHORT and size > 0.5 * last):
+            if size <= _ZERO_STRAIN or (self._exact and size <= _ROUNDING_STRAIN and size > 0.5 * last):
                 return size
-            if not left or not self._moved(step):
+            if not left or not self._take_step(step):
                 return size
-            if self._exact and size <= _NEAR:
+            if self._exact and size <= _REUSE_STRAIN:
                 # Convergence is quadratic, so this was the last step, and the factor is accurate to the same number of
                 # digits.
-                self._at()
+                self._evaluate()
                 return size
             last = size
         raise AssertionError("the last step has already returned")
 
-    def _at(self) -> ComplexArray:
-        """Evaluate the energy at the current map; return the gradient by the unknowns."""
+    def _evaluate(self) -> ComplexArray:
+        """Evaluate the energy at the current map; return its gradient with respect to the unknowns."""
         self._deformation: Deformation = self._energy.deform(self.w)
         pull = self._energy.gradient_of(self._deformation, self.w.size)
-        self._freedom.aim(pull)
-        return self._freedom.slopes(pull)
+        self._freedom.prepare(pull)
+        return self._freedom.gradient(pull)
 
     def _direction(self, gradient: ComplexArray) -> tuple[ComplexArray, bool]:
         """Return Newton's step, and whether it uses the exact second derivatives."""
@@ -138,22 +135,25 @@ class Minimum:
         dp, dq = np.sum(energy.g.conj() * moved, axis=0), np.sum(energy.g * moved, axis=0)
         return float(np.max((np.abs(dp) + np.abs(dq)) / np.abs(self._deformation.p)))
 
-    def _moved(self, step: ComplexArray) -> bool:
+    def _take_step(self, step: ComplexArray) -> bool:
         """Take the longest acceptable part of a step; return False if there is none."""
         before = self._energy.value_of(self._deformation) + self._freedom.extra()
-        t = 1.0
-        for _ in range(_HALVINGS):
+
+        def trial(t: float, bound: float) -> tuple[float, ComplexArray | None]:
             there = self._freedom.advance(self.w, t * step)
-            if there is not None:
-                value = self._energy.value(there) + self._freedom.extra()
-                if value <= before + _ROUNDING * abs(before) and is_injective(
-                    self._energy.F, there.view(np.float64).reshape(-1, 2)
-                ):
-                    self.w = there
-                    self._freedom.keep()
-                    return True
-            t *= 0.5
-        return False
+            if there is None:
+                return np.inf, None
+            value = self._energy.value(there) + self._freedom.extra()
+            accepted = value <= bound and is_injective(self._energy.F, there.view(np.float64).reshape(-1, 2))
+            return value, there if accepted else None
+
+        # Near the stationary point only rounding changes the energy, so no decrease is required.
+        taken = backtrack(trial, before + _ROUNDING * abs(before), 0.0, tries=_MAX_HALVINGS)
+        if taken is None:
+            return False
+        self.w = taken.state
+        self._freedom.keep()
+        return True
 
     def _forces(self, d: Deformation) -> Forces:
         energy = self._energy
@@ -175,7 +175,7 @@ class Minimum:
             "compared with those of the surface"
         )
 
-    def _by_lu(self) -> None:
+    def _factor_by_lu(self) -> None:
         """Factor the exact second derivatives by LU although they have a negative direction."""
         from scipy.sparse import dia_array
         from scipy.sparse.linalg import splu
@@ -195,14 +195,14 @@ class Minimum:
             ) from None
         self.doubts.append(Doubt.NOT_LEAST)
 
-    def _judge(self, left: float) -> None:
+    def _record_doubts(self, left: float) -> None:
         """Record the doubts."""
-        if not left <= _AT_REST:
+        if not left <= _CONVERGED:
             self.doubts.append(Doubt.NOT_AT_REST)
         if self._least_eigenvalue() < _SINGULAR:
             self.doubts.append(Doubt.NEAR_SINGULAR)
         p, q = np.abs(self._deformation.p), np.abs(self._deformation.q)
-        if np.any(p - q < _THIN * (p + q)):
+        if np.any(p - q < _COLLAPSED_RATIO * (p + q)):
             self.doubts.append(Doubt.NEAR_COLLAPSE)
         if self._freedom.resting:
             self.doubts.append(Doubt.SLIDING)
@@ -219,7 +219,7 @@ class Minimum:
             solve = lambda load: lu.solve(load.view(np.float64)).view(np.complex128)  # noqa: E731
         x = np.random.default_rng(0).standard_normal(scale.size)
         growth = 0.0
-        for _ in range(_ITERATIONS):
+        for _ in range(_POWER_ITERATIONS):
             x *= scale / np.linalg.norm(x)
             try:
                 x = scale * solve(x.view(np.complex128)).view(np.float64)

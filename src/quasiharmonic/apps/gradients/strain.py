@@ -14,10 +14,10 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from quasiharmonic.geometry.mesh.reference import rest_frames
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, names_of
 
 # The same minimum angle as in `mesh.reference` (§F.1).
-_LEAST_ANGLE = np.pi / 6
+_MIN_ANGLE = np.pi / 6
 
 
 class Strain(ABC):
@@ -33,28 +33,11 @@ class Strain(ABC):
 
 
 class RestStrain(Strain):
-    """The strain of the rest triangles.
+    """The strain of the rest triangles ``F`` of ``V``; ValueError names triangles without positive finite area.
 
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) float64
-    F : (f, 3) int64
-        Triangles with positive area.
-    signed : bool
-        Whether planar triangles may be clockwise, as in a `ReferenceMesh`. Triangles in space are always
-        counterclockwise, and so are those of a planar surface in `mesh.shapes`.
-
-    Raises
-    ------
-    ValueError
-        If areas exceed the range of doubles; the message names the triangles.
-
-    Attributes
-    ----------
-    m : (f,) float64
-        Areas.
-    half : (3, f) complex128
-        Half the gradients of the hat functions.
+    With ``signed``, planar triangles may be clockwise, as in a `ReferenceMesh`. Triangles in space are always
+    counterclockwise, and so are those of a planar surface in `mesh.triangle_shapes`. ``m`` (f,) are areas, ``half`` (3,
+    f) complex half the gradients of the hat functions.
     """
 
     def __init__(self, V: FloatArray, F: IntArray, *, signed: bool = True) -> None:
@@ -69,7 +52,7 @@ class RestStrain(Strain):
         lost = np.flatnonzero(~(np.isfinite(self.m) & np.isfinite(self.half).all(axis=0)))
         if lost.size:
             raise ValueError(
-                f"the areas of {named('triangle', 'triangles', lost)} at rest are outside the "
+                f"the areas of {names_of('triangle', 'triangles', lost)} at rest are outside the "
                 f"range of doubles: scale the "
                 "surface to about unit size"
             )
@@ -100,25 +83,19 @@ class RestStrain(Strain):
 class CorrectedStrain(Strain):
     """The strain of triangles with corrected angles (§F.1), in whose frame only vertex 2 moves.
 
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) float64
-    F : (f, 3) int64
-        Triangles with positive area.
-    half : (3, f) complex128
-        Half the gradients of the hat functions in the corrected triangles.
+    Arguments are those of `RestStrain`, and half the gradients (3, f) of the hat functions in the corrected triangles.
     """
 
     def __init__(self, V: FloatArray, F: IntArray, half: ComplexArray) -> None:
         self._rest = RestStrain(V, F)
         sides, sign = self._rest.sides, np.sign(self._rest.m)
         angles = sign * np.angle(-sides[(2, 0, 1), :] / sides)
-        raised = np.maximum(angles, _LEAST_ANGLE)
+        raised = np.maximum(angles, _MIN_ANGLE)
         total = raised.sum(axis=0)
         self._share, self._per_angle = raised / total, np.pi / total
         # A shear b rotates the side e by Im (b ē/e), and an angle is the difference of two directions.
         turn = sides.conj() / sides
-        self._by_shear: ComplexArray = np.where(angles > _LEAST_ANGLE, sign, 0.0) * (turn[(2, 0, 1), :] - turn)
+        self._by_shear: ComplexArray = np.where(angles > _MIN_ANGLE, sign, 0.0) * (turn[(2, 0, 1), :] - turn)
         # Vertex 2 is at sin θ₁ / sin θ₂ e^{iθ₀}.
         zero, one, two = np.pi * self._share
         self._cot_one, self._cot_two = 1 / np.tan(one), 1 / np.tan(two)

@@ -15,14 +15,13 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, as_complex
-from quasiharmonic.apps.gradients.forces import Forces
+from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, to_complex
+from quasiharmonic.apps.gradients.forces import Forces, TensorForces
 from quasiharmonic.apps.gradients.strain import CorrectedStrain, RestStrain, Strain
-from quasiharmonic.apps.gradients.tensor_forces import TensorForces
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.linsolve.laplacian import FactoredLaplacian
-from quasiharmonic.problem import Problem
+from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH, beltrami_coefficients
 from quasiharmonic.util.arrays import ComplexArray, check_choice
@@ -80,6 +79,7 @@ def quasi_harmonic_derivative(
     >>> bool(np.allclose(shifted, [1, 0]))
     True
     """
+    check_problem("quasi_harmonic_derivative", problem)
     check_choice("reference", reference, get_args(Reference))
     coefficients = beltrami_coefficients(mu, len(problem.F))
     with problem.exclusive() as own:
@@ -93,7 +93,7 @@ def quasi_harmonic_derivative(
         rest = problem.V, problem.F
         strain = partial(RestStrain, *rest) if mesh.kind == "rest" else partial(CorrectedStrain, *rest, half)
     uv = problem.positions(iterate.w)
-    dw = mesh.derivatives(as_complex(uv - problem.frame.centre))
+    dw = mesh.derivatives(to_complex(uv - problem.frame.centre))
     double = 2.0 / field.defect
     c, twist = double - 1.0, double * field.mu
     zero = np.zeros_like(field.mu)

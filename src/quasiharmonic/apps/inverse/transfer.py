@@ -11,9 +11,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.inverse.inverse import InverseMap, Per, SurfacePoints
+from quasiharmonic.apps.inverse.inverse_map import InverseMap, Per, SurfacePoints
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.util.arrays import FloatArray, check_choice
+from quasiharmonic.util.arrays import FloatArray, check_choice, check_instance
 
 #: The value of vertices without a corresponding point.
 Outside = Literal["nan", "nearest"]
@@ -57,6 +57,7 @@ class SurfaceMap:
 
     def __init__(self, source: InverseMap, target: InverseMap) -> None:
         for which, one in (("source", source), ("target", target)):
+            check_instance(which, one, InverseMap)
             if not one.certificate.bijective:
                 raise ValueError(f"the map of the {which} is not bijective: {one.certificate.summary()}")
         self.source, self.target = source, target

@@ -1,9 +1,10 @@
 """Maps as functions of JAX, with gradients.
 
-Arrays are in double precision (``mu`` in complex128) and on the CPU. First call
-``jax.config.update("jax_enable_x64", True)``. Every argument may have leading batch axes; `jax.vmap` adds one as well.
-Under `jax.jit` the maps are computed by a callback (`jax.pure_callback`). First derivatives are available in reverse
-mode (`jax.grad`, `jax.vjp`). JAX does not support `jax.jvp` of these functions.
+Parameters, results and errors are those of the functions of the same names in `quasiharmonic.torch`, with JAX arrays in
+place of tensors. First call ``jax.config.update("jax_enable_x64", True)``. Besides leading batch axes, `jax.vmap` adds
+one as well. Under `jax.jit` the maps are computed by a callback (`jax.pure_callback`), and JAX raises its own error
+with the message of `MapNotFound`. First derivatives are available in reverse mode (`jax.grad`, `jax.vjp`). JAX does not
+support `jax.jvp` of these functions.
 
 The package builds on `apps.gradients.layers`. Start reading here, then `callbacks`.
 """
@@ -22,10 +23,10 @@ from quasiharmonic.apps.gradients.layers import (
     DoubtfulDerivative,
     FlattenLayer,
     MapNotFound,
-    PolishedLayer,
+    PolishLayer,
     TensorLayer,
 )
-from quasiharmonic.apps.jax.callbacks import applied
+from quasiharmonic.apps.jax.callbacks import apply_layer
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
@@ -43,34 +44,11 @@ def quasi_harmonic_map(
     reference: Reference = "equilateral",
     linear_solver: str = "auto",
 ) -> jax.Array:
-    """Return quasi-harmonic maps of arrays, as `quasiharmonic.quasi_harmonic_map`.
+    """Return quasi-harmonic maps (…, n, 2) float64 of arrays, as `quasiharmonic.torch.quasi_harmonic_map`.
 
-    Parameters
-    ----------
-    problem : Problem
-        Triangles, fixed vertices, and the values of omitted arguments.
-    mu : (…, f) array of complex128, optional
-        Beltrami coefficients; zero by default. Their gradient is ``∂/∂Re μ − i ∂/∂Im μ``, JAX's convention.
-    target : (…, k, 2) array of float64, optional
-        Target positions of the fixed vertices.
-    rest : (…, n, 2) or (…, n, 3) array of float64, optional
-        Rest positions. They matter only with a ``reference`` other than ``"equilateral"``.
-    reference, linear_solver
-        As for `quasiharmonic.quasi_harmonic_map`.
-
-    Returns
-    -------
-    (…, n, 2) array of float64
-        Injective only if the target is convex or μ is suitable.
-
-    Raises
-    ------
-    TypeError
-        If an argument is not an array, or has the wrong dtype.
-    ValueError
-        If an argument is on another device or has the wrong shape, or `quasiharmonic.quasi_harmonic_map` raises it.
+    The gradient by ``mu`` is ``∂/∂Re μ − i ∂/∂Im μ``, JAX's convention.
     """
-    return applied(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
+    return apply_layer(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
 
 
 def injective_map(
@@ -83,36 +61,9 @@ def injective_map(
     start: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> jax.Array:
-    """Return polished injective maps of arrays, as `quasiharmonic.solve`, converged to rounding.
-
-    Parameters
-    ----------
-    problem : Problem
-        Triangles, fixed vertices, and the values of omitted arguments.
-    target : (…, k, 2) array of float64, optional
-        Target positions of the fixed vertices.
-    rest : (…, n, 2) or (…, n, 3) array of float64, optional
-        Rest positions.
-    polish, slide, start, linear_solver
-        As for `quasiharmonic.solve`; ``start`` is shared by the whole batch. If the boundary slides along curves that
-        are not straight, gradients are typically accurate to 0.5 % (see `polish_derivative`).
-
-    Returns
-    -------
-    (…, n, 2) array of float64
-
-    Raises
-    ------
-    TypeError
-        If an argument is not an array, or has the wrong dtype.
-    ValueError
-        If an argument is on another device or has the wrong shape, or `quasiharmonic.solve` raises it.
-    MapNotFound
-        If no injective map was found for one item of the batch. Under `jax.jit`, JAX raises its own error with this
-        message.
-    """
+    """Return polished injective maps (…, n, 2) float64 of arrays, as `quasiharmonic.torch.injective_map`."""
     first = None if start is None else np.asarray(start, dtype=np.float64)
-    return applied(PolishedLayer(problem, polish, slide, first, linear_solver), {"target": target, "rest": rest})
+    return apply_layer(PolishLayer(problem, polish, slide, first, linear_solver), {"target": target, "rest": rest})
 
 
 def flatten(
@@ -126,36 +77,6 @@ def flatten(
     start: ArrayLike | None = None,
     linear_solver: str = "auto",
 ) -> jax.Array:
-    """Return maps with a free boundary, as `quasiharmonic.flatten`, converged to rounding.
-
-    Parameters
-    ----------
-    rest : (…, n, 2) or (…, n, 3) array of float64
-        Rest positions of one connected surface.
-    F : (f, 3) array of int
-        Triangles.
-    fixed : (k,) array of int, optional
-        Fixed vertices.
-    target : (…, k, 2) array of float64, optional
-        Target positions of the fixed vertices.
-    energy, weights, start, linear_solver
-        As for `quasiharmonic.flatten`; ``start`` is shared by the whole batch.
-
-    Returns
-    -------
-    (…, n, 2) array of float64
-        Without ``fixed``, the gradient is that of the map nearest to this one, although `flatten` would lay it out
-        differently. Use functions that do not depend on the map's position and rotation.
-
-    Raises
-    ------
-    TypeError
-        If an argument is not an array, or has the wrong dtype.
-    ValueError
-        If an argument is on another device or has the wrong shape, or `quasiharmonic.flatten` raises it.
-    MapNotFound
-        If no injective map was found for one item of the batch. Under `jax.jit`, JAX raises its own error with this
-        message.
-    """
+    """Return maps (…, n, 2) float64 with a free boundary, as `quasiharmonic.torch.flatten`."""
     layer = FlattenLayer.of(rest, F, fixed, target, energy=energy, weights=weights, start=start, solver=linear_solver)
-    return applied(layer, {"rest": rest, "target": target})
+    return apply_layer(layer, {"rest": rest, "target": target})

@@ -15,24 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.layers import Array, Layer, back, expected, forth
+from quasiharmonic.apps.gradients.layers import Array, Layer, check_shape, compute_gradients, compute_maps, sum_to_shape
 from quasiharmonic.util.arrays import FloatArray
 
 # JAX passes only arrays from the forward to the backward pass. This cache keeps the last derivatives; older ones are
 # computed again from their maps.
-_KEPT = 16
+_MAX_RECENT = 16
 _lock = Lock()
 _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 
 
-def applied(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
-    """Return the maps of a layer for its arguments; arguments that are None are omitted.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not an array, or has the wrong dtype, device or shape.
-    """
+def apply_layer(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
+    """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes."""
     given = {name: array for name, array in arguments.items() if array is not None}
     for name, array in given.items():
         _check(name, array, layer.shapes[name])
@@ -46,7 +40,7 @@ def applied(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
 
 @dataclass(frozen=True)
 class _Call:
-    """A function of a layer; equal calls compare equal, so that JAX compiles one program for them."""
+    """A function bound to a layer. Instances with equal fields compare equal, so JAX compiles one program for them."""
 
     function: Callable[..., Any]
     layer: Layer
@@ -58,8 +52,8 @@ class _Call:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _map(layer: Layer, names: tuple[str, ...], *arrays: jax.Array) -> jax.Array:
-    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.places), jnp.float64)
-    maps: jax.Array = jax.pure_callback(_Call(_found, layer, names), shape, *arrays, vmap_method="expand_dims")
+    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.map_shape), jnp.float64)
+    maps: jax.Array = jax.pure_callback(_Call(_compute, layer, names), shape, *arrays, vmap_method="expand_dims")
     return maps
 
 
@@ -77,8 +71,10 @@ def _backward(
         jax.ShapeDtypeStruct((*lead, *layer.shapes[name]), array.dtype)
         for name, array in zip(names, arrays, strict=True)
     ]
-    pulled = jax.pure_callback(_Call(_pulled, layer, names), shapes, uv, cotangent, *arrays, vmap_method="expand_dims")
-    return tuple(_summed(gradient, array.shape) for gradient, array in zip(pulled, arrays, strict=True))
+    pulled = jax.pure_callback(
+        _Call(_pull_back, layer, names), shapes, uv, cotangent, *arrays, vmap_method="expand_dims"
+    )
+    return tuple(sum_to_shape(gradient, array.shape) for gradient, array in zip(pulled, arrays, strict=True))
 
 
 _map.defvjp(_forward, _backward)
@@ -88,35 +84,35 @@ def _lead(layer: Layer, names: tuple[str, ...], arrays: tuple[jax.Array, ...]) -
     return layer.batch(dict(zip(names, arrays, strict=True)))
 
 
-def _found(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
+def _compute(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
     """Compute the maps, and cache their derivatives."""
-    given = _given(names, arrays)
-    uv, derivatives = forth(layer, given)
+    given = _by_name(names, arrays)
+    uv, derivatives = compute_maps(layer, given)
     with _lock:
         for item, derivative in zip(np.ndindex(uv.shape[:-2]), derivatives, strict=True):
             _recent[_key(layer, layer.item(given, item), uv[item])] = derivative
-        while len(_recent) > _KEPT:
+        while len(_recent) > _MAX_RECENT:
             _recent.popitem(last=False)
     return uv
 
 
-def _pulled(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *arrays: Any) -> list[Array]:
+def _pull_back(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *arrays: Any) -> list[Array]:
     """The gradients with respect to all arguments, for the whole batch."""
-    given, uv, cotangent = _given(names, arrays), np.asarray(uv), np.asarray(cotangent)
+    given, uv, cotangent = _by_name(names, arrays), np.asarray(uv), np.asarray(cotangent)
     lead = np.broadcast_shapes(uv.shape[:-2], cotangent.shape[:-2])
-    uv, cotangent = (np.broadcast_to(array, (*lead, *layer.places)) for array in (uv, cotangent))
+    uv, cotangent = (np.broadcast_to(array, (*lead, *layer.map_shape)) for array in (uv, cotangent))
     derivatives = []
     for item in np.ndindex(lead):
         own = layer.item(given, item)
         with _lock:
             derivative = _recent.get(_key(layer, own, uv[item]))
         derivatives.append(derivative or layer.derivative(own, uv[item]))
-    found = back(layer, derivatives, cotangent, names)
+    found = compute_gradients(layer, derivatives, cotangent, names)
     # JAX's convention is ∂/∂Re − i ∂/∂Im.
     return [found[name].conj() for name in names]
 
 
-def _given(names: tuple[str, ...], arrays: tuple[Any, ...]) -> dict[str, Array]:
+def _by_name(names: tuple[str, ...], arrays: tuple[Any, ...]) -> dict[str, Array]:
     return {name: np.asarray(array) for name, array in zip(names, arrays, strict=True)}
 
 
@@ -126,13 +122,6 @@ def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer,
     for array in own.values():
         digest.update(np.ascontiguousarray(array).tobytes())
     return layer, digest.digest()
-
-
-def _summed(gradient: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """A gradient with batch axes, summed over the axes that the argument lacks or has with length 1."""
-    gradient = gradient.sum(axis=tuple(range(gradient.ndim - len(shape))))
-    short = tuple(i for i, size in enumerate(shape) if size == 1 and gradient.shape[i] != 1)
-    return gradient.sum(axis=short, keepdims=True) if short else gradient
 
 
 def _check(name: str, array: Any, one: tuple[int, ...]) -> None:
@@ -153,4 +142,4 @@ def _check(name: str, array: Any, one: tuple[int, ...]) -> None:
                 f"{name} is on {elsewhere[0]}, but maps are computed on the CPU: "
                 f"jax.device_put({name}, jax.devices('cpu')[0])"
             )
-    expected(name, array.shape, one)
+    check_shape(name, array.shape, one)

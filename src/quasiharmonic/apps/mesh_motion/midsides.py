@@ -14,8 +14,11 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Required least control value of an inverted element, relative to that of the triangle of its corners.
 _MARGIN = 0.1
-# Weight of displacements in the first try; maximum number of tries, each with a tenth of the weight; steps per try.
-_DEAR, _TRIES, _STEPS = 1e-2, 8, 30
+# Weight of displacements in the first try; each further try has a tenth of it.
+_DISPLACEMENT_WEIGHT = 1e-2
+_MAX_TRIES = 8
+# Steps per try.
+_STEPS = 30
 # Attempts in order. First value: rings of elements around inverted ones whose nodes move; None moves only mid-side
 # nodes of inverted elements. Second value: initial positions, as a fraction of the way from ``straight`` to
 # ``searched``. Further attempts start from the best result.
@@ -23,13 +26,13 @@ _ATTEMPTS = (None, 0.0), (0, 0.0), (1, 0.0), (3, 0.0), (3, 0.5), (3, 1.0)
 _FURTHER = 1, 2, 4, 8
 
 
-def sides(F: IntArray) -> tuple[IntArray, IntArray]:
+def find_sides(F: IntArray) -> tuple[IntArray, IntArray]:
     """Return the mid-side nodes of six-node triangles (f, 6), (s,) ascending, and the ends of their sides, (s, 2)."""
     middle, first = np.unique(F[:, MIDDLES], return_index=True)
     return middle, F[:, SIDES].reshape(-1, 2)[first]
 
 
-def carried(before: FloatArray, after: FloatArray, middle: IntArray, ends: IntArray) -> FloatArray:
+def follow_sides(before: FloatArray, after: FloatArray, middle: IntArray, ends: IntArray) -> FloatArray:
     """Return positions of mid-side nodes that follow their sides with the same rotation and scaling; (s, 2) float64.
 
     Nodes of straight sides keep their relative position. If both ends are unchanged, the node is exactly unchanged.
@@ -42,39 +45,25 @@ def carried(before: FloatArray, after: FloatArray, middle: IntArray, ends: IntAr
     return place.view(np.float64).reshape(-1, 2)
 
 
-def followed(F: IntArray, rest: FloatArray, points: FloatArray, held: IntArray) -> FloatArray:
+def restore_midsides(F: IntArray, rest: FloatArray, points: FloatArray, fixed: IntArray) -> FloatArray:
     """Move the free mid-side nodes to their relative position on their sides at rest; (n, 2) float64.
 
-    Parameters
-    ----------
-    F : (f, 6) int64
-    rest, points : (n, 2) float64
-        The rest mesh and the current mesh.
-    held : (k,) int64
-        Fixed nodes.
+    ``rest`` and ``points`` (n, 2) are the rest mesh and the current mesh.
     """
-    middle, ends = sides(F)
-    free = ~np.isin(middle, held)
+    middle, ends = find_sides(F)
+    free = ~np.isin(middle, fixed)
     there = points.copy()
-    there[middle[free]] = carried(rest, points, middle[free], ends[free])
+    there[middle[free]] = follow_sides(rest, points, middle[free], ends[free])
     return there
 
 
-def centred(F: IntArray, points: FloatArray, slid: IntArray, curves: Sequence[Curve]) -> FloatArray:
+def centre_midsides(F: IntArray, points: FloatArray, slid: IntArray, curves: Sequence[Curve]) -> FloatArray:
     """Move mid-side nodes that have slid along curves to the middle of their sides; (n, 2) float64.
 
-    A mid-side node outside the middle half of a straight side inverts its element, whatever the other nodes.
-
-    Parameters
-    ----------
-    F : (f, 6) int64
-    points : (n, 2) float64
-    slid : (k,) int64
-        Nodes that have slid; only mid-side nodes are used.
-    curves : sequence of Curve
-        Each node stays on its nearest curve.
+    A mid-side node outside the middle half of a straight side inverts its element, whatever the other nodes. ``slid``
+    (k,) are nodes that have slid, of which only mid-side nodes are used. Each node stays on its nearest curve.
     """
-    middle, ends = sides(F)
+    middle, ends = find_sides(F)
     of = np.isin(middle, slid)
     nodes, half = middle[of], points[ends[of]].mean(axis=1)
     own = np.argmin([curve.nearest(points[nodes])[1] for curve in curves], axis=0)
@@ -84,23 +73,11 @@ def centred(F: IntArray, points: FloatArray, slid: IntArray, curves: Sequence[Cu
     return there
 
 
-def settled(F: IntArray, straight: FloatArray, searched: FloatArray, held: IntArray) -> FloatArray:
-    """Move nodes around inverted elements as little as possible until no element is inverted.
+def untangle_elements(F: IntArray, straight: FloatArray, searched: FloatArray, fixed: IntArray) -> FloatArray:
+    """Move nodes around inverted elements as little as possible until no element is inverted; (n, 2) float64.
 
-    Parameters
-    ----------
-    F : (f, 6) int64
-    straight : (n, 2) float64
-        The mesh with its mid-side nodes at their preferred positions.
-    searched : (n, 2) float64
-        The mesh with mid-side nodes at other, perhaps better positions.
-    held : (k,) int64
-        Fixed nodes.
-
-    Returns
-    -------
-    (n, 2) float64
-        Some elements may still be inverted.
+    In ``straight`` (n, 2) the mid-side nodes are at their preferred positions, and in ``searched`` (n, 2) at other,
+    perhaps better ones. Some elements of the result may still be inverted.
     """
     best, bad = straight, inverted_elements(F, straight)
     for rings, share in (*_ATTEMPTS, *((rings, None) for rings in _FURTHER)):
@@ -109,28 +86,28 @@ def settled(F: IntArray, straight: FloatArray, searched: FloatArray, held: IntAr
         if share and searched is straight:
             continue
         begin = best if share is None else straight + share * (searched - straight)
-        found = _righted(F, begin, rings, held)
+        found = _untangle_near(F, begin, rings, fixed)
         left = inverted_elements(F, found)
         if left.size < bad.size:
             best, bad = found, left
     return best
 
 
-def _righted(F: IntArray, points: FloatArray, rings: int | None, held: IntArray) -> FloatArray:
+def _untangle_near(F: IntArray, points: FloatArray, rings: int | None, fixed: IntArray) -> FloatArray:
     """Move nodes within some rings of inverted elements; None moves only their mid-side nodes."""
     bad = inverted_elements(F, points)
-    movable = F[bad][:, MIDDLES] if rings is None else F[_around(F, bad, rings)]
-    return _bent(F, points, np.setdiff1d(movable, held))
+    movable = F[bad][:, MIDDLES] if rings is None else F[_grow(F, bad, rings)]
+    return _move_nodes(F, points, np.setdiff1d(movable, fixed))
 
 
-def _around(F: IntArray, which: IntArray, rings: int) -> IntArray:
+def _grow(F: IntArray, which: IntArray, rings: int) -> IntArray:
     """Return the elements within some rings of others."""
     for _ in range(rings):
         which = np.flatnonzero(np.isin(F[:, :3], F[which, :3]).any(axis=1))
     return which
 
 
-def _bent(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
+def _move_nodes(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
     """Move nodes as little as possible so that control values become positive.
 
     Minimise ``μ Σ |xᵢ − x̂ᵢ|²/h² + Σ max(0, margin − cᵢⱼ/c₀)²`` with initial positions x̂ by Levenberg–Marquardt steps
@@ -144,17 +121,17 @@ def _bent(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
     number = np.full(len(points), -1)
     number[free] = np.arange(free.size)
     now = points.copy()
-    dear = _DEAR
-    for _ in range(_TRIES):
+    weight = _DISPLACEMENT_WEIGHT
+    for _ in range(_MAX_TRIES):
         for _ in range(_STEPS):
-            step = _step(near, now, points, number, unit, size, dear)
+            step = _step(near, now, points, number, unit, size, weight)
             if step is None:
                 break
             now = now.copy()
             now[free] += step
         if not inverted_elements(near, now).size:
             break
-        dear *= 0.1
+        weight *= 0.1
     return now
 
 
@@ -165,7 +142,7 @@ def _chords(F: IntArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return nodes[..., 0], nodes[..., 1]
 
 
-def _lacking(F: IntArray, points: FloatArray, unit: FloatArray) -> FloatArray:
+def _find_deficits(F: IntArray, points: FloatArray, unit: FloatArray) -> FloatArray:
     """Return how far control values are below the margin; (f, 6)."""
     x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)
     return np.maximum(_MARGIN - jacobian_coefficients(x, y) / unit[:, None], 0.0)
@@ -178,7 +155,7 @@ def _step(
     number: IntArray,
     unit: FloatArray,
     size: float,
-    dear: float,
+    weight: float,
 ) -> FloatArray | None:
     """Return one Levenberg–Marquardt step (k, 2), or None if no step lowers the objective."""
     from scipy.sparse import csr_array, dia_array
@@ -186,9 +163,9 @@ def _step(
 
     free = np.flatnonzero(number >= 0)
     gone = (now[free] - first[free]) / size
-    lacking = _lacking(F, now, unit)
-    value = dear * (gone**2).sum() + (lacking**2).sum()
-    element, which = np.nonzero(lacking)
+    deficits = _find_deficits(F, now, unit)
+    value = weight * (gone**2).sum() + (deficits**2).sum()
+    element, which = np.nonzero(deficits)
     if not element.size:
         return None
     nodes = F[element]
@@ -202,18 +179,18 @@ def _step(
     row = np.broadcast_to(np.arange(len(element))[:, None, None], column.shape)
     known = np.broadcast_to(number[nodes][..., None] >= 0, column.shape)
     jacobian = csr_array((slopes[known], (row[known], column[known])), shape=(len(element), 2 * free.size))
-    load = jacobian.T @ lacking[element, which] - dear * gone.ravel()
+    load = jacobian.T @ deficits[element, which] - weight * gone.ravel()
     unknowns = 2 * free.size
-    matrix = jacobian.T @ jacobian + dia_array((np.full((1, unknowns), dear), [0]), shape=(unknowns, unknowns))
+    matrix = jacobian.T @ jacobian + dia_array((np.full((1, unknowns), weight), [0]), shape=(unknowns, unknowns))
     try:
         direction = splu(matrix.tocsc()).solve(load).reshape(-1, 2)
-    except RuntimeError:  # singular: in very bad elements the weight ``dear`` is lost to rounding
+    except RuntimeError:  # singular: in very bad elements the weight is lost to rounding
         return None
     there = now.copy()
     for halving in range(6):
         t = 0.5**halving
         there[free] = now[free] + t * size * direction
         further = (there[free] - first[free]) / size
-        if dear * (further**2).sum() + (_lacking(F, there, unit) ** 2).sum() < value:
+        if weight * (further**2).sum() + (_find_deficits(F, there, unit) ** 2).sum() < value:
             return t * size * direction
     return None

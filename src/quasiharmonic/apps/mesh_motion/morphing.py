@@ -9,13 +9,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.mesh_motion.midsides import carried, centred, followed, settled, sides
-from quasiharmonic.apps.mesh_motion.morphed import MorphResult, forbidden_elements
-from quasiharmonic.apps.mesh_motion.quadrilaterals import made_convex
+from quasiharmonic.apps.mesh_motion.midsides import (
+    centre_midsides,
+    find_sides,
+    follow_sides,
+    restore_midsides,
+    untangle_elements,
+)
+from quasiharmonic.apps.mesh_motion.morph_result import MorphResult, find_forbidden
+from quasiharmonic.apps.mesh_motion.quadrilaterals import make_convex
 from quasiharmonic.apps.mesh_motion.quality import element_quality
 from quasiharmonic.energies.energies import Energy
-from quasiharmonic.energies.newton.sliding import moved_onto
-from quasiharmonic.energies.polishing import energy_named, polished
+from quasiharmonic.energies.newton.sliding_boundary import move_onto
+from quasiharmonic.energies.polishing import PolishOptions, find_energy, polish_result
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
@@ -29,14 +35,23 @@ from quasiharmonic.geometry.mesh.elements import (
     element_array,
     name_elements,
     nets_of,
-    turned_over,
+    reverse_elements,
 )
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_planar_mesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.solver.search.solving import solve
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, check_range, index_array, map_array, named
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.solver.search.options import MAX_ITERATIONS
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_finite,
+    check_range,
+    index_array,
+    map_array,
+    names_of,
+)
 from quasiharmonic.util.progress import reports_progress
 
 
@@ -46,16 +61,16 @@ def morph(
     points: ArrayLike,
     F: ArrayLike,
     moved_vertices: ArrayLike,
-    positions: ArrayLike,
+    target: ArrayLike,
     *,
     energy: str | Energy | None = "symmetric-dirichlet",
-    max_iterations: int = 2000,
+    max_iterations: int = MAX_ITERATIONS,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
     slide: bool | BoundaryCurves = False,
     rest: ArrayLike | None = None,
     start: ArrayLike | None = None,
-    tolerance: float = 1e-8,
+    tol: float = 1e-8,
 ) -> MorphResult:
     """Move some nodes of a planar mesh and place the others so that no element is inverted.
 
@@ -69,7 +84,7 @@ def morph(
     moved_vertices : (k,) array of int
         Nodes to move, on the boundary or inside. Other boundary nodes are fixed, except mid-side nodes, which follow
         their side.
-    positions : (k, 2) array
+    target : (k, 2) array
         Target positions of the moved nodes.
     energy : str, Energy or None
         Energy that the placement minimises; see `quasiharmonic.polish`. The default preserves shapes and sizes of the
@@ -91,7 +106,7 @@ def morph(
     start : (n, 2) array, optional
         Initial mesh, close to the result. Default: ``points`` if ``rest`` is given, otherwise the harmonic extension of
         the displacement.
-    tolerance : float
+    tol : float
         The mesh has converged if a further step is predicted to lower the energy by less than this fraction; see
         `quasiharmonic.polish`. A larger value is faster, and the result depends more on the initial mesh.
 
@@ -135,28 +150,28 @@ def morph(
     F = element_array(F, len(points))
     used = np.unique(F)
     _check_used("points", points, used)
-    first = points if rest is None else _like("rest", rest, points, used)
-    begin = (None if rest is None else points) if start is None else _like("start", start, points, used)
+    first = points if rest is None else _check_positions("rest", rest, points, used)
+    begin = (None if rest is None else points) if start is None else _check_positions("start", start, points, used)
     F = _counterclockwise(F, first)
     check_spread(F, len(points))
-    fixed, target = _placed(points, F, moved_vertices, positions)
-    question = _Question(F, first, fixed, nets_of(F))
-    settings = _Settings(energy, max_iterations, linear_solver, callback, tolerance)
-    after, result = _answered(question, points, target, begin, (slide, np.asarray(moved_vertices)), settings)
+    fixed, goal = _find_fixed(points, F, moved_vertices, target)
+    given = _MorphProblem(F, first, fixed, nets_of(F))
+    settings = _Settings(energy, max_iterations, linear_solver, callback, tol)
+    after, result = _place_nodes(given, points, goal, begin, (slide, np.asarray(moved_vertices)), settings)
 
     def one_step() -> FloatArray:
         # Fix the boundary at the positions to which it has slid.
         alone = settings._replace(callback=None)
-        whole, _ = _answered(question, first, after[fixed], None, (False, fixed), alone)
+        whole, _ = _place_nodes(given, first, after[fixed], None, (False, fixed), alone)
         return np.full_like(whole, np.nan) if inverted_elements(F, whole).size else whole
 
     inverted = inverted_elements(F, after)
-    forbidden = np.intersect1d(inverted, forbidden_elements(F, after, fixed))
+    forbidden = np.intersect1d(inverted, find_forbidden(F, after, fixed))
     before, now = element_quality(F, points), element_quality(F, after)
     return MorphResult(after, F, inverted, forbidden, result, before, now, one_step)
 
 
-class _Question(NamedTuple):
+class _MorphProblem(NamedTuple):
     """A rest mesh, the nodes with given positions, and sets of triangles to search on, in order."""
 
     F: IntArray
@@ -172,11 +187,11 @@ class _Settings(NamedTuple):
     max_iterations: int
     linear_solver: str
     callback: Callable[[Step], object] | None
-    tolerance: float
+    tol: float
 
 
-def _answered(
-    question: _Question,
+def _place_nodes(
+    given: _MorphProblem,
     points: FloatArray,
     target: FloatArray,
     begin: FloatArray | None,
@@ -185,28 +200,19 @@ def _answered(
 ) -> tuple[FloatArray, MapResult]:
     """Place all nodes by the first set of triangles that leaves no element inverted, or by the best one.
 
-    Parameters
-    ----------
-    question : _Question
-    points : (n, 2) float64
-        Positions of nodes in no element, and of mid-side nodes on a sliding boundary.
-    target : (k, 2) float64
-        Target positions of the given nodes.
-    begin : (n, 2) float64 or None
-        Initial mesh.
-    slide : (bool or BoundaryCurves, (l,) int64)
-        The curves of the boundary, and the nodes that do not slide.
-    settings : _Settings
+    Nodes in no element, and mid-side nodes on a sliding boundary, are at ``points`` (n, 2). ``target`` (k, 2) has the
+    positions of the fixed nodes, and ``begin`` is the initial mesh. ``slide`` has the curves of the boundary, and the
+    nodes that do not slide.
     """
-    F, rest, fixed, nets = question
+    F, rest, fixed, nets = given
     if F.shape[1] == 6 and slide[0] is not False:
         # Mid-side nodes slide as other nodes do. They are then moved to the middle of their sides and fixed there.
-        there, slid = _searched(question, nets[-1], points, target, begin, slide, settings)
+        there, slid = _search(given, nets[-1], points, target, begin, slide, settings)
         has_slid = fixed[(there[fixed] != target).any(axis=1)]
         before = points.copy()
         before[fixed] = target
-        there = centred(F, there, has_slid, _curves(slide[0], nets[-1], before))
-        after, result = _answered(question, points, there[fixed], there, (False, fixed), settings)
+        there = centre_midsides(F, there, has_slid, _list_curves(slide[0], nets[-1], before))
+        after, result = _place_nodes(given, points, there[fixed], there, (False, fixed), settings)
         return after, replace(
             result,
             stages=slid.stages + result.stages,
@@ -215,12 +221,12 @@ def _answered(
         )
     best, least = None, np.inf
     for triangles in nets:
-        after, result = _searched(question, triangles, points, target, begin, slide, settings)
+        after, result = _search(given, triangles, points, target, begin, slide, settings)
         if F.shape[1] == 6:
             # Mid-side nodes outside these triangles have not moved yet.
             inside = ~np.isin(F[:, MIDDLES], triangles).any()
-            straight = followed(F, rest, after, fixed)
-            after = settled(F, straight, straight if inside else after, fixed)
+            straight = restore_midsides(F, rest, after, fixed)
+            after = untangle_elements(F, straight, straight if inside else after, fixed)
         left = inverted_elements(F, after).size
         if left < least:
             best, least = (after, result), left
@@ -230,8 +236,8 @@ def _answered(
     return best
 
 
-def _searched(
-    question: _Question,
+def _search(
+    given: _MorphProblem,
     triangles: IntArray,
     points: FloatArray,
     target: FloatArray,
@@ -240,21 +246,21 @@ def _searched(
     settings: _Settings,
 ) -> tuple[FloatArray, MapResult]:
     """Search a map of some triangles, untangle those at quadrilaterals' corners, and return the moved mesh."""
-    F, rest, fixed, _ = question
-    energy, max_iterations, linear_solver, callback, tolerance = settings
+    F, rest, fixed, _ = given
+    energy, max_iterations, linear_solver, callback, tol = settings
     used = np.unique(triangles)
     known = np.isin(fixed, used)
-    own, held = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
+    own, own_fixed = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
     # With the mesh's own reference triangles, the search starts from the harmonic extension of the displacement.
-    problem = Problem(rest[used], own, held, target[known], reference="corrected")
-    rails = _rails(slide[0], problem, used, slide[1])
+    problem = Problem(rest[used], own, own_fixed, target[known], reference="corrected")
+    curves = _select_curves(slide[0], problem, used, slide[1])
     corners = np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None
     if energy is not None:
-        energy_named(energy)
-    elif rails is not False:
+        find_energy(energy)
+    elif curves is not False:
         raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
-    if rails is not False:
-        problem = moved_onto(rails, problem)
+    if curves is not False:
+        problem = move_onto(curves, problem)
     result = solve(
         problem,
         start=None if begin is None else begin[used],
@@ -263,25 +269,17 @@ def _searched(
         callback=callback,
     )
     if corners is not None and result.status is not Status.INTERRUPTED:
-        result = made_convex(problem, result, corners, linear_solver=linear_solver)
+        result = make_convex(problem, result, corners, linear_solver=linear_solver)
     if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
-        result = polished(
-            problem,
-            result,
-            energy=energy,
-            tolerance=tolerance,
-            linear_solver=linear_solver,
-            callback=callback,
-            slide=rails,
-            triangles=corners,
-        )
+        polishing = PolishOptions(energy=energy, tol=tol, linear_solver=linear_solver, callback=callback, slide=curves)
+        result = polish_result(problem, result, polishing, triangles=corners)
     after = points.copy()
     after[fixed] = target
     after[used] = result.uv
     return after, result
 
 
-def _like(name: str, mesh: ArrayLike, points: FloatArray, used: IntArray) -> FloatArray:
+def _check_positions(name: str, mesh: ArrayLike, points: FloatArray, used: IntArray) -> FloatArray:
     """Check other positions of a mesh's nodes; nodes in no element may be anywhere."""
     array = map_array(name, mesh, len(points), finite=False)
     _check_used(name, array, used)
@@ -289,9 +287,9 @@ def _like(name: str, mesh: ArrayLike, points: FloatArray, used: IntArray) -> Flo
 
 
 def _check_used(name: str, points: FloatArray, used: IntArray) -> None:
-    mine = np.zeros_like(points)
-    mine[used] = points[used]
-    check_finite(name, "vertex", "vertices", mine)
+    used_points = np.zeros_like(points)
+    used_points[used] = points[used]
+    check_finite(name, "vertex", "vertices", used_points)
 
 
 def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
@@ -312,46 +310,48 @@ def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
         if flat.size:
             raise ValueError(f"{name_elements(F, flat)} degenerate: repair the mesh first")
         turning = orientation(*(rest[F[:, k]] for k in range(3))).astype(np.float64)
-    return np.where((turning < 0)[:, None], turned_over(F), F)
+    return np.where((turning < 0)[:, None], reverse_elements(F), F)
 
 
-def _placed(
-    points: FloatArray, F: IntArray, moved_vertices: ArrayLike, positions: ArrayLike
+def _find_fixed(
+    points: FloatArray, F: IntArray, moved_vertices: ArrayLike, target: ArrayLike
 ) -> tuple[IntArray, FloatArray]:
     """Return the fixed nodes (moved nodes and the rest of the boundary) and their target positions."""
     given = index_array("moved_vertices", moved_vertices)
     if given.ndim != 1:
         raise ValueError(f"moved_vertices must have shape (k,), not {given.shape}")
     check_range("moved_vertices", given, len(points))
-    target = map_array("positions", positions, len(given), finite=False)
-    check_finite("positions", "row", "rows", target)
+    positions = map_array("target", target, len(given), finite=False)
+    check_finite("target", "row", "rows", positions)
     idle = given[~np.isin(given, F)]
     if idle.size:
-        raise ValueError(f"moved_vertices refers to {named('vertex', 'vertices', idle)}, but no triangle uses them")
+        raise ValueError(f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, but no triangle uses them")
     left = np.setdiff1d(boundary_edges(covering_triangles(F)[0], len(points)), given)
     there = points.copy()
-    there[given] = target
+    there[given] = positions
     if F.shape[1] == 6:
-        middle, ends = sides(F)
+        middle, ends = find_sides(F)
         follows = np.isin(middle, left)
-        there[middle[follows]] = carried(points, there, middle[follows], ends[follows])
-    return np.concatenate([given, left]), np.concatenate([target, there[left]])
+        there[middle[follows]] = follow_sides(points, there, middle[follows], ends[follows])
+    return np.concatenate([given, left]), np.concatenate([positions, there[left]])
 
 
-def _curves(slide: bool | BoundaryCurves, triangles: IntArray, places: FloatArray) -> list[Curve]:
+def _list_curves(slide: bool | BoundaryCurves, triangles: IntArray, positions: FloatArray) -> list[Curve]:
     """Return the curves along which the boundary of some triangles slides."""
     if isinstance(slide, BoundaryCurves):
         return slide.curves
-    return [Curve.polygon(places[loop]) for loop in boundary_loops(triangles, len(places))]
+    return [Curve.polygon(positions[loop]) for loop in boundary_loops(triangles, len(positions))]
 
 
-def _rails(slide: bool | BoundaryCurves, problem: Problem, used: IntArray, moved: IntArray) -> bool | BoundaryCurves:
+def _select_curves(
+    slide: bool | BoundaryCurves, problem: Problem, used: IntArray, moved: IntArray
+) -> bool | BoundaryCurves:
     """Return the boundary curves in the indices of the triangles' vertices, with moved vertices fixed."""
-    held = np.searchsorted(used, moved)
+    own_fixed = np.searchsorted(used, moved)
     if isinstance(slide, BoundaryCurves):
-        return slide.among(used).holding(held)
+        return slide.among(used).holding(own_fixed)
     if slide is not True:
         return slide
-    places = np.zeros((problem.n, 2))
-    places[problem.fixed] = problem.target
-    return BoundaryCurves.around(problem.domain.loops, places, fixed=held)
+    positions = np.zeros((problem.n, 2))
+    positions[problem.fixed] = problem.target
+    return BoundaryCurves.around(problem.domain.loops, positions, fixed=own_fixed)

@@ -8,35 +8,23 @@ from dataclasses import replace
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.energies.newton.newton_descent import in_units
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status
-from quasiharmonic.solver.methods.untangling import untangled
+from quasiharmonic.solver.methods.untangling import untangle
 from quasiharmonic.util.arrays import IntArray
 
 # Maximum number of untangling steps; successful runs need a few dozen.
 _STEPS = 300
 
 
-def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linear_solver: str) -> MapResult:
+def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linear_solver: str) -> MapResult:
     """Continue from a map of triangles that halve quadrilaterals to one in which these are convex.
 
-    Parameters
-    ----------
-    problem : Problem
-        The rest mesh, in which the quadrilaterals are convex, and the fixed vertices.
-    result : MapResult
-        A map of the triangles on either side of one diagonal.
-    corners : (t, 3) int64
-        The triangles at all corners.
-    linear_solver : str
-
-    Returns
-    -------
-    MapResult
-        With an additional stage if steps were taken. The status is `Status.STALLED` if corners stay inverted; the map
-        then has the fewest inverted corners found.
+    The quadrilaterals are convex in the rest mesh, and ``corners`` (t, 3) are the triangles at all their corners. The
+    result has an additional stage if steps were taken. Its status is `Status.STALLED` if corners stay inverted; the map
+    then has the fewest inverted corners found.
     """
     before = inverted_triangles(corners, result.uv).size
     if not before:
@@ -46,7 +34,7 @@ def made_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     w = in_units(result.uv, exponent)
     areas = (signed_areas(problem.F, places).sum() for places in (w, in_units(problem.V, 0)))
     rest = problem.V * np.sqrt(np.divide(*areas))
-    for further in untangled(corners, w, problem.fixed, rest=rest, linear_solver=linear_solver):
+    for further in untangle(corners, w, problem.fixed, rest=rest, linear_solver=linear_solver):
         w, steps = further, steps + 1
         if steps == _STEPS:
             break

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import corner_triangles, element_rows
-from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients, least_jacobian
+from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients, min_jacobian
 from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
 
 
@@ -44,7 +44,7 @@ def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
     x, y = place.transpose(2, 0, 1)
     values = jacobian_coefficients(x, y)
     mean = np.abs(values.mean(axis=1))
-    even = least_jacobian(values) / np.where(mean > 0, mean, 1.0)
+    even = min_jacobian(values) / np.where(mean > 0, mean, 1.0)
     return np.abs(mean_ratio(points, F[:, :3])) * even
 
 

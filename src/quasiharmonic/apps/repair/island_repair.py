@@ -16,39 +16,30 @@ from dataclasses import replace
 
 import numpy as np
 
-from quasiharmonic.energies.polishing import polish_map
+from quasiharmonic.energies.polishing import PolishOptions, polish_map
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.fans import fans, renumbered
-from quasiharmonic.geometry.mesh.seams import Island
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
+from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.topology import boundary_edges, components
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.io.seamed_mesh import Island
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 from quasiharmonic.problem.diagnosis.obstruction import Obstruction
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.solver.search.solving import solve
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, named, named_edges
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, edge_names, names_of
 
-# Rings of vertices around inverted triangles that are free, tried in turn,
+# Numbers of rings of free vertices around inverted triangles, tried in turn.
 _RINGS = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32
-# while they are at most this fraction of the island's interior. Iterations on a patch other than the whole island.
-_MOST, _ITERATIONS = 0.5, 100
+# Maximum share of free vertices in the interior of the island.
+_MAX_SHARE = 0.5
+# Iterations on a patch other than the whole island.
+_PATCH_ITERATIONS = 100
 
 
 class IslandRepair:
-    """The repair of one island.
-
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) float64
-        The mesh's vertices.
-    island : Island
-    max_iterations : int
-        Maximum number of linear solves on the whole island.
-    linear_solver : str
-    callback : callable, optional
-        Called with a `Step` at every iteration.
+    """The repair of one island of a mesh with vertices ``V``.
 
     Attributes
     ----------
@@ -74,8 +65,8 @@ class IslandRepair:
         self.reason = ""
         self.diagnosis: Diagnosis | None = None
         self._F, self._V = island.F, V[island.vertices]
-        self._held = np.zeros(len(self.uv), dtype=np.bool_)
-        self._held[boundary_edges(self._F, len(self.uv))] = True
+        self._fixed = np.zeros(len(self.uv), dtype=np.bool_)
+        self._fixed[boundary_edges(self._F, len(self.uv))] = True
         self._max_iterations = max_iterations
         self._linear_solver = linear_solver
         self._callback = callback
@@ -98,14 +89,14 @@ class IslandRepair:
         tried: set[bytes] = set()
         for rings in () if whole else _RINGS:
             free = self._around(self._repairable(), rings)
-            if not 0 < np.count_nonzero(free) <= _MOST * np.count_nonzero(~self._held):
+            if not 0 < np.count_nonzero(free) <= _MAX_SHARE * np.count_nonzero(~self._fixed):
                 break
             for patch in self._components(free):
                 if patch.tobytes() not in tried:
                     tried.add(patch.tobytes())
-                    self._attempt(patch, _ITERATIONS, keep=True)
+                    self._attempt(patch, _PATCH_ITERATIONS, keep=True)
         if self._repairable().size:
-            for part in self._components(~self._held):
+            for part in self._components(~self._fixed):
                 if inverted_triangles(self._F[part[self._F].any(axis=1)], self.uv).size:
                     self._attempt(part, self._max_iterations, keep=not whole)
         if self.inverted.size:
@@ -114,7 +105,7 @@ class IslandRepair:
     def _repairable(self) -> IntArray:
         """Inverted triangles that have a free vertex."""
         left = self.inverted
-        return left[~self._held[self._F[left]].all(axis=1)]
+        return left[~self._fixed[self._F[left]].all(axis=1)]
 
     def _around(self, triangles: IntArray, rings: int) -> BoolArray:
         """Interior vertices within a number of rings of triangles; the triangles' own vertices are the first ring."""
@@ -122,7 +113,7 @@ class IslandRepair:
         near[self._F[triangles]] = True
         for _ in range(rings - 1):
             near[self._F[near[self._F].any(axis=1)]] = True
-        return near & ~self._held
+        return near & ~self._fixed
 
     def _components(self, free: BoolArray) -> Iterator[BoolArray]:
         """Split free vertices into the sets that edges connect."""
@@ -135,21 +126,16 @@ class IslandRepair:
             yield free & (label == first)
 
     def _patch(self, free: BoolArray) -> tuple[Problem, IntArray, IntArray]:
-        """The patch of triangles that touch free vertices; its other vertices are fixed.
+        """Return the patch of triangles at free vertices, and the island's indices of its vertices and triangles.
 
-        If its boundary passes through a vertex several times, the patch has several copies of the vertex.
-
-        Returns
-        -------
-        problem : Problem
-        vertices, triangles : (m,), (k,) int64
-            The island's indices of the patch's vertices and triangles.
+        Its other vertices are fixed. If its boundary passes through a vertex several times, the patch has several
+        copies of the vertex.
         """
         triangles = np.flatnonzero(free[self._F].any(axis=1))
-        F, first = renumbered(fans(self._F[triangles])[0], self._F[triangles])
+        F, first = renumber(fans(self._F[triangles])[0], self._F[triangles])
         vertices = self._F[triangles].ravel()[first]
-        held = np.flatnonzero(~free[vertices])
-        problem = Problem(self._V[vertices], F, held, self.uv[vertices[held]], reference="equilateral")
+        fixed = np.flatnonzero(~free[vertices])
+        problem = Problem(self._V[vertices], F, fixed, self.uv[vertices[fixed]], reference="equilateral")
         return problem, vertices, triangles
 
     def _attempt(self, free: BoolArray, iterations: int, *, keep: bool) -> None:
@@ -165,25 +151,25 @@ class IslandRepair:
         # Tutte's embedding suffices for most patches. If it fails, the diagnosis shows whether a map can exist.
         for allowed in (1, iterations):
             result = solve(problem, max_iterations=allowed, linear_solver=self._linear_solver, callback=self._callback)
-            if _uninterrupted(result).injective:
-                self._take(free, vertices, result.uv, keep)
+            if _check_interrupt(result).injective:
+                self._use_map(free, vertices, result.uv, keep)
                 return
             self.reason = result.status.value
             if result.diagnosis is not None:
-                self._blame(result.diagnosis, vertices, triangles)
+                self._store_diagnosis(result.diagnosis, vertices, triangles)
                 if result.diagnosis.forbids_injective:
                     return
 
-    def _take(self, free: BoolArray, vertices: IntArray, uv: FloatArray, keep: bool) -> None:
+    def _use_map(self, free: BoolArray, vertices: IntArray, uv: FloatArray, keep: bool) -> None:
         """Use a patch's map; undo it if triangles wind several times around a vertex."""
         before = self.uv.copy()
         self.uv[vertices] = uv
-        self._polish(self._put_back(free) if keep else free)
-        if not np.array_equal(free, ~self._held) and self._overwound(free):
+        self._polish(self._restore(free) if keep else free)
+        if not np.array_equal(free, ~self._fixed) and self._is_multiply_wound(free):
             self.uv = before
             self.reason = "The maps found for a part of the island wind more than once around one of its vertices."
 
-    def _put_back(self, moved: BoolArray) -> BoolArray:
+    def _restore(self, moved: BoolArray) -> BoolArray:
         """Return vertices to their old positions where possible; return the mask of those that stay moved."""
         moved, start = moved.copy(), self.island.uv
         F = self._F[moved[self._F].any(axis=1)]
@@ -210,11 +196,13 @@ class IslandRepair:
             problem, vertices, _ = self._patch(part)
             if not rest_shapes(problem.V, problem.F).flat.size:
                 polished = polish_map(
-                    problem.domain, self.uv[vertices], linear_solver=self._linear_solver, callback=self._callback
+                    problem.domain,
+                    self.uv[vertices],
+                    PolishOptions(linear_solver=self._linear_solver, callback=self._callback),
                 )
-                self.uv[vertices] = _uninterrupted(polished).uv
+                self.uv[vertices] = _check_interrupt(polished).uv
 
-    def _overwound(self, free: BoolArray) -> bool:
+    def _is_multiply_wound(self, free: BoolArray) -> bool:
         """Whether triangles wind more than once around an interior vertex of the patch; positive triangles can do so.
 
         Boundary vertices are not checked, because the fixed boundary may force this.
@@ -222,46 +210,46 @@ class IslandRepair:
         patch = np.zeros(len(self.uv), dtype=np.bool_)
         patch[self._F[free[self._F].any(axis=1)]] = True
         around = self._F[patch[self._F].any(axis=1)]
-        F, first = renumbered(fans(around)[0], around)
+        F, first = renumber(fans(around)[0], around)
         found = certify(F, self.uv[around.ravel()[first]])
         return bool(found.multiply_wound.size and np.setdiff1d(found.multiply_wound, np.concatenate(found.loops)).size)
 
     def _explain(self) -> None:
         """Set the reason for remaining inverted triangles, unless an attempt already has."""
         island, left = self.island, self.inverted
-        nowhere = np.flatnonzero(self._held & ~np.isfinite(self.uv).all(axis=1))
+        nowhere = np.flatnonzero(self._fixed & ~np.isfinite(self.uv).all(axis=1))
         corners = island.vertices[self._F]
         twice = np.flatnonzero((np.roll(corners, 1, axis=1) == corners).any(axis=1))
         if nowhere.size:
             self.reason = (
-                f"No finite position for the boundary {named('vertex', 'vertices', island.vertices[nowhere])}."
+                f"No finite position for the boundary {names_of('vertex', 'vertices', island.vertices[nowhere])}."
             )
         elif twice.size:
-            self.reason = f"A vertex is used twice in {named('triangle', 'triangles', island.triangles[twice])}."
-        elif self._held[self._F[left]].all(axis=1).any():
+            self.reason = f"A vertex is used twice in {names_of('triangle', 'triangles', island.triangles[twice])}."
+        elif self._fixed[self._F[left]].all(axis=1).any():
             # Triangles with three boundary vertices belong to no patch.
-            boundary = np.flatnonzero(self._held)
+            boundary = np.flatnonzero(self._fixed)
             problem = Problem(self._V, self._F, boundary, self.uv[boundary], reference="equilateral")
-            self._blame(diagnose(problem), np.arange(len(self.uv)), np.arange(len(self._F)))
+            self._store_diagnosis(diagnose(problem), np.arange(len(self.uv)), np.arange(len(self._F)))
 
-    def _blame(self, found: Diagnosis, vertices: IntArray, triangles: IntArray) -> None:
+    def _store_diagnosis(self, found: Diagnosis, vertices: IntArray, triangles: IntArray) -> None:
         """Store a patch's diagnosis in the mesh's numbering."""
         vertices, triangles = self.island.vertices[vertices], self.island.triangles[triangles]
         self.diagnosis = replace(
-            found, obstructions=tuple(_renamed(o, vertices, triangles) for o in found.obstructions)
+            found, obstructions=tuple(_renumber(o, vertices, triangles) for o in found.obstructions)
         )
         if found.forbids_injective:
             self.reason = self.diagnosis.summary()
 
 
-def _uninterrupted(result: MapResult) -> MapResult:
+def _check_interrupt(result: MapResult) -> MapResult:
     """Return the result; if Ctrl-C ended the search, raise KeyboardInterrupt to end the whole repair."""
     if result.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return result
 
 
-def _renamed(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obstruction:
+def _renumber(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obstruction:
     """Renumber the elements of an obstruction; its message then names the new numbers."""
     there = replace(
         found,
@@ -273,9 +261,9 @@ def _renamed(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obs
     if np.array_equal(vertices, np.arange(len(vertices))) and np.array_equal(triangles, np.arange(len(triangles))):
         return there
     elements = (
-        (there.triangles, named("triangle", "triangles", there.triangles)),
-        (there.vertices, named("vertex", "vertices", there.vertices)),
-        (there.edges, named_edges(there.edges)),
+        (there.triangles, names_of("triangle", "triangles", there.triangles)),
+        (there.vertices, names_of("vertex", "vertices", there.vertices)),
+        (there.edges, edge_names(there.edges)),
     )
     which = ", ".join(text for array, text in elements if array.size)
     return replace(there, message=f"{found.kind.name.capitalize().replace('_', ' ')}: {which or 'everywhere'}.")

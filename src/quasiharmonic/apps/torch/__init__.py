@@ -21,10 +21,10 @@ from quasiharmonic.apps.gradients.layers import (
     DoubtfulDerivative,
     FlattenLayer,
     MapNotFound,
-    PolishedLayer,
+    PolishLayer,
     TensorLayer,
 )
-from quasiharmonic.apps.torch.function import applied
+from quasiharmonic.apps.torch.function import apply_layer
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
@@ -48,18 +48,18 @@ def quasi_harmonic_map(
     ----------
     problem : Problem
         Triangles, fixed vertices, and the values of omitted arguments.
-    mu : (…, f) tensor of complex128, optional
+    mu : (…, f) complex128, optional
         Beltrami coefficients; zero by default. Their gradient is ``∂/∂Re μ + i ∂/∂Im μ``, PyTorch's convention.
-    target : (…, k, 2) tensor of float64, optional
+    target : (…, k, 2) float64, optional
         Target positions of the fixed vertices.
-    rest : (…, n, 2) or (…, n, 3) tensor of float64, optional
+    rest : (…, n, 2) or (…, n, 3) float64, optional
         Rest positions. They matter only with a ``reference`` other than ``"equilateral"``.
     reference, linear_solver
         As for `quasiharmonic.quasi_harmonic_map`.
 
     Returns
     -------
-    (…, n, 2) tensor of float64
+    (…, n, 2) float64
         Injective only if the target is convex or μ is suitable.
 
     Raises
@@ -69,7 +69,7 @@ def quasi_harmonic_map(
     ValueError
         If an argument is on another device or has the wrong shape, or `quasiharmonic.quasi_harmonic_map` raises it.
     """
-    return applied(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
+    return apply_layer(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
 
 
 def injective_map(
@@ -86,31 +86,25 @@ def injective_map(
 
     Parameters
     ----------
-    problem : Problem
-        Triangles, fixed vertices, and the values of omitted arguments.
-    target : (…, k, 2) tensor of float64, optional
-        Target positions of the fixed vertices.
-    rest : (…, n, 2) or (…, n, 3) tensor of float64, optional
-        Rest positions.
+    problem, target, rest
+        As for `quasi_harmonic_map`.
     polish, slide, start, linear_solver
         As for `quasiharmonic.solve`; ``start`` is shared by the whole batch. If the boundary slides along curves that
         are not straight, gradients are typically accurate to 0.5 % (see `polish_derivative`).
 
     Returns
     -------
-    (…, n, 2) tensor of float64
+    (…, n, 2) float64
 
     Raises
     ------
-    TypeError
-        If an argument is not a tensor, or has the wrong dtype.
-    ValueError
-        If an argument is on another device or has the wrong shape, or `quasiharmonic.solve` raises it.
+    TypeError, ValueError
+        As `quasi_harmonic_map`, or as `quasiharmonic.solve`.
     MapNotFound
         If no injective map was found for one item of the batch.
     """
     first = None if start is None else np.asarray(start, dtype=np.float64)
-    return applied(PolishedLayer(problem, polish, slide, first, linear_solver), {"target": target, "rest": rest})
+    return apply_layer(PolishLayer(problem, polish, slide, first, linear_solver), {"target": target, "rest": rest})
 
 
 def flatten(
@@ -141,18 +135,16 @@ def flatten(
 
     Returns
     -------
-    (…, n, 2) tensor of float64
+    (…, n, 2) float64
         Without ``fixed``, the gradient is that of the map nearest to this one, although `flatten` would lay it out
         differently. Use functions that do not depend on the map's position and rotation.
 
     Raises
     ------
-    TypeError
-        If an argument is not a tensor, or has the wrong dtype.
-    ValueError
-        If an argument is on another device or has the wrong shape, or `quasiharmonic.flatten` raises it.
+    TypeError, ValueError
+        As `quasi_harmonic_map`, or as `quasiharmonic.flatten`.
     MapNotFound
         If no injective map was found for one item of the batch.
     """
     layer = FlattenLayer.of(rest, F, fixed, target, energy=energy, weights=weights, start=start, solver=linear_solver)
-    return applied(layer, {"rest": rest, "target": target})
+    return apply_layer(layer, {"rest": rest, "target": target})

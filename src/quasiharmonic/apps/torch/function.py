@@ -9,20 +9,22 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.layers import Array, Layer, along, back, expected, forth, summed
+from quasiharmonic.apps.gradients.layers import (
+    Array,
+    Layer,
+    check_shape,
+    compute_changes,
+    compute_gradients,
+    compute_maps,
+    sum_to_shape,
+)
 
 _COMPILED = "maps are computed by NumPy and SciPy, so torch.compile breaks the graph here"
 
 
 @torch.compiler.disable(reason=_COMPILED)  # type: ignore[untyped-decorator]
-def applied(layer: Layer, arguments: Mapping[str, torch.Tensor | None]) -> torch.Tensor:
-    """Return the maps of a layer for its arguments; arguments that are None are omitted.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not a tensor, or has the wrong dtype, device or shape.
-    """
+def apply_layer(layer: Layer, arguments: Mapping[str, torch.Tensor | None]) -> torch.Tensor:
+    """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes."""
     given = {name: tensor for name, tensor in arguments.items() if tensor is not None}
     for name, tensor in given.items():
         _check(name, tensor, layer.shapes[name])
@@ -39,7 +41,7 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
     ) -> tuple[torch.Tensor, Sequence[Derivative]]:
         """Compute the maps and their derivatives."""
         arrays = {name: _numpy(tensor) for name, tensor in zip(names, tensors, strict=True)}
-        uv, derivatives = forth(layer, arrays)
+        uv, derivatives = compute_maps(layer, arrays)
         return torch.from_numpy(uv), derivatives
 
     @staticmethod
@@ -57,12 +59,12 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
         if cotangent is None:
             return (None,) * (2 + len(ctx.names))
         needed = [name for name, needs in zip(ctx.names, ctx.needs_input_grad[2:], strict=True) if needs]
-        found = back(ctx.layer, ctx.derivatives, _numpy(cotangent), needed)
+        found = compute_gradients(ctx.layer, ctx.derivatives, _numpy(cotangent), needed)
         return (
             None,
             None,
             *(
-                torch.from_numpy(summed(found[name], shape)) if name in found else None
+                torch.from_numpy(sum_to_shape(found[name], shape)) if name in found else None
                 for name, shape in zip(ctx.names, ctx.shapes, strict=True)
             ),
         )
@@ -73,7 +75,7 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
         moved = {
             name: _numpy(tangent) for name, tangent in zip(ctx.names, tangents, strict=True) if tangent is not None
         }
-        return torch.from_numpy(along(ctx.layer, ctx.derivatives, ctx.lead, moved)), None
+        return torch.from_numpy(compute_changes(ctx.layer, ctx.derivatives, ctx.lead, moved)), None
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, *arguments: Any) -> Any:
@@ -102,4 +104,4 @@ def _check(name: str, tensor: Any, one: tuple[int, ...]) -> None:
         raise TypeError(f"{name} must be of {wanted}, not {tensor.dtype}: {name}.to({wanted})")
     if tensor.device.type != "cpu":
         raise ValueError(f"{name} is on {tensor.device}, but maps are computed on the CPU: {name}.cpu()")
-    expected(name, tuple(tensor.shape), one)
+    check_shape(name, tuple(tensor.shape), one)

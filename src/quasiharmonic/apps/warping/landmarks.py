@@ -9,10 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_finite, map_array, named, real_array
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_finite,
+    check_sequence,
+    map_array,
+    names_of,
+    real_array,
+)
 
 # Minimum number of cells along the shorter side, so that vertices can move between landmarks and the border.
-_ACROSS = 6
+_MIN_CELLS = 6
 
 #: A polyline (a, 2), a ≥ 2, and its target polyline (b, 2).
 CurvePair = tuple[ArrayLike, ArrayLike]
@@ -20,18 +29,12 @@ CurvePair = tuple[ArrayLike, ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Points of an image and their target positions.
+    """Points of an image and their target positions."""
 
-    Attributes
-    ----------
-    before, after : (k, 2) float64
-    weights : (k,) float64
-        Cost of missing the target position; infinite for landmarks that reach it exactly.
-    """
-
+    # ``before``, ``after``: (k, 2)
     before: FloatArray
     after: FloatArray
-    weights: FloatArray
+    weights: FloatArray  # (k,): cost of missing the target position; infinite for landmarks that reach it exactly
 
     @property
     def hard(self) -> BoolArray:
@@ -39,7 +42,7 @@ class Landmarks:
         return np.isinf(self.weights)
 
 
-def landmarks_of(
+def make_landmarks(
     landmarks: ArrayLike,
     target: ArrayLike,
     weights: ArrayLike | None,
@@ -49,37 +52,28 @@ def landmarks_of(
 ) -> Landmarks:
     """Check landmarks, and sample curves as landmarks.
 
-    Parameters
-    ----------
-    landmarks, target, weights, curves
-        As in `quasiharmonic.warp_by_landmarks`.
-    step : float
-        Maximum spacing of the points on curves.
-    size : (2,) int64
-        Position of the image's last pixel, x and y.
-
-    Raises
-    ------
-    ValueError
-        If landmarks are malformed, outside the image, or at the same position.
+    The arguments are those of `quasiharmonic.warp_by_landmarks`. ``step`` is the maximum spacing of the points on
+    curves, and ``size`` (2,) the position of the image's last pixel, x and y. Raises ValueError if landmarks are
+    malformed, outside the image, or at the same position.
     """
     before, after = _points(landmarks, "landmarks"), _points(target, "target")
     if before.shape != after.shape:
         raise ValueError(f"target must have as many rows as landmarks, {len(before)}, not {len(after)}")
     weight = _weights(weights, len(before))
     _check_inside("landmarks", before, ((before >= 0) & (before <= size)).all(axis=1), size)
-    edge = on_border(before, size)
+    edge = is_on_border(before, size)
     if np.array_equal(before[edge], after[edge]):
         _check_inside("target", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
     soft = np.flatnonzero(edge & ~np.isinf(weight))
     if soft.size:
-        raise ValueError(f"weights: {named('landmark', 'landmarks', soft)} on the border, where landmarks are exact")
+        raise ValueError(f"weights: {names_of('landmark', 'landmarks', soft)} on the border, where landmarks are exact")
     _check_apart("landmarks", before)
     _check_apart("target", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
+    check_sequence("curves", curves, "pairs of polylines")
     for number, pair in enumerate(curves):
         if len(pair) != 2:
             raise ValueError(f"curve {number} must be two polylines, before and after, not {len(pair)}")
-        one, other = _resampled(*pair, f"curve {number}", step)
+        one, other = _resample(*pair, f"curve {number}", step)
         for name, points in ((f"curve {number}, before", one), (f"curve {number}, after", other)):
             _check_inside(name, points, ((points > 0) & (points < size)).all(axis=1), size)
         # A closed curve ends at its first point, and curves may share points.
@@ -90,7 +84,7 @@ def landmarks_of(
     return Landmarks(before, after, weight)
 
 
-def on_border(points: FloatArray, size: IntArray) -> BoolArray:
+def is_on_border(points: FloatArray, size: IntArray) -> BoolArray:
     """Which points (k, 2) are on the image's border."""
     edge: BoolArray = ((points == 0) | (points == size)).any(axis=1)
     return edge
@@ -110,7 +104,7 @@ def _weights(weights: ArrayLike | None, k: int) -> FloatArray:
         raise ValueError(f"weights must have shape ({k},), one for each landmark, not {array.shape}")
     bad = np.flatnonzero(~(array > 0))
     if bad.size:
-        raise ValueError(f"the weight is not positive at {named('landmark', 'landmarks', bad)}")
+        raise ValueError(f"the weight is not positive at {names_of('landmark', 'landmarks', bad)}")
     return array
 
 
@@ -121,10 +115,12 @@ def _check_apart(name: str, array: FloatArray, numbers: IntArray | None = None) 
         place = array[first[count > 1][0]]
         same = np.flatnonzero((array == place).all(axis=1))
         which = same if numbers is None else numbers[same]
-        raise ValueError(f"{name}: {named('point', 'points', which)} have the same position, {tuple(place.tolist())}")
+        raise ValueError(
+            f"{name}: {names_of('point', 'points', which)} have the same position, {tuple(place.tolist())}"
+        )
 
 
-def _resampled(start: ArrayLike, end: ArrayLike, name: str, step: float) -> tuple[FloatArray, FloatArray]:
+def _resample(start: ArrayLike, end: ArrayLike, name: str, step: float) -> tuple[FloatArray, FloatArray]:
     """Points on two polylines at equal fractions of their lengths, spaced by at most ``step`` on both."""
     lines = [real_array(name, line) for line in (start, end)]
     for line in lines:
@@ -149,23 +145,23 @@ def _check_inside(name: str, points: FloatArray, inside: Any, size: IntArray) ->
     outside = np.flatnonzero(~inside)
     if outside.size:
         raise ValueError(
-            f"{name}: {named('point', 'points', outside)} not inside the image, 0 < x < {size[0]} to the right and "
+            f"{name}: {names_of('point', 'points', outside)} not inside the image, 0 < x < {size[0]} to the right and "
             f"0 < y < {size[1]} down: the first is at {tuple(points[outside[0]].tolist())}"
         )
 
 
-def carried(border: FloatArray, before: FloatArray, after: FloatArray, size: IntArray) -> FloatArray:
+def interpolate_border(border: FloatArray, before: FloatArray, after: FloatArray, size: IntArray) -> FloatArray:
     """The displacements of border points, interpolated between the landmarks on the border; (m, 2)."""
     corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], dtype=np.float64)
     given = (corners[:, None] == before).all(axis=2).any(axis=1)
     knots = np.concatenate([corners[~given], before])
     way = np.concatenate([np.zeros((np.count_nonzero(~given), 2)), after - before])
     around = 2.0 * size.sum()
-    at, where = _along(knots, size), _along(border, size)
+    at, where = _border_distance(knots, size), _border_distance(border, size)
     return np.stack([np.interp(where, at, way[:, axis], period=around) for axis in (0, 1)], axis=1)
 
 
-def _along(border: FloatArray, size: IntArray) -> FloatArray:
+def _border_distance(border: FloatArray, size: IntArray) -> FloatArray:
     """The distance of border points from the first pixel along the border, first to the right; (m,)."""
     (x, y), (width, height) = border.T, size
     return np.select(
@@ -173,13 +169,13 @@ def _along(border: FloatArray, size: IntArray) -> FloatArray:
     )
 
 
-def picture_mesh(landmarks: FloatArray, width: int, height: int, along: int) -> tuple[FloatArray, IntArray]:
+def make_image_mesh(landmarks: FloatArray, width: int, height: int, along: int) -> tuple[FloatArray, IntArray]:
     """Triangulate a grid of ``along`` cells per longer side, without points near landmarks; landmarks come last."""
     from scipy.spatial import Delaunay, cKDTree
 
     spacing = max(width - 1, height - 1) / along
     size = (width - 1, height - 1)
-    x, y = (np.linspace(0, side, max(_ACROSS, round(side / spacing)) + 1) for side in size)
+    x, y = (np.linspace(0, side, max(_MIN_CELLS, round(side / spacing)) + 1) for side in size)
     grid = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
     sides, landmark_sides = ((p == 0) | (p == size) for p in (grid, landmarks))
     near = np.zeros(len(grid), dtype=bool)

@@ -14,83 +14,92 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.energies.newton.newton_descent import SHIFTS, NewtonDescent, in_units
+from quasiharmonic.energies.newton.line_search import backtrack
+from quasiharmonic.energies.newton.map_model import Coordinates, NewtonObjective, in_units, newton_descent
+from quasiharmonic.energies.newton.newton_descent import SHIFTS
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.util.arrays import ComplexArray, FloatArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 # Step as a fraction of the distance to the first collapse of a triangle.
 _FRACTION = 0.8
 # Minimum step, as a share of the remaining displacement.
-_SHORTEST = 1e-4
+_MIN_STEP = 1e-4
 
 
-class CarryingDescent(NewtonDescent):
-    """`NewtonDescent` whose fixed vertices can be moved to new positions."""
+class MovingDescent:
+    """A descent whose fixed vertices can be moved to new positions; see `newton_descent` for the parameters."""
 
-    def place(self, uv: FloatArray) -> None:
+    def __init__(
+        self, energy: NewtonObjective, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str
+    ) -> None:
+        self.newton, self._model = newton_descent(energy, uv, fixed, exponent, linear_solver)
+
+    @property
+    def uv(self) -> FloatArray:
+        """The current map; (n, 2) float64."""
+        return self._model.positions(self.newton.w)
+
+    def set_map(self, uv: FloatArray) -> None:
         """Continue from another injective map (n, 2), with the fixed vertices at their positions in it."""
-        self.w, self._pinned = in_units(uv, self.exponent), uv[self.fixed]
-        self._look()
+        coordinates = self._model.coordinates
+        self._model.coordinates = coordinates.with_pinned(uv[coordinates.fixed])
+        self.newton.state = self._model.evaluate(in_units(uv, coordinates.exponent))
 
-    def carry(self, target: FloatArray, tolerance: float, steps: int) -> float:
+    def move(self, target: FloatArray, tol: float, steps: int) -> float:
         """Move the fixed vertices to a target (k, 2), as far as possible without inverting triangles.
 
-        Between two partial moves, one descent step lowers the energy.
-
-        Parameters
-        ----------
-        target : (k, 2) float64
-        tolerance : float
-            As in `NewtonDescent.step`.
-        steps : int
-            Maximum number of steps.
-
-        Returns
-        -------
-        float
-            Share of the displacement that was reached: 1 if the vertices are exactly at the target.
+        Between two partial moves, one descent step lowers the energy. Return the share of the displacement that was
+        reached: 1 if the vertices are exactly at the target.
         """
         left = 1.0
         for k in range(steps):
             if k > 0:
-                self.step(tolerance)
-            t = self._carried(target)
+                self.newton.step(tol)
+            t = self._move_once(target)
             left *= 1 - t
             if left == 0 or t == 0:
                 break
         return 1 - left
 
-    def _look(self) -> None:
-        self._deformation = self.energy.deform(self.w)
-        self.value = self.first = self.energy.value_of(self._deformation)
-
-    def _carried(self, target: FloatArray) -> float:
+    def _move_once(self, target: FloatArray) -> float:
         """Take one step of the displacement; return its length, 1 for all of it and 0 for none."""
-        way = np.zeros_like(self.w)
-        way[self.fixed] = in_units(target, self.exponent) - self.w[self.fixed]
-        self.assemble(0.0)
-        found = self.system.descent(self.gradient() + self._pull(way), (0.0, *SHIFTS), self.solve)
+        model, start = self._model, self.newton.state
+        system, coordinates = model.system, model.coordinates
+        displacement = np.zeros_like(start.w)
+        displacement[coordinates.fixed] = in_units(target, coordinates.exponent) - start.w[coordinates.fixed]
+        model.assemble(start, 0.0)
+        found = system.descent(
+            model.gradient(start) + self._multiply_curvature(displacement), (0.0, *SHIFTS), model.solve
+        )
         if found is None:
             return 0.0
-        way[self.system.free] = found[0]
-        start, pinned = self.w, self._pinned
-        t = min(1.0, _FRACTION * float(self.energy.steps_to_collapse(start, way).min()))
-        while t >= _SHORTEST:
-            self.w = start + t * way
-            there = np.ldexp(self.w[self.fixed].view(np.float64).reshape(-1, 2), self.exponent)
-            self._pinned = target if t == 1 else there
-            if is_injective(self.energy.F, self.positions(self.w)):
-                self._look()
-                return t
-            t *= 0.5
-        self.w, self._pinned = start, pinned
-        return 0.0
+        displacement[system.free] = found[0]
 
-    def _pull(self, way: ComplexArray) -> ComplexArray:
+        def trial(t: float, bound: float) -> tuple[float, Coordinates | None]:
+            w = start.w + t * displacement
+            there = np.ldexp(w[coordinates.fixed].view(np.float64).reshape(-1, 2), coordinates.exponent)
+            moved = coordinates.with_pinned(target if t == 1 else there)
+            return 0.0, moved if is_injective(model.energy.F, moved.positions(w)) else None
+
+        longest = min(1.0, _FRACTION * float(model.energy.steps_to_collapse(start.w, displacement).min()))
+        if not longest >= _MIN_STEP:
+            return 0.0
+        tries = 1 + int(np.log2(longest / _MIN_STEP))
+        taken = backtrack(trial, 0.0, 0.0, longest=longest, tries=tries)
+        if taken is None:
+            return 0.0
+        model.coordinates = taken.state
+        self.newton.state = model.evaluate(start.w + taken.t * displacement)
+        return taken.t
+
+    def _multiply_curvature(self, displacement: ComplexArray) -> ComplexArray:
         """Product of the clamped second derivative with a displacement (n,), at the free vertices."""
-        corners, g = self.energy.F.T, self.energy.g
-        form = self.energy.curvature_of(self._deformation)
-        p, q = form.apply((g.conj() * way[corners]).sum(axis=0), (g * way[corners]).sum(axis=0))
+        energy = self._model.energy
+        corners, g = energy.F.T, energy.g
+        form = energy.curvature_of(self.newton.state.derivatives)
+        p, q = form.apply((g.conj() * displacement[corners]).sum(axis=0), (g * displacement[corners]).sum(axis=0))
         pull, at = (g * p + g.conj() * q).ravel(), corners.ravel()
-        both = np.bincount(at, pull.real, minlength=way.size) + 1j * np.bincount(at, pull.imag, minlength=way.size)
-        return both[self.system.free]
+        both = np.bincount(at, pull.real, minlength=displacement.size) + 1j * np.bincount(
+            at, pull.imag, minlength=displacement.size
+        )
+        return both[self._model.system.free]

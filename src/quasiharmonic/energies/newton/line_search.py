@@ -1,10 +1,15 @@
-"""Line search for all descents: backtracking with Armijo's rule, and extension beyond Newton's step."""
+"""Parts of a line search: backtracking with Armijo's rule, and extension beyond Newton's step.
+
+`map_model` combines them to the line search of Newton's method on positions, and sets its constants. `sliding_boundary`
+and `surface_descent` do so for their paths. Gradient methods on tensors (`solver.methods`) do not use this module.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
+from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.progress import heartbeat
 
 S = TypeVar("S")
@@ -13,29 +18,19 @@ S = TypeVar("S")
 _SUFFICIENT = 1e-4
 
 
-class Taken(NamedTuple, Generic[S]):
-    """An accepted step.
-
-    Attributes
-    ----------
-    t : float
-        Its length, in units of the direction.
-    value : float
-        The function's value there.
-    there : S
-        The state that the trial returned.
-    """
+class AcceptedStep(NamedTuple, Generic[S]):
+    """An accepted step: its length in units of the direction, and the function's value and the trial's state there."""
 
     t: float
     value: float
-    there: S
+    state: S
 
 
 #: Takes a length and a bound; returns the value there, and the state if the value is below the bound and accepted.
 Trial = Callable[[float, float], tuple[float, S | None]]
 
 
-def _half(t: float, value: float) -> float:
+def _halve(t: float, value: float) -> float:
     return 0.5
 
 
@@ -46,9 +41,9 @@ def backtrack(
     *,
     longest: float = 1.0,
     tries: int,
-    factor: Callable[[float, float], float] = _half,
-) -> Taken[S] | None:
-    """Try successive step lengths until the function decreases sufficiently.
+    factor: Callable[[float, float], float] = _halve,
+) -> AcceptedStep[S] | None:
+    """Try successive step lengths until the function decreases sufficiently; return the first accepted step or None.
 
     Parameters
     ----------
@@ -64,40 +59,53 @@ def backtrack(
         Maximum number of lengths.
     factor : callable
         Takes a length and the value there; returns the factor for the next length.
-
-    Returns
-    -------
-    Taken or None
-        The first accepted step.
     """
     t = longest
     for _ in range(tries):
         heartbeat()
         value, there = trial(t, before - _SUFFICIENT * min(t, 1.0) * expected_decrease)
         if there is not None:
-            return Taken(t, value, there)
+            return AcceptedStep(t, value, there)
         t *= factor(t, value)
     return None
 
 
-def extend(trial: Trial[S], taken: Taken[S], limit: float = float("inf"), *, longer: float = 2.0) -> Taken[S]:
-    """Lengthen an accepted full step as long as the function decreases.
+def backtrack_each(
+    values: Callable[[FloatArray], FloatArray],
+    before: FloatArray,
+    expected_decrease: FloatArray,
+    longest: FloatArray,
+    *,
+    tries: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Backtrack along one direction with a length for each of many independent functions.
+
+    ``values`` takes lengths (k,) and returns the functions' values (k,). A function with ``longest`` 0 stays. See
+    `backtrack` for the others. Return the accepted lengths (k,), 0 where none was accepted, and the values there.
+    """
+    t, moving = longest.copy(), longest > 0
+    for _ in range(tries):
+        heartbeat()
+        value = values(t)
+        too_far = moving & ~(value <= before - _SUFFICIENT * t * expected_decrease)
+        if not too_far.any():
+            return t, value
+        t[too_far] *= 0.5
+    t[too_far] = 0
+    return t, values(t)
+
+
+def extend(
+    trial: Trial[S], taken: AcceptedStep[S], limit: float = float("inf"), *, longer: float = 2.0
+) -> AcceptedStep[S]:
+    """Lengthen an accepted full step by factors ``longer``, up to ``limit``, as long as the function decreases.
 
     Far from the minimum, barriers decrease like powers, and Newton's step is several times too short.
-
-    Parameters
-    ----------
-    trial, taken
-        As in `backtrack`.
-    limit : float
-        Maximum length.
-    longer : float
-        Ratio of successive lengths; above 1.
     """
     while taken.t >= 1 and longer * taken.t <= limit:
         heartbeat()
         value, there = trial(longer * taken.t, taken.value)
         if there is None:
             break
-        taken = Taken(longer * taken.t, value, there)
+        taken = AcceptedStep(longer * taken.t, value, there)
     return taken

@@ -34,13 +34,11 @@ class NewtonSystem:
     Parameters
     ----------
     F : (f, 3) int64
-        Triangles.
     g : (3, f) complex128
         Half the gradients of the hat functions: ``dp = Σ conj(gᵢ) dwᵢ`` and ``dq = Σ gᵢ dwᵢ``.
     n : int
         Number of vertices.
     fixed : (k,) int
-        Fixed vertices.
     linear_solver : str
         A name of `quasiharmonic.linsolve`, or ``"auto"``.
 
@@ -99,13 +97,7 @@ class NewtonSystem:
         of_corners[0, free], of_corners[1, free] = upper[of], lower[of] - 1
 
     def assemble(self, form: QuadraticForm) -> None:
-        """Sum the triangles' quadratic forms into the matrix.
-
-        Parameters
-        ----------
-        form : QuadraticForm
-            On every triangle, multiplied by its area and weight.
-        """
+        """Sum the triangles' quadratic forms, multiplied by their areas and weights, into the matrix."""
         heartbeat()
         pp, qq = (np.ascontiguousarray(field, dtype=np.float64) for field in (form.pp, form.qq))
         rest = form.p2, form.q2, form.pq, form.pqc
@@ -133,17 +125,10 @@ class NewtonSystem:
         return csr_array(upper + triu(upper, k=1).T)
 
     def factor(self, shift: float = 0.0) -> None:
-        """Factor the assembled matrix.
+        """Factor the assembled matrix, its diagonal increased by the factor ``1 + shift``.
 
-        Parameters
-        ----------
-        shift : float
-            Relative increase of the diagonal. Because it is relative, its effect does not depend on triangle size.
-
-        Raises
-        ------
-        quasiharmonic.linsolve.NotPositiveDefinite
-            When the rounded matrix is not positive definite.
+        Because the shift is relative, its effect does not depend on triangle size. Raise `NotPositiveDefinite` if the
+        rounded matrix is not positive definite.
         """
         diagonal = self._diagonal * (1 + shift)
         # Where the triangles give no stiffness, use 1 on the diagonal.
@@ -179,13 +164,9 @@ class NewtonSystem:
 
         Returns
         -------
-        direction : (n - k,) complex128
-        expected_decrease : float
-            Rate of decrease of the energy along the direction (the squared Newton decrement); not negative.
-        number : int
-            Index of the successful shift.
-
-        If no shift gives a positive definite matrix, None is returned instead.
+        direction, expected_decrease, number : (n - k,) complex128, float, int
+            The direction, the rate of decrease along it (the squared Newton decrement, not negative), and the index of
+            the successful shift. None if no shift gives a positive definite matrix.
         """
         for number, shift in enumerate(shifts):
             try:

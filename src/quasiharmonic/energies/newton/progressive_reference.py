@@ -15,6 +15,10 @@ rest shapes.
 
 Triangles are weighted by rest area, as in the energy, with a slightly higher weight if they are far from rest.
 
+Polishing uses references, and flattening the proxies alone, because neither is better in both: 16 contracted disks with
+fixed boundary take 17 steps with references and 38 with proxies (medians), but 20 distant maps with free boundary take
+5.2 CPU seconds with references and 3.1 with proxies.
+
 References
 ----------
 .. [1] L. Liu, C. Ye, R. Ni, X.-M. Fu, Progressive parameterizations. ACM Transactions on Graphics 37 (2018).
@@ -27,47 +31,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from quasiharmonic.energies.deformation import DeformationEnergy
-from quasiharmonic.energies.energies import Deformation, QuadraticForm, SymmetricDirichlet, inverse
+from quasiharmonic.energies.energies import Deformation, SymmetricDirichlet, inverse
+from quasiharmonic.energies.newton.map_model import MapModel
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.problem.result import Status
-from quasiharmonic.util.arrays import ComplexArray, FloatArray
+from quasiharmonic.util.arrays import FloatArray
 
 #: Singular values against the references are between this and its inverse.
 REACH = 30.0
 # Weights of triangles are multiplied by this power of one plus their density.
 _POWER = 0.25
-# The approach continues while each step leaves less than this share of the energy.
-_WORTH = 0.5
-
-
-class RelativeDirichlet(DeformationEnergy):
-    """Symmetric Dirichlet energy against references between rest and a map, for one step from that map.
-
-    Parameters
-    ----------
-    energy : DeformationEnergy
-        Against rest; its density is `SymmetricDirichlet`.
-    at : Deformation
-        Deformation of the map, from ``energy``.
-    share : float
-        t, in (0, 1): the exponent of the singular values at the map.
-    """
-
-    def __init__(self, energy: DeformationEnergy, at: Deformation, share: float) -> None:
-        self.energy, self.F, self._least_places = energy.energy, energy.F, energy._least_places
-        a, b = (sigma ** (1 - share) for sigma in _singular_values(at))
-        det = a * b
-        # The reference is the image of z under s z + c z̄, and is stretched in the same direction as the map.
-        s, c = 0.5 * (a + b), 0.5 * (a - b) * at.q * at.p.conj() * inverse(np.abs(at.p) * np.abs(at.q))
-        self.g: ComplexArray = (s * energy.g - c * energy.g.conj()) / det
-        self.share: FloatArray = energy.share * (1 + energy.energy.density(at)) ** _POWER
-        self._det_per_area = energy._det_per_area / det
-        self._proxies = ReweightedDirichlet(np.inf)
-
-    def curvature_of(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
-        """Second derivatives of the proxies, which are positive definite; ``negative`` is ignored."""
-        return self._proxies.curvature(d).scaled(self.share)
+# The descent towards rest continues while each step leaves less than this share of the energy.
+_WORTHWHILE = 0.5
 
 
 def _singular_values(d: Deformation) -> tuple[FloatArray, FloatArray]:
@@ -76,62 +52,65 @@ def _singular_values(d: Deformation) -> tuple[FloatArray, FloatArray]:
     return larger, d.det / larger
 
 
-def relative(energy: DeformationEnergy, at: Deformation) -> RelativeDirichlet | None:
-    """Return the energy against references within reach of a map, or None if rest itself is within reach."""
+def reference_energy(energy: DeformationEnergy, at: Deformation) -> DeformationEnergy | None:
+    """Return the energy against references within reach of a map, or None if rest itself is within reach.
+
+    The references are between rest and the map, for one step from that map. The second derivatives are those of the
+    reweighted proxies.
+    """
     larger, smaller = _singular_values(at)
     farthest = max(float(np.log(larger.max())), -float(np.log(smaller.min())))
     # None also if the distance is not finite in double precision.
-    return RelativeDirichlet(energy, at, np.log(REACH) / farthest) if np.log(REACH) < farthest < np.inf else None
+    if not np.log(REACH) < farthest < np.inf:
+        return None
+    # The exponent of the singular values at the map.
+    t = np.log(REACH) / farthest
+    a, b = larger ** (1 - t), smaller ** (1 - t)
+    # The reference is the image of z under s z + c z̄, and is stretched in the same direction as the map.
+    s, c = 0.5 * (a + b), 0.5 * (a - b) * at.q * at.p.conj() * inverse(np.abs(at.p) * np.abs(at.q))
+    share = energy.share * (1 + energy.energy.density(at)) ** _POWER
+    return energy.with_references(ReweightedDirichlet(np.inf), s, c, a * b, share)
 
 
-def descend(descent: NewtonDescent, steps: int, tolerance: float) -> Iterator[Status | None]:
-    """Descend like `NewtonDescent.descend`, after a progressive approach for symmetric Dirichlet from distant maps.
+def descend(descent: NewtonDescent, model: MapModel, steps: int, tol: float) -> Iterator[Status | None]:
+    """Descend like `NewtonDescent.descend`, at first with progressive references if the energy is symmetric Dirichlet.
 
-    Parameters
-    ----------
-    descent : NewtonDescent
-        Without sliding boundary vertices; these have no approach.
-    steps, tolerance
-        As in `NewtonDescent.descend`.
-
-    Yields
-    ------
-    Status or None
-        After every step; a status ends the descent. The energy also decreases at every step of the approach.
+    The energy decreases at every step.
     """
     taken = 0
-    energy = descent.energy
-    if isinstance(energy, DeformationEnergy) and type(energy.energy) is SymmetricDirichlet:
+    if isinstance(model.energy, DeformationEnergy) and type(model.energy.energy) is SymmetricDirichlet:
         while taken < steps:
             before = descent.value
             with np.errstate(all="ignore"):
-                closer = _approached(descent, energy)
-            if not closer:
+                decreased = _step_towards_rest(descent, model, model.energy)
+            if not decreased:
                 break
             taken += 1
             yield None
-            if descent.value > _WORTH * before:
+            if descent.value > _WORTHWHILE * before:
                 break
-    yield from descent.descend(steps - taken, tolerance)
+    yield from descent.descend(steps - taken, tol)
 
 
-def _approached(descent: NewtonDescent, energy: DeformationEnergy) -> bool:
+def _step_towards_rest(descent: NewtonDescent, model: MapModel, energy: DeformationEnergy) -> bool:
     """Take one step towards references.
 
     Return False, with the map unchanged, if rest is within reach or the energy does not decrease.
     """
-    start, value = descent.w, descent.value
-    towards = relative(energy, energy.deform(start))
-    if towards is None:
+    start = descent.state
+    reference = reference_energy(energy, start.derivatives)
+    if reference is None:
         return False
-    closer = False
+    end = start
     try:
-        descent.lower(towards)
+        reference_model = model.with_energy(reference)
+        descent.restart(reference_model, reference_model.evaluate(start.w))
         descent.step(0.0)
-        closer = energy.value(descent.w) < value
+        there = model.evaluate(descent.w)
+        if there.value < start.value:
+            end = there
     finally:
         # Restore the map even if the user interrupts the step.
-        if not closer:
-            descent.w = start
-        descent.lower(energy)
-    return closer
+        model.system.take_gradients(energy.g)
+        descent.restart(model, end)
+    return end is not start

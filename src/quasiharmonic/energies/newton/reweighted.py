@@ -25,26 +25,25 @@ from quasiharmonic.geometry.mesh.reference import blocks
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 from quasiharmonic.util.kernels import compiled
 
-#: Lower and upper bound of the aim, in multiples of a triangle's size.
-NEAREST, FARTHEST = 5.0, 1000.0
+#: Lower bound of the aim, in multiples of a triangle's size.
+MIN_AIM = 5.0
+#: Upper bound of the aim, in multiples of a triangle's size.
+MAX_AIM = 1000.0
 
 
 class ReweightedDirichlet(SymmetricDirichlet):
     """Values and first derivatives of `SymmetricDirichlet`, second derivatives of its rigid proxies.
 
-    Parameters
-    ----------
-    aim : float
-        Maximum factor by which singular values aim to grow or shrink towards 1; above 1.
+    ``aim`` > 1 is the maximum factor by which singular values should grow or shrink towards 1.
     """
 
-    def __init__(self, aim: float = FARTHEST) -> None:
+    def __init__(self, aim: float = MAX_AIM) -> None:
         self.aim = aim
 
     @classmethod
     def at(cls, mean: float) -> ReweightedDirichlet:
         """Energy with the aim suited to a mean energy: the distance of an average triangle, ``σ⁻² = mean``."""
-        return cls(min(max(mean**0.5, NEAREST), FARTHEST))
+        return cls(min(max(mean**0.5, MIN_AIM), MAX_AIM))
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivative of ``½ Σ kᵢ ‖uᵢᵀ (J − σᵢ* R)‖²`` with constant uᵢ, σᵢ* and R.
@@ -75,5 +74,5 @@ def _factor(sigma: FloatArray, aim: float) -> FloatArray:
     """``(2σ − 2σ⁻³)/(σ − σ*)``, positive at ``σ = σ* = 1`` too."""
     rigid = 2 * (sigma + 1) * (sigma**2 + 1) / sigma**3
     # |σ − 1| exceeds |σ − σ*| where the aim limits σ*.
-    held = np.where(sigma < 1, (aim - 1) * sigma, (1 - 1 / aim) * sigma)
-    return rigid * np.maximum(1, np.abs(sigma - 1) / held)
+    limit = np.where(sigma < 1, (aim - 1) * sigma, (1 - 1 / aim) * sigma)
+    return rigid * np.maximum(1, np.abs(sigma - 1) / limit)

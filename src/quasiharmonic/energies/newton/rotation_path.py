@@ -31,25 +31,11 @@ def rates(F: IntArray, g: ComplexArray, w: ComplexArray, direction: ComplexArray
     return rate
 
 
-class Turning:
-    """Rotation paths for maps of one mesh.
+class RotationPath:
+    """Rotation paths of maps of one mesh, each of whose vertices is in a triangle.
 
-    Parameters
-    ----------
-    F : (f, 3) int64
-        Triangles; each vertex is in at least one.
-    g : (3, f) complex128
-        Half the gradients of the hat functions, as in `NewtonSystem`.
-    n : int
-        Number of vertices.
-    fixed : (k,) int
-        Fixed vertices, at least one in each component.
-    linear_solver : str
-
-    Raises
-    ------
-    quasiharmonic.linsolve.NotPositiveDefinite
-        When rounding leaves no positive definite Laplacian, because rest triangles differ too much; see `of`.
+    ``g`` (3, f) is as in `NewtonSystem`. Each component has at least one fixed vertex. The constructor raises
+    `NotPositiveDefinite` if rest triangles differ too much for a positive definite Laplacian; see `of`.
     """
 
     def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
@@ -61,8 +47,10 @@ class Turning:
         self._laplacian = Laplacian(F, n, fixed, linear_solver).factor(stiffness)
 
     @classmethod
-    def of(cls, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> Turning | None:
-        """Create a `Turning`, or return None if rounding leaves no positive definite Laplacian."""
+    def of(
+        cls, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto"
+    ) -> RotationPath | None:
+        """Create a `RotationPath`, or return None if rounding leaves no positive definite Laplacian."""
         try:
             return cls(F, g, n, fixed, linear_solver)
         except NotPositiveDefinite:
@@ -71,11 +59,8 @@ class Turning:
     def path(self, w: ComplexArray, direction: ComplexArray) -> Callable[[float], ComplexArray]:
         """Return a path through a map (n,) complex128 along a direction (n,), which is zero at the fixed vertices.
 
-        Returns
-        -------
-        callable
-            Maps a length t to a map, ``w + t · direction`` to first order. It may raise
-            `quasiharmonic.linsolve.NotPositiveDefinite` if rounding leaves no correct digit.
+        It maps a length t to a map, ``w + t · direction`` to first order. It may raise `NotPositiveDefinite` if
+        rounding leaves no correct digit.
         """
         (p, q), (dp, dq) = self._derivatives(w), self._derivatives(direction)
         angle = rates(self._F, self._g, w, direction).imag
@@ -86,7 +71,7 @@ class Turning:
             beyond_p = turned * (p + t * strain_p) - (p + t * dp)
             beyond_q = turned * (q + t * strain_q) - (q + t * dq)
             load = self._area * (beyond_p * self._g + beyond_q * self._g.conj())
-            return w + t * direction + self._laplacian.respond(self._gathered(load, w.size))
+            return w + t * direction + self._laplacian.respond(self._gather(load, w.size))
 
         return at
 
@@ -95,7 +80,7 @@ class Turning:
         corners = w[self._corners]
         return np.sum(self._g.conj() * corners, axis=0), np.sum(self._g * corners, axis=0)
 
-    def _gathered(self, load: ComplexArray, n: int) -> ComplexArray:
+    def _gather(self, load: ComplexArray, n: int) -> ComplexArray:
         """Sum the loads (3, f) of triangle corners at every vertex (n,)."""
         at, load = self._corners.ravel(), load.ravel()
         return np.bincount(at, load.real, minlength=n) + 1j * np.bincount(at, load.imag, minlength=n)

@@ -28,24 +28,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.geometry.coarsening.removal import by_degree, fill_rings, remove_vertices, room_for_round
+from quasiharmonic.geometry.coarsening.removal import allocate_round, fill_rings, remove_vertices, split_by_degree
 from quasiharmonic.util.arrays import BoolArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
 # A round that can remove only this fraction of the vertices is not carried out.
-_FEW = 0.04
+_MIN_FRACTION = 0.04
 # If fewer than this fraction of the vertices in the arrays remain, the arrays are compacted.
-_SPARSE = 0.7
+_COMPACT_BELOW = 0.7
 
 
 class Removal(NamedTuple):
-    """Vertices of one degree that are removed together; no two of them are neighbours.
+    """Vertices (r,) int64 of one degree that are removed together, no two of them neighbours.
 
-    Attributes
-    ----------
-    vertices : (r,) int64
-    rings : (r, d) int64
-        Their neighbours counterclockwise, the apex first.
+    ``rings`` (r, d) int64 has their neighbours counterclockwise, the apex first.
     """
 
     vertices: IntArray
@@ -71,26 +67,16 @@ class Coarsening:
     levels: dict[int, IntArray]
 
 
-def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
-    """Remove vertices until few are left.
+def coarsen(F: IntArray, n: int, fixed: BoolArray, goal: int) -> Coarsening:
+    """Remove vertices of a surface (f, 3) int64 until ``goal`` are left, or no other vertex can be removed.
 
-    Vertices with few neighbours are removed first. No new edge ends at a fixed vertex. Such an edge would be a
-    constraint that the fine mesh does not have, because the other end must be visible from the fixed vertex. So there
-    are no new chords, and the triangles along the boundary change little.
-
-    Parameters
-    ----------
-    F : (f, 3) int64
-        Triangles of a surface, consistently oriented.
-    n : int
-        Number of vertices.
-    held : (n,) bool
-        Fixed vertices: at least the whole boundary.
-    goal : int
-        Number of vertices to leave; more are left if no other vertex can be removed.
+    ``fixed`` (n,) bool is True at least on the whole boundary. Vertices with few neighbours are removed first. No new
+    edge ends at a fixed vertex. Such an edge would be a constraint that the fine mesh does not have, because the other
+    end must be visible from the fixed vertex. So there are no new chords, and the triangles along the boundary change
+    little.
     """
-    names, free, there = np.arange(n), ~held, np.ones(n, dtype=bool)
-    dice = np.random.default_rng(0).random(n)
+    names, free, remains = np.arange(n), ~fixed, np.ones(n, dtype=bool)
+    random_order = np.random.default_rng(0).random(n)
     # Transposed, (3, f), because operations on all first corners are then contiguous.
     T: IntArray = np.ascontiguousarray(F.T)
     rounds: list[list[Removal]] = []
@@ -98,27 +84,27 @@ def coarsen(F: IntArray, n: int, held: BoolArray, goal: int) -> Coarsening:
     left, halved = n, 2 * n
     while left > goal:
         heartbeat()
-        if left < _SPARSE * len(names):
+        if left < _COMPACT_BELOW * len(names):
             # Renumber the remaining vertices in the same order.
-            T = (np.cumsum(there) - 1).take(T)
-            names, free, dice, there = names[there], free[there], dice[there], there[there]
-        vertices, rings, of_degree = room_for_round(T)
-        remove_vertices(T, free, dice, vertices, rings, of_degree)
-        gone = int(of_degree.sum())
-        if gone < _FEW * left:
+            T = (np.cumsum(remains) - 1).take(T)
+            names, free, random_order, remains = names[remains], free[remains], random_order[remains], remains[remains]
+        vertices, rings, of_degree = allocate_round(T)
+        remove_vertices(T, free, random_order, vertices, rings, of_degree)
+        removed = int(of_degree.sum())
+        if removed < _MIN_FRACTION * left:
             break
         if 2 * left <= halved:
             levels[len(rounds)], halved = names[T].T if rounds else F, left
-        there[vertices[:gone]] = False
-        filled = np.empty((3, T.shape[1] - 2 * gone), dtype=np.int64)
-        fill_rings(T, there, rings, of_degree, filled)
+        remains[vertices[:removed]] = False
+        filled = np.empty((3, T.shape[1] - 2 * removed), dtype=np.int64)
+        fill_rings(T, remains, rings, of_degree, filled)
         T = filled
         rounds.append(_removals(names, vertices, rings, of_degree))
-        left -= gone
+        left -= removed
     return Coarsening(np.ascontiguousarray(names[T].T), rounds, levels)
 
 
-def touching(T: IntArray, marked: BoolArray) -> BoolArray:
+def has_marked_corner(T: IntArray, marked: BoolArray) -> BoolArray:
     """Whether each triangle has a marked corner; (f,) bool."""
     corners = marked.take(T)
     return corners[:, 0] | corners[:, 1] | corners[:, 2]
@@ -127,7 +113,7 @@ def touching(T: IntArray, marked: BoolArray) -> BoolArray:
 def _removals(names: IntArray, vertices: IntArray, rings: IntArray, of_degree: IntArray) -> list[Removal]:
     """The removals of a round, with the vertex numbers of the fine mesh."""
     found, done = [], 0
-    for some in by_degree(names.take(rings[: of_degree @ np.arange(of_degree.size)]), of_degree):
-        found.append(Removal(names.take(vertices[done : done + len(some)]), some))
-        done += len(some)
+    for ring_rows in split_by_degree(names.take(rings[: of_degree @ np.arange(of_degree.size)]), of_degree):
+        found.append(Removal(names.take(vertices[done : done + len(ring_rows)]), ring_rows))
+        done += len(ring_rows)
     return found

@@ -18,82 +18,68 @@ from quasiharmonic.util.progress import heartbeat
 # triangles have a mean below this limit has a good position.
 _GOOD = 8.0
 # Other positions to try: fractions of the way from the apex to the centre of the ring, and distances from the apex into
-# the ring, in units of the distance to the nearest side. The second set is tried if none of the first is valid. Its
+# the ring, in units of the distance to the nearest side. The second row is tried if none of the first is valid. Its
 # last position is always valid up to rounding.
-_TOWARDS_MIDDLE, _INWARDS = (0.75, 0.5), (2.0, 1.0, 0.5)
-_LESS_LIKELY_TOWARDS_MIDDLE, _LESS_LIKELY_INWARDS = (0.25, 0.1), (8.0, 4.0, 0.25)
+_TOWARDS_MIDDLE = ((0.75, 0.5), (0.25, 0.1))
+_INWARDS = ((2.0, 1.0, 0.5), (8.0, 4.0, 0.25))
 # Rings per block, so that the data stay in the cache.
-_RINGS = 1024
+_RINGS_PER_BLOCK = 1024
 
 
-def prolong(w: ComplexArray, coarsening: Coarsening, held: BoolArray) -> ComplexArray:
-    """Prolong a map from the coarse mesh to the fine mesh.
+def prolong(w: ComplexArray, coarsening: Coarsening, fixed: BoolArray) -> ComplexArray:
+    """Prolong a map (n,) complex128, given at the vertices of the coarse mesh, to the fine mesh.
 
-    Parameters
-    ----------
-    w : (n,) complex128
-        Map ``u + i v``; only the values at the vertices of the coarse mesh are used.
-    coarsening : Coarsening
-    held : (n,) bool
-        Fixed vertices.
-
-    Returns
-    -------
-    (n,) complex128
-        Equal to ``w`` at fixed vertices. Other vertices may move, because the map is smoothed where this inverts no
-        triangle.
+    The result equals ``w`` at fixed vertices. Other vertices may move, because the map is smoothed where this inverts
+    no triangle.
     """
     w = w.copy()
     for number in reversed(range(len(coarsening.rounds))):
         for vertices, rings in coarsening.rounds[number]:
             heartbeat()
-            w[vertices] = places(w.take(rings))
+            w[vertices] = reinsertion_positions(w.take(rings))
         if number in coarsening.levels:
-            smooth(w, coarsening.levels[number], held)
+            smooth(w, coarsening.levels[number], fixed)
     return w
 
 
-def places(ring: ComplexArray) -> ComplexArray:
+def reinsertion_positions(ring: ComplexArray) -> ComplexArray:
     """Position of a vertex in each ring (r, d), the apex first; (r,) complex128."""
-    place = np.empty(len(ring), dtype=np.complex128)
-    find_places(np.ascontiguousarray(ring), place)
-    return place
+    position = np.empty(len(ring), dtype=np.complex128)
+    find_places(np.ascontiguousarray(ring), position)
+    return position
 
 
 @compiled
-def find_places(ring: ComplexArray, place: ComplexArray) -> None:
+def find_places(ring: ComplexArray, position: ComplexArray) -> None:
     """Fill in the position (r,) of a vertex in each ring (r, d), the apex first."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for start in range(0, len(ring), _RINGS):
-            some = ring[start : start + _RINGS]
+        for start in range(0, len(ring), _RINGS_PER_BLOCK):
+            block = ring[start : start + _RINGS_PER_BLOCK]
             # Transpose to corner by corner, because rows are too short for fast NumPy operations. Use real numbers,
             # because products of complex numbers are not rounded the same way on all platforms.
-            corners = np.ascontiguousarray(some.view(np.float64).reshape(*some.shape, 2).transpose(1, 2, 0))
-            place.view(np.float64).reshape(-1, 2)[start : start + _RINGS] = _best(corners).T
+            corners = np.ascontiguousarray(block.view(np.float64).reshape(*block.shape, 2).transpose(1, 2, 0))
+            position.view(np.float64).reshape(-1, 2)[start : start + _RINGS_PER_BLOCK] = _best_positions(corners).T
 
 
-def _best(ring: FloatArray) -> FloatArray:
+def _best_positions(ring: FloatArray) -> FloatArray:
     """Positions for rings (d, 2, r), the apex first; (2, r)."""
-    place = _sum(ring) / len(ring)
-    shape = _shape(place[None], ring)[0]
+    position = _sum_in_order(ring) / len(ring)
+    shape = _shape(position[None], ring)[0]
     poor = np.flatnonzero(~(shape < _GOOD * len(ring)))
-    for towards, inwards in (
-        (_TOWARDS_MIDDLE, _INWARDS),
-        (_LESS_LIKELY_TOWARDS_MIDDLE, _LESS_LIKELY_INWARDS),
-    ):
+    for towards, inwards in zip(_TOWARDS_MIDDLE, _INWARDS, strict=True):
         if not poor.size:
             break
         around = ring.take(poor, axis=2)
-        candidates = _candidates(around, place.take(poor, axis=1), towards, inwards)
+        candidates = _candidates(around, position.take(poor, axis=1), towards, inwards)
         shapes = _shape(candidates, around)
         best = shapes.argmin(axis=0)
         lowest = shapes[best, np.arange(poor.size)]
         better = np.flatnonzero(lowest < shape.take(poor))
         at, best = poor.take(better), best.take(better)
-        place[0, at], place[1, at] = candidates[best, 0, better], candidates[best, 1, better]
+        position[0, at], position[1, at] = candidates[best, 0, better], candidates[best, 1, better]
         shape[at] = lowest.take(better)
         poor = poor[np.isinf(shape.take(poor))]
-    return place
+    return position
 
 
 def _candidates(
@@ -106,7 +92,7 @@ def _candidates(
     right_x, right_y, left_x, left_y = arm_x[:-1], arm_y[:-1], arm_x[1:], arm_y[1:]
     turn_x = right_x * left_x + right_y * left_y
     turn_y = right_x * left_y - right_y * left_x
-    room = (turn_y / _length(left_x - right_x, left_y - right_y)).min(axis=0)
+    clearance = (turn_y / _length(left_x - right_x, left_y - right_y)).min(axis=0)
     # A fan of positive triangles turns from the first arm to the last; half that turn points inwards. For one triangle,
     # the sum of the unit vectors of its two arms points in the direction of half its angle.
     size = length[1:] * length[:-1]
@@ -119,12 +105,14 @@ def _candidates(
     x, y = turn_x[0], turn_y[0]
     for by_x, by_y in zip(turn_x[1:], turn_y[1:], strict=True):
         x, y = x * by_x - y * by_y, x * by_y + y * by_x
-    room /= length[0]
-    first_x, first_y = room * arm_x[0], room * arm_y[0]
+    clearance /= length[0]
+    first_x, first_y = clearance * arm_x[0], clearance * arm_y[0]
     step = np.stack([first_x * x - first_y * y, first_x * y + first_y * x])
-    places = np.concatenate([np.multiply.outer(towards, middle - apex), np.multiply.outer(inwards, step)])
-    places += apex
-    return places
+    reinsertion_positions = np.concatenate(
+        [np.multiply.outer(towards, middle - apex), np.multiply.outer(inwards, step)]
+    )
+    reinsertion_positions += apex
+    return reinsertion_positions
 
 
 def _length(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -134,15 +122,12 @@ def _length(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.sqrt(square, out=square)
 
 
-def _shape(place: FloatArray, ring: FloatArray) -> FloatArray:
+def _shape(position: FloatArray, ring: FloatArray) -> FloatArray:
     """Squared sides over twice the area, summed over the triangles around each vertex; infinite if one is not positive.
 
-    Parameters
-    ----------
-    place : (c, 2, r) float64
-    ring : (d, 2, r) float64
+    ``position`` is (c, 2, r) and ``ring`` (d, 2, r).
     """
-    x, y = (np.concatenate([ring[-1:, i], ring[:, i]])[:, None] - place[:, i] for i in (0, 1))
+    x, y = (np.concatenate([ring[-1:, i], ring[:, i]])[:, None] - position[:, i] for i in (0, 1))
     square = x * x
     square += y * y
     # |a|² + |b|² + |b − a|² = 2 (|a|² + |b|² − a·b), and the area is half of a × b.
@@ -152,12 +137,12 @@ def _shape(place: FloatArray, ring: FloatArray) -> FloatArray:
     shape -= x[:-1] * x[1:]
     shape -= y[:-1] * y[1:]
     shape /= area
-    total = 2 * _sum(shape)
+    total = 2 * _sum_in_order(shape)
     total[~(area.min(axis=0) > 0)] = np.inf
     return total
 
 
-def _sum(terms: FloatArray) -> FloatArray:
+def _sum_in_order(terms: FloatArray) -> FloatArray:
     """Sum over the first axis in order. NumPy uses another order if each term is a single number."""
     total: FloatArray = terms[0].copy()
     for term in terms[1:]:
@@ -166,27 +151,19 @@ def _sum(terms: FloatArray) -> FloatArray:
 
 
 @compiled
-def smooth(w: ComplexArray, F: IntArray, held: BoolArray) -> None:
-    """Move every vertex to the centre of its neighbours, and undo moves that invert a triangle; in place.
-
-    Parameters
-    ----------
-    w : (n,) complex128
-    F : (f, 3) int64
-    held : (n,) bool
-        Fixed vertices.
-    """
+def smooth(w: ComplexArray, F: IntArray, fixed: BoolArray) -> None:
+    """Move every free vertex to the centre of its neighbours, in place; undo moves that invert a triangle."""
     from scipy.sparse import csr_array
 
     # Every neighbour of an interior vertex is the head of exactly one half-edge from it.
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
     degree = np.bincount(tail, minlength=w.size)
-    moving = np.flatnonzero((degree > 0) & ~held)
+    moving = np.flatnonzero((degree > 0) & ~fixed)
     new = w.copy()
     for to, of in ((new.real, w.real), (new.imag, w.imag)):
         to[moving] = np.bincount(tail, of.take(head), w.size)[moving] / degree[moving]
     del degree, head
-    inverted = np.flatnonzero(~positive(new, F))
+    inverted = np.flatnonzero(~are_positive(new, F))
     if inverted.size:
         table = (np.ones(F.size, dtype=np.int8), tail, np.arange(0, F.size + 1, 3))
         of_vertex = csr_array(table, shape=(len(F), w.size)).tocsc()
@@ -198,15 +175,15 @@ def smooth(w: ComplexArray, F: IntArray, held: BoolArray) -> None:
         new[corners] = w[corners]
         # Only triangles around the restored vertices may have become inverted.
         around = of_vertex[:, corners].indices
-        inverted = around[~positive(new, F[around])]
+        inverted = around[~are_positive(new, F[around])]
     w[:] = new
 
 
-def positive(w: ComplexArray, T: IntArray) -> BoolArray:
+def are_positive(w: ComplexArray, T: IntArray) -> BoolArray:
     """Whether triangles (t, 3) of a map are positive in floating point; (t,) bool."""
     corners = w.take(T)
     x, y = corners.real, corners.imag
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])
     area -= (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    positive: BoolArray = area > 0
-    return positive
+    are_positive: BoolArray = area > 0
+    return are_positive

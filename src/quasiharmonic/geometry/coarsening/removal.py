@@ -22,7 +22,7 @@ _PASSES = 3
 _PER_NEIGHBOUR = 0.35
 
 
-def room_for_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+def allocate_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Allocate vertices, rings and degrees of a round. Each triangle belongs to at most one removed vertex."""
     f = T.shape[1]
     vertices, rings, of_degree = (np.empty(size, dtype=np.int64) for size in (f // 3, f, MOST_NEIGHBOURS + 1))
@@ -31,7 +31,7 @@ def room_for_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
 
 @compiled
 def remove_vertices(
-    T: IntArray, free: BoolArray, dice: FloatArray, vertices: IntArray, rings: IntArray, of_degree: IntArray
+    T: IntArray, free: BoolArray, random_order: FloatArray, vertices: IntArray, rings: IntArray, of_degree: IntArray
 ) -> None:
     """Choose the vertices that one round removes.
 
@@ -41,7 +41,7 @@ def remove_vertices(
         Triangles, corner by corner.
     free : (n,) bool
         Vertices that may be removed or get new edges; all interior.
-    dice : (n,) float64
+    random_order : (n,) float64
         Random numbers in [0, 1] for the order of removal.
     vertices : (f // 3,) int64
         Output: the chosen vertices, sorted by degree, then by index.
@@ -51,18 +51,18 @@ def remove_vertices(
         Output: the number of chosen vertices of each degree.
     """
     degree = np.bincount(T.ravel(), minlength=free.size)
-    chosen = _independent(T, free, degree, dice)
+    chosen = _choose_independent(T, free, degree, random_order)
     # A fan moves edges from the apex's neighbours to the apex, so an apex with few edges is best.
-    burden = np.where(free, degree + dice, np.inf)
+    cost = np.where(free, degree + random_order, np.inf)
     candidates = []
-    for some, around in _rings(T, chosen, degree):
-        around = _from_apex(around, burden)
+    for some, around in _trace_rings(T, chosen, degree):
+        around = _rotate_to_apex(around, cost)
         fits = free.take(around[0]) & free.take(around[2:-1]).all(axis=0)
         candidates.append((some.compress(fits), around.compress(fits, axis=1)))
     of_degree[:] = 0
     if not candidates:
         return
-    new = _bring_new_edges(T, free.size, [around for _, around in candidates])
+    new = _adds_new_edges(T, free.size, [around for _, around in candidates])
     begin = done = 0
     for (some, around), taken in zip(candidates, new, strict=True):
         d, r = len(around), int(taken.sum())
@@ -73,13 +73,13 @@ def remove_vertices(
 
 
 @compiled
-def fill_rings(T: IntArray, there: BoolArray, rings: IntArray, of_degree: IntArray, filled: IntArray) -> None:
+def fill_rings(T: IntArray, remains: BoolArray, rings: IntArray, of_degree: IntArray, filled: IntArray) -> None:
     """Fill in the triangles after a round: those of T (3, f) with all corners left, and the fans of the rings."""
-    kept = there.take(T[0])
+    kept = remains.take(T[0])
     for corner in T[1:]:
-        kept &= there.take(corner)
+        kept &= remains.take(corner)
     parts = [T.compress(kept, axis=1)]
-    for some in by_degree(rings, of_degree):
+    for some in split_by_degree(rings, of_degree):
         r, d = some.shape
         fans = np.empty((3, d - 2, r), dtype=np.int64)
         fans[0], fans[1], fans[2] = some.T[0], some.T[1:-1], some.T[2:]
@@ -87,7 +87,7 @@ def fill_rings(T: IntArray, there: BoolArray, rings: IntArray, of_degree: IntArr
     np.concatenate(parts, axis=1, out=filled)
 
 
-def by_degree(rings: IntArray, of_degree: IntArray) -> Iterator[IntArray]:
+def split_by_degree(rings: IntArray, of_degree: IntArray) -> Iterator[IntArray]:
     """Yield concatenated rings as arrays (r, d), for every degree d that occurs."""
     begin = 0
     for d, r in enumerate(of_degree.tolist()):
@@ -96,34 +96,30 @@ def by_degree(rings: IntArray, of_degree: IntArray) -> Iterator[IntArray]:
             begin += d * r
 
 
-def _independent(T: IntArray, free: BoolArray, degree: IntArray, dice: FloatArray) -> BoolArray:
+def _choose_independent(T: IntArray, free: BoolArray, degree: IntArray, random_order: FloatArray) -> BoolArray:
     """Choose free vertices of few neighbours, no two of them neighbours; (n,) bool."""
-    order = np.where(free & (degree > 0) & (degree <= MOST_NEIGHBOURS), dice + _PER_NEIGHBOUR * degree, np.inf)
+    order = np.where(free & (degree > 0) & (degree <= MOST_NEIGHBOURS), random_order + _PER_NEIGHBOUR * degree, np.inf)
     chosen = np.zeros(order.size, dtype=bool)
     # Choose every vertex that comes first in all its triangles. Further passes use the triangles without a chosen
     # corner and exclude the neighbours of chosen vertices. They add about half as many vertices.
     for _ in range(_PASSES):
-        first, soonest = T[0], order.take(T[0])
+        first, earliest = T[0], order.take(T[0])
         for corner in T[1:]:
             at = order.take(corner)
-            first = np.where(at < soonest, corner, first)
-            soonest = np.minimum(at, soonest)
-        now = (np.bincount(first, minlength=order.size) == degree) & np.isfinite(order)
-        chosen |= now
-        near = now.take(first)
+            first = np.where(at < earliest, corner, first)
+            earliest = np.minimum(at, earliest)
+        selected = (np.bincount(first, minlength=order.size) == degree) & np.isfinite(order)
+        chosen |= selected
+        near = selected.take(first)
         order[T.compress(near, axis=1)] = np.inf
         T = T.compress(~near, axis=1)
     return chosen
 
 
-def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield the chosen vertices with their rings, degree by degree; they are interior and no two are neighbours.
+def _trace_rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield the chosen vertices (r,) with their rings (d, r), counterclockwise, degree by degree.
 
-    Yields
-    ------
-    vertices : (r,) int64
-    rings : (d, r) int64
-        Neighbours counterclockwise.
+    The vertices are interior and no two are neighbours.
     """
     from scipy.sparse import csr_array
 
@@ -133,18 +129,20 @@ def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[I
     number = np.full(chosen.size, -1, dtype=np.int32)
     number[vertices] = np.arange(vertices.size)
     columns = [number.take(corner) for corner in T]
-    places = [np.flatnonzero(column >= 0) for column in columns]
-    columns = [column.take(place) for column, place in zip(columns, places, strict=True)]
+    entries_of = [np.flatnonzero(column >= 0) for column in columns]
+    columns = [column.take(entry_of) for column, entry_of in zip(columns, entries_of, strict=True)]
     # Converting the sparse matrix of entries and vertices to columns sorts by vertex in a fifth of the time of a sort.
-    entries = sum(place.size for place in places)
+    entries = sum(entry_of.size for entry_of in entries_of)
     table = (np.ones(entries, dtype=np.int8), np.concatenate(columns), np.arange(entries + 1, dtype=np.int32))
     order = csr_array(table, shape=(entries, vertices.size)).tocsc().indices
     del number, columns, table
     tail, head = (
-        np.concatenate([T[(corner + step) % 3].take(place) for corner, place in enumerate(places)]).take(order)
+        np.concatenate([T[(corner + step) % 3].take(entry_of) for corner, entry_of in enumerate(entries_of)]).take(
+            order
+        )
         for step in (1, 2)
     )
-    del places, order
+    del entries_of, order
     begin = done = 0
     for d, count in enumerate(np.bincount(of_degree, minlength=MOST_NEIGHBOURS + 1).tolist()):
         if d < 3 or not count:
@@ -159,15 +157,15 @@ def _rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[tuple[I
         begin, done = begin + d * count, done + count
 
 
-def _from_apex(rings: IntArray, burden: FloatArray) -> IntArray:
+def _rotate_to_apex(rings: IntArray, cost: FloatArray) -> IntArray:
     """Rotate rings (d, r) so that they begin with the vertex of least burden."""
     d, r = rings.shape
-    turn = burden.take(rings).argmin(axis=0)
+    turn = cost.take(rings).argmin(axis=0)
     turned: IntArray = rings.take((turn + np.arange(d)[:, None]) % d * r + np.arange(r))
     return turned
 
 
-def _bring_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[BoolArray]:
+def _adds_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[BoolArray]:
     """Whether each fan of rings (d, r) adds only edges that do not exist and that no earlier fan adds."""
     apex = np.concatenate([rings[0].repeat(len(rings) - 3) for rings in candidates])
     other = np.concatenate([rings[2:-1].T.ravel() for rings in candidates])
@@ -175,12 +173,12 @@ def _bring_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[Bo
     # Existing edges that may be claimed: from an apex to a vertex that is to get an edge to an apex.
     tails, heads = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
     tails[apex], heads[other] = True, True
-    there = []
+    remains = []
     for tail, head in zip(T, T[(1, 2, 0), :], strict=True):
         at = np.flatnonzero(tails.take(tail) & heads.take(head))
-        there.append(edge_keys(tail.take(at), head.take(at), n))
+        remains.append(edge_keys(tail.take(at), head.take(at), n))
     # Sort existing edges and claims together, with a claim after the edge of the same key.
-    keys = 2 * np.concatenate([*there, claims])
+    keys = 2 * np.concatenate([*remains, claims])
     keys[keys.size - claims.size :] += 1
     keys.sort()
     step, is_claim = np.diff(keys), (keys[1:] & 1).astype(bool)

@@ -14,12 +14,13 @@ from quasiharmonic.geometry.exact.predicates import two_product, two_sum
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, check_finite, real_array
 
 # Longest arc in radians, so that a few nodes integrate its length to rounding.
-_LONGEST_ARC = np.pi / 4
+_MAX_ARC = np.pi / 4
 # Turn of a curve along one chord, in radians.
 _FLAT = 0.1
-# Relative to the curve's size, a derivative below SLOW counts as zero. A zero of the derivative is interior if its
-# parameter differs by at least _INSIDE from both ends.
-SLOW, _INSIDE = 1e-9, 1e-6
+#: A derivative below this value, relative to the curve's size, counts as zero.
+ZERO_DERIVATIVE = 1e-9
+# A zero of the derivative is interior if its parameter differs by at least this value from both ends.
+_INSIDE = 1e-6
 # Nodes of Gauss' formula for a length.
 _NODES = 16
 
@@ -42,7 +43,7 @@ class Arc:
     first: float
     last: float
 
-    def transformed(self, matrix: FloatArray, shift: FloatArray) -> Arc:
+    def transform(self, matrix: FloatArray, shift: FloatArray) -> Arc:
         """The elliptic arc after ``x → matrix @ x + shift``."""
         centre, a, b = (matrix @ np.asarray(x, dtype=np.float64) for x in (self.centre, self.a, self.b))
         return Arc(centre + shift, a, b, self.first, self.last)
@@ -59,17 +60,17 @@ class Piece(NamedTuple):
         Control points, or centre and axes, padded with zeros.
     angles : (float, float)
         First and last angle of an arc.
-    within : bool
+    continues : bool
         Whether it continues an arc that was split.
     """
 
     degree: int
     control: ComplexArray
     angles: tuple[float, float]
-    within: bool
+    continues: bool
 
 
-def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
+def split_piece(i: int, piece: ArrayLike | Arc) -> list[Piece]:
     """Check piece ``i`` of a curve. Split long arcs, and split Bézier curves at interior zeros of the derivative."""
     if isinstance(piece, Arc):
         rows = [real_array(f"piece {i} of the curve", x) for x in (piece.centre, piece.a, piece.b)]
@@ -84,16 +85,16 @@ def parts(i: int, piece: ArrayLike | Arc) -> list[Piece]:
         raise ValueError(f"piece {i} of the curve is not finite")
     if not isinstance(piece, Arc):
         return [
-            Piece(len(control) - 1, _four(between(control, *span)), ends, False)
+            Piece(len(control) - 1, _pad(subcurve(control, *span)), ends, False)
             for span in pairwise([0.0, *_cusps(control), 1.0])
         ]
-    four = _four(control)
-    steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _LONGEST_ARC)))
+    four = _pad(control)
+    steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _MAX_ARC)))
     angles = np.linspace(*ends, steps + 1).tolist()
     return [Piece(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
 
 
-def _four(control: FloatArray) -> ComplexArray:
+def _pad(control: FloatArray) -> ComplexArray:
     """Control points, or centre and axes (k, 2), in the format of `Piece`."""
     four = np.zeros(4, dtype=np.complex128)
     four[: len(control)] = as_complex(control)
@@ -116,10 +117,10 @@ def _cusps(control: FloatArray) -> list[float]:
     roots = np.roots(by_power[::-1]).real
     inner = np.unique(roots[(roots > _INSIDE) & (roots < 1 - _INSIDE)])
     speed = np.abs(np.polynomial.polynomial.polyval(inner, by_power))
-    return [float(t) for t in inner[speed <= SLOW * np.abs(points).max()]]
+    return [float(t) for t in inner[speed <= ZERO_DERIVATIVE * np.abs(points).max()]]
 
 
-def straight(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
+def make_lines(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
     """Straight lines between consecutive points."""
     array = real_array("points", points)
     least = 3 if closed else 2
@@ -130,7 +131,7 @@ def straight(points: ArrayLike, *, closed: bool) -> list[FloatArray]:
     return list(np.stack([ends[:-1], ends[1:]], axis=1))
 
 
-def chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
+def count_chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
     """Number of chords of a piece such that the curve turns little along each."""
     if degree == 1:
         return 1
@@ -143,7 +144,7 @@ def chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
     return int(max(4, 2 * np.ceil(bends / _FLAT)))
 
 
-def between(control: FloatArray, t: float, u: float) -> FloatArray:
+def subcurve(control: FloatArray, t: float, u: float) -> FloatArray:
     """Control points (degree + 1, 2) of the part of a Bézier curve between two parameters.
 
     They are values of its blossom: de Casteljau's construction with a separate parameter in each round. For control
@@ -200,7 +201,7 @@ def on_ellipse(control: FloatArray, angle: FloatArray) -> FloatArray:
 
 
 @cache
-def gauss() -> tuple[FloatArray, FloatArray]:
+def gauss_rule() -> tuple[FloatArray, FloatArray]:
     """Nodes and weights of Gauss' formula on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     return (nodes + 1) / 2, weights / 2

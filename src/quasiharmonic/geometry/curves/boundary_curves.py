@@ -15,15 +15,23 @@ from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,
     IntArray,
+    check_numbers,
     check_range,
+    describe,
     index_array,
-    kind_of,
     loop_arrays,
-    named,
+    names_of,
 )
 
 # Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
-_THERE = 2.0**-51
+_SAME_POSITION = 2.0**-51
+
+
+def check_corner_angle(angle: float) -> None:
+    """Raise a ValueError unless the turning angle of corners is from 0 to 180 degrees."""
+    check_numbers(corner_angle=angle)
+    if not 0 <= angle <= 180:
+        raise ValueError(f"corner_angle must be between 0 and 180 degrees, not {angle}")
 
 
 class BoundaryCurves:
@@ -73,19 +81,19 @@ class BoundaryCurves:
         if isinstance(curves, Curve) or (isinstance(curves, np.ndarray) and curves.ndim == 2):
             curves = [curves]
         if not isinstance(curves, Iterable):
-            raise ValueError(f"curves must be a Curve, a polygon (k, 2) or a list of those, not {kind_of(curves)}")
+            raise ValueError(f"curves must be a Curve, a polygon (k, 2) or a list of those, not {describe(curves)}")
         self.curves = [curve if isinstance(curve, Curve) else Curve.polygon(curve) for curve in curves]
         if not self.curves:
             raise ValueError("there is no curve to slide along")
         on = {} if on is None else on
         if not isinstance(on, Mapping):
-            raise ValueError(f"on must map vertices to curves, as in {{12: 0}}, not {kind_of(on)}")
+            raise ValueError(f"on must map vertices to curves, as in {{12: 0}}, not {describe(on)}")
         vertices, numbers = index_array("on", list(on)), index_array("on", list(on.values()))
         check_range("on", numbers, len(self.curves), "curve", "curves")
         self.on: dict[int, int] = dict(zip(vertices.tolist(), numbers.tolist(), strict=True))
         self.fixed = index_array("fixed", fixed).ravel()
-        if not 0 <= corner_angle <= 180:
-            raise ValueError(f"corner_angle must be between 0 and 180 degrees, not {corner_angle}")
+        check_corner_angle(corner_angle)
+        check_numbers(tolerance=tolerance)
         if not 0 <= tolerance < 1:
             raise ValueError(f"tolerance must be between 0 and 1, not {tolerance}")
         self.corner_angle, self.tolerance = float(corner_angle), float(tolerance)
@@ -107,7 +115,7 @@ class BoundaryCurves:
         absent = np.setdiff1d(known, used)
         if absent.size:
             raise ValueError(
-                f"the boundary curves refer to {named('vertex', 'vertices', absent)}, but no triangle uses them"
+                f"the boundary curves refer to {names_of('vertex', 'vertices', absent)}, but no triangle uses them"
             )
         on = {int(np.searchsorted(used, v)): k for v, k in self.on.items()}
         return self._with(on, np.searchsorted(used, self.fixed))
@@ -132,11 +140,11 @@ class BoundaryCurves:
             vertices have the same position, or neighbours on the boundary are not neighbours on the curve.
         """
         boundary = np.concatenate(loops)
-        curve, s = self._found(boundary, uv)
+        curve, s = self._assign_curves(boundary, uv)
         corners = [self._corners(one, uv[boundary]) for one in self.curves]
         slides = ~np.isin(boundary, self.fixed)
         slides[[member for taken in corners for member in taken]] = False
-        places, chains = uv.copy(), []
+        positions, chains = uv.copy(), []
         for k, (one, taken) in enumerate(zip(self.curves, corners, strict=True)):
             at_corners = np.array(list(taken), dtype=np.int64)
             members = np.union1d(np.flatnonzero(curve == k), at_corners)
@@ -147,18 +155,18 @@ class BoundaryCurves:
             members = members[np.argsort(along[members], kind="stable")]
             chain = Chain(one, boundary[members], along[members], slides[members])
             _check_order(chain, k, loops, len(uv))
-            moves = (slides[members] | np.isin(members, at_corners)) & ~np.isin(chain.vertices, self.fixed)
-            _move(places, chain.vertices[moves], one.position(chain.s[moves]))
+            is_moved = (slides[members] | np.isin(members, at_corners)) & ~np.isin(chain.vertices, self.fixed)
+            _move_vertices(positions, chain.vertices[is_moved], one.position(chain.s[is_moved]))
             chains.append(chain)
-        return Track(chains, places)
+        return Track(chains, positions)
 
     def off(self, loops: Sequence[IntArray], uv: FloatArray) -> IntArray:
         """Boundary vertices that are on no curve and are fixed; checks the vertices in ``on`` as `lay` does."""
         boundary = np.concatenate(loops)
-        curve, _ = self._found(boundary, uv)
+        curve, _ = self._assign_curves(boundary, uv)
         return boundary[curve < 0]
 
-    def _corners(self, one: Curve, places: FloatArray) -> dict[int, float]:
+    def _corners(self, one: Curve, positions: FloatArray) -> dict[int, float]:
         """Rows of the boundary positions (b, 2) that are at corners of a curve, with their lengths along it.
 
         Each corner gets the vertex nearest to it, on this curve or another. A vertex gets at most one corner.
@@ -166,40 +174,41 @@ class BoundaryCurves:
         marks = one.corners(self.corner_angle)
         found = []
         for mark, corner in zip(marks, one.position(marks), strict=True):
-            away = np.abs(as_complex(places - corner))
-            found.append((float(away.min()), int(np.argmin(away)), float(mark)))
+            distances = np.abs(as_complex(positions - corner))
+            found.append((float(distances.min()), int(np.argmin(distances)), float(mark)))
         taken: dict[int, float] = {}
         for distance, member, mark in sorted(found):
             if distance <= self.tolerance * one.size:
                 taken.setdefault(member, mark)
         return taken
 
-    def _found(self, boundary: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
+    def _assign_curves(self, boundary: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
         """Index of the curve of each boundary vertex, -1 if there is none, and its length along the curve."""
-        told = index_array("on", list(self.on))
-        check_range("on", told, len(uv))
+        assigned = index_array("on", list(self.on))
+        check_range("on", assigned, len(uv))
         check_range("fixed", self.fixed, len(uv))
-        inner = np.setdiff1d(told, boundary)
+        inner = np.setdiff1d(assigned, boundary)
         if inner.size:
             raise ValueError(
-                f"on assigns curves to interior {named('vertex', 'vertices', inner)}: only boundary vertices can slide"
+                f"on assigns curves to interior {names_of('vertex', 'vertices', inner)}: only boundary "
+                "vertices can slide"
             )
         only = np.array([self.on.get(int(v), -1) for v in boundary])
         allowed = self.tolerance * max(one.size for one in self.curves)
-        curve, s, least = np.full(boundary.size, -1), np.zeros(boundary.size), np.full(boundary.size, np.inf)
+        curve, s, smallest = np.full(boundary.size, -1), np.zeros(boundary.size), np.full(boundary.size, np.inf)
         for k, one in enumerate(self.curves):
-            asked = np.flatnonzero((only < 0) | (only == k))
-            where, away = one.nearest(uv[boundary[asked]])
-            far = (away > allowed) & (only[asked] == k)
-            if far.any():
+            candidates = np.flatnonzero((only < 0) | (only == k))
+            where, distance = one.nearest(uv[boundary[candidates]])
+            too_far = (distance > allowed) & (only[candidates] == k)
+            if too_far.any():
                 raise ValueError(
-                    f"on assigns curve {k} to {named('vertex', 'vertices', boundary[asked[far]])}, "
+                    f"on assigns curve {k} to {names_of('vertex', 'vertices', boundary[candidates[too_far]])}, "
                     f"but the distance to it is "
-                    f"up to {away[far].max():.3g}, and at most {allowed:.3g} is allowed"
+                    f"up to {distance[too_far].max():.3g}, and at most {allowed:.3g} is allowed"
                 )
-            near = (away <= allowed) & (away < least[asked])
-            found = asked[near]
-            curve[found], s[found], least[found] = k, where[near], away[near]
+            near = (distance <= allowed) & (distance < smallest[candidates])
+            found = candidates[near]
+            curve[found], s[found], smallest[found] = k, where[near], distance[near]
         if (curve < 0).all():
             raise ValueError(
                 f"no boundary vertex is within {allowed:.3g} of the curves to slide along: check the scale and the "
@@ -208,27 +217,21 @@ class BoundaryCurves:
         return curve, s
 
 
-def rails_of(slide: bool | BoundaryCurves, loops: Sequence[IntArray], uv: FloatArray) -> BoundaryCurves:
+def sliding_curves(slide: bool | BoundaryCurves, loops: Sequence[IntArray], uv: FloatArray) -> BoundaryCurves:
     """Interpret the argument ``slide``: `BoundaryCurves`, or True for the polygons of the current boundary."""
     if isinstance(slide, BoundaryCurves):
         return slide
     if slide is True:
         return BoundaryCurves.around(loops, uv)
-    raise ValueError(f"slide must be True or BoundaryCurves, not {kind_of(slide)}")
+    raise ValueError(f"slide must be True or BoundaryCurves, not {describe(slide)}")
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """The vertices on one curve, in order along it.
+    """The vertices (k,) int64 on one curve, in order along it.
 
-    Attributes
-    ----------
-    curve : Curve
-    vertices : (k,) int64
-    s : (k,) float64
-        Initial lengths along the curve, increasing.
-    sliding : (k,) bool
-        Whether each vertex may slide.
+    ``s`` (k,) has their initial lengths along the curve, increasing. ``sliding`` (k,) bool tells which vertices may
+    slide.
     """
 
     curve: Curve
@@ -236,39 +239,27 @@ class Chain:
     s: FloatArray
     sliding: BoolArray
 
-    def every(self, s: FloatArray) -> FloatArray:
+    def all_lengths(self, s: FloatArray) -> FloatArray:
         """Lengths of all vertices along the curve, with the sliding ones at ``s``."""
-        every = self.s.copy()
-        every[self.sliding] = s
-        return every
+        all_lengths = self.s.copy()
+        all_lengths[self.sliding] = s
+        return all_lengths
 
     def in_order(self, s: FloatArray) -> bool:
         """Whether the vertices are still in order with the sliding ones at ``s``."""
-        every = self.every(s)
-        backwards = np.diff(every) <= 0
+        all_lengths = self.all_lengths(s)
+        backwards = np.diff(all_lengths) <= 0
         if not self.curve.closed:
             return not backwards.any()
         # Around a closed curve the lengths decrease exactly once.
-        return int(backwards.sum()) + int(every[0] <= every[-1]) == 1
+        return int(backwards.sum()) + int(all_lengths[0] <= all_lengths[-1]) == 1
 
 
 class Track:
     """All sliding vertices, with the geometry of all curves evaluated together.
 
-    Parameters
-    ----------
-    chains : list of Chain
-    uv : (n, 2) float64
-        The map with its boundary on the curves.
-
-    Attributes
-    ----------
-    chains : list of Chain
-    uv : (n, 2) float64
-    vertices : (k,) int64
-        Sliding vertices, curve by curve.
-    s : (k,) float64
-        Initial lengths along the curves.
+    ``uv`` (n, 2) is the map with its boundary on the curves. ``vertices`` (k,) int64 are the sliding vertices, curve by
+    curve. ``s`` (k,) float64 has their initial lengths along the curves.
     """
 
     def __init__(self, chains: Sequence[Chain], uv: FloatArray) -> None:
@@ -278,9 +269,9 @@ class Track:
         self.vertices = np.concatenate([chain.vertices[chain.sliding] for chain in chains])
         self.s = np.concatenate([chain.s[chain.sliding] for chain in chains])
 
-    def every(self, s: FloatArray) -> list[FloatArray]:
+    def all_lengths(self, s: FloatArray) -> list[FloatArray]:
         """Lengths of all vertices of each chain, with the sliding ones at ``s``."""
-        return [chain.every(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)]
+        return [chain.all_lengths(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True)]
 
     def position(self, s: FloatArray) -> FloatArray:
         """Positions of the sliding vertices; (k, 2) float64."""
@@ -291,7 +282,7 @@ class Track:
         tangent, curvature = np.empty(s.size, dtype=np.complex128), np.empty(s.size)
         for curve, part in self._parts():
             tangent[part], curvature[part] = curve.frame(s[part], forward[part])
-            tangent[part][curve.barred(s[part], forward[part])] = 0
+            tangent[part][curve.has_ended(s[part], forward[part])] = 0
         return tangent, curvature
 
     def advance(self, s: FloatArray, step: FloatArray, *, stop: bool = False) -> FloatArray:
@@ -313,11 +304,11 @@ class Track:
         ]
 
 
-def _move(places: FloatArray, vertices: IntArray, there: FloatArray) -> None:
+def _move_vertices(positions: FloatArray, vertices: IntArray, there: FloatArray) -> None:
     """Move vertices to their positions, except those that are there up to rounding."""
-    off = np.abs(places[vertices] - there) > _THERE * np.abs(there).max(initial=0)
-    moves = off.any(axis=1)
-    places[vertices[moves]] = there[moves]
+    off = np.abs(positions[vertices] - there) > _SAME_POSITION * np.abs(there).max(initial=0)
+    is_moved = off.any(axis=1)
+    positions[vertices[is_moved]] = there[is_moved]
 
 
 def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> None:

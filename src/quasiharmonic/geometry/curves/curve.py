@@ -14,24 +14,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.curves.arcs import (
-    SLOW,
+    ZERO_DERIVATIVE,
     Arc,
     angle_at,
     as_complex,
-    between,
-    chords,
-    gauss,
+    count_chords,
+    gauss_rule,
+    make_lines,
     on_bezier,
     on_ellipse,
-    parts,
-    straight,
+    split_piece,
+    subcurve,
 )
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
-# Squares, and products of four numbers, of coordinates in this range neither overflow nor underflow.
-_LARGEST, _SMALLEST = 1e75, 1e-75
+# Squares, and products of four numbers, of coordinates below this do not overflow
+_MAX_SIZE = 1e75
+# and above this do not underflow.
+_MIN_SIZE = 1e-75
 # Ends closer than this fraction of the curve's size are connected.
-_MEET = 1e-9
+_GAP = 1e-9
 # Smaller turns, in radians, are ignored: their effect on an optimisation is below its tolerance.
 _KINK = 1e-3
 # Step in the parameter of the chord that gives the direction of a piece where its derivative is zero.
@@ -39,15 +41,17 @@ _CHORD = 1e-5
 # Number of distances between points and chords computed together.
 _PAIRS = 1 << 20
 # Lengths below this fraction of the curve's size count as rounding.
-_SNAP = 1e-13
+_ROUNDING = 1e-13
 # Number of parameters of each piece in the table of lengths.
-_TABLE = 32
+_TABLE_SIZE = 32
 # Distance in the parameter from an end of a piece at which the search near that end starts.
-_INWARD = 1e-2
+_INNER_START = 1e-2
 # A search for a parameter has converged if the parameter changes by at most this.
-_RESTS = 1e-15
-# Maximum number of steps of the searches for a parameter by length, and by distance.
-_MOST_STEPS, _REFINEMENTS = 60, 40
+_CONVERGED = 1e-15
+# Maximum number of steps of the search for a parameter by length.
+_LENGTH_STEPS = 60
+# Maximum number of steps of the search for a parameter by distance.
+_DISTANCE_STEPS = 40
 
 
 class Curve:
@@ -83,14 +87,14 @@ class Curve:
     """
 
     def __init__(self, pieces: Sequence[ArrayLike | Arc]) -> None:
-        found = [part for i, piece in enumerate(pieces) for part in parts(i, piece)]
+        found = [part for i, piece in enumerate(pieces) for part in split_piece(i, piece)]
         if not found:
             raise ValueError("a curve has at least one piece")
         self._degree = np.array([part.degree for part in found])
         self._control = np.stack([part.control for part in found])
         self._angles = np.array([part.angles for part in found])
         # Long arcs are split to integrate their length. These splits are not joints.
-        self._within = np.array([part.within for part in found])
+        self._continues = np.array([part.continues for part in found])
         self._measure()
         self._join()
 
@@ -106,25 +110,25 @@ class Curve:
     @classmethod
     def polygon(cls, points: ArrayLike) -> Curve:
         """Create the closed polygon through points (k, 2)."""
-        return cls(straight(points, closed=True))
+        return cls(make_lines(points, closed=True))
 
     @classmethod
     def polyline(cls, points: ArrayLike) -> Curve:
         """Create the open polyline through points (k, 2)."""
-        return cls(straight(points, closed=False))
+        return cls(make_lines(points, closed=False))
 
     @classmethod
     def circle(cls, radius: float = 1.0, centre: ArrayLike = (0.0, 0.0)) -> Curve:
         """Create a circle, counterclockwise from its rightmost point."""
         return cls([Arc(centre, (radius, 0.0), (0.0, radius), 0.0, 2 * np.pi)])
 
-    def transformed(self, matrix: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> Curve:
+    def transform(self, matrix: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> Curve:
         """Transform the curve by ``x → matrix @ x + shift``; ``matrix`` (2, 2) or a number, ``shift`` (2,)."""
         matrix = np.asarray(matrix, dtype=np.float64) * (np.eye(2) if np.ndim(matrix) == 0 else 1.0)
         offset = np.asarray(shift, dtype=np.float64)
         return Curve(
             [
-                piece.transformed(matrix, offset) if isinstance(piece, Arc) else piece @ matrix.T + offset
+                piece.transform(matrix, offset) if isinstance(piece, Arc) else piece @ matrix.T + offset
                 for piece in self.section(0.0, self.length)
             ]
         )
@@ -132,7 +136,7 @@ class Curve:
     def section(self, start: float, end: float) -> list[FloatArray | Arc]:
         """Pieces between two lengths along the curve; continues past the start if ``end`` is not larger."""
         m = self._degree.size
-        (first, last), (begin, stop) = self.place(np.array([start, end]))
+        (first, last), (begin, stop) = self.locate(np.array([start, end]))
         last += m if end <= start else 0
         found: list[FloatArray | Arc] = []
         for k in range(first, last + 1):
@@ -141,10 +145,10 @@ class Curve:
                 continue
             points = self._control[k % m].view(np.float64).reshape(-1, 2)
             if self._degree[k % m]:
-                found.append(between(points[: self._degree[k % m] + 1], t, u))
+                found.append(subcurve(points[: self._degree[k % m] + 1], t, u))
                 continue
             angles = angle_at(self._angles[[k % m, k % m]], np.array([t, u])).tolist()
-            before = found[-1] if found and self._within[k % m] else None
+            before = found[-1] if found and self._continues[k % m] else None
             if isinstance(before, Arc):
                 found[-1] = replace(before, last=angles[1])
             else:
@@ -162,7 +166,7 @@ class Curve:
 
     def position(self, s: FloatArray) -> FloatArray:
         """Points at lengths (k,) along the curve, evaluated in twice the precision and rounded once; (k, 2) float64."""
-        piece, t = self.place(np.asarray(s, dtype=np.float64))
+        piece, t = self.locate(np.asarray(s, dtype=np.float64))
         found = np.empty((t.size, 2))
         for degree in np.unique(self._degree[piece]):
             which = self._degree[piece] == degree
@@ -173,7 +177,7 @@ class Curve:
                 found[which] = on_ellipse(control, angle_at(self._angles[piece[which]], t[which]))
         return found
 
-    def sampled(self, s: FloatArray, *, exactly: bool = False) -> tuple[ComplexArray, ComplexArray]:
+    def sample(self, s: FloatArray, *, exactly: bool = False) -> tuple[ComplexArray, ComplexArray]:
         """Points and unit tangents at lengths of any shape.
 
         By default the lengths are interpolated in a table, which is fast and accurate enough for measures of shape.
@@ -182,7 +186,7 @@ class Curve:
         if self.closed:
             s = np.mod(s, self.length)
         if exactly:
-            piece, t = self.place(s.ravel())
+            piece, t = self.locate(s.ravel())
         else:
             at = np.interp(s.ravel(), *self._table)
             piece = np.clip(at.astype(np.int64), 0, self._degree.size - 1)
@@ -190,22 +194,12 @@ class Curve:
         return self._point(piece, t).reshape(s.shape), self._direction(piece, t)[0].reshape(s.shape)
 
     def frame(self, s: FloatArray, forward: BoolArray) -> tuple[ComplexArray, FloatArray]:
-        """Direction and curvature of the curve.
+        """Unit tangents (k,) complex128 and curvatures (k,), positive where the curve turns to the left.
 
-        Parameters
-        ----------
-        s : (k,) float64
-        forward : (k,) bool
-            At a joint, whether to use the piece that begins there instead of the piece that ends there.
-
-        Returns
-        -------
-        tangent : (k,) complex128
-            Unit tangents in the direction of the curve.
-        curvature : (k,) float64
-            Positive where the curve turns to the left.
+        ``forward`` (k,) bool tells whether to use the piece that begins at a joint instead of the piece that ends
+        there.
         """
-        piece, t = self.place(s)
+        piece, t = self.locate(s)
         back = ~forward & (s == self._starts[piece])
         if not self.closed:
             back &= piece > 0
@@ -234,13 +228,13 @@ class Curve:
         around = np.mod(found, self.length)
         return np.where(around < self.length, around, 0.0)
 
-    def barred(self, s: FloatArray, forward: BoolArray) -> BoolArray:
+    def has_ended(self, s: FloatArray, forward: BoolArray) -> BoolArray:
         """Whether an open curve has ended in the given direction."""
         return np.where(forward, s >= self.length, s <= 0) & (not self.closed)
 
     def corners(self, angle: float) -> FloatArray:
         """Ascending lengths at which the curve turns by at least ``angle`` degrees, with the ends of an open curve."""
-        marks = self._starts[:-1][(np.abs(self._turn) >= np.radians(angle)) & ~self._within]
+        marks = self._starts[:-1][(np.abs(self._turn) >= np.radians(angle)) & ~self._continues]
         return marks if self.closed else np.unique(np.append(marks, (0.0, self.length)))
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -259,19 +253,19 @@ class Curve:
         for other in (0, -1, 1):
             candidate = here + other
             candidate = candidate % self._degree.size if self.closed else np.clip(candidate, 0, self._degree.size - 1)
-            begin = np.where(candidate == here, at, _INWARD if other > 0 else 1 - _INWARD)
-            found, away = self._refined(candidate, begin, z)
-            better = away < best
+            begin = np.where(candidate == here, at, _INNER_START if other > 0 else 1 - _INNER_START)
+            found, offset = self._refine(candidate, begin, z)
+            better = offset < best
             piece, t = np.where(better, candidate, piece), np.where(better, found, t)
-            best = np.minimum(best, away)
-        s = self._starts[piece] + self._way(piece, t)
+            best = np.minimum(best, offset)
+        s = self._starts[piece] + self._length_to(piece, t)
         # Return the exact length of a joint for points at a joint.
         joint = np.concatenate([piece, (piece + 1) % self._degree.size if self.closed else piece + 1])
         for s_joint in joint.reshape(2, -1):
             goal = self._starts[s_joint]
             off = np.abs(s - goal)
             off = np.minimum(off, self.length - off) if self.closed else off
-            s = np.where(off <= _SNAP * self.size, goal, s)
+            s = np.where(off <= _ROUNDING * self.size, goal, s)
         return np.where(s < self.length, s, 0.0) if self.closed else s, best
 
     def _measure(self) -> None:
@@ -280,7 +274,7 @@ class Curve:
         by_degree = [(a, 0 * a, 0 * a, 0 * a), (a, b - a, 0 * a, 0 * a), (a, 2 * (b - a), a - 2 * b + c, 0 * a)]
         by_degree.append((a, 3 * (b - a), 3 * (a - 2 * b + c), d - a + 3 * (b - c)))
         self._powers = np.stack([np.choose(self._degree, rows) for rows in zip(*by_degree, strict=True)], axis=1)
-        count = np.array([chords(*part) for part in zip(self._degree, self._control, self._angles, strict=True)])
+        count = np.array([count_chords(*part) for part in zip(self._degree, self._control, self._angles, strict=True)])
         self._chord_piece = np.repeat(np.arange(count.size), count)
         nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         self._chord_width = 1.0 / count[self._chord_piece]
@@ -289,38 +283,38 @@ class Curve:
         self._chord_head = self._point(self._chord_piece, (nth + 1) * self._chord_width)
         every = np.concatenate([self._chord_tail, self._chord_head])
         self.size = float(max(np.ptp(every.real), np.ptp(every.imag)))
-        if not (self.size > _SMALLEST and np.abs(every).max() < _LARGEST):
+        if not (self.size > _MIN_SIZE and np.abs(every).max() < _MAX_SIZE):
             raise ValueError(
                 f"a curve of size {self.size:.3g} around {every[0]:.3g} is outside the supported range "
-                f"({_SMALLEST:.0e} to {_LARGEST:.0e}): scale the drawing"
+                f"({_MIN_SIZE:.0e} to {_MAX_SIZE:.0e}): scale the drawing"
             )
-        lengths = self._way(np.arange(count.size), np.ones(count.size))
-        kept = lengths > _SNAP * self.size
+        lengths = self._length_to(np.arange(count.size), np.ones(count.size))
+        kept = lengths > _ROUNDING * self.size
         if not kept.all():
             self._degree, self._control = self._degree[kept], self._control[kept]
-            self._angles, self._within = self._angles[kept], self._within[kept]
+            self._angles, self._continues = self._angles[kept], self._continues[kept]
             self._measure()
             return
         self._starts = np.concatenate([[0.0], np.cumsum(lengths)])
         self.length = float(self._starts[-1])
         # Table of lengths with piece and parameter in one number: piece 3, t = 0.25 is 3.25.
-        piece, nth = np.divmod(np.arange(_TABLE * lengths.size), _TABLE)
-        way = self._starts[piece] + self._way(piece, nth / _TABLE)
-        self._table = np.append(way, self.length), np.append(piece + nth / _TABLE, float(lengths.size))
+        piece, nth = np.divmod(np.arange(_TABLE_SIZE * lengths.size), _TABLE_SIZE)
+        length = self._starts[piece] + self._length_to(piece, nth / _TABLE_SIZE)
+        self._table = np.append(length, self.length), np.append(piece + nth / _TABLE_SIZE, float(lengths.size))
 
     def _join(self) -> None:
         """Check that pieces meet; determine whether the curve is closed and its turns at joints."""
         m = self._degree.size
         every = np.arange(m)
         heads, tails = self._point(every, np.ones(m)), self._point(every, np.zeros(m))
-        apart = np.abs(heads - np.roll(tails, -1)) > _MEET * self.size
-        if apart[:-1].any():
-            k = int(np.argmax(apart[:-1]))
+        is_apart = np.abs(heads - np.roll(tails, -1)) > _GAP * self.size
+        if is_apart[:-1].any():
+            k = int(np.argmax(is_apart[:-1]))
             raise ValueError(
                 f"pieces {k} and {k + 1} of the curve (without pieces of zero length) do not meet: "
                 f"{heads[k]:.6g} and {tails[k + 1]:.6g}"
             )
-        self.closed = not apart[-1]
+        self.closed = not is_apart[-1]
         ahead, _ = self._direction(every, np.zeros(m))
         before = np.roll(self._direction(every, np.ones(m))[0], 1)
         self._turn = np.angle(ahead / before)
@@ -328,38 +322,38 @@ class Curve:
             self._turn[0] = 0.0
         self.stops = self.corners(np.degrees(_KINK))
 
-    def place(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
+    def locate(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Piece indices and parameters in [0, 1] at lengths along the curve."""
         piece = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, self._degree.size - 1)
         whole = self._starts[piece + 1] - self._starts[piece]
-        way = np.clip(s - self._starts[piece], 0.0, whole)
+        length = np.clip(s - self._starts[piece], 0.0, whole)
         # The table gives a good start, but rounding may put it outside the piece.
         guess = np.clip(np.interp(s, *self._table) - piece, 1e-3, 1 - 1e-3)
-        t = np.where((self._degree[piece] == 1) | (way <= 0) | (way >= whole), way / whole, guess)
-        open_ = np.flatnonzero((self._degree[piece] != 1) & (t > 0) & (t < 1))
-        low, high = np.zeros(open_.size), np.ones(open_.size)
+        t = np.where((self._degree[piece] == 1) | (length <= 0) | (length >= whole), length / whole, guess)
+        active = np.flatnonzero((self._degree[piece] != 1) & (t > 0) & (t < 1))
+        low, high = np.zeros(active.size), np.ones(active.size)
         # Newton's method, with bisection if a step leaves the bracket.
-        for _ in range(_MOST_STEPS):
-            if not open_.size:
+        for _ in range(_LENGTH_STEPS):
+            if not active.size:
                 break
-            here = t[open_]
-            excess = self._way(piece[open_], here) - way[open_]
+            here = t[active]
+            excess = self._length_to(piece[active], here) - length[active]
             low, high = np.where(excess < 0, here, low), np.where(excess < 0, high, here)
-            speed = np.abs(self._derivatives(piece[open_], here)[0])
+            speed = np.abs(self._derivatives(piece[active], here)[0])
             with np.errstate(all="ignore"):
                 there = here - excess / speed
             there = np.where((there > low) & (there < high), there, 0.5 * (low + high))
-            t[open_] = np.where(excess == 0, here, there)
-            going = np.abs(t[open_] - here) > 4e-16
-            open_, low, high = open_[going], low[going], high[going]
+            t[active] = np.where(excess == 0, here, there)
+            moving = np.abs(t[active] - here) > 4e-16
+            active, low, high = active[moving], low[moving], high[moving]
         return piece, t
 
-    def _way(self, piece: IntArray, t: FloatArray) -> FloatArray:
+    def _length_to(self, piece: IntArray, t: FloatArray) -> FloatArray:
         """Length of pieces from their start to a parameter, by Gauss' formula for curved pieces."""
         found = np.abs(self._control[piece, 1] - self._control[piece, 0]) * t
         curved = np.flatnonzero(self._degree[piece] != 1)
         if curved.size:
-            nodes, weights = gauss()
+            nodes, weights = gauss_rule()
             which, until = np.repeat(piece[curved], nodes.size), t[curved]
             speed = np.abs(self._derivatives(which, (until[:, None] * nodes).ravel())[0])
             found[curved] = until * (speed.reshape(-1, nodes.size) @ weights)
@@ -398,7 +392,7 @@ class Curve:
         first, second = self._derivatives(piece, t)
         speed = np.abs(first)
         # If control points coincide with an end, the derivative is 0 there, and a short chord gives the direction.
-        slow = speed <= SLOW * np.abs(self._control[piece]).max(axis=1).clip(self.size)
+        slow = speed <= ZERO_DERIVATIVE * np.abs(self._control[piece]).max(axis=1).clip(self.size)
         if slow.any():
             step = np.where(t < 0.5, _CHORD, -_CHORD)
             chord = (self._point(piece, t + step) - self._point(piece, t)) / step
@@ -414,32 +408,32 @@ class Curve:
         portion = max(1, _PAIRS // side.size)
         for start in range(0, z.size, portion):
             part = slice(start, start + portion)
-            away = z[part, None] - self._chord_tail
-            along = np.clip((away / side).real, 0.0, 1.0)
-            chord[part] = np.argmin(np.abs(away - along * side), axis=1)
+            offset = z[part, None] - self._chord_tail
+            along = np.clip((offset / side).real, 0.0, 1.0)
+            chord[part] = np.argmin(np.abs(offset - along * side), axis=1)
             share[part] = np.take_along_axis(along, chord[part, None], axis=1)[:, 0]
         return chord, share
 
-    def _refined(self, piece: IntArray, t: FloatArray, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    def _refine(self, piece: IntArray, t: FloatArray, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Parameter of the nearest point of a piece to each given point, by Newton's method, and the distance."""
-        t, least = t.copy(), np.abs(self._point(piece, t) - z)
-        best, going = t.copy(), np.arange(z.size)
-        for _ in range(_REFINEMENTS):
-            at, here = piece[going], t[going]
-            away = self._point(at, here) - z[going]
+        t, smallest = t.copy(), np.abs(self._point(piece, t) - z)
+        best, active = t.copy(), np.arange(z.size)
+        for _ in range(_DISTANCE_STEPS):
+            at, here = piece[active], t[active]
+            offset = self._point(at, here) - z[active]
             first, second = self._derivatives(at, here)
-            slope = (away.conj() * first).real
+            slope = (offset.conj() * first).real
             square = np.abs(first) ** 2
-            bend = square + (away.conj() * second).real
+            bend = square + (offset.conj() * second).real
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = slope / np.where(bend > 0.5 * square, bend, square)
             there = np.clip(here - np.nan_to_num(step), 0.0, 1.0)
-            found = np.abs(self._point(at, there) - z[going])
-            better = found < least[going]
-            best[going[better]], least[going[better]] = there[better], found[better]
-            t[going] = there
+            found = np.abs(self._point(at, there) - z[active])
+            better = found < smallest[active]
+            best[active[better]], smallest[active[better]] = there[better], found[better]
+            t[active] = there
             # Most points converge in four steps; near a zero of the derivative it takes ten times as many.
-            going = going[np.abs(there - here) > _RESTS]
-            if not going.size:
+            active = active[np.abs(there - here) > _CONVERGED]
+            if not active.size:
                 break
-        return best, least
+        return best, smallest

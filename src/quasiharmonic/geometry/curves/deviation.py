@@ -21,9 +21,9 @@ from quasiharmonic.geometry.curves.boundary_curves import Chain, Track
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Sample points on a section, as fractions of its length.
-_SHARES = np.arange(1, 8) / 8
+_FRACTIONS = np.arange(1, 8) / 8
 # Maximum deviation of an edge relative to the largest initial deviation.
-_ALLOWED = 1.2
+_MAX_GROWTH = 1.2
 # Squared deviations below this fraction of the squared size of the curve are rounding: the curve is straight.
 _STRAIGHT = 1e-18
 
@@ -64,7 +64,7 @@ class DeviationBarrier:
             if not chain.curve.closed:
                 tail = tail[tail < chain.s.size - 1]
             head = ahead[tail]
-            bound = _ALLOWED**2 * _worst(chain, tail, head)
+            bound = _MAX_GROWTH**2 * _max_deviation(chain, tail, head)
             kept = chain.sliding[tail] | chain.sliding[head]
             if bound <= _STRAIGHT * chain.curve.size**2 or not kept.any():
                 continue
@@ -76,45 +76,51 @@ class DeviationBarrier:
 
     def value(self, s: FloatArray) -> float:
         """Mean barrier over the edges; ``inf`` if an edge exceeds its bound."""
-        total = sum(float(_barrier(share)[0].sum()) for share, _, _ in self._shares(s))
-        return total / max(len(self.pairs), 1)
+        return self.value_of(self.room(s))
+
+    def room(self, s: FloatArray) -> FloatArray:
+        """``1 − m/M`` of each edge (e,); not positive for an edge that exceeds its bound."""
+        return np.concatenate([np.empty(0), *(1 - share for share, _, _ in self._shares(s))])
+
+    @staticmethod
+    def value_of(room: FloatArray) -> float:
+        """Mean barrier of edges, given the `room` (e,) of each."""
+        if not room.size:
+            return 0.0
+        return float(np.mean(-np.log(room) - (1 - room))) if (room > 0).all() else np.inf
 
     def derivatives(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """First and second derivatives of the mean barrier by the lengths at the ends of each edge.
+        """First (e, 2) and second (e, 2, 2) derivatives of the mean barrier by the lengths at the ends of each edge.
 
-        Returns
-        -------
-        slope : (e, 2) float64
-        bend : (e, 2, 2) float64
-            Positive semidefinite.
+        The second derivatives are made positive semidefinite.
         """
-        slopes, bends = [np.empty((0, 2))], [np.empty((0, 2, 2))]
+        gradients, hessians = [np.empty((0, 2))], [np.empty((0, 2, 2))]
         for share, by_ends, by_both in self._shares(s):
-            _, first, second = _barrier(share)
-            slopes.append(first[:, None] * by_ends)
-            bends.append(
+            first, second = share / (1 - share), 1 / (1 - share) ** 2
+            gradients.append(first[:, None] * by_ends)
+            hessians.append(
                 first[:, None, None] * by_both + second[:, None, None] * by_ends[:, :, None] * by_ends[:, None, :]
             )
         count = max(len(self.pairs), 1)
-        return np.concatenate(slopes) / count, np.concatenate(bends) / count
+        return np.concatenate(gradients) / count, np.concatenate(hessians) / count
 
     def _shares(self, s: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         """``m/M`` of the edges on each curve, with first and second derivatives by the lengths of the ends."""
-        found, every = [], self._track.every(s)
+        found, every = [], self._track.all_lengths(s)
         for (k, tail, head), bound in zip(self._edges, self._bounds, strict=True):
-            share, by_ends, by_both = _strayed(
+            share, by_ends, by_both = _mean_deviation(
                 self._track.chains[k], every[k][tail], every[k][head], exactly=self._exactly
             )
             found.append((share / bound, by_ends / bound, by_both / bound))
         return found
 
 
-def _worst(chain: Chain, tail: IntArray, head: IntArray) -> float:
+def _max_deviation(chain: Chain, tail: IntArray, head: IntArray) -> float:
     """Largest squared deviation of an edge, initially or with sliding vertices halfway to the next."""
     if not tail.size:
         return 0.0
     here, there = chain.s[tail], chain.s[head]
-    found = _strayed(chain, here, there)[0].max()
+    found = _mean_deviation(chain, here, there)[0].max()
     middle = here + 0.5 * ((there - here) % chain.curve.length)
     # Halfway positions are used only for two consecutive edges with a sliding vertex between them, so that no corner is
     # cut off.
@@ -122,42 +128,34 @@ def _worst(chain: Chain, tail: IntArray, head: IntArray) -> float:
     links = [(order[int(i)], k) for k, i in enumerate(tail) for i in [head[k]] if int(i) in order and chain.sliding[i]]
     if links:
         before, after = (middle[k] % chain.curve.length for k in np.array(links).T[::-1])
-        found = max(found, _strayed(chain, before, after)[0].max())
+        found = max(found, _mean_deviation(chain, before, after)[0].max())
     return float(found)
 
 
-def _strayed(
+def _mean_deviation(
     chain: Chain, begin: FloatArray, end: FloatArray, *, exactly: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean squared distances between sections (e,) of a curve and their chords, with derivatives by both ends."""
     curve = chain.curve
     gap = (end - begin) % curve.length if curve.closed else end - begin
-    shares = np.concatenate([[0.0], _SHARES, [1.0]])
+    shares = np.concatenate([[0.0], _FRACTIONS, [1.0]])
     along = begin[:, None] + gap[:, None] * shares
-    points, tangents = curve.sampled(along, exactly=exactly)
+    points, tangents = curve.sample(along, exactly=exactly)
     side = points[:, -1] - points[:, 0]
     normal = 1j * side / np.abs(side)
     local = (points[:, 1:-1] - points[:, :1]) / side[:, None]
-    away = local.imag * np.abs(side)[:, None]
+    distance = local.imag * np.abs(side)[:, None]
 
     def across(vectors: NDArray[np.complex128]) -> FloatArray:
         return np.asarray((vectors * normal.conj()[:, None]).real)
 
-    own = across(tangents[:, 1:-1])
-    by_begin = (1 - _SHARES) * own - (1 - local.real) * across(tangents[:, :1])
-    by_end = _SHARES * own - local.real * across(tangents[:, -1:])
+    inner = across(tangents[:, 1:-1])
+    by_begin = (1 - _FRACTIONS) * inner - (1 - local.real) * across(tangents[:, :1])
+    by_end = _FRACTIONS * inner - local.real * across(tangents[:, -1:])
     by_ends = np.stack([by_begin, by_end], axis=1)
-    count = _SHARES.size
+    count = _FRACTIONS.size
     return (
-        (away**2).sum(axis=1) / count,
-        2 * (away[:, None] * by_ends).sum(axis=2) / count,
+        (distance**2).sum(axis=1) / count,
+        2 * (distance[:, None] * by_ends).sum(axis=2) / count,
         2 * by_ends @ by_ends.swapaxes(1, 2) / count,
     )
-
-
-def _barrier(share: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """``−log(1 − x) − x`` with its first two derivatives."""
-    room = 1 - share
-    with np.errstate(divide="ignore", invalid="ignore"):
-        value = np.where(room > 0, -np.log1p(-np.minimum(share, 1)) - share, np.inf)
-    return value, share / room, 1 / room**2

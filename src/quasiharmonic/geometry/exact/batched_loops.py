@@ -21,37 +21,27 @@ def certify_each(
 ) -> list[Certificate]:
     """Certify maps exactly; each result equals that of `certify`.
 
-    Parameters
-    ----------
-    F : sequence of (f, 3) int64
-        Triangles of each surface.
-    uv : sequence of (n, 2) float64
-        Positions of the vertices of each surface.
-    loops : sequence of sequences of (l,) int64
-        Boundary loops of each surface, as returned by `boundary_loops`; not checked.
-
-    Returns
-    -------
-    list of Certificate
+    The loops are those of `boundary_loops`, not checked.
     """
     if not F:
         return []
     vertices = np.cumsum([0, *map(len, uv)])
     triangles = np.cumsum([0, *map(len, F)])
-    places = np.concatenate(uv)
+    positions = np.concatenate(uv)
     good = np.array([len(rims) == 1 for rims in loops]) & (np.diff(triangles) > 0)
-    bad = inverted_triangles(np.concatenate([T + first for T, first in zip(F, vertices[:-1], strict=True)]), places)
+    bad = inverted_triangles(np.concatenate([T + first for T, first in zip(F, vertices[:-1], strict=True)]), positions)
     good[np.searchsorted(triangles, bad, side="right") - 1] = False
-    alone = np.flatnonzero(good)
-    if alone.size:
-        rims = [loops[k][0] + vertices[k] for k in alone.tolist()]
-        good[alone] = simple_loops(rims, places)
+    candidates = np.flatnonzero(good)
+    if candidates.size:
+        rims = [loops[k][0] + vertices[k] for k in candidates.tolist()]
+        good[candidates] = simple_loops(rims, positions)
     return [
-        _bijective(F[k], uv[k], loops[k]) if good[k] else certify(F[k], uv[k], loops=loops[k]) for k in range(len(F))
+        _bijective_certificate(F[k], uv[k], loops[k]) if good[k] else certify(F[k], uv[k], loops=loops[k])
+        for k in range(len(F))
     ]
 
 
-def _bijective(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certificate:
+def _bijective_certificate(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certificate:
     """Certificate of a bijective map."""
     none = np.empty(0, dtype=np.int64)
     return Certificate(

@@ -35,22 +35,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from quasiharmonic.geometry.exact.loops import Obstacle, Reason, judge_loops, listed, simple_loops
-from quasiharmonic.geometry.exact.triangles import overwound_vertices, triangle_signs
+from quasiharmonic.geometry.exact.loops import Obstacle, Reason, check_loops, join_items, simple_loops
+from quasiharmonic.geometry.exact.triangles import find_multiply_wound, triangle_signs
 from quasiharmonic.geometry.mesh.topology import edges, trace_loops
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     ReadOnly,
-    check_range,
-    counted,
-    loop_arrays,
-    map_array,
-    named,
-    own_triangles,
-    true_or_false,
+    count_of,
+    names_of,
     unchangeable,
 )
 from quasiharmonic.util.display import Displayable
@@ -138,23 +133,23 @@ class Certificate(ReadOnly, Displayable):
         """Describe in one or two sentences what is certified, or what is wrong and where."""
         further = [r.text for r in self.reasons if r.kind is not Obstacle.NOT_INJECTIVE]
         if self.injective:
-            all_of_them = "the only triangle is" if self.triangles == 1 else f"all {self.triangles} triangles are"
-            said = f"Injective: {all_of_them} positive."
+            triangles = "the only triangle is" if self.triangles == 1 else f"all {self.triangles} triangles are"
+            first_sentence = f"Injective: {triangles} positive."
         elif self.triangles:
-            counted = _counted(self.inverted, self.degenerate, self.nonfinite)
-            said = f"Not injective: of {self.triangles} triangles, {counted}."
+            bad_triangles = _count_by_kind(self.inverted, self.degenerate, self.nonfinite)
+            first_sentence = f"Not injective: of {self.triangles} triangles, {bad_triangles}."
         else:
             return "Not injective: there are no triangles."
         if self.bijective:
-            return f"{said} Bijective: the boundary does not meet itself, and no point is covered twice."
+            return f"{first_sentence} Bijective: the boundary does not meet itself, and no point is covered twice."
         if not further:
-            return said
+            return first_sentence
         more = f"; and {len(further) - 3} more" if len(further) > 3 else ""
-        return f"{said} Not bijective{'' if self.injective else ' either'}: {'; '.join(further[:3])}{more}."
+        return f"{first_sentence} Not bijective{'' if self.injective else ' either'}: {'; '.join(further[:3])}{more}."
 
     def short_repr(self) -> str:
         bad = self.inverted.size + self.degenerate.size + self.nonfinite.size
-        triangles = counted("triangle", "triangles", self.triangles)
+        triangles = count_of("triangle", "triangles", self.triangles)
         if bad or not self.triangles:
             return f"not injective, {bad:,} of {triangles} not positive"
         also = {True: " and bijective", False: ", not bijective", None: ""}[self.bijective]
@@ -183,14 +178,22 @@ class Certificate(ReadOnly, Displayable):
 
 
 def certify(
-    F: ArrayLike, uv: ArrayLike, *, boundary: bool = True, loops: Sequence[ArrayLike] | None = None
+    F: IntArray, uv: FloatArray, *, boundary: bool = True, loops: Sequence[IntArray] | None = None
 ) -> Certificate:
-    """Verify whether the map of an array of triangles is injective and bijective; as `quasiharmonic.certify`."""
-    true_or_false("boundary", boundary)
-    F, uv = _taken(F, uv)
-    given = None if loops is None else loop_arrays(loops, len(uv))
-    if given == [] and len(F):
-        raise ValueError("loops has no boundary loop: omit it to find the loops automatically")
+    """Verify exactly whether a map is injective and bijective; `quasiharmonic.certify` converts and checks its input.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+        Triangles; only the range of their indices is checked.
+    uv : (n, 2) float64
+        Positions, which need not be finite.
+    boundary : bool
+        Whether to check the boundary, too.
+    loops : sequence of (l,) int64, optional
+        The boundary loops of ``F``, at least one if there are triangles; not checked.
+    """
+    F, uv = unchangeable(F), unchangeable(uv)
     sign, nonfinite = triangle_signs(F, uv)
     inverted = degenerate = np.empty(0, dtype=np.int64)
     reasons: list[Reason] = []
@@ -199,23 +202,23 @@ def certify(
     elif sign.min() <= 0:
         inverted = np.flatnonzero(sign < 0)
         degenerate = np.setdiff1d(np.flatnonzero(sign == 0), nonfinite, assume_unique=True)
-        text = f"of {len(F)} triangles, {_counted(inverted, degenerate, nonfinite)}"
+        text = f"of {len(F)} triangles, {_count_by_kind(inverted, degenerate, nonfinite)}"
         reasons.append(Reason(Obstacle.NOT_INJECTIVE, text))
     known: list[IntArray] = []
     crossings, multiply_wound = np.empty((0, 4), dtype=np.int64), np.empty(0, dtype=np.int64)
     if boundary and len(F):
-        known, broken = _loops(F, len(uv)) if given is None else (given, [])
-        reasons += broken
+        known, defects = _find_loops(F, len(uv)) if loops is None else (list(loops), [])
+        reasons += defects
         # If all triangles are positive and the only loop is simple, the loop encloses the sum of their areas. So it
         # runs counterclockwise and winds once around its inside, and no further test is needed.
-        plain = not reasons and len(known) == 1 and bool(simple_loops(known, uv)[0])
-        if not broken and not plain:
-            multiply_wound = overwound_vertices(F, uv, sign, known)
+        is_simple = not reasons and len(known) == 1 and bool(simple_loops(known, uv)[0])
+        if not defects and not is_simple:
+            multiply_wound = find_multiply_wound(F, uv, sign, known)
             if np.isfinite(uv[np.concatenate(known)]).all():
-                crossings, found = judge_loops(known, uv)
+                crossings, found = check_loops(known, uv)
                 reasons += found
         if multiply_wound.size:
-            text = f"triangles wind more than once around {named('vertex', 'vertices', multiply_wound)}"
+            text = f"triangles wind more than once around {names_of('vertex', 'vertices', multiply_wound)}"
             reasons.append(Reason(Obstacle.MULTIPLY_WOUND, text))
     return Certificate(
         triangles=len(F),
@@ -232,61 +235,26 @@ def certify(
     )
 
 
-def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
-    """Whether every triangle of an array is strictly positive; as `quasiharmonic.is_injective`."""
-    F, uv = _taken(F, uv)
+def is_injective(F: IntArray, uv: FloatArray) -> bool:
+    """Return whether there are triangles and all are strictly positive; the arguments are as for `certify`."""
     return len(F) > 0 and bool(triangle_signs(F, uv)[0].min() > 0)
 
 
-def inverted_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
-    """Indices of the triangles that are not strictly positive; as `quasiharmonic.inverted_triangles`."""
-    return np.flatnonzero(triangle_signs(*_taken(F, uv))[0] <= 0)
+def inverted_triangles(F: IntArray, uv: FloatArray) -> IntArray:
+    """Return the indices of the triangles that are not strictly positive; the arguments are as for `certify`."""
+    return np.flatnonzero(triangle_signs(F, uv)[0] <= 0)
 
 
-def _taken(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
-    """Convert triangles to int64 and positions to float64; raise ValueError if this is not possible exactly."""
-    triangles = own_triangles(F)
-    given = getattr(uv, "uv", uv)
-    places = map_array("uv", given, finite=False)
-    rounded = _rounded(given, places)
-    if rounded.size:
-        # Report a vertex that does not exist first: it is the simpler mistake.
-        check_range("F", triangles, len(places))
-        raise ValueError(f"uv does not fit double precision at {named('vertex', 'vertices', rounded)}")
-    return triangles, places
-
-
-def _rounded(given: ArrayLike, places: FloatArray) -> IntArray:
-    """Indices of vertices whose positions (n, 2) may differ from the input because double precision rounded them."""
-    stored = np.asarray(given)
-    if stored.dtype.kind == "f" and stored.dtype.itemsize > 8:
-        return np.flatnonzero(((places != stored) & ~np.isnan(places)).any(axis=1))
-    if stored.dtype.kind == "f" and not isinstance(given, list | tuple):
-        return np.empty(0, dtype=np.int64)
-    large = np.argwhere(np.abs(places) >= 2.0**53)
-    if stored.dtype.kind == "f":
-        # NumPy converts a list of integers and floats to doubles, which rounds large integers.
-        kept = [at for at in large.tolist() if _is_rounded(given, places, *at)]
-        large = np.array(kept, dtype=np.int64).reshape(-1, 2)
-    return np.unique(large[:, 0])
-
-
-def _is_rounded(given: Any, places: FloatArray, vertex: int, axis: int) -> bool:
-    """Whether an integer in nested lists differs from the double that it was converted to."""
-    number = given[vertex][axis]
-    return not isinstance(number, float | np.floating) and int(number) != int(places[vertex, axis])
-
-
-def _counted(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
+def _count_by_kind(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
     """Count and list the non-positive triangles by kind."""
     return ", ".join(
-        f"{bad.size} {'is' if bad.size == 1 else 'are'} {what} ({listed(bad.tolist())})"
+        f"{bad.size} {'is' if bad.size == 1 else 'are'} {what} ({join_items(bad.tolist())})"
         for bad, what in ((inverted, "inverted"), (degenerate, "degenerate"), (nonfinite, "not finite"))
         if bad.size
     )
 
 
-def _loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
+def _find_loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
     """Boundary loops, or the reasons why there are no valid loops."""
     parts, repeated = edges(F, n), np.empty(0, dtype=np.int64)
     # An edge from a vertex to itself is never interior, so only the other kinds of edges need a test.
@@ -294,21 +262,21 @@ def _loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
         repeated = np.flatnonzero((F[:, (1, 2, 0)] == F).any(axis=1))
     wrong = (
         (repeated.tolist(), "triangles repeat a vertex"),
-        (_dashed(parts.nonmanifold), "edges are in three or more triangles"),
-        (_dashed(parts.inconsistent), "edges are traversed twice in the same direction"),
+        (_edge_names(parts.nonmanifold), "edges are in three or more triangles"),
+        (_edge_names(parts.inconsistent), "edges are traversed twice in the same direction"),
     )
-    broken = [f"{what} ({listed(found)})" for found, what in wrong if found]
-    if not broken:
+    defects = [f"{what} ({join_items(found)})" for found, what in wrong if found]
+    if not defects:
         try:
             loops = trace_loops(parts.boundary)
         except ValueError as error:
-            broken = [str(error)]
-    if broken:
-        return [], [Reason(Obstacle.NOT_A_SURFACE, f"the mesh is not a surface: {text}") for text in broken]
+            defects = [str(error)]
+    if defects:
+        return [], [Reason(Obstacle.NOT_A_SURFACE, f"the mesh is not a surface: {text}") for text in defects]
     if not loops:
         return [], [Reason(Obstacle.NO_BOUNDARY, "the surface has no boundary")]
     return loops, []
 
 
-def _dashed(pairs: IntArray) -> list[str]:
+def _edge_names(pairs: IntArray) -> list[str]:
     return [f"{i}–{j}" for i, j in pairs.tolist()]

@@ -23,23 +23,19 @@ from collections.abc import Iterable
 import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.geometry.exact.sweep import triangulate
 from quasiharmonic.geometry.exact.triangles import triangle_signs
-from quasiharmonic.geometry.exact.triangulation import triangulate
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-# Bounds with a margin on the rounding of an orientation and of an in-circle determinant, relative to the sum of
-# the magnitudes of their terms.
-_FLAT, _ROUND = 4e-16, 2e-15
+# Bound with a margin on the rounding of an orientation, relative to the sum of the magnitudes of its terms.
+_ORIENTATION_BOUND = 4e-16
+# The same for an in-circle determinant.
+_CIRCLE_BOUND = 2e-15
 
 
 class BlockedError(ValueError):
-    """A segment passes through a point that is not one of its ends.
-
-    Attributes
-    ----------
-    point : int
-    """
+    """A segment passes through the point ``point``, which is not one of its ends."""
 
     def __init__(self, tail: int, head: int, point: int) -> None:
         super().__init__(f"the segment from point {tail} to point {head} passes through point {point}")
@@ -70,7 +66,7 @@ def constrained_delaunay(points: FloatArray, segments: IntArray, hull: IntArray)
     ValueError
         If points coincide, or a point is outside the polygon.
     """
-    F = by_qhull(points)
+    F = delaunay_by_qhull(points)
     triangulation = None
     if not _covers(F, points, hull):
         triangulation = Triangulation.of_points(points, hull)
@@ -82,46 +78,36 @@ def constrained_delaunay(points: FloatArray, segments: IntArray, hull: IntArray)
     if not len(missing):
         return F
     triangulation = triangulation or Triangulation(points, F)
-    triangulation.keep(segments)
+    triangulation.require(segments)
     for tail, head in missing.tolist():
         triangulation.recover(tail, head)
     return triangulation.triangles()
 
 
 def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
-    """Triangulate a simple polygon without further points.
+    """Triangulate a simple polygon (k, 2) without further points; None if the polygon runs clockwise.
 
     The algorithm runs in plain Python and suits polygons of up to a few hundred corners.
-
-    Parameters
-    ----------
-    points : (k, 2) float64
-        Corners of the polygon.
-
-    Returns
-    -------
-    (k - 2, 3) int64 or None
-        Counterclockwise triangles, or None if the polygon runs clockwise.
     """
-    corners = _whole(points)
+    corners = _scale_to_integers(points)
     if sum(corners[k - 1][0] * y - x * corners[k - 1][1] for k, (x, y) in enumerate(corners)) < 0:
         return None
-    made = Triangulation(points, np.array(triangulate(corners), dtype=np.int64))
+    triangulation = Triangulation(points, np.array(triangulate(corners), dtype=np.int64))
     sides = np.arange(len(points))
-    made.keep(np.stack([sides, np.roll(sides, -1)], axis=1))
-    made.legalise()
-    return made.triangles()
+    triangulation.require(np.stack([sides, np.roll(sides, -1)], axis=1))
+    triangulation.legalise()
+    return triangulation.triangles()
 
 
-def _whole(points: FloatArray) -> list[tuple[int, int]]:
-    """Scale points by a power of two to whole numbers, exactly."""
+def _scale_to_integers(points: FloatArray) -> list[tuple[int, int]]:
+    """Scale points by a power of two to integers, exactly."""
     ratios = [value.as_integer_ratio() for value in points.ravel().tolist()]
     finest = max(denominator for _, denominator in ratios)
-    whole = [numerator * (finest // denominator) for numerator, denominator in ratios]
-    return list(zip(whole[::2], whole[1::2], strict=True))
+    integers = [numerator * (finest // denominator) for numerator, denominator in ratios]
+    return list(zip(integers[::2], integers[1::2], strict=True))
 
 
-def by_qhull(points: FloatArray) -> IntArray:
+def delaunay_by_qhull(points: FloatArray) -> IntArray:
     """Delaunay triangles computed by Qhull, all of them counterclockwise."""
     from scipy.spatial import Delaunay, QhullError
 
@@ -150,14 +136,7 @@ def _covers(F: IntArray, points: FloatArray, hull: IntArray) -> bool:
 
 
 class Triangulation:
-    """Triangulation of a convex polygon that is changed by edge flips.
-
-    Parameters
-    ----------
-    points : (n, 2) float64
-    F : (t, 3) int64
-        Strictly positive triangles that cover a convex polygon once.
-    """
+    """Triangulation of a convex polygon, which strictly positive triangles cover once, changed by edge flips."""
 
     def __init__(self, points: FloatArray, F: IntArray) -> None:
         self._array = points
@@ -165,32 +144,32 @@ class Triangulation:
         tails, heads, apexes = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.roll(F, -2, axis=1).ravel()
         # The third corner of the triangle to the left of each half-edge, and one half-edge from every point.
         self._apex = dict(zip(zip(tails.tolist(), heads.tolist(), strict=True), apexes.tolist(), strict=True))
-        self._some = dict(zip(tails.tolist(), heads.tolist(), strict=True))
-        self._kept: set[tuple[int, int]] = set()
+        self._neighbour = dict(zip(tails.tolist(), heads.tolist(), strict=True))
+        self._required: set[tuple[int, int]] = set()
 
     @classmethod
     def of_points(cls, points: FloatArray, hull: IntArray) -> Triangulation:
         """Insert the points one by one into the convex polygon with corners ``hull``."""
         fan = np.stack([np.full(len(hull) - 2, hull[0]), hull[1:-1], hull[2:]], axis=1)
-        made = cls(points, fan)
-        made.legalise()
+        triangulation = cls(points, fan)
+        triangulation.legalise()
         inner = np.setdiff1d(np.arange(len(points)), hull)
         at = int(hull[0])
-        for point in inner[_along_curve(points[inner])].tolist():
-            made._insert(point, at)
+        for point in inner[_snake_order(points[inner])].tolist():
+            triangulation._insert(point, at)
             at = point
-        return made
+        return triangulation
 
     def triangles(self) -> IntArray:
         """All triangles, (t, 3) int64, each starting at its smallest corner."""
         found = [(a, b, c) for (a, b), c in self._apex.items() if a < b and a < c]
         return np.array(found, dtype=np.int64).reshape(-1, 3)
 
-    def keep(self, segments: IntArray) -> None:
+    def require(self, segments: IntArray) -> None:
         """Mark segments that `legalise` must not remove."""
         pairs = [(a, b) for a, b in segments.tolist()]
-        self._kept.update(pairs)
-        self._kept.update((b, a) for a, b in pairs)
+        self._required.update(pairs)
+        self._required.update((b, a) for a, b in pairs)
 
     def legalise(self) -> None:
         """Flip edges until all unmarked edges satisfy Delaunay's criterion."""
@@ -198,8 +177,8 @@ class Triangulation:
 
     def recover(self, tail: int, head: int) -> None:
         """Make a segment an edge by flipping the edges that cross it."""
-        crossing = deque(self._crossed(tail, head))
-        made = []
+        crossing = deque(self._find_crossed(tail, head))
+        new_edges = []
         while crossing:
             p, q = crossing.popleft()
             if not self._flippable(p, q):
@@ -212,19 +191,19 @@ class Triangulation:
             ):
                 crossing.append((left, right))
             else:
-                made.append((left, right))
-        self._legalise(made)
+                new_edges.append((left, right))
+        self._legalise(new_edges)
 
-    def _crossed(self, tail: int, head: int) -> list[tuple[int, int]]:
+    def _find_crossed(self, tail: int, head: int) -> list[tuple[int, int]]:
         """Edges that cross a segment, starting at its tail, with the end on its right first."""
         if (tail, head) in self._apex or (head, tail) in self._apex:
             return []
-        right = self._some[tail]
+        right = self._neighbour[tail]
         while True:
             left = self._apex[tail, right]
             if self._turn(tail, head, right) < 0 < self._turn(tail, head, left):
                 break
-            if self._turn(tail, head, left) == 0 and self._ahead(tail, head, left):
+            if self._turn(tail, head, left) == 0 and self._is_ahead(tail, head, left):
                 raise BlockedError(tail, head, left)
             right = left
         found = [(right, left)]
@@ -239,7 +218,7 @@ class Triangulation:
     def _insert(self, point: int, at: int) -> None:
         """Split the triangle or edge that contains a point; the search starts ``at`` another point."""
         a = at
-        b = self._some[a]
+        b = self._neighbour[a]
         c = self._apex[a, b]
         # Cross any side that has the point on its right. This terminates in Delaunay triangulations.
         while True:
@@ -265,8 +244,8 @@ class Triangulation:
             self._apex[tail, head] = point
             self._apex[head, point] = tail
             self._apex[point, tail] = head
-            self._some[tail] = head
-        self._some[point] = around[0][0]
+            self._neighbour[tail] = head
+        self._neighbour[point] = around[0][0]
         self._legalise(around)
 
     def _legalise(self, suspects: Iterable[tuple[int, int]]) -> None:
@@ -274,7 +253,7 @@ class Triangulation:
         waiting = list(suspects)
         while waiting:
             p, q = waiting.pop()
-            if (p, q) not in self._apex or (q, p) not in self._apex or (p, q) in self._kept:
+            if (p, q) not in self._apex or (q, p) not in self._apex or (p, q) in self._required:
                 continue
             if self._in_circle(p, q) and self._flippable(p, q):
                 left, right = self._flip(p, q)
@@ -290,10 +269,10 @@ class Triangulation:
         left, right = self._apex.pop((p, q)), self._apex.pop((q, p))
         for a, b, c in ((right, q, left), (left, p, right)):
             self._apex[a, b], self._apex[b, c], self._apex[c, a] = c, a, b
-        self._some[p], self._some[q] = right, left
+        self._neighbour[p], self._neighbour[q] = right, left
         return left, right
 
-    def _ahead(self, tail: int, head: int, point: int) -> bool:
+    def _is_ahead(self, tail: int, head: int, point: int) -> bool:
         x, y = self._x, self._y
         along = (x[head] - x[tail]) * (x[point] - x[tail]) + (y[head] - y[tail]) * (y[point] - y[tail])
         return along > 0
@@ -303,7 +282,7 @@ class Triangulation:
         x, y = self._x, self._y
         left = (x[a] - x[c]) * (y[b] - y[c])
         right = (y[a] - y[c]) * (x[b] - x[c])
-        if abs(left - right) > _FLAT * (abs(left) + abs(right)) + 1e-300:
+        if abs(left - right) > _ORIENTATION_BOUND * (abs(left) + abs(right)) + 1e-300:
             return left - right
         return float(orientation(self._array[a], self._array[b], self._array[c]))
 
@@ -317,10 +296,10 @@ class Triangulation:
         size = (
             pp * (abs(qx * ay) + abs(qy * ax)) + qq * (abs(ax * py) + abs(ay * px)) + aa * (abs(px * qy) + abs(py * qx))
         )
-        return det > _ROUND * size
+        return det > _CIRCLE_BOUND * size
 
 
-def _along_curve(points: FloatArray) -> IntArray:
+def _snake_order(points: FloatArray) -> IntArray:
     """Order points row by row in alternating directions, so that neighbours in the order are close."""
     rows = max(int(np.sqrt(len(points) / 2)), 1)
     low, extent = points.min(axis=0), np.ptp(points, axis=0)

@@ -9,24 +9,12 @@ from quasiharmonic.geometry.mesh.polygons import Polygons
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
-def not_convex(polygons: Polygons | None, F: IntArray, uv: FloatArray) -> IntArray:
-    """Find polygons that are not strictly convex or not counterclockwise.
+def find_concave(polygons: Polygons | None, F: IntArray, uv: FloatArray) -> IntArray:
+    """Find polygons that are not strictly convex or not counterclockwise, (k,) int64 ascending.
 
     A polygon is strictly convex and winds once if and only if two conditions hold. It turns left at every corner, and
     every edge lies to the left as seen from the first corner. The second condition excludes polygons that wind several
     times. Then all triangulations of the polygon have only positive triangles.
-
-    Parameters
-    ----------
-    polygons : Polygons or None
-        Rings of corners of the triangles; None if all faces are triangles.
-    F : (f, 3) int64
-    uv : (n, 2) float64
-
-    Returns
-    -------
-    (k,) int64
-        Ascending indices.
     """
     if polygons is None:
         polygons = Polygons(np.arange(F.size), 3 * np.arange(len(F) + 1))

@@ -58,34 +58,34 @@ def inverted_elements(F: ArrayLike, points: ArrayLike) -> IntArray:
     points = map_array("points", points, finite=False)
     F = element_rows(F, len(points))
     if F.shape[1] == 6:
-        return _curved(points[F])
+        return _find_inverted_curved(points[F])
     triangles, of = (F, np.arange(len(F))) if F.shape[1] == 3 else corner_triangles(F)
     sign, _ = orientation_or_nonfinite(*(points[triangles[:, k]] for k in range(3)))
     return np.unique(of[sign <= 0])
 
 
-def _curved(nodes: FloatArray) -> IntArray:
+def _find_inverted_curved(nodes: FloatArray) -> IntArray:
     """Inverted elements among second-order triangles (f, 6, 2); (k,) int64."""
     with np.errstate(all="ignore"):
-        place = nodes - nodes[:, :1]
-        exponent = np.frexp(np.abs(place).max(axis=(1, 2)))[1]
-        place = np.ldexp(place, -exponent[:, None, None])
-        extent = np.abs(place).max(axis=1).prod(axis=1)
-        values = jacobian_coefficients(place[..., 0], place[..., 1])
+        offsets = nodes - nodes[:, :1]
+        exponent = np.frexp(np.abs(offsets).max(axis=(1, 2)))[1]
+        offsets = np.ldexp(offsets, -exponent[:, None, None])
+        extent = np.abs(offsets).max(axis=1).prod(axis=1)
+        values = jacobian_coefficients(offsets[..., 0], offsets[..., 1])
         bound = (_RELATIVE_BOUND * extent + _UNDERFLOW_BOUND)[:, None]
         good, bad = (values > bound).all(axis=1), (values[:, :3] < -bound).any(axis=1)
     # Elements that are not finite are neither good nor bad here.
     for k in np.flatnonzero(~good & ~bad).tolist():
-        bad[k] = not (np.isfinite(nodes[k]).all() and _positive_everywhere(nodes[k]))
+        bad[k] = not (np.isfinite(nodes[k]).all() and _is_positive_everywhere(nodes[k]))
     return np.flatnonzero(bad)
 
 
-def _positive_everywhere(nodes: FloatArray) -> bool:
+def _is_positive_everywhere(nodes: FloatArray) -> bool:
     """Whether the Jacobian determinant of one element (6, 2) is positive everywhere, in integer arithmetic."""
     ratios = [value.as_integer_ratio() for value in nodes.ravel().tolist()]
     unit = max(denominator for _, denominator in ratios)  # all are powers of two
-    whole = [numerator * (unit // denominator) for numerator, denominator in ratios]
-    x, y = whole[::2], whole[1::2]
+    integers = [numerator * (unit // denominator) for numerator, denominator in ratios]
+    x, y = integers[::2], integers[1::2]
     a, b, c, ab, bc, ca = (
         sum(s * p * q for row, p in zip(form, x, strict=True) for s, q in zip(row, y, strict=True))
         for form in FORMS.tolist()

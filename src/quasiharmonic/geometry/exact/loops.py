@@ -26,7 +26,7 @@ from quasiharmonic.util.kernels import compiled
 SignArray = NDArray[np.int8]
 
 # Maximum number of pairs of boundary edges to list. A collapsed boundary has billions.
-_MOST_CROSSINGS = 1000
+_MAX_CROSSINGS = 1000
 # Number of pairs of an edge and a point at the same height that are processed together.
 PAIR_CHUNK = 1 << 18
 
@@ -49,14 +49,7 @@ class Obstacle(StrEnum):
 class Reason:
     """One reason why a map is not bijective.
 
-    Attributes
-    ----------
-    kind : Obstacle
-        Kind of defect.
-    text : str
-        Description of the defect and its location.
-    loops : tuple of int
-        The boundary loops concerned, as indices into `Certificate.loops`.
+    ``loops`` are the boundary loops concerned, as indices into `Certificate.loops`.
     """
 
     kind: Obstacle
@@ -86,28 +79,17 @@ class Contacts:
     complete: bool
 
 
-def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
-    """Find all pairs of segments that share more than a common end.
+def contacts(positions: FloatArray, ends: IntArray, limit: int) -> Contacts:
+    """Find at most ``limit`` pairs of segments that share more than a common end.
 
-    Parameters
-    ----------
-    positions : (n, 2) float64
-        Points; finite where ``ends`` uses them.
-    ends : (m, 2) int64
-        Segments as pairs of points. A segment with two equal ends is a point.
-    most : int
-        Maximum number of pairs to collect.
-
-    Returns
-    -------
-    Contacts
-        Pairs without a common end that meet, and pairs with a common end that overlap.
+    ``ends`` (m, 2) int64 has the segments as pairs of points, whose positions are finite. A segment with two equal ends
+    is a point. The result has pairs without a common end that meet, and pairs with a common end that overlap.
     """
     tail, head = np.array(ends.T, order="C")
     p, q = positions[tail], positions[head]
     found, relations = [np.empty((0, 2), dtype=np.int64)], [np.empty(0, dtype=np.int8)]
     number = 0
-    for i, j in _doubtful(positions, tail, head, np.array([0, len(ends)])):
+    for i, j in _find_doubtful(positions, tail, head, np.array([0, len(ends)])):
         relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
         near = np.flatnonzero(relation != SegmentRelation.DISJOINT)
         i, j, relation = i[near], j[near], relation[near]
@@ -116,33 +98,33 @@ def contacts(positions: FloatArray, ends: IntArray, most: int) -> Contacts:
         found.append(np.stack([i[bad], j[bad]], axis=1))
         relations.append(relation[bad])
         number += len(found[-1])
-        if number > most:
+        if number > limit:
             break
-    return Contacts(np.concatenate(found)[:most], np.concatenate(relations)[:most], number <= most)
+    return Contacts(np.concatenate(found)[:limit], np.concatenate(relations)[:limit], number <= limit)
 
 
-def _doubtful(
-    places: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray
+def _find_doubtful(
+    positions: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray
 ) -> Iterable[tuple[IntArray, IntArray]]:
     """Yield portions of the segment pairs that need an exact test."""
     # Usually there are few or no such pairs. A collapsed boundary has billions, which are not stored.
     pairs = np.empty((len(tails), 2), dtype=np.int64)
-    number = doubtful_pairs(np.ascontiguousarray(places, dtype=np.float64), tails, heads, starts, pairs)
+    number = doubtful_pairs(np.ascontiguousarray(positions, dtype=np.float64), tails, heads, starts, pairs)
     if number < 0:
-        p, q = places[tails], places[heads]
+        p, q = positions[tails], positions[heads]
         return box_pairs_within(np.minimum(p, q), np.maximum(p, q), starts)
     i, j = pairs[:number].T
     return [(i, j)] if number else []
 
 
 @compiled
-def doubtful_pairs(places: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray, pairs: IntArray) -> int:
+def doubtful_pairs(positions: FloatArray, tails: IntArray, heads: IntArray, starts: IntArray, pairs: IntArray) -> int:
     """List pairs of segments of the same group that may share more than an end, as far as floating point can tell.
 
     Segments (m,) are sorted by group, with starts (g + 1,). Return the number of pairs (k, 2), or -1 if they do not
     fit.
     """
-    p, q = places[tails], places[heads]
+    p, q = positions[tails], positions[heads]
     found, number = [np.empty((0, 2), dtype=np.int64)], 0
     for i, j in box_pairs_within(np.minimum(p, q), np.maximum(p, q), starts):
         tail, head = tails[i] == tails[j], heads[i] == heads[j]
@@ -164,8 +146,8 @@ def doubtful_pairs(places: FloatArray, tails: IntArray, heads: IntArray, starts:
         number += len(found[-1])
         if number > len(pairs):
             return -1
-    listed = np.concatenate(found)
-    pairs[:number] = listed[np.lexsort(listed.T[::-1])]
+    join_items = np.concatenate(found)
+    pairs[:number] = join_items[np.lexsort(join_items.T[::-1])]
     return number
 
 
@@ -185,30 +167,18 @@ def _may_meet(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> Boo
 
 
 def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
-    """Test which of many loops are simple; contacts between different loops do not matter.
-
-    Parameters
-    ----------
-    loops : list of (l,) int64
-        Vertices, at least three each.
-    uv : (n, 2) float64
-        Positions, finite where the loops use them.
-
-    Returns
-    -------
-    (k,) bool
-    """
+    """Tell which of many loops are simple, (k,) bool; contacts between different loops do not matter."""
     simple = np.ones(len(loops), dtype=bool)
-    vertices, starts, following = _in_turn(loops)
+    vertices, starts, following = _concatenate_loops(loops)
     p = uv.take(vertices, 0)
-    for i, j in _doubtful(p, np.arange(len(p)), following, starts):
+    for i, j in _find_doubtful(p, np.arange(len(p)), following, starts):
         q = p[following]
         relation = segment_relation(p.take(i, 0), q.take(i, 0), p.take(j, 0), q.take(j, 0))
         joined = (following[i] == j) | (following[j] == i)
-        met = np.where(joined, relation == SegmentRelation.OVERLAPPING, relation != SegmentRelation.DISJOINT)
+        meets = np.where(joined, relation == SegmentRelation.OVERLAPPING, relation != SegmentRelation.DISJOINT)
         # An edge of zero length lies entirely on the edges before and after it.
-        met |= (p.take(i, 0) == q.take(i, 0)).all(axis=1) | (p.take(j, 0) == q.take(j, 0)).all(axis=1)
-        simple[np.searchsorted(starts, i[met], side="right") - 1] = False
+        meets |= (p.take(i, 0) == q.take(i, 0)).all(axis=1) | (p.take(j, 0) == q.take(j, 0)).all(axis=1)
+        simple[np.searchsorted(starts, i[meets], side="right") - 1] = False
         if not simple.any():
             break
     return simple
@@ -237,21 +207,19 @@ def winding(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[I
     """
     turns = np.zeros(len(points), dtype=np.int64)
     on = np.zeros(len(points), dtype=bool)
-    for _, point, turn in _passed(points, tails, heads):
+    for _, point, turn in _cross_rays(points, tails, heads):
         turns += np.bincount(point, weights=turn, minlength=len(points)).astype(np.int64)
         on[point[turn == 0]] = True
     return turns, on
 
 
-def _passed(points: FloatArray, tails: FloatArray, heads: FloatArray) -> Iterator[tuple[IntArray, IntArray, SignArray]]:
-    """Edges that cross rays from points to the right, in portions.
+def _cross_rays(
+    points: FloatArray, tails: FloatArray, heads: FloatArray
+) -> Iterator[tuple[IntArray, IntArray, SignArray]]:
+    """Yield edges, points and turns (m,) where edges cross the rays from points to the right, in portions.
 
-    Yields
-    ------
-    edge, point : (m,) int64
-    turn : (m,) int8
-        1 for an edge that crosses the ray upwards, -1 for downwards, 0 for an edge that contains the point.
-        The lower end of an edge counts as on the ray; the upper end does not.
+    The turn is 1 for an edge that crosses the ray upwards, -1 for downwards, 0 for an edge that contains the point. The
+    lower end of an edge counts as on the ray; the upper end does not.
     """
     low, high = np.minimum(tails, heads), np.maximum(tails, heads)
     by_level = np.argsort(points[:, 1], kind="stable")
@@ -273,8 +241,8 @@ def _passed(points: FloatArray, tails: FloatArray, heads: FloatArray) -> Iterato
         rising = (tail[:, 1] <= here[:, 1]) & (here[:, 1] < head[:, 1]) & (side > 0)
         falling = (head[:, 1] <= here[:, 1]) & (here[:, 1] < tail[:, 1]) & (side < 0)
         on = (side == 0) & (low[edge, 0] <= here[:, 0])
-        met = rising | falling | on
-        yield edge[met], point[met], (rising.astype(np.int8) - falling)[met]
+        meets = rising | falling | on
+        yield edge[meets], point[meets], (rising.astype(np.int8) - falling)[meets]
 
 
 @dataclass(frozen=True)
@@ -296,32 +264,32 @@ class _Curves:
 
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:
-        tail, start, following = _in_turn(loops)
+        tail, start, following = _concatenate_loops(loops)
         head, owner = tail[following], np.repeat(np.arange(len(loops)), np.diff(start))
         return cls(start, owner, np.stack([tail, head], 1), uv[tail], uv[head], following)
 
 
-def _in_turn(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
-    """Vertices loop by loop (k,), the start of each loop and the end of the last (l + 1,), and successors (k,)."""
+def _concatenate_loops(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the concatenated loops (k,), their offsets (l + 1,), and the index of each vertex's successor (k,)."""
     starts = np.cumsum([0, *map(len, loops)])
     following = np.arange(1, starts[-1] + 1)
     following[starts[1:] - 1] = starts[:-1]
     return np.concatenate(loops), starts, following
 
 
-def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[Reason]]:
+def check_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[Reason]]:
     """Pairs of edges that meet where they should not (m, 4), and the reasons why the loops are not valid."""
     curves = _Curves.of(loops, uv)
-    pairs = _meeting_edges(curves, uv)
+    pairs = _find_meeting_edges(curves, uv)
     if not len(pairs):
         # Nesting is defined only for simple, disjoint loops.
-        return np.empty((0, 4), dtype=np.int64), _misplaced(curves)
+        return np.empty((0, 4), dtype=np.int64), _find_misplaced(curves)
     crossings = curves.ends[pairs].reshape(-1, 4)
     owners = curves.owner[pairs]
     reasons = []
     for i, j in np.unique(owners, axis=0).tolist():
-        met = crossings[(owners == (i, j)).all(axis=1)]
-        where = listed([f"{a}→{b} with {c}→{d}" for a, b, c, d in met.tolist()], 3)
+        meets = crossings[(owners == (i, j)).all(axis=1)]
+        where = join_items([f"{a}→{b} with {c}→{d}" for a, b, c, d in meets.tolist()], 3)
         if i == j:
             reasons.append(Reason(Obstacle.SELF_INTERSECTION, f"boundary loop {i} meets itself ({where})", (i,)))
         else:
@@ -329,24 +297,24 @@ def judge_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[R
     return crossings, reasons
 
 
-def _meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
+def _find_meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
     """Sorted pairs of edges (m, 2) that share more than a common vertex."""
     consecutive = np.stack([np.arange(len(curves.ends)), curves.following], axis=1)
     # An edge of zero length lies entirely on the edges before and after it.
     point = (curves.p == curves.q).all(axis=1)
-    swallowed = np.sort(consecutive[point[consecutive].any(axis=1)], axis=1)
-    pairs = np.concatenate([swallowed, contacts(uv, curves.ends, _MOST_CROSSINGS).pairs])
-    return np.unique(pairs, axis=0)[:_MOST_CROSSINGS] if len(pairs) else pairs
+    on_zero_edges = np.sort(consecutive[point[consecutive].any(axis=1)], axis=1)
+    pairs = np.concatenate([on_zero_edges, contacts(uv, curves.ends, _MAX_CROSSINGS).pairs])
+    return np.unique(pairs, axis=0)[:_MAX_CROSSINGS] if len(pairs) else pairs
 
 
-def _misplaced(curves: _Curves) -> list[Reason]:
+def _find_misplaced(curves: _Curves) -> list[Reason]:
     """Reasons why simple, disjoint loops do not bound a region that is covered once."""
     p, q, start = curves.p, curves.q, curves.start
     # At the lexicographically first vertex of a simple loop the turn is strict and has the orientation of the loop.
     lowest = np.lexsort((p[:, 1], p[:, 0], curves.owner))[start[:-1]]
     before = np.where(lowest == start[:-1], start[1:], lowest) - 1
     sense = orientation(p[before], p[lowest], q[lowest])
-    around, inner = _containing(curves, p[lowest])
+    around, inner = _find_nesting(curves, p[lowest])
     covered = np.bincount(inner, weights=sense[around], minlength=len(sense)).astype(np.int64)
     fits = ((covered == 0) & (sense > 0)) | ((covered == 1) & (sense < 0))
     reasons = []
@@ -354,20 +322,20 @@ def _misplaced(curves: _Curves) -> list[Reason]:
         outside = around[inner == loop].tolist()
         runs = f"boundary loop {loop} runs {'counterclockwise' if sense[loop] > 0 else 'clockwise'}"
         if outside:
-            text = f"{runs} inside {listed(outside)}: its interior is covered {covered[loop] + sense[loop]} times"
+            text = f"{runs} inside {join_items(outside)}: its interior is covered {covered[loop] + sense[loop]} times"
             reasons.append(Reason(Obstacle.NESTING, text, (loop, *outside)))
         else:
             reasons.append(Reason(Obstacle.WINDING, f"{runs} and no other loop is around it", (loop,)))
     return reasons
 
 
-def _containing(curves: _Curves, anchor: FloatArray) -> tuple[IntArray, IntArray]:
+def _find_nesting(curves: _Curves, anchor: FloatArray) -> tuple[IntArray, IntArray]:
     """Pairs of loops, the first around the second; ``anchor`` (l, 2) has one vertex position of each loop."""
     number = len(anchor)
     if number == 1:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     turns: dict[int, int] = {}
-    for edge, point, turn in _passed(anchor, curves.p, curves.q):
+    for edge, point, turn in _cross_rays(anchor, curves.p, curves.q):
         key, at = np.unique(curves.owner[edge] * number + point, return_inverse=True)
         sums = np.bincount(at, weights=turn, minlength=len(key))
         for pair, change in zip(key.tolist(), sums.tolist(), strict=True):
@@ -377,6 +345,6 @@ def _containing(curves: _Curves, anchor: FloatArray) -> tuple[IntArray, IntArray
     return around[others], inner[others]
 
 
-def listed(items: Sequence[object], most: int = 5) -> str:
+def join_items(items: Sequence[object], limit: int = 5) -> str:
     """Join the first few items for a message."""
-    return ", ".join(str(item) for item in items[:most]) + (", …" if len(items) > most else "")
+    return ", ".join(str(item) for item in items[:limit]) + (", …" if len(items) > limit else "")

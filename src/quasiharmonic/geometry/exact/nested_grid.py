@@ -24,31 +24,33 @@ from quasiharmonic.util.kernels import compiled
 # shifted by ``s`` bits.
 _BITS = 40
 # Length of a list above which a division of its cell is considered. The cell is divided in one of two cases:
-_LONG = 12
+_LONG_LIST = 12
 # the lists of its parts together have at most this many times its own triangles,
-_MORE = 1.5
+_MAX_GROWTH = 1.5
 # or the non-empty parts have on average at most this fraction of its own triangles.
-_GAIN = 0.75
+_MAX_FRACTION = 0.75
 # A part that keeps all triangles of its cell is not divided again if they are at most this many. Such triangles usually
 # share a corner and would crowd around it at any size.
-_CROWD = 48
+_MAX_CROWD = 48
 # Maximum total length of the lists per triangle of the mesh; limits the memory.
-_ENTRIES = 64
+_MAX_ENTRIES = 64
 # The same limit for the cells of the first grid.
-_AT_FIRST = 16
+_FIRST_ENTRIES = 16
 # A cell beyond an edge's line by more than this, in the unit box, is outside in spite of rounding.
 _MARGIN = 2.0**-48
 # Additional margin for products that underflow.
-_TINY = 2.0**-1000
-# Entries spread over cells per block, so that the data stay in the cache; initial list capacity per entry.
-_ROWS, _ROOM = 1 << 14, 4
+_UNDERFLOW_MARGIN = 2.0**-1000
+# Entries spread over cells per block, so that the data stay in the cache.
+_ENTRIES_PER_BLOCK = 1 << 14
+# Initial list capacity per entry.
+_CAPACITY = 4
 
 
 @dataclass(frozen=True)
 class _Level:
     """The cells made by one division, and their concatenated lists."""
 
-    place: IntArray
+    coordinates: IntArray
     """(k, 2) Coordinates of the cells."""
     length: IntArray
     """(k,) Length of each list."""
@@ -62,21 +64,13 @@ class _Level:
         kept = np.ones(self.length.size, dtype=np.bool_)
         kept[cells] = False
         triangle = self.triangle[np.repeat(kept, self.length)]
-        return _Level(self.place, np.where(kept, self.length, 0), triangle, self.crowded)
+        return _Level(self.coordinates, np.where(kept, self.length, 0), triangle, self.crowded)
 
 
 class NestedGrid:
-    """Lists of triangles by position.
+    """Lists of counterclockwise triangles (f, 3, 2) in the box [0, 1]², by position.
 
-    Parameters
-    ----------
-    corners : (f, 3, 2) float64
-        Counterclockwise triangles in the box [0, 1]².
-
-    Attributes
-    ----------
-    listed : (m,) int32
-        Triangles, list after list; each list is ascending.
+    ``listed`` (m,) int32 has the triangles, list after list; each list is ascending.
     """
 
     def __init__(self, corners: FloatArray) -> None:
@@ -84,24 +78,26 @@ class NestedGrid:
         finest = _coordinates(corners)
         self._low, self._high = finest.min(axis=1), finest.max(axis=1)
         self._lines = _lines(corners)
-        self._shift = shift = self._first_shift()
+        self._shift = shift = self._choose_shift()
         columns, lines = (int(m) + 1 for m in self._high.max(axis=0) >> shift)
         self._columns = columns
-        everything = np.arange(len(corners))
-        level = self._divided(everything, np.zeros_like(everything), np.zeros((1, 2), np.int64), columns, lines, shift)
-        levels, parts, made = [level], [np.full(level.length.size, -1, dtype=np.int64)], level.length.size
-        room = _ENTRIES * len(corners) + 1000 - level.triangle.size
+        all_triangles = np.arange(len(corners))
+        level = self._divide(
+            all_triangles, np.zeros_like(all_triangles), np.zeros((1, 2), np.int64), columns, lines, shift
+        )
+        levels, parts, cell_count = [level], [np.full(level.length.size, -1, dtype=np.int64)], level.length.size
+        capacity = _MAX_ENTRIES * len(corners) + 1000 - level.triangle.size
         while shift >= 2:
             shift -= 2
-            split, finer = self._refined(level, shift, room)
+            split, finer = self._refine(level, shift, capacity)
             if not split.size:
                 break
-            parts[-1][split] = made + 16 * np.arange(split.size)
+            parts[-1][split] = cell_count + 16 * np.arange(split.size)
             levels[-1] = level.without(split)
             levels.append(finer)
             parts.append(np.full(finer.length.size, -1, dtype=np.int64))
-            made += finer.length.size
-            room -= finer.triangle.size + levels[-2].triangle.size - level.triangle.size
+            cell_count += finer.length.size
+            capacity -= finer.triangle.size + levels[-2].triangle.size - level.triangle.size
             level = finer
         del self._low, self._high, self._lines
         # Cells are numbered level after level. ``_begin`` has the start of each cell's list. ``_parts`` has the first
@@ -111,80 +107,67 @@ class NestedGrid:
         self._parts = np.concatenate(parts)
 
     def lists(self, points: FloatArray) -> tuple[IntArray, IntArray]:
-        """Ranges in ``listed`` of the triangles that may contain points of the unit box.
+        """Return where the list of triangles that may contain each point (k, 2) begins and ends in ``listed``.
 
-        Points and corners must have been scaled by the same monotonic arithmetic, so that rounding does not
-        separate a point from its triangle.
-
-        Parameters
-        ----------
-        points : (k, 2) float64
-
-        Returns
-        -------
-        begin, end : (k,) int64
+        Points and corners must have been scaled by the same monotonic arithmetic, so that rounding does not separate a
+        point from its triangle.
         """
         cell = np.empty(len(points), dtype=np.int64)
         find_cells(np.ascontiguousarray(points), self._columns, self._shift, self._parts, cell)
         return self._begin[cell], self._begin[cell + 1]
 
-    def _first_shift(self) -> int:
+    def _choose_shift(self) -> int:
         """Number of halvings from the first grid's cells to the finest cells."""
         f = len(self._low)
         shift = max(_BITS - (f.bit_length() + 1) // 2, 0)
         while True:
             reach = (self._high >> shift) - (self._low >> shift) + 1
             # Long triangles oblique to the grid meet many cells; then use a coarser first grid.
-            if int((reach[:, 0] * reach[:, 1]).sum()) <= _AT_FIRST * f or shift >= _BITS:
+            if int((reach[:, 0] * reach[:, 1]).sum()) <= _FIRST_ENTRIES * f or shift >= _BITS:
                 return shift
             shift += 1
 
-    def _refined(self, level: _Level, shift: int, room: int) -> tuple[IntArray, _Level]:
-        """Choose the cells of a level to divide, and return them with their parts; adds at most ``room`` entries."""
-        split = np.flatnonzero((level.length > _LONG) & ~level.crowded)
+    def _refine(self, level: _Level, shift: int, capacity: int) -> tuple[IntArray, _Level]:
+        """Choose the cells of a level to divide; return them with their parts, of at most ``capacity`` entries."""
+        split = np.flatnonzero((level.length > _LONG_LIST) & ~level.crowded)
         number = np.full(level.length.size, -1, dtype=np.int64)
         number[split] = np.arange(split.size)
         parent = np.repeat(number, level.length)
         concerned = np.flatnonzero(parent >= 0)
-        finer = self._divided(level.triangle[concerned], parent[concerned], 4 * level.place[split], 4, 4, shift)
+        finer = self._divide(level.triangle[concerned], parent[concerned], 4 * level.coordinates[split], 4, 4, shift)
         parts = finer.length.reshape(-1, 16)
         before, after = level.length[split], parts.sum(axis=1)
         # Divisions around a corner where triangles crowd do not shorten the lists at first, but add few entries.
-        chosen = (after <= _MORE * before) | (after <= _GAIN * before * (parts > 0).sum(axis=1))
+        chosen = (after <= _MAX_GROWTH * before) | (after <= _MAX_FRACTION * before * (parts > 0).sum(axis=1))
         # Divide the cells with the longest lists first.
         order = np.argsort(-before, kind="stable")
         more = np.cumsum(np.where(chosen, after - before, 0)[order])
-        chosen[order[more > room]] = False
+        chosen[order[more > capacity]] = False
         part = np.repeat(chosen, 16)
         entry = np.repeat(part, finer.length)
-        crowded = ((parts == before[:, None]) & (before <= _CROWD)[:, None])[chosen].ravel()
-        return split[chosen], _Level(finer.place[part], finer.length[part], finer.triangle[entry], crowded)
+        crowded = ((parts == before[:, None]) & (before <= _MAX_CROWD)[:, None])[chosen].ravel()
+        return split[chosen], _Level(finer.coordinates[part], finer.length[part], finer.triangle[entry], crowded)
 
-    def _divided(
+    def _divide(
         self, triangle: IntArray, parent: IntArray, corner: IntArray, columns: int, lines: int, shift: int
     ) -> _Level:
         """Divide cells into grids of ``columns`` × ``lines``.
 
-        Parameters
-        ----------
-        triangle, parent : (e,) int64
-            Entries of the lists of cells, and the cell of each entry; sorted by cell, then by triangle.
-        corner : (k, 2) int64
-            Coordinates of the first part of each cell.
-        columns, lines, shift : int
+        ``triangle`` and ``parent`` (e,) are the entries of the lists of cells, and the cell of each entry; they are
+        sorted by cell, then by triangle. ``corner`` (k, 2) has the coordinates of the first part of each cell.
         """
         size = len(corner) * columns * lines
-        length, room = np.empty(size, dtype=np.int64), _ROOM * triangle.size
+        length, capacity = np.empty(size, dtype=np.int64), _CAPACITY * triangle.size
         while True:
-            listed = np.empty(room, dtype=np.int64)
-            room = divide_cells(
+            listed = np.empty(capacity, dtype=np.int64)
+            capacity = divide_cells(
                 self._low, self._high, *self._lines, triangle, parent, corner, columns, lines, shift, length, listed
             )
-            if room <= listed.size:
+            if capacity <= listed.size:
                 break
         inner = np.indices((lines, columns))[::-1].reshape(2, -1).T
-        place = (corner[:, None, :] + inner).reshape(-1, 2)
-        return _Level(place, length, listed[:room], np.zeros(size, dtype=np.bool_))
+        coordinates = (corner[:, None, :] + inner).reshape(-1, 2)
+        return _Level(coordinates, length, listed[:capacity], np.zeros(size, dtype=np.bool_))
 
 
 @compiled
@@ -219,13 +202,13 @@ def divide_cells(
     """Fill in the lists of the parts of cells, and their lengths; return the total length.
 
     If the lists do not fit into ``listed``, only fill in the lengths. low, high: finest cells between which each
-    triangle lies (f, 2); nx, ny, offset: as returned by `_lines`; others as in `NestedGrid._divided`.
+    triangle lies (f, 2); nx, ny, offset: as returned by `_lines`; others as in `NestedGrid._divide`.
     """
     from scipy.sparse import csr_array
 
     cells, counts = [np.empty(0, dtype=np.int64)], [np.zeros(1, dtype=np.int64)]
-    for start in range(0, triangle.size, _ROWS):
-        t, p = triangle[start : start + _ROWS], parent[start : start + _ROWS]
+    for start in range(0, triangle.size, _ENTRIES_PER_BLOCK):
+        t, p = triangle[start : start + _ENTRIES_PER_BLOCK], parent[start : start + _ENTRIES_PER_BLOCK]
         first = np.maximum(low[t] >> shift, corner[p])
         last = np.minimum(high[t] >> shift, corner[p] + [columns - 1, lines - 1])
         wide, tall = (last - first + 1).T
@@ -265,7 +248,7 @@ def _meet(
     """Whether triangles, given by row, meet cells that their boxes meet; True if in doubt."""
     size = 2.0 ** (shift - _BITS)
     middle_x, middle_y = (x + 0.5) * size, (y + 0.5) * size
-    reach = offset - (0.5 * size + _MARGIN) * (np.abs(nx) + np.abs(ny)) - _TINY
+    reach = offset - (0.5 * size + _MARGIN) * (np.abs(nx) + np.abs(ny)) - _UNDERFLOW_MARGIN
     meets = np.ones(row.size, dtype=np.bool_)
     for i in range(3):
         meets &= middle_x * nx[row, i] + middle_y * ny[row, i] >= reach[row, i]

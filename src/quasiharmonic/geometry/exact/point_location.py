@@ -21,22 +21,20 @@ from quasiharmonic.util.kernels import compiled
 _UNSURE = 2.0**-50
 # Result for a point whose triangle floating point cannot determine.
 _UNDECIDED = -2
-# The same bound relative to |l| + |r|, and a bound on the loss by underflow.
-_RELATIVE_BOUND, _UNDERFLOW_BOUND = 2.0**-51, 2.0**-1000
+# The same bound relative to |l| + |r|.
+_RELATIVE_BOUND = 2.0**-51
+# Bound on the loss by underflow.
+_UNDERFLOW_BOUND = 2.0**-1000
 # Barycentric coordinates use determinants whose error is at most this fraction of the triangle's determinant.
-_ACCURATE = 2.0**-40
-# Points per block, and pairs of a point and a candidate per block, so that the data stay in the cache.
-_POINTS, _PAIRS = 1 << 13, 1 << 17
+_MAX_ERROR = 2.0**-40
+# Points per block, so that the data stay in the cache.
+_POINTS_PER_BLOCK = 1 << 13
+# Pairs of a point and a candidate per block.
+_PAIRS_PER_BLOCK = 1 << 17
 
 
 class PointLocator:
-    """Point location in triangles.
-
-    Parameters
-    ----------
-    corners : (f, 3, 2) float64
-        Triangles, at least one, all finite and counterclockwise.
-    """
+    """Point location in finite counterclockwise triangles (f, 3, 2), at least one."""
 
     def __init__(self, corners: FloatArray) -> None:
         self._corners = corners
@@ -50,50 +48,35 @@ class PointLocator:
         self._grid = NestedGrid(scaled - self._origin)
 
     def find(self, points: FloatArray) -> IntArray:
-        """Find the closed triangle that contains each point, exactly for the coordinates as stored.
+        """Find the closed triangle that contains each point (k, 2), exactly for the coordinates as stored.
 
-        Parameters
-        ----------
-        points : (k, 2) float64
-
-        Returns
-        -------
-        (k,) int64
-            The smallest index if several triangles contain a point; -1 if none does or the point is not finite.
+        The result is the smallest index if several triangles contain a point; -1 if none does or the point is not
+        finite.
         """
         found = np.full(len(points), -1, dtype=np.int64)
-        for start in range(0, len(points), _POINTS):
-            here = points[start : start + _POINTS]
+        for start in range(0, len(points), _POINTS_PER_BLOCK):
+            here = points[start : start + _POINTS_PER_BLOCK]
             boxed = np.flatnonzero(((here >= self._low) & (here <= self._high)).all(axis=1))
             scaled, hits = np.ldexp(here[boxed], self._exponent), np.empty(boxed.size, dtype=np.int64)
             begin, end = self._grid.lists(scaled - self._origin)
             sure_hits(scaled, begin, end, self._grid.listed, self._rows, hits)
             unsure = np.flatnonzero(hits == _UNDECIDED)
-            hits[unsure] = self._decided(here[boxed[unsure]], begin[unsure], end[unsure])
+            hits[unsure] = self._decide(here[boxed[unsure]], begin[unsure], end[unsure])
             found[start + boxed] = hits
         return found
 
     def barycentric(self, points: FloatArray, triangle: IntArray) -> FloatArray:
-        """Barycentric coordinates of points in triangles that contain them.
+        """Barycentric coordinates (k, 3) of points in triangles that contain them, as returned by `find`.
 
-        Parameters
-        ----------
-        points : (k, 2) float64
-        triangle : (k,) int64
-            Triangles, as returned by `find`, never -1.
-
-        Returns
-        -------
-        (k, 3) float64
-            Never negative. Zero exactly if the point lies on the opposite edge, or within 1e-300 of it.
+        They are never negative, and zero exactly if the point lies on the opposite edge or within 1e-300 of it.
         """
         weights = np.empty((len(points), 3))
-        for start in range(0, len(points), _POINTS):
-            chunk = slice(start, start + _POINTS)
+        for start in range(0, len(points), _POINTS_PER_BLOCK):
+            chunk = slice(start, start + _POINTS_PER_BLOCK)
             weights[chunk] = self._weights(points[chunk], triangle[chunk])
         return weights
 
-    def _decided(self, points: FloatArray, begin: IntArray, end: IntArray) -> IntArray:
+    def _decide(self, points: FloatArray, begin: IntArray, end: IntArray) -> IntArray:
         """Compute the result of `find` for points that floating point cannot decide."""
         found = np.full(len(points), -1, dtype=np.int64)
         for point, entry in _pairs(begin, end):
@@ -105,9 +88,9 @@ class PointLocator:
 
     def _contain(self, points: FloatArray, point: IntArray, triangle: IntArray) -> BoolArray:
         """Whether each closed triangle contains the point paired with it."""
-        least = _least_determinants(np.ldexp(points, self._exponent)[point], self._rows.take(triangle, axis=0))
-        contain: BoolArray = least > _UNSURE
-        unsure = np.flatnonzero(np.abs(least) <= _UNSURE)
+        lowest = _lowest_determinants(np.ldexp(points, self._exponent)[point], self._rows.take(triangle, axis=0))
+        contain: BoolArray = lowest > _UNSURE
+        unsure = np.flatnonzero(np.abs(lowest) <= _UNSURE)
         if unsure.size:
             p, (a, b, c) = points[point[unsure]], self._corners[triangle[unsure]].swapaxes(0, 1)
             contain[unsure] = (orientation(p, a, b) >= 0) & (orientation(p, b, c) >= 0) & (orientation(p, c, a) >= 0)
@@ -122,22 +105,22 @@ class PointLocator:
         left, right = dx[[1, 2, 0]] * dy[[2, 0, 1]], dy[[1, 2, 0]] * dx[[2, 0, 1]]
         area = left - right
         error = _RELATIVE_BOUND * (np.abs(left) + np.abs(right)).max(axis=0) + _UNDERFLOW_BOUND
-        poor = np.flatnonzero((error > _ACCURATE * area.sum(axis=0)) | (area.min(axis=0) <= error))
-        if poor.size:
-            area[:, poor] = _careful_areas(points[poor], self._corners[triangle[poor]])
+        inaccurate = np.flatnonzero((error > _MAX_ERROR * area.sum(axis=0)) | (area.min(axis=0) <= error))
+        if inaccurate.size:
+            area[:, inaccurate] = _accurate_areas(points[inaccurate], self._corners[triangle[inaccurate]])
         return (area / area.sum(axis=0)).T
 
 
 def _pairs(begin: IntArray, end: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield portions of the pairs of a point and an entry of its list, sorted by point, then entry."""
     count = end - begin
-    upto = np.cumsum(count)
+    total = np.cumsum(count)
     start = done = 0
     while start < begin.size:
-        stop = max(int(np.searchsorted(upto, done + _PAIRS, side="right")), start + 1)
+        stop = max(int(np.searchsorted(total, done + _PAIRS_PER_BLOCK, side="right")), start + 1)
         point = np.repeat(np.arange(start, stop), count[start:stop])
-        yield point, np.arange(done, int(upto[stop - 1])) + (end - upto)[point]
-        start, done = stop, int(upto[stop - 1])
+        yield point, np.arange(done, int(total[stop - 1])) + (end - total)[point]
+        start, done = stop, int(total[stop - 1])
 
 
 @compiled
@@ -156,22 +139,22 @@ def sure_hits(
     hits[:] = -1
     for point, entry in _pairs(begin, end):
         triangle = listed[entry]
-        least = _least_determinants(points[point], rows.take(triangle, axis=0))
-        possible = np.flatnonzero(least >= -_UNSURE)[::-1]
+        lowest = _lowest_determinants(points[point], rows.take(triangle, axis=0))
+        possible = np.flatnonzero(lowest >= -_UNSURE)[::-1]
         # Writing backwards leaves the first candidate.
-        hits[point[possible]] = np.where(least > _UNSURE, triangle, _UNDECIDED)[possible]
+        hits[point[possible]] = np.where(lowest > _UNSURE, triangle, _UNDECIDED)[possible]
 
 
-def _least_determinants(points: FloatArray, rows: FloatArray) -> FloatArray:
+def _lowest_determinants(points: FloatArray, rows: FloatArray) -> FloatArray:
     """Minimum determinant of each point with the edges of its paired triangle; positive inside."""
     x, y = points.T
     ax, bx, cx = (rows[:, i] - x for i in (0, 2, 4))
     ay, by, cy = (rows[:, i] - y for i in (1, 3, 5))
-    least: FloatArray = np.minimum(ax * by - ay * bx, bx * cy - by * cx)
-    return np.minimum(least, cx * ay - cy * ax, out=least)
+    lowest: FloatArray = np.minimum(ax * by - ay * bx, bx * cy - by * cx)
+    return np.minimum(lowest, cx * ay - cy * ax, out=lowest)
 
 
-def _careful_areas(points: FloatArray, corners: FloatArray) -> FloatArray:
+def _accurate_areas(points: FloatArray, corners: FloatArray) -> FloatArray:
     """Areas of points with the edges opposite to the corners (k, 3, 2), in a unit of each triangle; (3, k)."""
     extent = corners.max(axis=1) / 2 - corners.min(axis=1) / 2
     exponent = -1 - np.frexp(extent)[1]

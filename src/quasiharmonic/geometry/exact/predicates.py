@@ -41,11 +41,11 @@ _RELATIVE_BOUND = 2.0**-51
 _UNDERFLOW_BOUND = 2.0**-1060
 # After scaling, a coordinate of stage 2 is 0 or at least this; stage 3 takes the other triples. So all
 # intermediate values are multiples of 2⁻⁹⁸⁴, and no product underflows.
-_SMALLEST_SCALED = 2.0**-440
+_MIN_SCALED = 2.0**-440
 # Triples per block in stage 2, so that the sixteen components stay in the cache.
 _EXACT_CHUNK = 8192
 # Levels of a box tree, from the root, whose pairs are enumerated directly.
-_SKIPPED = 5
+_SKIPPED_LEVELS = 5
 # Pairs of boxes per block in `box_pairs`.
 PAIR_CHUNK = 1 << 17
 
@@ -83,26 +83,21 @@ def orientation(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> SignArray:
 def orientation_or_nonfinite(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> tuple[SignArray, IntArray]:
     """Compute `orientation`, but report triples with NaN or infinite coordinates instead of raising.
 
-    Returns
-    -------
-    sign : (k,) int8
-        As `orientation`, and 0 for the triples in ``nonfinite``.
-    nonfinite : (m,) int64
-        Ascending flat indices of the triples with NaN or infinite coordinates.
+    Returns the signs (k,) int8, 0 for these triples, and the ascending flat indices of these triples.
     """
     a, b, c = (np.asarray(p, dtype=np.float64) for p in (a, b, c))
     corners = (a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
     # An overflow or an invalid operation makes the bound infinite or the determinant NaN, so the triple stays
     # undecided.
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        sign = _filtered(*corners)
+        sign = _sign_if_certain(*corners)
         if np.all(sign):
             return sign, np.empty(0, dtype=np.int64)
         undecided = sign == 0
         x = np.stack([np.broadcast_to(p, sign.shape)[undecided] for p in corners])
         finite = np.isfinite(x).all(axis=0)
         decided = np.zeros(finite.size, dtype=np.int8)
-        decided[finite] = _exact(x[:, finite])
+        decided[finite] = _decide_exactly(x[:, finite])
         sign[undecided] = decided
     return sign, np.flatnonzero(undecided)[~finite]
 
@@ -110,10 +105,10 @@ def orientation_or_nonfinite(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> tuple[
 def sure_orientation(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
     """The `orientation` where floating point is certain of it; 0 elsewhere."""
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        return _filtered(a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
+        return _sign_if_certain(a[..., 0], a[..., 1], b[..., 0], b[..., 1], c[..., 0], c[..., 1])
 
 
-def _filtered(
+def _sign_if_certain(
     ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray, cx: FloatArray, cy: FloatArray
 ) -> SignArray:
     """Sign of the orientation where floating point is certain of it; 0 elsewhere."""
@@ -129,36 +124,36 @@ def _filtered(
     return sign
 
 
-def _exact(x: FloatArray) -> SignArray:
+def _decide_exactly(x: FloatArray) -> SignArray:
     """Orientation of the triples ``x``, (6, k) finite, as rows ax, ay, bx, by, cx, cy."""
-    # Rounded differences have the right sign. So two products of different sign decide the orientation. This covers
-    # coincident corners and lines along an axis at little cost.
+    # Rounded differences have the right sign. If the two products have different signs, the sign of their difference is
+    # therefore exact. This covers coincident corners and lines along an axis at little cost.
     left = np.sign(x[0] - x[4]) * np.sign(x[3] - x[5])
     right = np.sign(x[1] - x[5]) * np.sign(x[2] - x[4])
     sign: SignArray = np.sign(left - right).astype(np.int8)
-    open_ = np.flatnonzero((left == right) & (left != 0) & ((x[0] != x[2]) | (x[1] != x[3])))
-    for start in range(0, open_.size, _EXACT_CHUNK):
-        chunk = open_[start : start + _EXACT_CHUNK]
-        sign[chunk] = _scaled(x[:, chunk])
+    undecided = np.flatnonzero((left == right) & (left != 0) & ((x[0] != x[2]) | (x[1] != x[3])))
+    for start in range(0, undecided.size, _EXACT_CHUNK):
+        chunk = undecided[start : start + _EXACT_CHUNK]
+        sign[chunk] = _decide_scaled(x[:, chunk])
     return sign
 
 
-def _scaled(x: FloatArray) -> SignArray:
-    """Compute `_exact` after scaling every triple to magnitude one."""
+def _decide_scaled(x: FloatArray) -> SignArray:
+    """Compute `_decide_exactly` after scaling every triple to magnitude one."""
     exponent = np.frexp(np.abs(x).max(axis=0))[1]
     scaled = np.ldexp(x, -exponent)
     # Scaling may have rounded the coordinates of these triples; the following code is valid for the others.
-    wide = ((np.abs(scaled) < _SMALLEST_SCALED) & (x != 0)).any(axis=0)
-    sign = _filtered(*scaled)
-    open_ = (sign == 0) & ~wide
-    if np.any(open_):
-        sign[open_] = _expanded(scaled[:, open_])
+    wide = ((np.abs(scaled) < _MIN_SCALED) & (x != 0)).any(axis=0)
+    sign = _sign_if_certain(*scaled)
+    undecided = (sign == 0) & ~wide
+    if np.any(undecided):
+        sign[undecided] = _decide_by_expansion(scaled[:, undecided])
     for k in np.flatnonzero(wide):
-        sign[k] = _in_integers(x[:, k])
+        sign[k] = _decide_in_integers(x[:, k])
     return sign
 
 
-def _expanded(x: FloatArray) -> SignArray:
+def _decide_by_expansion(x: FloatArray) -> SignArray:
     """Orientation by expansion, for coordinates of magnitude up to one that are 0 or ≥ 2⁻⁴⁴⁰."""
     return np.sign(_sum(_components(x))).astype(np.int8)
 
@@ -218,7 +213,7 @@ def _split(a: FloatArray) -> tuple[FloatArray, FloatArray]:
     return high, a - high
 
 
-def _in_integers(x: FloatArray) -> int:
+def _decide_in_integers(x: FloatArray) -> int:
     """Orientation of one triple (6,) in integer arithmetic."""
     ratios = [value.as_integer_ratio() for value in x.tolist()]
     unit = max(denominator for _, denominator in ratios)  # all are powers of two
@@ -263,17 +258,9 @@ class SegmentRelation(IntEnum):
 
 
 def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> SignArray:
-    """Classify the intersection of the closed segments ``pq`` and ``rs``, exactly.
+    """Classify the intersection of the closed segments ``pq`` and ``rs`` exactly, as a `SegmentRelation`.
 
-    Parameters
-    ----------
-    p, q, r, s : (k, 2) float64
-        Ends of the segments, finite; a segment may be a single point.
-
-    Returns
-    -------
-    (k,) int8
-        Values of `SegmentRelation`.
+    The ends (k, 2) are finite; a segment may be a single point.
     """
     relation = np.zeros(len(p), dtype=np.int8)
     r_side, s_side = orientation(p, q, r), orientation(p, q, s)
@@ -315,21 +302,11 @@ def _in_box(x: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
 
 
 def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of closed boxes that meet, in portions.
+    """Yield pairs ``i < j`` of closed boxes that meet, in portions, each pair once.
 
     A binary tree over the boxes *in the given order* is traversed against itself, all pairs of a level at once. Boxes
     of consecutive edges of a curve make a tight tree, whatever the scale of the parts of the curve. So the cost for
     such boxes is about proportional to the number of boxes and of pairs found.
-
-    Parameters
-    ----------
-    lo, hi : (k, 2) float64
-        Corners.
-
-    Yields
-    ------
-    i, j : (m,) int64
-        Indices of boxes that meet, ``i < j``, each pair once.
     """
     tree = _box_tree(lo, hi, max(len(lo) - 1, 0).bit_length())
     for i, j in _meeting(tree, tree):
@@ -337,28 +314,18 @@ def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArr
 
 
 def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of closed boxes of the same group that meet; equals `box_pairs` of each group.
+    """Yield pairs of closed boxes of the same group that meet; equals `box_pairs` of each group.
 
-    Parameters
-    ----------
-    lo, hi : (k, 2) float64
-        Corners, sorted by group.
-    starts : (g + 1,) int64
-        Start of each group, and the end of the last one.
-
-    Yields
-    ------
-    i, j : (m,) int64
-        Indices of boxes that meet, ``i < j``, each pair once.
+    The boxes are sorted by group. ``starts`` (g + 1,) has the start of each group, and the end of the last one.
     """
     sizes, groups = np.diff(starts), len(starts) - 1
     depth = int(max(sizes.max(initial=1) - 1, 0)).bit_length()
     # Each group has its own tree. All trees have the same depth.
-    place = np.arange(len(lo)) + np.repeat((np.arange(groups) << depth) - starts[:-1], sizes)
+    leaf = np.arange(len(lo)) + np.repeat((np.arange(groups) << depth) - starts[:-1], sizes)
     number = np.full(groups << depth, -1)
-    number[place] = np.arange(len(lo))
+    number[leaf] = np.arange(len(lo))
     leaves = np.full((2, groups << depth, 2), np.array([np.inf, -np.inf])[:, None, None])
-    leaves[0, place], leaves[1, place] = lo, hi
+    leaves[0, leaf], leaves[1, leaf] = lo, hi
     tree = _box_tree(leaves[0], leaves[1], depth)
     for i, j in _meeting(tree, tree):
         yield number[i[i < j]], number[j[i < j]]
@@ -367,13 +334,7 @@ def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterat
 def box_pairs_between(
     lo: FloatArray, hi: FloatArray, other_lo: FloatArray, other_hi: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of closed boxes that meet, the first of one set and the second of another; as `box_pairs`.
-
-    Yields
-    ------
-    i, j : (m,) int64
-        Indices of a box (k, 2) of the first set and of a box (l, 2) of the second, each pair once.
-    """
+    """Yield pairs of closed boxes that meet, the first of one set and the second of another; as `box_pairs`."""
     depth = max(len(lo) - 1, len(other_lo) - 1, 0).bit_length()
     yield from _meeting(_box_tree(lo, hi, depth), _box_tree(other_lo, other_hi, depth))
 
@@ -399,7 +360,7 @@ def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArra
     """
     # The first few levels have so few boxes that testing all pairs is faster than a traversal.
     depth, roots = len(one) - 1, np.arange(len(one[-1][0]))
-    skipped = min(depth, _SKIPPED)
+    skipped = min(depth, _SKIPPED_LEVELS)
     number = np.arange(1 << skipped)
     i, j = (part.ravel() for part in np.broadcast_arrays(number[:, None], number))
     if one is other:

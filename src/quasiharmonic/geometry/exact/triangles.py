@@ -1,13 +1,14 @@
-"""Exact orientation of the triangles of a mesh, and exact winding around vertices."""
+"""Exact orientation of the triangles of a mesh, exact winding around vertices, and exact search for overlaps."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite, sure_orientation
+from quasiharmonic.geometry.exact.predicates import box_pairs, orientation, orientation_or_nonfinite, sure_orientation
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range
 from quasiharmonic.util.kernels import compiled
+from quasiharmonic.util.progress import heartbeat
 
 SignArray = NDArray[np.int8]
 
@@ -16,20 +17,12 @@ TRIANGLE_CHUNK = 1 << 16
 
 
 def triangle_signs(F: IntArray, uv: FloatArray) -> tuple[SignArray, IntArray]:
-    """Exact orientations of triangles (f, 3) int64 with positions (n, 2) float64; both arrays are contiguous.
+    """Exact orientations (f,) int8 of triangles, and the ascending indices of those with a non-finite coordinate.
 
-    Returns
-    -------
-    sign : (f,) int8
-        1 if counterclockwise, -1 if clockwise, 0 if the area is zero or a coordinate is NaN or infinite.
-    nonfinite : (m,) int64
-        Ascending indices of the triangles with a NaN or infinite coordinate.
-
-    Raises
-    ------
-    ValueError
-        If ``F`` refers to vertices that do not exist.
+    An orientation is 1 if counterclockwise, -1 if clockwise, 0 if the area is zero or a coordinate is not finite.
+    Raises a ValueError if ``F`` refers to vertices that do not exist.
     """
+    F, uv = np.ascontiguousarray(F), np.ascontiguousarray(uv)
     sign, nonfinite = np.empty(len(F), dtype=np.int8), np.empty(0, dtype=np.int64)
     number = sure_signs(F, uv, sign)
     if number < 0:
@@ -58,22 +51,10 @@ def sure_signs(F: IntArray, uv: FloatArray, sign: SignArray) -> int:
     return sign.size - int(np.count_nonzero(sign))
 
 
-def overwound_vertices(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArray]) -> IntArray:
+def find_multiply_wound(F: IntArray, uv: FloatArray, sign: SignArray, loops: list[IntArray]) -> IntArray:
     """Find the vertices with only positive triangles around them whose angles add up to more than 2π, exactly.
 
-    Parameters
-    ----------
-    F : (f, 3) int64
-    uv : (n, 2) float64
-    sign : (f,) int8
-        Orientations, as returned by `triangle_signs`.
-    loops : list of (l,) int64
-        The boundary loops, the surface to their left.
-
-    Returns
-    -------
-    (k,) int64
-        Ascending indices.
+    ``sign`` (f,) are the orientations, as returned by `triangle_signs`; ``loops`` have the surface to their left.
 
     Notes
     -----
@@ -85,14 +66,17 @@ def overwound_vertices(F: IntArray, uv: FloatArray, sign: SignArray, loops: list
     turns = np.zeros(len(uv), dtype=np.int64)
     count_turns(F, uv, turns)
     turns[F[sign <= 0]] = 0
-    rim = np.concatenate(loops)
-    once = turns[rim] == 1
-    here, begin, end = rim[once], *(np.concatenate([np.roll(loop, by) for loop in loops])[once] for by in (-1, 1))
-    turns[here[_comes_before(uv[here], uv[begin], uv[end])]] = 2
+    boundary = np.concatenate(loops)
+    wound_once = turns[boundary] == 1
+    here, begin, end = (
+        boundary[wound_once],
+        *(np.concatenate([np.roll(loop, by) for loop in loops])[wound_once] for by in (-1, 1)),
+    )
+    turns[here[_has_smaller_angle(uv[here], uv[begin], uv[end])]] = 2
     return np.flatnonzero(turns > 1)
 
 
-def _comes_before(centre: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
+def _has_smaller_angle(centre: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
     """Whether the direction from a centre to ``one`` has a smaller angle in [0, 2π) than the direction to ``other``."""
     lower_one, lower_other = (
         (to[:, 1] < centre[:, 1]) | ((to[:, 1] == centre[:, 1]) & (to[:, 0] < centre[:, 0])) for to in (one, other)
@@ -116,3 +100,33 @@ def count_turns(F: IntArray, uv: FloatArray, turns: IntArray) -> None:
         for corner, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             passing = (level[:, following] < level[:, corner]) & (level[:, last] >= level[:, corner])
             np.add.at(turns, chunk[:, corner].compress(passing), 1)
+
+
+def find_overlapping(F: IntArray, uv: FloatArray) -> IntArray:
+    """Find the triangles that overlap another one with positive area, (k,) int64 ascending; all are counterclockwise.
+
+    Two convex sets have no common area if and only if a line separates them. For two triangles a side of one of them
+    then does. Triangles that only touch do not count.
+
+    Examples
+    --------
+    >>> uv = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.3, 0.3], [1.0, 1.0]])
+    >>> find_overlapping(np.array([[0, 1, 2], [1, 4, 2], [3, 4, 2]]), uv)
+    array([0, 1, 2])
+    """
+    found = np.zeros(len(F), dtype=np.bool_)
+    corners = uv[F]
+    for i, j in box_pairs(corners.min(axis=1), corners.max(axis=1)):
+        heartbeat()
+        one, other = corners[i], corners[j]
+        apart = _is_separated_by_side(one, other)
+        apart[~apart] = _is_separated_by_side(other[~apart], one[~apart])
+        found[i[~apart]] = found[j[~apart]] = True
+    return np.flatnonzero(found)
+
+
+def _is_separated_by_side(one: FloatArray, other: FloatArray) -> BoolArray:
+    """Whether the second triangle of each pair (k, 3, 2) lies to the right of a side of the first, or on it."""
+    tail, head = one[:, :, None], one[:, (1, 2, 0), None]
+    right = np.asarray(orientation(tail, head, other[:, None]) <= 0)
+    return np.asarray(np.any(np.all(right, axis=2), axis=1))

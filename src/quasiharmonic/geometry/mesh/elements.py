@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import edges
-from quasiharmonic.util.arrays import IntArray, check_range, index_array, named, named_edges
+from quasiharmonic.util.arrays import IntArray, check_range, edge_names, index_array, names_of
 
 #: Pairs of corners of a six-node triangle, and the mid-side node between each pair.
 SIDES = np.array([(0, 1), (1, 2), (2, 0)])
@@ -23,17 +23,14 @@ _QUARTERS = np.array([(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)])
 _HALVES = np.array([(0, 1, 2), (0, 2, 3)])
 _CORNERS = np.array([(0, 1, 2), (1, 2, 3), (2, 3, 0), (3, 0, 1)])
 # Order of the nodes in the opposite direction around the element, by the number of nodes.
-_TURNED = {3: [0, 2, 1], 4: [0, 3, 2, 1], 6: [0, 2, 1, 5, 4, 3]}
+_REVERSED = {3: [0, 2, 1], 4: [0, 3, 2, 1], 6: [0, 2, 1, 5, 4, 3]}
 
 
 def element_array(F: ArrayLike, n: int) -> IntArray:
     """Convert elements among ``n`` nodes to (f, 3), (f, 4) or (f, 6) int64; returns a copy.
 
-    Raises
-    ------
-    ValueError
-        If there are no elements, the shape is wrong, a node does not exist, or an element repeats a node. Also if
-        a mid-side node lies between different corners in different elements.
+    Raises a ValueError if there are no elements, the shape is wrong, a node does not exist, or an element repeats a
+    node. Also if a mid-side node lies between different corners in different elements.
     """
     array = element_rows(F, n)
     if array.size == 0:
@@ -50,17 +47,11 @@ def element_array(F: ArrayLike, n: int) -> IntArray:
 
 
 def element_rows(F: ArrayLike, n: int) -> IntArray:
-    """Convert elements among ``n`` nodes to (f, 3), (f, 4) or (f, 6) int64, where f may be 0; returns a copy.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or a node does not exist.
-    """
+    """Convert elements among ``n`` nodes to (f, 3), (f, 4) or (f, 6) int64, where f may be 0; returns a copy."""
     array = index_array("F", F)
     if array.size == 0:
         return np.empty((0, 3), dtype=np.int64)
-    if array.ndim != 2 or array.shape[1] not in _TURNED:
+    if array.ndim != 2 or array.shape[1] not in _REVERSED:
         raise ValueError(
             "F must have shape (f, 3), (f, 4) or (f, 6), triangles, quadrilaterals or six-node triangles, not "
             f"{array.shape}"
@@ -73,10 +64,10 @@ def _check_middles(F: IntArray) -> None:
     """Raise if neighbouring six-node triangles (f, 6) place a mid-side node between different corners."""
     ends = np.sort(F[:, SIDES].reshape(-1, 2), axis=1)
     middle, first, number = np.unique(F[:, MIDDLES], return_index=True, return_inverse=True)
-    torn = (ends != ends[first][number.ravel()]).any(axis=1)
-    if torn.any():
+    differs = (ends != ends[first][number.ravel()]).any(axis=1)
+    if differs.any():
         raise ValueError(
-            f"{named('node', 'nodes', middle[np.unique(number.ravel()[torn])])} between different "
+            f"{names_of('node', 'nodes', middle[np.unique(number.ravel()[differs])])} between different "
             f"corners in one triangle "
             "than in another: a row of F needs the three corners, then the nodes between the first and the second, "
             "the second and the third, the third and the first"
@@ -84,28 +75,19 @@ def _check_middles(F: IntArray) -> None:
 
 
 def check_spread(F: IntArray, n: int) -> None:
-    """Raise if neighbouring elements of a planar mesh of ``n`` nodes overlap; elements are counterclockwise.
-
-    Raises
-    ------
-    ValueError
-        If both elements of a side lie on the same side of it; the message names the sides.
-    """
+    """Raise if neighbouring elements of a planar mesh of ``n`` nodes overlap; elements are counterclockwise."""
     found = edges(covering_triangles(F)[0], n)
     if found.inconsistent.size and not found.nonmanifold.size:
         raise ValueError(
-            f"the rest mesh is folded at {named_edges(found.inconsistent)}: both elements lie on the same side, so "
+            f"the rest mesh is folded at {edge_names(found.inconsistent)}: both elements lie on the same side, so "
             "some are inverted. Pass a valid mesh, with the argument rest= of `morph`"
         )
 
 
-def joined(blocks: Sequence[IntArray]) -> IntArray:
+def join_elements(blocks: Sequence[IntArray]) -> IntArray:
     """Join blocks of elements (k, 3), (k, 4) or (k, 6) into rows of one length.
 
-    Raises
-    ------
-    ValueError
-        If there are six-node triangles and other elements.
+    Raises a ValueError if there are six-node triangles and other elements.
     """
     sizes = {block.shape[1] for block in blocks if len(block)}
     if len(sizes) > 1 and 6 in sizes:
@@ -114,26 +96,21 @@ def joined(blocks: Sequence[IntArray]) -> IntArray:
         )
     width = max(sizes, default=3)
     # A triangle among quadrilaterals repeats its last node.
-    whole = [block[:, [*range(block.shape[1]), 2][:width]] for block in blocks if len(block)]
-    return np.concatenate([np.empty((0, width), dtype=np.int64), *whole])
+    padded = [block[:, [*range(block.shape[1]), 2][:width]] for block in blocks if len(block)]
+    return np.concatenate([np.empty((0, width), dtype=np.int64), *padded])
 
 
 def name_elements(F: IntArray, which: IntArray) -> str:
     """Name the first few of the given elements: ``quadrilaterals 3, 8``."""
     if F.shape[1] == 4:
-        return named("quadrilateral", "quadrilaterals", which)
-    return named("triangle", "triangles", which)
+        return names_of("quadrilateral", "quadrilaterals", which)
+    return names_of("triangle", "triangles", which)
 
 
 def covering_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
-    """Triangles among all nodes that cover every element once.
+    """Return triangles (t, 3) among all nodes that cover every element once, and the element (t,) of each.
 
-    Returns
-    -------
-    triangles : (t, 3) int64
-        Four for a six-node triangle, two for a quadrilateral.
-    of : (t,) int64
-        Index of the element of each triangle.
+    There are four for a six-node triangle, two for a quadrilateral.
     """
     if F.shape[1] == 3:
         return F, np.arange(len(F))
@@ -154,15 +131,10 @@ def nets_of(F: IntArray) -> list[IntArray]:
 
 
 def corner_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
-    """Corner triangles of quadrilaterals (f, 4); all are positive if and only if the quadrilaterals are convex.
+    """Return the corner triangles (4f, 3) of quadrilaterals (f, 4), and the element of each.
 
-    Returns
-    -------
-    triangles : (t, 3) int64
-        Four for each quadrilateral. A triangle among quadrilaterals occurs twice, so every element is covered twice.
-        The corner is the middle node.
-    of : (t,) int64
-        Index of the element of each triangle.
+    All are positive if and only if the quadrilaterals are convex. The corner is the middle node. A triangle among
+    quadrilaterals occurs twice, so every element is covered twice.
     """
     triangles, of = _parts(F, _CORNERS)
     at = np.arange(len(of)) % len(_CORNERS)
@@ -178,9 +150,9 @@ def rim(F: IntArray) -> IntArray:
     return np.unique(found[count == 1])
 
 
-def turned_over(F: IntArray) -> IntArray:
+def reverse_elements(F: IntArray) -> IntArray:
     """The same elements with their nodes in the opposite direction, starting at the same node."""
-    turned: IntArray = F[:, _TURNED[F.shape[1]]]
+    turned: IntArray = F[:, _REVERSED[F.shape[1]]]
     if F.shape[1] == 4:
         triangles = F[:, 2] == F[:, 3]
         turned[triangles] = F[triangles][:, [0, 2, 1, 1]]

@@ -1,11 +1,17 @@
-"""Fans: sets of triangles around a vertex that are joined by edges. A vertex with several fans can be split."""
+"""Fans: sets of triangles around a vertex that are joined by edges. A vertex with several fans can be split.
+
+`open_along` opens a mesh along edges without changing its vertices and triangles. The result is a second set of
+triangles, ``FT``, whose indices differ on the two sides of a cut, like texture corners.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from quasiharmonic.geometry.mesh.topology import edge_keys, linked
-from quasiharmonic.util.arrays import BoolArray, IntArray
+from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
+from quasiharmonic.util.arrays import BoolArray, IntArray, check_range, edge_names
 
 
 def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
@@ -30,7 +36,8 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
     ahead = corner[:, (1, 2, 0)].ravel()
     key = edge_keys(tail, head, int(F.max(initial=0)) + 1)
-    order = np.argsort(key, kind="stable")
+    # The order of equal keys has no effect.
+    order = np.argsort(key)
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     first = first[np.diff(first, append=key.size) == 2]
     one, other = order[first], order[first + 1]
@@ -40,60 +47,74 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
     one, other = one[opposed], other[opposed]
     # The half-edge of a corner begins there. Joining two half-edges identifies the start of each with the end of the
     # other.
-    split = linked(np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other]), F.size)
-    component = linked(one // 3, other // 3, len(F))
+    split = label_components(np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other]), F.size)
+    component = label_components(one // 3, other // 3, len(F))
     # Labels are smallest elements, so their rank is the order of appearance.
     split, component = ((np.cumsum(label == np.arange(label.size)) - 1)[label] for label in (split, component))
     return split.reshape(-1, 3), component
 
 
-def renumbered(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
-    """Number the vertices of some triangles without gaps.
+def renumber(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
+    """Number the vertices of some triangles (k, 3), as returned by `fans`, without gaps.
 
-    Parameters
-    ----------
-    split : (k, 3) int64
-        Triangles, as returned by `fans`.
-    F : (k, 3) int64
-        The same triangles by the original vertices. New numbers follow their order, so a mesh without split vertices
-        and without gaps keeps its numbers.
-
-    Returns
-    -------
-    renumbered : (k, 3) int64
-    first : (m,) int64
-        One corner of every vertex, as an index into the flattened triangles.
+    ``F`` has the same triangles by the original vertices. New numbers follow their order, so a mesh without split
+    vertices and without gaps keeps its numbers. Also returns one corner of every vertex, as an index into the flattened
+    triangles.
     """
     _, first, own = np.unique(split.ravel(), return_index=True, return_inverse=True)
     order = np.argsort(F.ravel()[first], kind="stable")
     return np.argsort(order)[own.reshape(-1, 3)], first[order]
 
 
-def numbered(F: IntArray, split: IntArray, n: int) -> tuple[IntArray, IntArray]:
+def number_fans(F: IntArray, split: IntArray, n: int) -> tuple[IntArray, IntArray]:
     """Give every fan a vertex: the first fan around a vertex keeps its number, further fans follow all vertices.
 
-    Parameters
-    ----------
-    F : (f, 3) int64
-        Triangles.
-    split : (f, 3) int64
-        Their fans, as numbered by `fans`.
-    n : int
-        Number of vertices.
-
-    Returns
-    -------
-    FT : (f, 3) int64
-        The triangles by fans; equals ``F`` where a vertex was not split.
-    origin : (n + c,) int64
-        The vertex of each fan: ``origin[FT]`` is ``F``, and the first ``n`` entries are ``0 … n - 1``.
+    ``split`` are the triangles as numbered by `fans`. Returns the triangles by fans, and the vertex of each fan, whose
+    first ``n`` entries are ``0 … n - 1``.
     """
-    # Fans are numbered by first appearance.
-    vertex = F.ravel()[np.unique(split.ravel(), return_index=True)[1]]
+    vertex = np.empty(int(split.max(initial=-1)) + 1, dtype=np.int64)
+    vertex[split] = F
     order = np.argsort(vertex, kind="stable")
-    keeps = np.diff(vertex[order], prepend=-1) > 0
-    kept, copies = order[keeps], order[~keeps]
+    is_first = np.diff(vertex[order], prepend=-1) > 0
+    kept, copies = order[is_first], order[~is_first]
     own = np.empty(vertex.size, dtype=np.int64)
     own[kept] = vertex[kept]
     own[copies] = np.arange(n, n + copies.size)
     return own[split], np.concatenate([np.arange(n), vertex[copies]])
+
+
+class Corners(NamedTuple):
+    """Corners of the triangles of a mesh that was opened along edges.
+
+    Attributes
+    ----------
+    FT : (f, 3) int64
+        The triangles, by copies of vertices. It equals ``F`` where a vertex was not split. One copy of a split vertex
+        keeps its number; the others follow all vertices.
+    origin : (n + c,) int64
+        The vertex of each copy: ``origin[FT]`` is ``F``, and the first ``n`` entries are ``0 … n - 1``.
+    """
+
+    FT: IntArray
+    origin: IntArray
+
+
+def open_along(F: IntArray, cut: IntArray, n: int) -> Corners:
+    """Open a mesh (f, 3) int64 along edges (k, 2) int64.
+
+    Boundary edges have no effect. A single edge with two interior ends opens nothing. Vertices at which triangles touch
+    without a common edge are split, too. Raises a ValueError that names the first cuts that are not edges of the mesh.
+    """
+    check_range("edges", cut, n)
+    # Few sides have both ends on a cut, and only these are searched.
+    marked = np.zeros(n, dtype=bool)
+    marked[cut] = True
+    at_corner = marked[F]
+    open_side = at_corner & at_corner[:, (1, 2, 0)]
+    sides = edge_keys(F[open_side], F[:, (1, 2, 0)][open_side], n)
+    wanted = edge_keys(cut[:, 0], cut[:, 1], n)
+    unknown = ~np.isin(wanted, sides)
+    if unknown.any():
+        raise ValueError(f"{edge_names(cut[unknown])}: not an edge of the mesh")
+    open_side[open_side] = np.isin(sides, wanted)
+    return Corners(*number_fans(F, fans(F, open_side)[0], n))

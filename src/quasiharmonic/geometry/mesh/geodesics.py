@@ -29,14 +29,14 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.sparse import csr_array
 
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, named
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, names_of
 from quasiharmonic.util.progress import heartbeat
 
 # Number of sources in one Dijkstra run, on the subgraph around them.
-_AT_A_TIME = 64
+_SOURCES_PER_RUN = 64
 # Growth of the search radius for sources that have not reached all of their targets.
-_FARTHER = 1.25
+_RADIUS_GROWTH = 1.25
 
 
 def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: float = 0.0) -> csr_array:
@@ -67,7 +67,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
     shapes = rest_shapes(V, F, lowest=lowest)
     if shapes.flat.size:
         raise ValueError(
-            f"{named('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: repair the mesh first"
+            f"{names_of('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: repair the mesh first"
         )
     n, f = len(V), len(F)
     # Half-edges, corner by corner; the next half-edge of a triangle is f further.
@@ -104,7 +104,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
         )
         a, b = np.concatenate([a[left], c[right]]), np.concatenate([c[left], b[right]])
     row, column, length = (np.concatenate(part) for part in zip(*found, strict=True))
-    return _shortest(row, column, length * shapes.unit, n)
+    return _minimum_lengths(row, column, length * shapes.unit, n)
 
 
 def edge_graph(F: IntArray, n: int) -> csr_array:
@@ -120,49 +120,27 @@ def edge_graph(F: IntArray, n: int) -> csr_array:
 def neighbours_within(edges: csr_array, sources: IntArray, rings: int) -> tuple[IntArray, IntArray]:
     """Vertices at most ``rings`` edges away from each source, without the source itself.
 
-    Parameters
-    ----------
-    edges : (n, n) csr_array
-        Result of `edge_graph`.
-    sources : (s,) int64
-        Vertices. The search is fastest if neighbours in this order are close on the surface.
-    rings : int
-        Maximum number of edges.
-
-    Returns
-    -------
-    row, vertex : (k,) int64
-        Index of the source, ascending, and the vertex.
+    Returns the index of the source (k,), ascending, and the vertex (k,). ``edges`` is the result of `edge_graph`. The
+    search is fastest if sources that follow each other are close on the surface.
     """
     from scipy.sparse.csgraph import dijkstra
 
     found = []
-    for start, part in _portions(sources):
-        inside, graph, own = _around(edges, part, rings)
-        apart = dijkstra(graph, indices=own, unweighted=True, limit=rings)
-        row, vertex = np.nonzero(np.isfinite(apart) & (apart > 0))
+    for start, part in _split_sources(sources):
+        inside, graph, own = _subgraph_around(edges, part, rings)
+        distance = dijkstra(graph, indices=own, unweighted=True, limit=rings)
+        row, vertex = np.nonzero(np.isfinite(distance) & (distance > 0))
         found.append((row + start, inside[vertex]))
     row, vertex = (np.concatenate(part) for part in zip(*found, strict=True))
     return row, vertex
 
 
 def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target: IntArray, reach: float) -> FloatArray:
-    """Lengths of the shortest chains of segments from each source to its own targets.
+    """Lengths (k,) of the shortest chains of segments from each source to its own targets.
 
-    Parameters
-    ----------
-    segments : (n, n) csr_array
-        Result of `straight_segments`.
-    sources : (s,) int64
-        Vertices, ordered as for `neighbours_within`.
-    row, target : (k,) int64
-        Index of the source, ascending, and the target vertex. The target must be reachable.
-    reach : float
-        Initial search radius. The radius grows for sources that do not reach all of their targets.
-
-    Returns
-    -------
-    (k,) float64
+    ``segments`` is the result of `straight_segments`. ``row`` (k,) is the index of the source, ascending, and
+    ``target`` (k,) a vertex that is reachable from it. ``reach`` is the initial search radius. The radius grows for
+    sources that do not reach all of their targets.
     """
     from scipy.sparse.csgraph import dijkstra
 
@@ -170,28 +148,28 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
     first = np.searchsorted(row, np.arange(sources.size + 1))
     left, limit = np.arange(sources.size), reach
     while left.size:
-        for _, part in _portions(left):
-            inside, graph, own = _around(segments, sources[part], limit)
-            apart = dijkstra(graph, indices=own, limit=limit)
-            place = np.full(segments.shape[0], -1)
-            place[inside] = np.arange(inside.size)
+        for _, part in _split_sources(left):
+            inside, graph, own = _subgraph_around(segments, sources[part], limit)
+            distance = dijkstra(graph, indices=own, limit=limit)
+            index = np.full(segments.shape[0], -1)
+            index[inside] = np.arange(inside.size)
             for k, source in enumerate(part.tolist()):
                 pairs = slice(first[source], first[source + 1])
-                at = place[target[pairs]]
-                length[pairs] = np.where(at < 0, np.inf, apart[k, at])
+                at = index[target[pairs]]
+                length[pairs] = np.where(at < 0, np.inf, distance[k, at])
         left = np.unique(row[np.isinf(length)])
-        limit *= _FARTHER
+        limit *= _RADIUS_GROWTH
     return length
 
 
-def _portions(sources: IntArray) -> Iterator[tuple[int, IntArray]]:
+def _split_sources(sources: IntArray) -> Iterator[tuple[int, IntArray]]:
     """Yield portions of the sources, each with its start."""
-    for start in range(0, sources.size, _AT_A_TIME):
+    for start in range(0, sources.size, _SOURCES_PER_RUN):
         heartbeat()
-        yield start, sources[start : start + _AT_A_TIME]
+        yield start, sources[start : start + _SOURCES_PER_RUN]
 
 
-def _around(graph: csr_array, sources: IntArray, reach: float) -> tuple[IntArray, csr_array, IntArray]:
+def _subgraph_around(graph: csr_array, sources: IntArray, reach: float) -> tuple[IntArray, csr_array, IntArray]:
     """Return the vertices within reach of any source, the graph among them, and the sources' indices in it."""
     from scipy.sparse.csgraph import dijkstra
 
@@ -204,19 +182,19 @@ def _twins(tail: IntArray, head: IntArray, n: int) -> IntArray:
     """Index of the opposite half-edge of each half-edge; -1 on the boundary."""
     key, opposite = tail * n + head, head * n + tail
     order = np.argsort(key)
-    place = np.minimum(np.searchsorted(key, opposite, sorter=order), key.size - 1)
-    twin: IntArray = np.where(key[order[place]] == opposite, order[place], -1)
+    index = np.minimum(np.searchsorted(key, opposite, sorter=order), key.size - 1)
+    twin: IntArray = np.where(key[order[index]] == opposite, order[index], -1)
     return twin
 
 
-def _shortest(row: IntArray, column: IntArray, length: FloatArray, n: int) -> csr_array:
+def _minimum_lengths(row: IntArray, column: IntArray, length: FloatArray, n: int) -> csr_array:
     """Sparse matrix with the minimum of all lengths of each entry."""
     key = row * n + column
     order = np.argsort(key, kind="stable")
     key = key[order]
     first = np.flatnonzero(np.diff(key, prepend=-1))
-    least, at = np.minimum.reduceat(length[order], first), order[first]
-    return csr_array((least, (row[at].astype(np.int32), column[at].astype(np.int32))), shape=(n, n))
+    smallest, at = np.minimum.reduceat(length[order], first), order[first]
+    return csr_array((smallest, (row[at].astype(np.int32), column[at].astype(np.int32))), shape=(n, n))
 
 
 def _cross(a: ComplexArray, b: ComplexArray) -> FloatArray:

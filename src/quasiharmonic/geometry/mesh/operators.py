@@ -45,14 +45,7 @@ class Operators:
     def laplacian(self, a: FloatArray | None = None) -> csr_array:
         """``Gᵀ A G`` for a tensor field; the cotangent Laplacian by default.
 
-        Parameters
-        ----------
-        a : (f, 3) float64, optional
-            Entries a11, a12, a22 of ``mⱼ⁻¹ A₍ⱼ₎`` by triangle.
-
-        Returns
-        -------
-        (n, n) csr_array of float64
+        ``a`` (f, 3) has the entries a11, a12, a22 of ``mⱼ⁻¹ A₍ⱼ₎`` by triangle.
         """
         if a is None:
             a = np.tile([1.0, 0.0, 1.0], (self.m.size, 1))
@@ -63,21 +56,7 @@ class Operators:
 
 
 def operators(V: NDArray[np.floating], F: NDArray[np.integer], reference: Reference = "rest") -> Operators:
-    """Build the operators of a mesh.
-
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) float
-        Rest positions.
-    F : (f, 3) int
-        Triangles, consistently oriented.
-    reference : {"rest", "equilateral", "corrected"}
-        The reference triangles of gradients and areas.
-
-    Returns
-    -------
-    Operators
-    """
+    """Build the operators of a mesh; ``reference`` selects the triangles of gradients and areas."""
     triangles = own_triangles(F)
     mesh = ReferenceMesh(np.asarray(V, dtype=np.float64), triangles, reference)
     f, n = len(triangles), len(V)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, named
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, names_of
 
 # Ears whose scores differ by less count as equal, and the first one is cut, so that rounding does not decide.
-_ALIKE = 1e-9
+_SCORE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +53,15 @@ class Polygons:
         """Index of the polygon of each triangle; (f,) int64."""
         return np.repeat(np.arange(len(self)), self.sizes - 2)
 
+    def divide(self, divided: BoolArray) -> Polygons:
+        """Polygons of which those in a mask (p,) are replaced by their triangles."""
+        rings = np.split(self.corners, self.starts[1:-1])
+        first = self.first_triangle
+        new: list[IntArray] = []
+        for k, ring in enumerate(rings):
+            new += [3 * t + np.arange(3) for t in range(first[k], first[k + 1])] if divided[k] else [ring]
+        return Polygons(np.concatenate(new), np.cumsum([0, *map(len, new)]))
+
     def diagonals(self, F: IntArray) -> IntArray:
         """Edges (d, 2) of the triangles ``F`` inside polygons, by vertices; a mesh cannot be cut there."""
         inside = np.repeat(self.sizes > 3, self.sizes - 2)
@@ -64,7 +73,7 @@ class Polygons:
         return found[count == 2, 1:]
 
 
-def triangulated(V: FloatArray, vertices: IntArray, starts: IntArray) -> tuple[IntArray, Polygons]:
+def triangulate_polygons(V: FloatArray, vertices: IntArray, starts: IntArray) -> tuple[IntArray, Polygons]:
     """Triangulate polygons by their shape.
 
     Each polygon is projected along its mean normal. Then ears are cut off, best shape first. An ear is a convex corner
@@ -99,10 +108,10 @@ def triangulated(V: FloatArray, vertices: IntArray, starts: IntArray) -> tuple[I
     T = np.empty((len(vertices) - 2 * len(sizes), 3), dtype=np.int64)
     first = starts[:-1] - 2 * np.arange(len(sizes))
     for size in np.unique(sizes).tolist():
-        alike = np.flatnonzero(sizes == size)
-        rings = starts[alike, None] + np.arange(size)
-        cut = rings[:, None] if size == 3 else _ears(V[vertices[rings]], rings)
-        T[first[alike, None] + np.arange(size - 2)] = cut
+        same_size = np.flatnonzero(sizes == size)
+        rings = starts[same_size, None] + np.arange(size)
+        cut = rings[:, None] if size == 3 else _triangulate_by_ears(V[vertices[rings]], rings)
+        T[first[same_size, None] + np.arange(size - 2)] = cut
     # Assign triangle corners to polygon corners in reverse order, so that the first one is kept.
     corner = np.empty(len(vertices), dtype=np.int64)
     corner[T.ravel()[::-1]] = np.arange(T.size)[::-1]
@@ -112,25 +121,25 @@ def triangulated(V: FloatArray, vertices: IntArray, starts: IntArray) -> tuple[I
 def _check_rings(vertices: IntArray, sizes: IntArray) -> None:
     small = np.flatnonzero(sizes < 3)
     if small.size:
-        raise ValueError(f"{named('face', 'faces', small)} of fewer than three corners")
+        raise ValueError(f"{names_of('face', 'faces', small)} of fewer than three corners")
     face = np.repeat(np.arange(len(sizes)), np.where(sizes > 3, sizes, 0))
     vertices = vertices[np.repeat(sizes > 3, sizes)]
     order = np.lexsort((vertices, face))
     same = (np.diff(face[order]) == 0) & (np.diff(vertices[order]) == 0)
     if same.any():
         raise ValueError(
-            f"{named('face', 'faces', np.unique(face[order][1:][same]))} with a vertex twice: remove the repetition"
+            f"{names_of('face', 'faces', np.unique(face[order][1:][same]))} with a vertex twice: remove the repetition"
         )
 
 
-def _ears(points: FloatArray, rings: IntArray) -> IntArray:
+def _triangulate_by_ears(points: FloatArray, rings: IntArray) -> IntArray:
     """Triangulate polygons (p, k, 3) with k corners each, numbered ``rings`` (p, k); (p, k - 2, 3)."""
     # If coordinates or their products are not finite, any triangulation is accepted.
     with np.errstate(all="ignore"):
-        return _cut(_projected(points), rings)
+        return _cut_ears(_project(points), rings)
 
 
-def _cut(flat: ComplexArray, rings: IntArray) -> IntArray:
+def _cut_ears(flat: ComplexArray, rings: IntArray) -> IntArray:
     """Cut ears off plane polygons (p, k), best first."""
     triangles = []
     while rings.shape[1] > 3:
@@ -143,7 +152,7 @@ def _cut(flat: ComplexArray, rings: IntArray) -> IntArray:
     return np.stack([*triangles, rings], axis=1)
 
 
-def _projected(points: FloatArray) -> ComplexArray:
+def _project(points: FloatArray) -> ComplexArray:
     """Project polygons (p, k, 3) along their mean normal (Newell's formula) to complex numbers (p, k)."""
     ahead = np.roll(points, -1, axis=1)
     normal = np.cross(points, ahead).sum(axis=1)
@@ -165,27 +174,27 @@ def _best_ears(flat: ComplexArray) -> IntArray:
         # Score the remaining triangle, too.
         score = np.minimum(score, _shape(after, np.roll(flat, -2, axis=1), before))
     rows = np.arange(len(flat))
-    best = np.argmax(score >= score.max(axis=1, keepdims=True) - _ALIKE, axis=1)
-    chosen, open_, untried = best.copy(), np.ones(len(flat), dtype=np.bool_), score.copy()
-    while open_.any():
-        row, ear = rows[open_], chosen[open_]
+    best = np.argmax(score >= score.max(axis=1, keepdims=True) - _SCORE_TOLERANCE, axis=1)
+    chosen, is_open, untried = best.copy(), np.ones(len(flat), dtype=np.bool_), score.copy()
+    while is_open.any():
+        row, ear = rows[is_open], chosen[is_open]
         blocked = _contains_another(flat[row], ear) & (untried[row, ear] > 0)
         untried[row[blocked], ear[blocked]] = -np.inf
-        open_[row[~blocked]] = False
-        again = row[blocked]
-        most = untried[again].max(axis=1, keepdims=True)
-        chosen[again] = np.argmax(untried[again] >= most - _ALIKE, axis=1)
+        is_open[row[~blocked]] = False
+        blocked_rows = row[blocked]
+        best_left = untried[blocked_rows].max(axis=1, keepdims=True)
+        chosen[blocked_rows] = np.argmax(untried[blocked_rows] >= best_left - _SCORE_TOLERANCE, axis=1)
         # A polygon without any ear crosses itself. Any triangulation is equally bad, so cut the best-scored corner.
-        hopeless = again[most[:, 0] <= 0]
-        chosen[hopeless], open_[hopeless] = best[hopeless], False
+        without_ear = blocked_rows[best_left[:, 0] <= 0]
+        chosen[without_ear], is_open[without_ear] = best[without_ear], False
     return chosen
 
 
 def _shape(a: ComplexArray, b: ComplexArray, c: ComplexArray) -> FloatArray:
     """Twice the signed area over the sum of the squared sides; 0 if the triangle is a point."""
-    doubled = ((b - a).conj() * (c - a)).imag
+    twice_area = ((b - a).conj() * (c - a)).imag
     sides = np.abs(b - a) ** 2 + np.abs(c - b) ** 2 + np.abs(a - c) ** 2
-    return np.divide(doubled, sides, out=np.zeros_like(sides), where=sides > 0)
+    return np.divide(twice_area, sides, out=np.zeros_like(sides), where=sides > 0)
 
 
 def _contains_another(flat: ComplexArray, ear: IntArray) -> BoolArray:

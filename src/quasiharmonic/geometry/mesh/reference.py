@@ -32,21 +32,10 @@ _BLOCK = 8192
 
 
 def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray]:
-    """Isometrically map every triangle of a mesh to a frame in the plane.
+    """Isometrically map every triangle of a mesh to a frame in the plane, with vertex 0 at the origin.
 
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) float64
-        Vertices of a planar or a curved mesh.
-    F : (f, 3) int
-        Triangles.
-
-    Returns
-    -------
-    z1 : (f,) float64
-        Vertex 1, on the real axis (vertex 0 is the origin).
-    z2 : (f,) complex128
-        Vertex 2. Its imaginary part is signed for planar meshes and non-negative for curved ones.
+    Returns vertex 1 (f,) float64, which is on the real axis, and vertex 2 (f,) complex128. The imaginary part of vertex
+    2 is signed for planar meshes and non-negative for curved ones.
     """
     return _frames(V, F)[:2]
 
@@ -72,24 +61,24 @@ def lay_flat(V: FloatArray, F: IntArray, exponent: int, z1: FloatArray, z2: Comp
     """Fill in the frames (f,) of `rest_frames`, computed in units of 2^exponent; return the number of zero areas."""
     coordinates = np.ldexp(V.T, -exponent, order="C")
     for part in blocks(len(F)):
-        z1[part], z2.real[part], z2.imag[part] = _laid_flat(coordinates, F[part])
+        z1[part], z2.real[part], z2.imag[part] = _lay_each_flat(coordinates, F[part])
     np.ldexp(z1, exponent, out=z1)
     np.ldexp(z2.view(np.float64), exponent, out=z2.view(np.float64))
     return int(np.count_nonzero((z1 == 0) | (z2.imag == 0)))
 
 
-def _laid_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _lay_each_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Vertex 1 on the axis, and both coordinates of vertex 2, in each triangle's frame; (f,) each."""
     corners = [along.take(F) for along in coordinates]
     e1 = [corner[:, 1] - corner[:, 0] for corner in corners]
     e2 = [corner[:, 2] - corner[:, 0] for corner in corners]
     length = np.sqrt(_dot(e1, e1))
-    safe = np.where(length > 0, length, 1.0)
+    divisor = np.where(length > 0, length, 1.0)
     normal = [e1[i] * e2[j] - e1[j] * e2[i] for i, j in ((0, 1), (1, 2), (2, 0))[: 1 if len(e1) == 2 else 3]]
     across = normal[0] if len(normal) == 1 else np.sqrt(_dot(normal, normal))
     # If vertices 0 and 1 coincide, the direction is arbitrary.
     along = np.where(length > 0, _dot(e1, e2), np.sqrt(_dot(e2, e2)))
-    return length, along / safe, across / safe
+    return length, along / divisor, across / divisor
 
 
 def _dot(a: list[FloatArray], b: list[FloatArray]) -> FloatArray:
@@ -146,7 +135,7 @@ class ReferenceMesh:
         else:
             z1, z2 = rest_frames(V, F)
             if kind == "corrected":
-                z1, z2 = _corrected(z1, z2)
+                z1, z2 = _correct(z1, z2)
             m, gamma, per_entry = _tables(z1, z2)
         f = len(F)
         self.m: FloatArray = np.broadcast_to(m, (f,))
@@ -156,43 +145,20 @@ class ReferenceMesh:
 
     def __getitem__(self, part: slice) -> ReferenceMesh:
         """Restrict to a slice of the triangles, with the same vertices."""
-        some = copy(self)
-        some.F, some.m, some.gamma = self.F[part], self.m[part], self.gamma[:, part]
-        some.half_gamma, some.stiffness_by_entry = self.half_gamma[:, part], self.stiffness_by_entry[:, part]
-        return some
+        part_mesh = copy(self)
+        part_mesh.F, part_mesh.m, part_mesh.gamma = self.F[part], self.m[part], self.gamma[:, part]
+        part_mesh.half_gamma, part_mesh.stiffness_by_entry = self.half_gamma[:, part], self.stiffness_by_entry[:, part]
+        return part_mesh
 
     def edge_stiffness(self, a: FloatArray) -> FloatArray:
-        """Off-diagonal entries of every triangle's ``Gᵀ A G``.
+        """Off-diagonal entries (3, f) of every triangle's ``Gᵀ A G``, for the edges (0,1), (1,2), (2,0).
 
-        Parameters
-        ----------
-        a : (3, f) float64
-            Rows a11, a12, a22 of the tensor without its area factor, ``A₍ⱼ₎ = mⱼ 𝒜ⱼ``.
-
-        Returns
-        -------
-        (3, f) float64
-            For the edges (0,1), (1,2), (2,0) of each triangle.
+        ``a`` (3, f) has the rows a11, a12, a22 of the tensor without its area factor, ``A₍ⱼ₎ = mⱼ 𝒜ⱼ``.
         """
         return np.einsum("eaf,af->ef", self.stiffness_by_entry.reshape(3, 3, -1), a)
 
     def derivatives(self, w: ComplexArray) -> Derivatives:
-        """Differentiate a complex map on every triangle.
-
-        Parameters
-        ----------
-        w : (n,) complex128
-            Positions u + iv.
-
-        Returns
-        -------
-        Derivatives
-
-        Raises
-        ------
-        ValueError
-            If ``w`` does not have one position for each vertex.
-        """
+        """Differentiate a complex map (n,) on every triangle."""
         if w.shape != (self.n,):
             raise ValueError(f"w must have shape ({self.n},), one position for each vertex, not {w.shape}")
         f = len(self.F)
@@ -250,7 +216,7 @@ def _tables(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray,
     return m, 1j * opposite / (2 * m), per_entry
 
 
-def _corrected(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+def _correct(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray]:
     """The corrected triangles of §F.1, with side 0-1 of unit length."""
 
     def angle(at: ComplexArray, to: ComplexArray) -> FloatArray:

@@ -12,11 +12,11 @@ from quasiharmonic.geometry.mesh.topology import edges as sort_edges
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
+    check_bool,
     check_range,
+    edge_names,
     index_array,
-    named_edges,
     triangle_rows,
-    true_or_false,
     vertex_array,
 )
 
@@ -48,22 +48,7 @@ class Refined:
     weights: FloatArray
 
     def extend(self, values: ArrayLike) -> FloatArray:
-        """Interpolate values at the old vertices to all vertices, linearly on the old triangles.
-
-        Parameters
-        ----------
-        values : (n, …) array
-            One row for each old vertex.
-
-        Returns
-        -------
-        (n + s, …) float64
-
-        Raises
-        ------
-        ValueError
-            If the number of rows differs from the number of old vertices.
-        """
+        """Interpolate values (n, …) at the old vertices to all vertices, linearly on the old triangles."""
         old = np.asarray(values, dtype=np.float64)
         if not old.ndim or len(old) != len(self.V) - len(self.parents):
             rows = "a number" if not old.ndim else f"{len(old)} rows"
@@ -73,7 +58,7 @@ class Refined:
         return np.concatenate([old, np.einsum("sk,sk...->s...", self.weights, old[self.parents])])
 
 
-def composed(first: Refined, second: Refined) -> Refined:
+def compose(first: Refined, second: Refined) -> Refined:
     """Compose two successive refinements into one, with three parents for each vertex."""
     n = len(first.V) - len(first.parents)
 
@@ -105,10 +90,10 @@ def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool 
     wanted = np.unique(np.sort(_pairs(edges), axis=1), axis=0)
     found = sort_edges(F, n)
     allowed = [found.interior, np.sort(found.boundary, axis=1)]
-    _refuse(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
-    true_or_false("boundary", boundary)
+    _check_known(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
+    check_bool("boundary", boundary)
     if not boundary:
-        _refuse(wanted, _keys(found.interior, n), n, "on the boundary; pass boundary=True to split it")
+        _check_known(wanted, _keys(found.interior, n), n, "on the boundary; pass boundary=True to split it")
 
     V = np.concatenate([V, V[wanted[:, 0]] / 2 + V[wanted[:, 1]] / 2])
     keys = _keys(wanted, n)
@@ -140,21 +125,21 @@ def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, 
             parts.append(np.stack(corners, axis=1))
             of.append(t)
 
-    def turned(number: int, to: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    def rotate(number: int, to: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         # Corners and midpoints of triangles, rotated so that corner `to` is the last.
         t = np.flatnonzero(count == number)
         columns = (to[t, None] + [1, 2, 0]) % 3
         return t, F[t[:, None], columns].T, middle[t[:, None], columns].T
 
-    t, (a, b, c), (_, _, r) = turned(1, np.argmax(middle, axis=1))
+    t, (a, b, c), (_, _, r) = rotate(1, np.argmax(middle, axis=1))
     replace(t, (r, c, a), (r, b, c))
-    t, (a, b, c), (p, q, _) = turned(2, np.argmin(middle, axis=1))
+    t, (a, b, c), (p, q, _) = rotate(2, np.argmin(middle, axis=1))
     through_b = _length(V, b, q) <= _length(V, a, p)
     replace(t, (c, q, p), (q, a, b), (q, b, p))
     k = np.flatnonzero(~through_b)
     parts[-2][k] = np.stack([a, b, p], axis=1)[k]
     parts[-1][k] = np.stack([a, p, q], axis=1)[k]
-    t, (a, b, c), (p, q, r) = turned(3, np.zeros(len(F), dtype=np.int64))
+    t, (a, b, c), (p, q, r) = rotate(3, np.zeros(len(F), dtype=np.int64))
     replace(t, (p, q, r), (a, r, q), (b, p, r), (c, q, p))
     return np.concatenate([first, *parts]), np.concatenate([np.arange(len(F)), *of])
 
@@ -172,11 +157,11 @@ def _pairs(edges: ArrayLike) -> IntArray:
     return array.reshape(-1, 2)
 
 
-def _refuse(wanted: IntArray, known: IntArray, n: int, why: str) -> None:
+def _check_known(wanted: IntArray, known: IntArray, n: int, reason: str) -> None:
     inside = ((wanted >= 0) & (wanted < n)).all(axis=1)
     bad = wanted[~(inside & np.isin(_keys(wanted, n), known))]
     if len(bad):
-        raise ValueError(f"cannot split {named_edges(bad)}: {why}")
+        raise ValueError(f"cannot split {edge_names(bad)}: {reason}")
 
 
 def _keys(pairs: IntArray, n: int) -> IntArray:

@@ -45,44 +45,29 @@ FORMS = _forms()
 
 
 def jacobian_coefficients(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Control values of Jacobian determinants, in floating point.
+    """Control values (f, 6) of twice the Jacobian determinant, in floating point, for coordinates (f, 6) of nodes.
 
-    Parameters
-    ----------
-    x, y : (f, 6) float64
-        Coordinates of the nodes of each element.
-
-    Returns
-    -------
-    (f, 6) float64
-        Control values of twice the determinant in the order of `PAIRS`: three corners, then the sides 01, 12 and 20.
+    They have the order of `PAIRS`: three corners, then the sides 01, 12 and 20.
     """
     return np.asarray(np.einsum("fa,kab,fb->fk", x, FORMS.astype(np.float64), y, optimize=True))
 
 
-def least_jacobian(values: FloatArray) -> FloatArray:
+def min_jacobian(values: FloatArray) -> FloatArray:
     """Minimum of quadratic forms on the triangle where barycentric coordinates are non-negative.
 
-    Parameters
-    ----------
-    values : (f, 6) float64
-        Control values, as returned by `jacobian_coefficients`.
-
-    Returns
-    -------
-    (f,) float64
-        Minimum in floating point, up to rounding relative to the largest control value. It is attained at a corner, or
-        at a critical point on a side or in the interior.
+    ``values`` (f, 6) are control values, as returned by `jacobian_coefficients`. The result is correct up to rounding
+    relative to the largest control value. The minimum is attained at a corner, or at a critical point on a side or in
+    the interior.
     """
     scale = np.abs(values).max(axis=1)
     values = values / np.where(scale > 0, scale, 1.0)[:, None]
     (a, b, c), (ab, bc, ca) = values[:, :3].T, values[:, 3:].T
-    least = np.minimum(np.minimum(a, b), c)
+    lowest = np.minimum(np.minimum(a, b), c)
     for start, end, between in ((a, b, ab), (b, c, bc), (c, a, ca)):
         fall, rise = start - between, end - between
         within = (fall > 0) & (rise > 0)
         share = fall / np.where(within, fall + rise, 1.0)
-        least = np.where(within, np.minimum(least, start - fall * share), least)
+        lowest = np.where(within, np.minimum(lowest, start - fall * share), lowest)
     # Slopes at the first corner towards the second and the third, and half the second derivatives. For straight sides
     # these are noise, and so is the critical point. The form is evaluated there, so noise cannot give too low a
     # minimum.
@@ -93,4 +78,4 @@ def least_jacobian(values: FloatArray) -> FloatArray:
     inside = convex & (at > 0).all(axis=0) & (at.sum(axis=0) < 1)
     s, t = np.where(inside, at, 0.0)
     value = a + 2 * (second * s + third * t) + bb * s**2 + cc * t**2 + 2 * cross * s * t
-    return np.asarray(scale * np.minimum(least, value))
+    return np.asarray(scale * np.minimum(lowest, value))

@@ -13,11 +13,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.util.arrays import BoolArray, IntArray, check_range, named, own_triangles, unchangeable
+from quasiharmonic.util.arrays import BoolArray, IntArray, check_range, names_of, own_triangles, unchangeable
 from quasiharmonic.util.kernels import compiled
 
 # Number of half-edges from which the sparse matrix is faster than a sort.
-_MANY = 10_000
+_SPARSE_FROM = 10_000
 
 
 @dataclass(frozen=True)
@@ -43,20 +43,7 @@ class Edges:
 
 
 def edges(F: NDArray[np.integer], n: int) -> Edges:
-    """Sort the half-edges of ``F`` and classify the edges.
-
-    Parameters
-    ----------
-    F : (f, 3) int
-        Triangles; every index in ``0 … n - 1``.
-    n : int
-        Number of vertices, below 2³¹.
-
-    Returns
-    -------
-    Edges
-        Each kind in ascending order of its undirected edge.
-    """
+    """Classify the edges of triangles, each kind in ascending order of its undirected edge; ``n`` must be below 2³¹."""
     T = own_triangles(F)
     pairs, sizes = np.empty((T.size, 2), dtype=np.int64), np.empty(4, dtype=np.int64)
     if not sort_edges(T, n, pairs, sizes):
@@ -64,8 +51,8 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
     # Most edges have two half-edges. Release the rest of the memory, which was never touched.
     pairs.resize((int(sizes.sum()), 2), refcheck=False)
     end = np.cumsum(sizes).tolist()
-    rest = (pairs[start:stop].copy() for start, stop in pairwise(end))
-    return Edges(pairs[: end[0]], *rest)
+    others = (pairs[start:stop].copy() for start, stop in pairwise(end))
+    return Edges(pairs[: end[0]], *others)
 
 
 @compiled
@@ -76,8 +63,8 @@ def sort_edges(F: IntArray, n: int, pairs: IntArray, sizes: IntArray) -> int:
     T = np.ascontiguousarray(F.T, dtype=np.int32)
     tail, head = T.ravel(), T[(1, 2, 0), :].ravel()
     # SciPy halves the time for large meshes, but importing it for this alone takes longer.
-    by_edge = _by_rows if tail.size >= _MANY and "scipy.sparse" in sys.modules else _by_keys
-    low, high, direction = by_edge(tail, head, n)
+    sort = _sort_by_rows if tail.size >= _SPARSE_FROM and "scipy.sparse" in sys.modules else _sort_by_keys
+    low, high, direction = sort(tail, head, n)
     del T, tail, head
     starts = np.ones(low.size, dtype=bool)
     np.not_equal(high[1:], high[:-1], out=starts[1:])
@@ -101,7 +88,7 @@ def sort_edges(F: IntArray, n: int, pairs: IntArray, sizes: IntArray) -> int:
 _Integers = NDArray[np.integer]
 
 
-def _by_keys(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[_Integers, _Integers, BoolArray]:
+def _sort_by_keys(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[_Integers, _Integers, BoolArray]:
     """Sort half-edges by edge: smaller end, larger end, and whether the half-edge starts at the larger end."""
     key = edge_keys(tail, head, n)
     key *= 2
@@ -112,8 +99,8 @@ def _by_keys(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[
     return low, high, direction
 
 
-def _by_rows(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[_Integers, _Integers, BoolArray]:
-    """As `_by_keys`, by a sparse matrix; half-edges of the same edge may come in another order."""
+def _sort_by_rows(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[_Integers, _Integers, BoolArray]:
+    """As `_sort_by_keys`, by a sparse matrix; half-edges of the same edge may come in another order."""
     from scipy.sparse import csr_array
 
     table = (tail > head, np.minimum(tail, head), np.arange(tail.size + 1))
@@ -135,19 +122,29 @@ def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> I
     return keys
 
 
+def find_twins(F: IntArray) -> IntArray:
+    """Return for each triangle (f, 3) the first one with the same three vertices, in any order."""
+    twin = np.arange(len(F))
+    # The sum of hashed vertices does not depend on their order. Only triangles with equal sums are compared.
+    hashed = np.arange(int(F.max(initial=-1)) + 1, dtype=np.uint64)
+    for shift in (np.uint64(31), np.uint64(29)):
+        hashed += np.uint64(0x9E3779B97F4A7C15)
+        hashed ^= hashed >> shift
+        hashed *= np.uint64(0xBF58476D1CE4E5B9)
+    sums = hashed[F].sum(axis=1)
+    ordered = np.sort(sums)
+    several = np.flatnonzero(np.isin(sums, ordered[1:][ordered[1:] == ordered[:-1]]))
+    if several.size:
+        corners = np.sort(F[several], axis=1)
+        order = np.lexsort(corners.T)
+        starts = np.ones(order.size, dtype=bool)
+        starts[1:] = (corners[order[1:]] != corners[order[:-1]]).any(axis=1)
+        twin[several[order]] = several[order[starts]][np.cumsum(starts) - 1]
+    return twin
+
+
 def boundary_edges(F: NDArray[np.integer], n: int) -> IntArray:
-    """Half-edges ``i → j`` on the boundary, with their triangle to the left.
-
-    Parameters
-    ----------
-    F : (f, 3) array of int
-    n : int
-        Number of vertices.
-
-    Returns
-    -------
-    (k, 2) int64
-    """
+    """Half-edges ``i → j`` (k, 2) on the boundary, with their triangle to the left."""
     return edges(F, n).boundary
 
 
@@ -170,25 +167,11 @@ def boundary_loops(F: NDArray[np.integer], n: int) -> list[IntArray]:
 
 
 def trace_loops(boundary: IntArray) -> list[IntArray]:
-    """Order directed boundary edges into loops.
+    """Order directed boundary edges (k, 2) into loops, sorted by their first vertex, which is their smallest.
 
-    Parameters
-    ----------
-    boundary : (k, 2) int64
-        Half-edges ``i → j``, as in `Edges.boundary`.
-
-    Returns
-    -------
-    list of (l,) int64
-        Each loop in order with the surface to its left: counterclockwise around the outside of a
-        planar mesh, clockwise around its holes (the direction of eq. 15). Each loop starts at its smallest
-        vertex. Loops are sorted by their first vertex.
-
-    Raises
-    ------
-    ValueError
-        If the edges do not form loops: two fans of triangles touch at a vertex, or the mesh is
-        not a consistently oriented surface.
+    The surface is to the left: loops run counterclockwise around the outside of a planar mesh and clockwise around its
+    holes (the direction of eq. 15). Raises a ValueError if the edges do not form loops: two fans of triangles touch at
+    a vertex, or the mesh is not a consistently oriented surface.
     """
     vertices, lengths = np.empty(len(boundary), dtype=np.int64), np.empty(len(boundary), dtype=np.int64)
     number = follow_loops(boundary, vertices, lengths)
@@ -196,9 +179,12 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
         tails, heads = np.sort(boundary, axis=0).T
         shared = np.unique(tails[1:][tails[1:] == tails[:-1]])
         if shared.size:
-            raise ValueError(f"the boundary passes more than once through {named('vertex', 'vertices', shared)}")
+            raise ValueError(
+                f"the boundary passes more than once through {names_of('vertex', 'vertices', shared)}; "
+                "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
+            )
         unpaired = np.setxor1d(tails, heads)
-        raise ValueError(f"the boundary does not close at {named('vertex', 'vertices', unpaired)}")
+        raise ValueError(f"the boundary does not close at {names_of('vertex', 'vertices', unpaired)}")
     return np.split(vertices, np.cumsum(lengths[: number - 1])) if number > 1 else [vertices][:number]
 
 
@@ -209,54 +195,35 @@ def follow_loops(boundary: IntArray, vertices: IntArray, lengths: IntArray) -> i
     if (tails[1:] == tails[:-1]).any() or not np.array_equal(tails, heads):
         return -1
     following = dict(zip(boundary[:, 0].tolist(), boundary[:, 1].tolist(), strict=True))
-    passed: list[int] = []
+    visited: list[int] = []
     number = 0
     for start in tails.tolist():
         if start not in following:
             continue
-        before, here = len(passed), start
+        before, here = len(visited), start
         while here in following:
-            passed.append(here)
+            visited.append(here)
             here = following.pop(here)
-        lengths[number] = len(passed) - before
+        lengths[number] = len(visited) - before
         number += 1
-    vertices[:] = passed
+    vertices[:] = visited
     return number
 
 
 def components(F: NDArray[np.integer], n: int) -> IntArray:
-    """Label of the connected component of every vertex.
+    """Label of the connected component of every vertex, (n,) int64: its smallest vertex.
 
-    Parameters
-    ----------
-    F : (f, 3) array of int
-    n : int
-        Number of vertices.
-
-    Returns
-    -------
-    (n,) int64
-        Smallest vertex of the component. A vertex without triangle is a component of its own.
+    A vertex without triangle is a component of its own.
     """
     T = own_triangles(F)
     # Two edges of a triangle connect its three vertices.
-    return linked(T[:, :2], T[:, 1:], n)
+    return label_components(T[:, :2], T[:, 1:], n)
 
 
-def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
-    """Label of the connected component of every node of a graph.
+def label_components(tail: IntArray, head: IntArray, n: int) -> IntArray:
+    """Label of the connected component of every node of a graph, (n,) int64: its smallest node.
 
-    Parameters
-    ----------
-    tail, head : (e,) or (e, k) int64
-        Nodes ``0 … n - 1`` at the ends of each link.
-    n : int
-        Number of nodes.
-
-    Returns
-    -------
-    (n,) int64
-        Smallest node of the component.
+    ``tail`` and ``head`` (e,) or (e, k) are the nodes at the ends of each link.
     """
     label = np.empty(n, dtype=np.int64)
     tail, head = unchangeable(tail), unchangeable(head)
@@ -269,7 +236,7 @@ def linked(tail: IntArray, head: IntArray, n: int) -> IntArray:
 @compiled
 def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> int:
     """Fill in the smallest node of every node's component (n,); return 0 if a link is out of range, else 1."""
-    # Importing SciPy's csgraph takes longer than all other work on a small mesh, so this is done here. Every edge
+    # This function replaces SciPy's csgraph, whose import takes longer than all other work on a small mesh. Every edge
     # attaches the larger label of its ends to the smaller one, and labels follow their labels to the root
     # (Shiloach and Vishkin 1982). The number of rounds grows with the logarithm of the size.
     tail, head = tail.ravel(), head.ravel()
@@ -283,10 +250,10 @@ def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> int:
         while not np.array_equal(here, root := here[here]):
             here = root
         one, other = here[tail], here[head]
-        apart = one != other
-        if not apart.any():
+        differ = one != other
+        if not differ.any():
             break
-        tail, head, one, other = tail[apart], head[apart], one[apart], other[apart]
+        tail, head, one, other = tail[differ], head[differ], one[differ], other[differ]
         np.minimum.at(here, np.maximum(one, other), np.minimum(one, other))
     label[:] = here
     return 1

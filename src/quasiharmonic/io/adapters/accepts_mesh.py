@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io.adapters.cells import planar_cells
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
-from quasiharmonic.util.arrays import FloatArray, IntArray, kind_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, describe
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -50,56 +50,56 @@ class AcceptsPlanarMesh(Protocol[P, R_co]):
 
 def accepts_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> AcceptsMesh[P, R]:
     """Decorate a function of ``V``, ``F``, … so that it accepts one mesh in their place."""
-    return _taking(function, 0)
+    return _decorate(function, 0)
 
 
 def writer_accepts_mesh(function: Callable[Concatenate[Path, ArrayLike, ArrayLike, P], R]) -> WriterAcceptsMesh[P, R]:
     """Decorate a function of a path, ``V``, ``F``, … so that it accepts one mesh in place of ``V`` and ``F``."""
-    return _taking(function, 1)
+    return _decorate(function, 1)
 
 
 def accepts_planar_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> AcceptsPlanarMesh[P, R]:
     """Decorate a function of planar ``points`` and elements ``F`` so that it accepts one mesh in their place."""
-    return _taking(function, 0, planar_cells)
+    return _decorate(function, 0, planar_cells)
 
 
 def init_accepts_mesh(init: Callable[..., None]) -> Callable[..., None]:
     """Decorate an ``__init__`` of ``V``, ``F``, … so that it accepts one mesh in their place."""
-    made: Callable[..., None] = _taking(init, 1)
+    made: Callable[..., None] = _decorate(init, 1)
     return made
 
 
 def init_accepts_planar_mesh(init: Callable[..., None]) -> Callable[..., None]:
     """Decorate an ``__init__`` of planar ``points`` and elements ``F`` so that it accepts one mesh in their place."""
-    made: Callable[..., None] = _taking(init, 1, planar_cells)
+    made: Callable[..., None] = _decorate(init, 1, planar_cells)
     return made
 
 
-def _taking(
-    function: Callable[..., Any], place: int, arrays: Callable[[Any], tuple[FloatArray, IntArray]] = mesh_arrays
+def _decorate(
+    function: Callable[..., Any], index: int, arrays: Callable[[Any], tuple[FloatArray, IntArray]] = mesh_arrays
 ) -> Any:
-    """Return a function that also accepts a mesh as argument number ``place``, in place of positions and ``F``."""
-    first = list(inspect.signature(function).parameters)[place]
+    """Return a function that also accepts a mesh as argument number ``index``, in place of positions and ``F``."""
+    first = list(inspect.signature(function).parameters)[index]
 
     @wraps(function)
-    def taking(*args: Any, **kwargs: Any) -> Any:
-        if len(args) > place and stands_for_mesh(args[place]):
-            mesh, before, after = args[place], args[:place], args[place + 1 :]
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        if len(args) > index and stands_for_mesh(args[index]):
+            mesh, before, after = args[index], args[:index], args[index + 1 :]
             _check_room(function, mesh, len(args) + 1, kwargs)
             args = (*before, *arrays(mesh), *after)
-        elif len(args) > place and isinstance(args[place], tuple) and np.ndim(args[place][:1]) > 2:
-            pair = f"a tuple of {len(args[place])} arrays"
+        elif len(args) > index and isinstance(args[index], tuple) and np.ndim(args[index][:1]) > 2:
+            pair = f"a tuple of {len(args[index])} arrays"
             raise TypeError(f"V is {pair}: pass them as separate arguments, as in {function.__name__}(*mesh)")
         elif first in kwargs and "F" not in kwargs and stands_for_mesh(kwargs[first]):
             kwargs[first], kwargs["F"] = arrays(kwargs[first])
         return function(*args, **kwargs)
 
-    return taking
+    return wrapper
 
 
 def _check_room(function: Callable[..., Any], mesh: object, count: int, kwargs: dict[str, Any]) -> None:
     """Raise a TypeError if both a mesh and ``F`` were passed."""
     parameters = inspect.signature(function).parameters.values()
-    most = sum(parameter.kind is not inspect.Parameter.KEYWORD_ONLY for parameter in parameters)
-    if "F" in kwargs or count > most:
-        raise TypeError(f"{kind_of(mesh)} provides both V and F: omit F, or pass the array V instead")
+    max_count = sum(parameter.kind is not inspect.Parameter.KEYWORD_ONLY for parameter in parameters)
+    if "F" in kwargs or count > max_count:
+        raise TypeError(f"{describe(mesh)} provides both V and F: omit F, or pass the array V instead")

@@ -12,69 +12,53 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.elements import joined
+from quasiharmonic.geometry.mesh.elements import join_elements
 from quasiharmonic.io.adapters.objects import MeshLike, planar_arrays
-from quasiharmonic.util.arrays import FloatArray, IntArray, index_array, kind_of, vertex_array
+from quasiharmonic.io.registry import suffixes
+from quasiharmonic.util.arrays import FloatArray, IntArray, describe, index_array, vertex_array
 
 # Number of nodes by kind of cell, in meshio's and VTK's names; then the kinds to skip, which have no area.
 _NODES = {"triangle": 3, "quad": 4, "triangle6": 6, 5: 3, 9: 4, 22: 6}
-_PASSED_OVER = ("vertex", "line", "line3", 1, 2, 3, 4, 21)
+_SKIPPED_CELLS = ("vertex", "line", "line3", 1, 2, 3, 4, 21)
 # VTK's kind number of polygons, which are cut into triangles.
 _POLYGON = 7
 # Permutation from DOLFINx's node order to the order around the element, by number of nodes.
-_AROUND = {3: [0, 1, 2], 4: [0, 1, 3, 2], 6: [0, 1, 2, 5, 3, 4]}
-_FILES = (".msh", ".vtk", ".vtu")
+_DOLFINX_ORDER = {3: [0, 1, 2], 4: [0, 1, 3, 2], 6: [0, 1, 2, 5, 3, 4]}
 
 
 def planar_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     """Return the nodes and the elements of a planar mesh, given as an object, a mapping or a path.
 
-    Parameters
-    ----------
-    mesh : object, mapping or path
-        A mesh of scikit-fem (``doflocs`` and ``dofs.element_dofs``), of DOLFINx (``geometry.x`` and
-        ``geometry.dofmap``), of meshio (``cells`` in blocks) or of PyVista (``cells_dict``); the path of a ``.msh``,
-        ``.vtk`` or ``.vtu`` file; or any mesh that `quasiharmonic.io.adapters.objects.mesh_arrays` accepts, whose
-        larger faces are cut into triangles.
-
-    Returns
-    -------
-    points : (n, 2) float64
-        Nodes in the library's order; (n, 3) if they do not lie in a plane of constant z.
-    F : (f, 3), (f, 4) or (f, 6) int64
-        Elements in the format of `quasiharmonic.geometry.mesh.elements`.
-
-    Raises
-    ------
-    ValueError
-        If there are cells of other kinds, or six-node triangles together with other elements.
-    quasiharmonic.io.MeshFileError
-        If the file cannot be read.
+    Objects are meshes of scikit-fem (``doflocs`` and ``dofs.element_dofs``), DOLFINx (``geometry.x`` and
+    ``geometry.dofmap``), meshio (``cells`` in blocks) or PyVista (``cells_dict``), and all that `mesh_arrays` accepts.
+    A path ends in ``.msh``, ``.vtk`` or ``.vtu``. Nodes (n, 2) have the library's order; they are (n, 3) if they do not
+    lie in a plane of constant z. Elements have the format of `geometry.mesh.elements`. ValueError for cells of other
+    kinds, or six-node triangles together with other elements; MeshFileError if the file cannot be read.
     """
-    if isinstance(mesh, str | PathLike) and Path(mesh).suffix.lower() in _FILES:
+    if isinstance(mesh, str | PathLike) and Path(mesh).suffix.lower() in suffixes("read_elements"):
         from quasiharmonic.io.fem.files import read_fem
 
         read = read_fem(mesh)
         return read.points, read.F
-    whole: Any = mesh
-    what = kind_of(mesh)
-    if hasattr(whole, "doflocs"):
-        return _planar(np.asarray(whole.doflocs).T, what), index_array(f"t of {what}", whole.dofs.element_dofs).T
-    if hasattr(whole, "geometry"):
-        F = index_array(f"dofmap of {what}", whole.geometry.dofmap)
-        order = _AROUND.get(F.shape[1] if F.ndim == 2 else 0)
-        return _planar(whole.geometry.x, what), F if order is None else F[:, order]
-    blocks = _blocks(whole)
+    given: Any = mesh
+    what = describe(mesh)
+    if hasattr(given, "doflocs"):
+        return _planar(np.asarray(given.doflocs).T, what), index_array(f"t of {what}", given.dofs.element_dofs).T
+    if hasattr(given, "geometry"):
+        F = index_array(f"dofmap of {what}", given.geometry.dofmap)
+        order = _DOLFINX_ORDER.get(F.shape[1] if F.ndim == 2 else 0)
+        return _planar(given.geometry.x, what), F if order is None else F[:, order]
+    blocks = _blocks(given)
     if blocks is None:
         return planar_arrays(mesh)
-    return _planar(whole.points, what), _elements(blocks, f"cells of {what}")
+    return _planar(given.points, what), _elements(blocks, f"cells of {what}")
 
 
 def _elements(blocks: Iterable[tuple[Any, Any]], name: str) -> IntArray:
     """Join blocks of elements, each of one kind in meshio's or VTK's names, into rows of one length."""
     rows = []
     for kind, nodes in blocks:
-        if kind in _PASSED_OVER:
+        if kind in _SKIPPED_CELLS:
             continue
         if kind not in _NODES:
             raise ValueError(
@@ -82,7 +66,7 @@ def _elements(blocks: Iterable[tuple[Any, Any]], name: str) -> IntArray:
                 "quadrilaterals are supported"
             )
         rows.append(index_array(name, nodes).reshape(-1, _NODES[kind]))
-    return joined(rows)
+    return join_elements(rows)
 
 
 def _blocks(mesh: Any) -> list[tuple[Any, Any]] | None:

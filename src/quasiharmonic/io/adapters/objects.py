@@ -13,14 +13,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.polygons import triangulated
-from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
+from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_range,
+    describe,
     index_array,
-    kind_of,
     triangle_rows,
     vertex_array,
 )
@@ -93,9 +93,13 @@ _FACES = ("faces", "triangles", "F", "cells", "simplices")
 # scikit-fem's positions; they are columns, as are the corners of its elements.
 _BY_COLUMNS = "doflocs"
 
-# Kinds of cells that are faces, and kinds to skip (points and lines), in meshio's and VTK's names.
-_FACES_OF, _PASSED_OVER = ("triangle", "quad", "polygon"), ("vertex", "line")
-_FACES_OF_VTK, _PASSED_OVER_OF_VTK = (5, 7, 9), (0, 1, 2, 3, 4)
+# Kinds of cells that are faces, by the names of meshio.
+_FACE_CELLS = ("triangle", "quad", "polygon")
+# Kinds of cells to skip, by the names of meshio.
+_SKIPPED_CELLS = ("vertex", "line")
+# The same by the numbers of VTK.
+_FACE_CELLS_OF_VTK = (5, 7, 9)
+_SKIPPED_CELLS_OF_VTK = (0, 1, 2, 3, 4)
 
 
 def stands_for_mesh(value: object) -> bool:
@@ -142,7 +146,7 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
 
         read = read_mesh(mesh)
         return read.V, read.F
-    what = kind_of(mesh)
+    what = describe(mesh)
     by_columns = getattr(mesh, _BY_COLUMNS, None)
     if by_columns is not None:
         V = vertex_array(np.asarray(by_columns).T, f"{_BY_COLUMNS} of {what}")
@@ -176,7 +180,7 @@ def seamed_mesh(mesh: MeshLike) -> SeamedMesh:
     if isinstance(mesh, io.MeshData):
         return io.seamed(mesh)
     if not stands_for_mesh(mesh):
-        raise TypeError(f"{kind_of(mesh)} is not a mesh: pass a SeamedMesh, or the path of a file")
+        raise TypeError(f"{describe(mesh)} is not a mesh: pass a SeamedMesh, or the path of a file")
     return SeamedMesh(*mesh_arrays(mesh))
 
 
@@ -219,9 +223,9 @@ def _triangles(V: FloatArray, name: str, faces: Any, kinds: Any) -> IntArray:
 
 def _block(name: str, block: Any) -> Iterable[IntArray]:
     """Return the faces of one meshio block."""
-    if block.type in _PASSED_OVER:
+    if block.type in _SKIPPED_CELLS:
         return ()
-    if block.type not in _FACES_OF:
+    if block.type not in _FACE_CELLS:
         raise ValueError(f"{name} has cells of type {block.type!r}: only surface cells are supported")
     return (index_array(name, ring) for ring in block.data)
 
@@ -239,8 +243,8 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
     sizes = numbers[heads]
     faces = np.ones(len(heads), dtype=np.bool_)
     if kinds is not None:
-        faces = np.isin(kinds, _FACES_OF_VTK)
-        wrong = np.setdiff1d(kinds, (*_FACES_OF_VTK, *_PASSED_OVER_OF_VTK))
+        faces = np.isin(kinds, _FACE_CELLS_OF_VTK)
+        wrong = np.setdiff1d(kinds, (*_FACE_CELLS_OF_VTK, *_SKIPPED_CELLS_OF_VTK))
         if wrong.size:
             raise ValueError(f"{name} has cells of VTK type {wrong[0]}: only surface cells are supported")
     corner = np.repeat(faces, sizes + 1)
@@ -266,4 +270,4 @@ def _cut(V: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
     check_range("the faces", corners, len(V))
     space = V if V.shape[1] == 3 else np.column_stack([V, np.zeros(len(V))])
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    return corners[triangulated(space, corners, starts)[0]]
+    return corners[triangulate_polygons(space, corners, starts)[0]]

@@ -13,49 +13,32 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.fem.gmsh import read_gmsh
-from quasiharmonic.io.fem.legacy_vtk import read_legacy_vtk
 from quasiharmonic.io.fem.meshparts import MeshParts
-from quasiharmonic.io.fem.vtu import read_vtu
-from quasiharmonic.io.meshdata import is_planar
-from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, named
+from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
+from quasiharmonic.io.models.meshdata import is_planar
+from quasiharmonic.io.registry import find_format, suffixes
+from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, names_of
 
-_READERS = {".msh": read_gmsh, ".vtk": read_legacy_vtk, ".vtu": read_vtu}
 # Errors that readers may raise on damaged files.
 _DAMAGE = (ValueError, IndexError, KeyError, OverflowError)
 
 
 @dataclass(frozen=True, eq=False)
 class FemMesh:
-    """A planar mesh and all other data of its file.
+    """A planar mesh and all other data of its file."""
 
-    Attributes
-    ----------
-    points : (n, 2) float64
-        Every point of the file, in its order.
-    F : (f, 3), (f, 4) or (f, 6) int64
-        Triangles of three or six nodes and quadrilaterals of all blocks of the file, in order, in the format of
-        `quasiharmonic.geometry.mesh.elements`.
-    source : Path
-        The file.
-    parts : MeshParts
-        The parsed file.
-    """
-
-    points: FloatArray
+    points: FloatArray  # (n, 2): every point of the file, in its order
+    # (f, 3), (f, 4) or (f, 6): triangles and quadrilaterals of all blocks of the file, in order, in the format of
+    # `geometry.mesh.elements`
     F: IntArray
-    source: Path
-    parts: MeshParts
+    source: Path  # The file
+    parts: MeshParts  # The parsed file
 
     def point_field(self, name: str, vertices: ArrayLike) -> FloatArray:
         """Return vectors at some points, (k, 2) float64, from the file's point data at the last time.
 
-        Raises
-        ------
-        MeshFileError
-            If the data do not exist, are not vectors in the plane, or a value at these points is missing or not finite.
+        MeshFileError if the data do not exist, are not vectors in the plane, or a value at these points is not finite.
         """
         which, fields = np.asarray(vertices, dtype=np.int64), self.parts.fields
         if name not in fields:
@@ -76,7 +59,7 @@ class FemMesh:
         if lost.size:
             raise MeshFileError(
                 self.source,
-                f"{name!r} has no finite value at {named('boundary point', 'boundary points', lost)} (0-based)",
+                f"{name!r} has no finite value at {names_of('boundary point', 'boundary points', lost)} (0-based)",
                 remedy="give every boundary point a value, 0 for points that do not move",
             )
         if values[:, 2:].any():
@@ -85,20 +68,11 @@ class FemMesh:
 
 
 def read_fem(path: str | os.PathLike[str]) -> FemMesh:
-    """Read a planar mesh for finite elements.
+    """Read a planar mesh for finite elements: .msh of version 2 or 4, legacy .vtk or .vtu, as text or binary.
 
-    Parameters
-    ----------
-    path : str or path-like
-        A ``.msh`` of version 2 or 4, a legacy ``.vtk`` of an unstructured grid or polygons, or a ``.vtu``, each as text
-        or binary.
-
-    Raises
-    ------
-    MeshFileError
-        If the format is not supported, the file cannot be read, or the mesh is not planar. Also if the file has no
-        triangles or quadrilaterals, or has other cells with area. Supported are triangles of three or six nodes and
-        quadrilaterals of four.
+    MeshFileError if the format is not supported, the file cannot be read, or the mesh is not planar. Also if the file
+    has no triangles or quadrilaterals, or cells with area other than triangles of three or six nodes and quadrilaterals
+    of four.
     """
     source = Path(path)
     try:
@@ -111,15 +85,11 @@ def read_fem(path: str | os.PathLike[str]) -> FemMesh:
 def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str]) -> None:
     """Check before a computation whether a mesh could be written.
 
-    Raises
-    ------
-    MeshFileError
-        If the suffix differs from that of the source, because a conversion would lose data.
-    OutputError
-        If the file cannot be written.
+    MeshFileError if the suffix differs from that of the source, because a conversion would lose data; OutputError if
+    the file cannot be written.
     """
     there, here = Path(path).suffix.lower(), Path(source).suffix.lower()
-    if here in _READERS and there != here:
+    if here in suffixes("read_elements") and there != here:
         raise MeshFileError(
             path,
             f"a {here} file can only be written as {here}: {there or 'a file without suffix'} could lose groups, "
@@ -130,22 +100,10 @@ def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str
 
 
 def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) -> None:
-    """Write a mesh with new positions in the plane; every other byte of its file is unchanged.
+    """Write a mesh with new positions (n, 2) in the plane; every other byte of its file is unchanged.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file to write, with the suffix of the source. An existing file is replaced when the new one is complete.
-    mesh : FemMesh
-    points : (n, 2) array
-        New positions, rounded to single precision if the file has single precision.
-
-    Raises
-    ------
-    ValueError
-        If ``points`` has the wrong shape or is not finite.
-    MeshFileError, OutputError
-        As for `check_fem_output`. Also if positions are too large for the file's precision.
+    Positions are rounded to single precision if the file has single precision. ValueError if they have the wrong shape
+    or are not finite; MeshFileError if they are too large for the file's precision. Other errors as `check_fem_output`.
     """
     points = map_array("points", points, len(mesh.points))
     check_fem_output(path, mesh.source)
@@ -153,7 +111,7 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
         expected = points.astype(mesh.parts.precision).astype(np.float64)
     if not np.isfinite(expected).all():
         raise MeshFileError(path, "positions are too large for the file's single precision")
-    data = mesh.parts.replaced(points)
+    data = mesh.parts.replace_points(points)
     written = _mesh(mesh.source, data)
     if not (
         np.array_equal(written.points, expected)
@@ -166,13 +124,8 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
 
 def _mesh(source: Path, data: bytes) -> FemMesh:
     """Parse a file and check it."""
-    reader = _READERS.get(source.suffix.lower())
-    if reader is None:
-        raise MeshFileError(
-            source,
-            f"{source.suffix or 'files without suffix'} cannot be read",
-            remedy="convert it to .msh, .vtk or .vtu",
-        )
+    reader = find_format(source, "read_elements").read_elements
+    assert reader is not None
     try:
         with np.errstate(invalid="ignore"):
             parts = reader(data)
@@ -184,7 +137,7 @@ def _mesh(source: Path, data: bytes) -> FemMesh:
         raise MeshFileError(source, "has no triangles")
     lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if lost.size:
-        raise MeshFileError(source, f"not finite at {named('point', 'points', lost)} (0-based)")
+        raise MeshFileError(source, f"not finite at {names_of('point', 'points', lost)} (0-based)")
     used = points[np.unique(F)]
     if not is_planar(used):
         raise MeshFileError(

@@ -8,9 +8,9 @@ from itertools import groupby
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.elements import joined
+from quasiharmonic.geometry.mesh.elements import join_elements
+from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers, stack_tables
 from quasiharmonic.io.fem.meshparts import MeshParts
-from quasiharmonic.io.fem.tables import Table, TableReader, replaced, stacked
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Number of nodes of each kind of element that is read, and of the kinds that are skipped: lines and points.
@@ -30,15 +30,8 @@ _NAMES = {
 def read_gmsh(data: bytes) -> MeshParts:
     """Parse an MSH file.
 
-    Parameters
-    ----------
-    data : bytes
-
-    Raises
-    ------
-    ValueError
-        If the file is not MSH of version 2 or 4, ends early, or has other elements than points, lines, triangles of
-        three or six nodes and quadrilaterals of four.
+    ValueError if the file is not MSH of version 2 or 4, ends early, or has other elements than points, lines, triangles
+    of three or six nodes and quadrilaterals of four.
     """
     version, order, position = _format(data)
     nodes: list[tuple[IntArray, Table]] = []
@@ -64,7 +57,7 @@ def read_gmsh(data: bytes) -> MeshParts:
         and all(np.array_equal(other, numbers) for other in elements[1:])
     ):
         raise ValueError("it has several meshes: save each in a separate file")
-    place = stacked([table for _, table in nodes], 3)
+    place = stack_tables([table for _, table in nodes], 3)
     known = np.argsort(tags, kind="stable")
     at = np.searchsorted(tags, numbers, sorter=known).clip(max=max(len(tags) - 1, 0))
     F = known[at] if len(tags) else numbers
@@ -76,14 +69,14 @@ def read_gmsh(data: bytes) -> MeshParts:
         F = F[np.sort(np.unique(np.sort(F, axis=1), axis=0, return_index=True)[1])]
     # Use the last time step.
     fields = {
-        title: partial(_node_data, data, *places[-1], order, tags[known], known) for title, places in later.items()
+        title: partial(_node_data, data, *values[-1], order, tags[known], known) for title, values in later.items()
     }
     return MeshParts(
         nodes[0][1].values.astype(np.float64),
         F.astype(np.int64),
         np.dtype(np.float64),
         fields,
-        lambda points: replaced(data, place, np.tile(points, (len(nodes), 1))),
+        lambda points: replace_numbers(data, place, np.tile(points, (len(nodes), 1))),
     )
 
 
@@ -132,7 +125,7 @@ def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -
         return tags.values[:, 0].astype(np.int64), place
     reader = TableReader(data, begin, end, order)
     blocks = int(reader.take("u8", 2 if version == "4.0" else 4)[0])
-    numbers, places = [np.empty(0, dtype=np.int64)], []
+    numbers, values = [np.empty(0, dtype=np.int64)], []
     for _ in range(blocks):
         first, second, parametric = reader.take("i4", 3).tolist()
         count = int(reader.take("u8", 1)[0])
@@ -140,14 +133,14 @@ def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -
         width = 3 + (parametric and (first if version == "4.1" else second))
         if version == "4.1":
             numbers.append(reader.take("u8", count).astype(np.int64))
-            places += reader.tables(count, ("f8", width))
+            values += reader.tables(count, ("f8", width))
         else:
             tags, place = reader.tables(count, ("i4", 1), ("f8", width))
             numbers.append(tags.values[:, 0].astype(np.int64))
-            places.append(place)
-    if not places:
+            values.append(place)
+    if not values:
         raise ValueError("there are no nodes")
-    return np.concatenate(numbers), stacked(places, 3)
+    return np.concatenate(numbers), stack_tables(values, 3)
 
 
 def _elements(data: bytes, begin: int, end: int, version: str, order: str | None) -> IntArray:
@@ -165,7 +158,7 @@ def _elements(data: bytes, begin: int, end: int, version: str, order: str | None
             if kind in _ELEMENTS:
                 found.append(table[:, -_nodes_of(kind) :].astype(np.int64))
             count -= max(size, 1)
-        return joined(found)
+        return join_elements(found)
     reader = TableReader(data, begin, end, order)
     for _ in range(int(reader.take("u8", 2 if version == "4.0" else 4)[0])):
         kind = int(reader.take("i4", 3)[2])
@@ -173,7 +166,7 @@ def _elements(data: bytes, begin: int, end: int, version: str, order: str | None
         table = reader.tables(size, ("i4" if version == "4.0" else "u8", 1 + _nodes_of(kind)))[0].values
         if kind in _ELEMENTS:
             found.append(table[:, 1:].astype(np.int64))
-    return joined(found)
+    return join_elements(found)
 
 
 def _element_lines(numbers: list[int], count: int) -> IntArray:
@@ -189,7 +182,7 @@ def _element_lines(numbers: list[int], count: int) -> IntArray:
         at = stop
     if at > len(numbers):
         raise ValueError("it ends too early")
-    return joined([np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)])
+    return join_elements([np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)])
 
 
 def _nodes_of(kind: int) -> int:

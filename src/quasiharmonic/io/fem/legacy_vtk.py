@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
+from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers
 from quasiharmonic.io.fem.meshparts import MeshParts
-from quasiharmonic.io.fem.tables import Table, TableReader, replaced
 from quasiharmonic.io.fem.vtk_cells import elements
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -37,20 +37,13 @@ _POLY = {b"VERTICES": 2, b"LINES": 4, b"POLYGONS": 7, b"TRIANGLE_STRIPS": 6}
 def read_legacy_vtk(data: bytes) -> MeshParts:
     """Parse a legacy VTK file.
 
-    Parameters
-    ----------
-    data : bytes
-
-    Raises
-    ------
-    ValueError
-        If the file is not legacy VTK, ends early, has other cells with area than triangles and quadrilaterals, or has
-        an unknown section or type.
+    ValueError if the file is not legacy VTK, ends early, has other cells with area than triangles and quadrilaterals,
+    or has an unknown section or type.
     """
-    return _Walk(data).parts()
+    return _LegacyReader(data).parts()
 
 
-class _Walk:
+class _LegacyReader:
     """A parser that reads a file section by section."""
 
     def __init__(self, data: bytes) -> None:
@@ -85,7 +78,7 @@ class _Walk:
         place = self._points
         F = elements(np.concatenate(connectivity), np.concatenate(starts), kinds, len(place.values))
         points = place.values.astype(np.float64)
-        change = partial(replaced, self._data, place)
+        change = partial(replace_numbers, self._data, place)
         return MeshParts(points, F, np.dtype(place.values.dtype.newbyteorder("=")), self._fields, change)
 
     def _section(self, name: bytes, words: list[bytes]) -> None:
@@ -173,7 +166,7 @@ class _Walk:
         start = self._reader.position
         self._skip(kind, self._count * components)
         if self._of_points and kind.lower() in _KINDS:
-            self._fields[_decoded(name)] = partial(self._values, start, kind.lower(), components, self._count)
+            self._fields[_decode_name(name)] = partial(self._values, start, kind.lower(), components, self._count)
 
     def _values(self, start: int, kind: bytes, components: int, count: int) -> FloatArray:
         order = None if self._reader.text else ">"
@@ -203,7 +196,7 @@ class _Walk:
         self._reader.take("u1", length)
 
 
-def _decoded(name: bytes) -> str:
+def _decode_name(name: bytes) -> str:
     """Decode a name, in which %20 stands for a space."""
     from urllib.parse import unquote_to_bytes
 

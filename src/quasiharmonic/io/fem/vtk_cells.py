@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.elements import joined
+from quasiharmonic.geometry.mesh.elements import join_elements
 from quasiharmonic.util.arrays import IntArray
 
 #: Kinds without area: vertices, lines, lists of them, and second-order lines.
-_LOWER = (1, 2, 3, 4, 21)
+_POINTS_AND_LINES = (1, 2, 3, 4, 21)
 # Number of nodes of the kinds that are elements. Polygons of three or four corners are elements too.
 _ELEMENTS = {5: 3, 9: 4, 22: 6}
 _POLYGON = 7
@@ -26,22 +26,9 @@ _NAMES = {
 def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: int) -> IntArray:
     """Return the triangles and quadrilaterals; (f, 3), (f, 4) or (f, 6) int64, as in `geometry.mesh.elements`.
 
-    Parameters
-    ----------
-    connectivity : (m,) int64
-        Points of all cells, one cell after another.
-    starts : (c + 1,) int64
-        Index in ``connectivity`` at which each cell starts, then the end.
-    kinds : (c,) int64
-        VTK's kind of each cell. A polygon with three corners is a triangle, one with four a quadrilateral.
-    points : int
-        Number of points.
-
-    Raises
-    ------
-    ValueError
-        If a cell with area is of another kind, six-node triangles occur with other elements, or a point index is out of
-        range.
+    ``connectivity`` (m,) has the points of all cells, one cell after another. Cell i begins at ``starts[i]``, and
+    ``kinds[i]`` is VTK's kind of it. A polygon with three corners is a triangle, one with four a quadrilateral.
+    ValueError for a cell with area of another kind, six-node triangles with other elements, or a point out of range.
     """
     if len(starts) != len(kinds) + 1 or (np.diff(starts) < 0).any() or starts[-1] > len(connectivity):
         raise ValueError("its lists of cells contradict each other")
@@ -49,7 +36,7 @@ def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: 
     wanted = (kinds == _POLYGON) & np.isin(sizes, (3, 4))
     for kind, size in _ELEMENTS.items():
         wanted |= (kinds == kind) & (sizes == size)
-    other = np.unique(kinds[~wanted & ~np.isin(kinds, _LOWER)])
+    other = np.unique(kinds[~wanted & ~np.isin(kinds, _POINTS_AND_LINES)])
     if other.size:
         names = (_NAMES.get(kind, "polygon" if kind == _POLYGON else f"number {kind}") for kind in other.tolist())
         raise ValueError(
@@ -57,7 +44,7 @@ def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: 
         )
     begins, sizes = starts[:-1][wanted], sizes[wanted]
     changes = np.flatnonzero(np.diff(sizes)) + 1
-    F = joined(
+    F = join_elements(
         [
             connectivity[block[:, None] + np.arange(size[0])]
             for block, size in zip(np.split(begins, changes), np.split(sizes, changes), strict=True)

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.io.fem.byte_tables import TableReader, replace_numbers
 from quasiharmonic.io.fem.meshparts import MeshParts
-from quasiharmonic.io.fem.tables import TableReader, replaced
 from quasiharmonic.io.fem.vtk_cells import elements
 from quasiharmonic.util.arrays import FloatArray
 
@@ -60,15 +60,8 @@ class _Array:
 def read_vtu(data: bytes) -> MeshParts:
     """Parse a VTU file.
 
-    Parameters
-    ----------
-    data : bytes
-
-    Raises
-    ------
-    ValueError
-        If the file is not VTU, has several pieces or times, an unknown encoding, or other cells with area than
-        triangles and quadrilaterals.
+    ValueError if the file is not VTU, has several pieces or times, an unknown encoding, or other cells with area than
+    triangles and quadrilaterals.
     """
     file = _VtuFile(data)
     points = file.only("Points", None)
@@ -81,7 +74,7 @@ def read_vtu(data: bytes) -> MeshParts:
     F = elements(connectivity, np.concatenate([[0], ends]), kinds, len(place))
     fields = {name: partial(_rows, file, array) for name, array in file.point_data.items()}
     kind = np.dtype(_KINDS[precision])
-    return MeshParts(place.astype(np.float64), F, kind, fields, partial(file.replaced, points))
+    return MeshParts(place.astype(np.float64), F, kind, fields, partial(file.replace_points, points))
 
 
 def _rows(file: _VtuFile, array: _Array) -> FloatArray:
@@ -141,8 +134,8 @@ class _VtuFile:
             raise ValueError(f"it has {len(found)} arrays of {what}: save one array at one time step")
         return found[0]
 
-    def values(self, array: _Array, most: int) -> NDArray[Any]:
-        """Return the numbers of an array, at most ``most`` of them if compressed."""
+    def values(self, array: _Array, max_count: int) -> NDArray[Any]:
+        """Return the numbers of an array, at most ``max_count`` of them if compressed."""
         kind = _KINDS.get(array.attributes.get("type", ""))
         if kind is None:
             raise ValueError(f"arrays of {array.attributes.get('type', '')[:40]} are not numbers")
@@ -150,14 +143,14 @@ class _VtuFile:
             text = self._data[array.begin : array.end].split()
             return np.array(text, dtype=np.bytes_).astype(np.float64 if kind[0] == "f" else np.int64).astype(kind)
         number = np.dtype(self._order + kind)
-        return np.frombuffer(self._block(array, most * number.itemsize)[0], number)
+        return np.frombuffer(self._block(array, max_count * number.itemsize)[0], number)
 
-    def replaced(self, array: _Array, points: FloatArray) -> bytes:
+    def replace_points(self, array: _Array, points: FloatArray) -> bytes:
         """Return the file with the first two of every three numbers of an array replaced."""
         if array.attributes.get("format") == "ascii":
             reader = TableReader(self._data, array.begin, array.end, None)
             table = reader.tables(len(points), (_KINDS[array.attributes["type"]], 3))[0]
-            return replaced(self._data, table, points)
+            return replace_numbers(self._data, table, points)
         number = np.dtype(self._order + _KINDS[array.attributes["type"]])
         block, begin, end = self._block(array, 3 * self.points * number.itemsize)
         numbers = np.frombuffer(block, number).reshape(-1, 3).copy()
@@ -165,9 +158,9 @@ class _VtuFile:
             numbers[:, :2] = points
         if numbers.tobytes() == block:
             return self._data
-        coded = self._coded(numbers.tobytes(), array)
-        whole = self._data[:begin] + coded + self._data[end:]
-        longer = len(coded) - (end - begin)
+        encoded = self._encode(numbers.tobytes(), array)
+        whole = self._data[:begin] + encoded + self._data[end:]
+        longer = len(encoded) - (end - begin)
         if not longer or array.attributes.get("format") == "binary":
             return whole
         # Correct the offsets of the arrays after this one.
@@ -198,10 +191,10 @@ class _VtuFile:
             self._arrays.setdefault((self._path[-1], attributes.get("Name", "")), []).append(array)
             self._open = None
 
-    def _block(self, array: _Array, most: int) -> tuple[bytes, int, int]:
+    def _block(self, array: _Array, max_bytes: int) -> tuple[bytes, int, int]:
         """Return the bytes of an array, and the start and end of their encoded form in the file.
 
-        Compressed data of more than ``most`` bytes raise a `ValueError`.
+        Compressed data of more than ``max_bytes`` bytes raise a `ValueError`.
         """
         begin, raw = self._where(array)
         take = _take_raw if raw else _take_base64
@@ -214,14 +207,16 @@ class _VtuFile:
         header, at = take(self._data, begin, size * (3 + count))
         part, last, *lengths = np.frombuffer(header, self._word)[1:].tolist()
         sizes = [part] * (count - 1) + [last or part] * (count > 0)
-        if sum(sizes) > most:
-            raise ValueError(f"compressed data have {sum(sizes)} bytes, but at most {most} are expected")
+        if sum(sizes) > max_bytes:
+            raise ValueError(f"compressed data have {sum(sizes)} bytes, but at most {max_bytes} are expected")
         packed, end = take(self._data, at, sum(lengths))
         ends = accumulate(lengths, initial=0)
-        whole = b"".join(self._unpacked(packed[a:b], size) for (a, b), size in zip(pairwise(ends), sizes, strict=True))
+        whole = b"".join(
+            self._decompress(packed[a:b], size) for (a, b), size in zip(pairwise(ends), sizes, strict=True)
+        )
         return whole, begin, end
 
-    def _unpacked(self, packed: bytes, size: int) -> bytes:
+    def _decompress(self, packed: bytes, size: int) -> bytes:
         """Decompress bytes to a given size."""
         assert self._coder is not None
         coder = self._coder[1]()
@@ -234,7 +229,7 @@ class _VtuFile:
             raise ValueError(f"compressed data are damaged: {size} bytes were expected")
         return whole
 
-    def _coded(self, block: bytes, array: _Array) -> bytes:
+    def _encode(self, block: bytes, array: _Array) -> bytes:
         """Encode bytes in the same way as an array of the same length in the file."""
         begin, raw = self._where(array)
         code: Callable[[bytes], bytes] = bytes if raw else base64.b64encode

@@ -1,4 +1,4 @@
 """Mesh formats: OBJ, OFF, PLY, STL and glTF, each with a reader and, except STL, a writer.
 
-The package builds on `io.meshdata`. Start reading in `off`, the shortest one.
+The package builds on `io.models`. Start reading in `off`, the shortest one.
 """

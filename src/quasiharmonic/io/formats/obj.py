@@ -11,22 +11,27 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.atomic import no_remains, write_whole
 from quasiharmonic.io.formats.objlines import REFUSED, read_obj_lines
-from quasiharmonic.io.materials import companions, with_libraries, write_material
-from quasiharmonic.io.meshdata import KeptLines, MeshData, polygon_mesh
-from quasiharmonic.io.textual import integer_table, number_table, read_text
+from quasiharmonic.io.lowlevel.atomic import no_remains, write_whole
+from quasiharmonic.io.lowlevel.textual import integer_table, number_table, read_text
+from quasiharmonic.io.models.materials import companions, materials_lost, with_libraries, write_material
+from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
 
 # Kinds of line, for the reader that parses all lines of a kind at once.
-_BLANK, _VERTEX, _TEXTURE, _NORMAL, _FACE, _STATEMENT = range(6)
+_BLANK = 0
+_VERTEX = 1
+_TEXTURE = 2
+_NORMAL = 3
+_FACE = 4
+_STATEMENT = 5
 # Lines that this reader would take for statements, but that need the line-by-line reader.
-_CAREFUL = b"|".join([b"v", b"vt", b"vn", b"f", b"l", b"p", *sorted(REFUSED)])
-_NOT_PLAIN = re.compile(rb"^(?:[\x01-\x20]|(?:" + _CAREFUL + rb")\s)", re.MULTILINE)
+_KEYWORDS = b"|".join([b"v", b"vt", b"vn", b"f", b"l", b"p", *sorted(REFUSED)])
+_NOT_PLAIN = re.compile(rb"^(?:[\x01-\x20]|(?:" + _KEYWORDS + rb")\s)", re.MULTILINE)
 # References of a corner of each form: 0 vertices, 1 texture coordinates, 2 normals.
 _FORMS = {b"1": (0,), b"1/1": (0, 1), b"1//1": (0, 2), b"1/1/1": (0, 1, 2)}
 _CHUNK = 100_000
 # Number of first bytes in which the line ending is detected.
-_HEAD = 4096
+_DETECTED_BYTES = 4096
 
 
 def read_obj(path: str | os.PathLike[str]) -> MeshData:
@@ -37,11 +42,6 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
     numbers are read. Further numbers after the coordinates of a ``v`` are kept. Normals are kept unparsed, and so is
     every statement that is not geometry: groups, materials, comments and unknown statements. Blank lines and comments
     after data are dropped. A backslash at the end of a line continues it, except in a comment.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
     data = read_text(path)
     mesh = read_regular(path, data) or read_obj_lines(path, data)
     with open(path, "rb") as file:
-        return replace(mesh, newline=b"\r\n" if b"\r\n" in file.read(_HEAD) else b"\n")
+        return replace(mesh, newline=b"\r\n" if b"\r\n" in file.read(_DETECTED_BYTES) else b"\n")
 
 
 def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
@@ -66,7 +66,7 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
 
     Numbers are written so that reading them returns the same doubles. The name of a material library (``mtllib``) is
     changed so that the new file refers to the same library. With a texture, two more files are written: a library and
-    an image (`quasiharmonic.io.materials.companions`).
+    an image (`quasiharmonic.io.models.materials.companions`).
 
     Parameters
     ----------
@@ -90,6 +90,13 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
         mesh = with_libraries(path, mesh)
         pieces = (piece.replace(b"\n", mesh.newline) for piece in _pieces(mesh))
         write_whole(path, lambda file: file.writelines(pieces), durable=durable)
+
+
+def not_in_obj(mesh: MeshData) -> list[str]:
+    """Return descriptions of the mesh data that an OBJ file will not contain."""
+    lost = materials_lost(mesh)
+    further = [] if mesh.carried is None else mesh.carried.further()
+    return lost + [what for what in further if not (lost and what == "materials")]
 
 
 def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
@@ -129,8 +136,8 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
         normal_lines=flat.get(2),
         vt=None if vt is None else np.ascontiguousarray(vt[:, :2]),
         extra=np.ascontiguousarray(rows[:, 3:]) if rows.shape[1] > 3 else None,
-        lines=KeptLines(positions, rows),
-        map_lines=None if vt is None else KeptLines(places, vt[:, :2]),
+        lines=OriginalLines(positions, rows),
+        map_lines=None if vt is None else OriginalLines(places, vt[:, :2]),
         normals=_lines_of(_NORMAL, data, ends, kinds),
         statements=statements,
         statement_faces=before[kinds == _STATEMENT],
@@ -211,13 +218,13 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
         yield line + b"\n" if line else b""
 
 
-def _lines(keyword: str, kept: KeptLines | None, rows: NDArray[np.float64]) -> Iterator[bytes]:
+def _lines(keyword: str, original: OriginalLines | None, rows: NDArray[np.float64]) -> Iterator[bytes]:
     """Yield rows of numbers as text; unchanged rows keep their original lines."""
-    same = np.zeros(len(rows), dtype=np.bool_) if kept is None else kept.unchanged(rows)
-    if kept is None or not same.any():
+    same = np.zeros(len(rows), dtype=np.bool_) if original is None else original.unchanged(rows)
+    if original is None or not same.any():
         yield from _number_lines(keyword, rows)
         return
-    texts = kept.text.split(b"\n")
+    texts = original.text.split(b"\n")
     # Yield runs of unchanged and of changed rows.
     ends = [*(np.flatnonzero(same[1:] != same[:-1]) + 1).tolist(), len(rows)]
     begin = 0

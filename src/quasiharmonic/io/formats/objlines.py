@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.meshdata import KeptLines, MeshData, polygon_mesh
-from quasiharmonic.io.textual import integer, number, shown
+from quasiharmonic.io.lowlevel.textual import integer, number, shown
+from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
 
 # Statements that are refused: reading would lose their geometry.
 REFUSED = {b"curv", b"curv2", b"surf", b"bsp", b"bzp", b"cdc", b"cdp", b"fo", b"call"}
 _PLAIN_ELEMENT = re.compile(rb"[lp][ \t0-9]*")
 # Most numbers after the coordinates of a vertex: weight and colour with opacity.
-_MOST_EXTRA = 5
+_MAX_EXTRA = 5
 # More corners indicate a damaged file.
-_MOST_CORNERS = 1000
+_MAX_CORNERS = 1000
 
 
 def read_obj_lines(path: str | os.PathLike[str], data: bytes) -> MeshData:
@@ -64,7 +64,7 @@ class _Reader:
         return self.result()
 
     def vertex(self, line: int, text: bytes) -> None:
-        row = _numbers(text, 3 + _MOST_EXTRA)
+        row = _numbers(text, 3 + _MAX_EXTRA)
         if len(row) < 3:
             raise _FaultError(f"a vertex with {_count(row, 'coordinate')}", "give three")
         self.coordinates.extend(row)
@@ -84,11 +84,11 @@ class _Reader:
 
     def face(self, line: int, text: bytes) -> None:
         # Split only as many corners as the error message needs, because a line may be very long.
-        corners = _uncommented(text).split(None, _MOST_CORNERS + 1)[1:]
+        corners = _strip_comment(text).split(None, _MAX_CORNERS + 1)[1:]
         if len(corners) < 3:
             raise _FaultError(f"face with {_count(corners, 'corner')}", "a triangle has 3")
-        if len(corners) > _MOST_CORNERS:
-            raise _FaultError(f"face with more than {_MOST_CORNERS} corners", "triangulate it first")
+        if len(corners) > _MAX_CORNERS:
+            raise _FaultError(f"face with more than {_MAX_CORNERS} corners", "triangulate it first")
         counts = (len(self.width), len(self.vt) // 2, self.normal_count)
         begin = len(self.corners)
         for corner in corners:
@@ -132,8 +132,8 @@ class _Reader:
             normal_lines=normals if (normals >= 0).any() else None,
             vt=np.array(self.vt, dtype=np.float64).reshape(-1, 2) if self.vt else None,
             extra=extra,
-            lines=KeptLines(bytes(self.positions), V if extra is None else np.hstack([V, extra])),
-            map_lines=KeptLines(bytes(self.places), np.array(self.vt, dtype=np.float64).reshape(-1, 2)),
+            lines=OriginalLines(bytes(self.positions), V if extra is None else np.hstack([V, extra])),
+            map_lines=OriginalLines(bytes(self.places), np.array(self.vt, dtype=np.float64).reshape(-1, 2)),
             normals=bytes(self.normals),
             statements=bytes(self.statements),
             statement_faces=np.array(self.statement_faces, dtype=np.int64),
@@ -178,14 +178,14 @@ def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
         yield start, text
 
 
-def _uncommented(text: bytes) -> bytes:
+def _strip_comment(text: bytes) -> bytes:
     return text.split(b"#", 1)[0]
 
 
-def _numbers(text: bytes, most: int) -> list[float]:
-    tokens = _uncommented(text).split(None, most + 1)[1:]
-    if len(tokens) > most:
-        raise _FaultError(f"{shown(text.split(None, 1)[0])} with more than {most} numbers", "remove the rest")
+def _numbers(text: bytes, max_count: int) -> list[float]:
+    tokens = _strip_comment(text).split(None, max_count + 1)[1:]
+    if len(tokens) > max_count:
+        raise _FaultError(f"{shown(text.split(None, 1)[0])} with more than {max_count} numbers", "remove the rest")
     return [number(token) for token in tokens]
 
 

@@ -10,16 +10,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.meshdata import MeshData, polygon_mesh
-from quasiharmonic.io.textual import integer, integer_table, number, number_table, read_text, shown
+from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.lowlevel.textual import integer, integer_table, number, number_table, read_text, shown
+from quasiharmonic.io.models.meshdata import MeshData, in_plane, polygon_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Texture coordinates, colours and normals follow the coordinates, so the reader can skip them.
 _HEADER = re.compile(rb"(?:ST)?C?N?OFF")
 # More corners indicate a damaged file.
-_MOST_CORNERS = 1000
+_MAX_CORNERS = 1000
 
 
 def read_off(path: str | os.PathLike[str]) -> MeshData:
@@ -27,11 +27,6 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
 
     The counts may follow the header on the same line. Comments are ignored, and so are further numbers after the
     coordinates of a vertex or the corners of a face (colours, normals).
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
 
     Returns
     -------
@@ -94,6 +89,11 @@ def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
     write_whole(path, (head + points + faces).encode())
 
 
+def write_off_map(path: str | os.PathLike[str], mesh: MeshData) -> None:
+    """Write the map of a mesh as a mesh in the plane; raise `MeshFileError` if it has seams, which OFF cannot store."""
+    write_off(path, in_plane(mesh))
+
+
 def read_regular(data: bytes, line: int, vertices: int, faces: int) -> tuple[FloatArray, IntArray, IntArray] | None:
     """Read the vertices and triangles after ``line`` if all lines have the regular form; otherwise return None."""
     if data.count(b"\n") != line + vertices + faces:
@@ -142,9 +142,9 @@ def _read_lines(
 
 def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -> list[int]:
     """Return the corners of the face on a line."""
-    count, *rest = text.split(None, _MOST_CORNERS + 1)
+    count, *rest = text.split(None, _MAX_CORNERS + 1)
     size = integer(count)
-    if not 3 <= size <= _MOST_CORNERS:
+    if not 3 <= size <= _MAX_CORNERS:
         remedy = "a triangle has 3" if size < 3 else "triangulate it first"
         raise MeshFileError(path, f"face with {size} corners", line, remedy)
     if len(rest) < size:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.formats.normals import normal_lines, normal_rows
-from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, decoded, encoded
-from quasiharmonic.io.meshdata import Carried, MeshData, polygon_mesh, vertex_places
-from quasiharmonic.io.textual import read_bytes
+from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables, parse_tables
+from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.lowlevel.textual import read_bytes
+from quasiharmonic.io.models.meshdata import Carried, MeshData, polygon_mesh, vertex_places
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Property names of texture coordinates, at vertices and at the corners of faces.
@@ -26,14 +26,7 @@ _NORMAL = "nx", "ny", "nz"
 
 
 class CarriedPly(Carried):
-    """The tables of a PLY file.
-
-    Parameters
-    ----------
-    tables : PlyTables
-    V, F
-        As for `Carried`.
-    """
+    """The tables of a PLY file, and its mesh."""
 
     def __init__(self, tables: PlyTables, V: FloatArray, F: IntArray) -> None:
         super().__init__(V, F)
@@ -62,11 +55,6 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
     Texture coordinates are read from the faces' ``texcoord`` (a pair for each corner, so that seams are possible).
     Without it, they are read from the vertices' ``s`` and ``t``, ``u`` and ``v``, or ``texture_u`` and ``texture_v``.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
     Returns
     -------
     MeshData
@@ -81,7 +69,7 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
     try:
         # Converting a signalling NaN is invalid; it is reported later as not finite.
         with np.errstate(invalid="ignore"):
-            return _mesh(decoded(data), os.fspath(path))
+            return _mesh(parse_tables(data), os.fspath(path))
     except ValueError as error:
         raise MeshFileError(path, str(error), remedy="" if data else "it is empty") from error
 
@@ -94,13 +82,6 @@ def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
     all other data of that file, and its positions unchanged. Other meshes keep normals and colours that are unique per
     vertex.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file to write.
-    mesh : MeshData
-        The mesh.
-
     Raises
     ------
     OutputError
@@ -111,7 +92,7 @@ def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
         tables = carried.tables
     else:
         tables = PlyTables((_vertices(mesh), _faces(mesh)))
-    write_whole(path, encoded(_with_places(tables, mesh)))
+    write_whole(path, encode_tables(_with_places(tables, mesh)))
 
 
 def not_in_ply(mesh: MeshData) -> list[str]:
@@ -168,8 +149,8 @@ def _read_colours(vertex: Element) -> FloatArray | None:
     found = [column for name in _COLOUR if (column := vertex.find(name)) is not None and column.sizes is None]
     if [column.name for column in found] not in (list(_COLOUR), list(_COLOUR[:3])):
         return None
-    whole = [np.iinfo(c.values.dtype).max if c.values.dtype.kind in "iu" else 1 for c in found]
-    return np.stack([c.values / one for c, one in zip(found, whole, strict=True)], axis=1)
+    scales = [np.iinfo(c.values.dtype).max if c.values.dtype.kind in "iu" else 1 for c in found]
+    return np.stack([c.values / one for c, one in zip(found, scales, strict=True)], axis=1)
 
 
 def _read_places(

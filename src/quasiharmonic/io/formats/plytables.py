@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.textual import shown
+from quasiharmonic.io.lowlevel.textual import shown
 from quasiharmonic.util.arrays import IntArray
 
 _KINDS = {
@@ -24,24 +24,17 @@ _KINDS = {
 }
 _WORDS = {kind: word for word, kind in reversed(_KINDS.items())}
 _ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": ""}
-_FIRST = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
+_FIRST_LINE = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """One property of all rows of an element.
-
-    Attributes
-    ----------
-    name : str
-    values : (k,) array
-        The numbers, in the type of the file; the lists of all rows one after another.
-    sizes : (r,) int64 or None
-        Length of each row's list; None if each row has one number.
-    """
+    """One property of all rows of an element."""
 
     name: str
+    #: The numbers (k,), in the type of the file; the lists of all rows one after another.
     values: NDArray[Any]
+    #: Length of each row's list, (r,); None if each row has one number.
     sizes: IntArray | None = None
 
 
@@ -79,17 +72,9 @@ class _Property:
     count: str | None
 
 
-def decoded(data: bytes) -> PlyTables:
-    """Parse a PLY file, text or binary.
-
-    Memory is limited to a few times the file size.
-
-    Raises
-    ------
-    ValueError
-        If the file is not PLY, is damaged, or ends too early.
-    """
-    first = _FIRST.match(data)
+def parse_tables(data: bytes) -> PlyTables:
+    """Parse a PLY file, text or binary, in memory of a few times its size; raise a ValueError if it is damaged."""
+    first = _FIRST_LINE.match(data)
     if first is None:
         raise ValueError("does not start like a PLY file")
     newline = first.group(1)
@@ -101,7 +86,7 @@ def decoded(data: bytes) -> PlyTables:
     return PlyTables(tuple(Element(name, rows, reader.columns(rows, of)) for name, rows, of in declared), remarks)
 
 
-def encoded(tables: PlyTables) -> bytes:
+def encode_tables(tables: PlyTables) -> bytes:
     """Return the bytes of a PLY file, binary and little-endian."""
     lines = [b"ply", b"format binary_little_endian 1.0", *tables.remarks]
     for element in tables.elements:
@@ -241,7 +226,7 @@ class _TextReader:
         """Return the next table."""
         if all(of.count is None for of in properties):
             table = self._take(rows * len(properties)).reshape(rows, -1)
-            return tuple(Column(of.name, _typed(table[:, i], of.kind)) for i, of in enumerate(properties))
+            return tuple(Column(of.name, _convert(table[:, i], of.kind)) for i, of in enumerate(properties))
         return self._alike(rows, properties) or self._one_by_one(rows, properties)
 
     def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
@@ -254,7 +239,7 @@ class _TextReader:
             return None
         self._at += table.size
         lists = table.reshape(rows, -1)
-        return (Column(of.name, _typed(lists[:, 1:].ravel(), of.kind), _typed(lists[:, 0], "i4").astype(np.int64)),)
+        return (Column(of.name, _convert(lists[:, 1:].ravel(), of.kind), _convert(lists[:, 0], "i4").astype(np.int64)),)
 
     def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
         """Return the next table, read row by row."""
@@ -264,7 +249,7 @@ class _TextReader:
             for i, of in enumerate(properties):
                 size = 1
                 if of.count is not None:
-                    size = int(_typed(self._take(1), of.count)[0])
+                    size = int(_convert(self._take(1), of.count)[0])
                     if size < 0:
                         raise ValueError(f"it has a list of {size} numbers")
                 parts[i].append(self._take(size))
@@ -272,7 +257,7 @@ class _TextReader:
         return tuple(
             Column(
                 of.name,
-                _typed(np.concatenate([np.empty(0), *parts[i]]), of.kind),
+                _convert(np.concatenate([np.empty(0), *parts[i]]), of.kind),
                 None if of.count is None else np.array(sizes[i], dtype=np.int64),
             )
             for i, of in enumerate(properties)
@@ -286,7 +271,7 @@ class _TextReader:
         return self._numbers[self._at - count : self._at]
 
 
-def _typed(numbers: NDArray[np.float64], kind: str) -> NDArray[Any]:
+def _convert(numbers: NDArray[np.float64], kind: str) -> NDArray[Any]:
     """Convert numbers of a text file to the type in the header."""
     if kind[0] == "f":
         with np.errstate(over="ignore"):

@@ -8,9 +8,9 @@ import re
 import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.formats.welding import welded
-from quasiharmonic.io.meshdata import MeshData
-from quasiharmonic.io.textual import read_bytes
+from quasiharmonic.io.formats.welding import weld
+from quasiharmonic.io.lowlevel.textual import read_bytes
+from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -25,11 +25,6 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
     """Read a surface from an STL file, text or binary.
 
     Corners at exactly equal positions become one vertex.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
 
     Returns
     -------
@@ -51,7 +46,7 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
         raise MeshFileError(path, "is not a text or binary STL file, or is cut off")
     if not len(corners):
         raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
-    V, F = welded(corners.reshape(-1, 3))
+    V, F = weld(corners.reshape(-1, 3))
     try:
         return MeshData(V, F.reshape(-1, 3), source=os.fspath(path))
     except ValueError as error:

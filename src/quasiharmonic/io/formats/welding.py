@@ -7,20 +7,8 @@ import numpy as np
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
-def welded(points: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Merge equal points.
-
-    Parameters
-    ----------
-    points : (k, d) float64
-
-    Returns
-    -------
-    unique : (n, d) float64
-        The distinct points, in the order of their first occurrence.
-    which : (k,) int64
-        For each point its row of ``unique``.
-    """
+def weld(points: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the distinct points of (k, d), in the order of their first occurrence, and the row of each point (k,)."""
     _, first, which = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     return points[first[order]], np.argsort(order)[which.ravel()]

@@ -12,26 +12,14 @@ from quasiharmonic.util.progress import heartbeat
 _SEGMENTS = 1 << 14
 
 
-def clear(p: FloatArray, q: FloatArray, ends: IntArray, walls: IntArray, positions: FloatArray, most: int) -> BoolArray:
-    """Return which segments provably meet no wall, except walls that share an end with them.
+def clear(
+    p: FloatArray, q: FloatArray, ends: IntArray, walls: IntArray, positions: FloatArray, max_pairs: int
+) -> BoolArray:
+    """Return which segments p–q (k, 2) provably meet no wall, except walls that share an end with them; (k,) bool.
 
-    Parameters
-    ----------
-    p, q : (k, 2) float64
-        Ends of the segments.
-    ends : (k, 2) int64
-        Indices of the ends among the points, -1 for other positions.
-    walls : (m, 2) int64
-        Walls as pairs of points.
-    positions : (n, 2) float64
-        The points.
-    most : int
-        Approximate limit on the pairs of a segment and a nearby wall to check.
-
-    Returns
-    -------
-    (k,) bool
-        True is exact. False may also mean that the segment was not checked.
+    True is exact. False may also mean that the segment was not checked. ``ends`` (k, 2) are the indices of the
+    segments' ends in ``positions`` (n, 2), -1 for other points. ``walls`` (m, 2) are pairs of points. ``max_pairs`` is
+    an approximate limit on the pairs of a segment and a nearby wall to check.
     """
     result = np.zeros(len(p), dtype=bool)
     # Sort along a space-filling curve, so that few boxes overlap.
@@ -44,18 +32,18 @@ def clear(p: FloatArray, q: FloatArray, ends: IntArray, walls: IntArray, positio
     for start in range(0, len(p), _SEGMENTS):
         part = order[start : start + _SEGMENTS]
         a, b, (first, last) = p[part], q[part], ends[part].T
-        met = np.zeros(len(part), dtype=bool)
+        blocked = np.zeros(len(part), dtype=bool)
         heartbeat()
         for i, j in box_pairs_between(np.minimum(a, b), np.maximum(a, b), low, high):
             spent += i.size
-            if spent > most:
+            if spent > max_pairs:
                 return result
             apart = (first[i] != tail[j]) & (first[i] != head[j]) & (last[i] != tail[j]) & (last[i] != head[j])
-            apart &= ~met[i]
+            apart &= ~blocked[i]
             i, j = i[apart], j[apart]
             relation = segment_relation(a.take(i, 0), b.take(i, 0), r.take(j, 0), s.take(j, 0))
-            met[i[relation != SegmentRelation.DISJOINT]] = True
-        result[part] = ~met
+            blocked[i[relation != SegmentRelation.DISJOINT]] = True
+        result[part] = ~blocked
     return result
 
 

@@ -92,18 +92,13 @@ class Convex:
 
 
 class Lattice:
-    """Positions as integers: the doubles of a target divided by their smallest unit.
-
-    Parameters
-    ----------
-    positions : (k, 2) float64
-        Finite positions.
+    """Positions (k, 2) as integers: the doubles of a target divided by their smallest unit.
 
     Attributes
     ----------
     points : list of (int, int)
         The same points, exactly.
-    near : (k, 2) float64
+    approximate : (k, 2) float64
         The same points, centred and scaled to magnitude one, rounded.
     """
 
@@ -112,23 +107,23 @@ class Lattice:
         mantissa = np.ldexp(fraction, 53).astype(np.int64)
         lowest = int(exponent[mantissa != 0].min(initial=np.iinfo(np.int32).max))
         shift = np.where(mantissa != 0, exponent - lowest, 0)
-        whole = [m << s for m, s in zip(mantissa.ravel().tolist(), shift.ravel().tolist(), strict=True)]
-        self.points: list[Point] = list(zip(whole[::2], whole[1::2], strict=True))
+        integers = [m << s for m, s in zip(mantissa.ravel().tolist(), shift.ravel().tolist(), strict=True)]
+        self.points: list[Point] = list(zip(integers[::2], integers[1::2], strict=True))
         self._lowest = lowest - 53
-        xs, ys = whole[::2], whole[1::2]
+        xs, ys = integers[::2], integers[1::2]
         self.low, self.high = (min(xs), min(ys)), (max(xs), max(ys))
         self._centre = (self.low[0] + self.high[0]) // 2, (self.low[1] + self.high[1]) // 2
         self._unit = max(self.high[0] - self.low[0], self.high[1] - self.low[1], 1)
-        self.near = self._near([(x, y, 1) for x, y in self.points])
+        self.approximate = self._approximate([(x, y, 1) for x, y in self.points])
 
-    def _near(self, points: Sequence[tuple[int, int, int]]) -> FloatArray:
+    def _approximate(self, points: Sequence[tuple[int, int, int]]) -> FloatArray:
         (cx, cy), unit = self._centre, self._unit
         # Python rounds quotients of integers once, for any size.
         return np.array([((x - cx * w) / (unit * w), (y - cy * w) / (unit * w)) for x, y, w in points])
 
     def corners(self, area: Convex) -> FloatArray:
-        """Return corners of a polygon in the coordinates of ``near``; (r, 2) float64."""
-        return self._near(area.corners)
+        """Return corners of a polygon in the coordinates of ``approximate``; (r, 2) float64."""
+        return self._approximate(area.corners)
 
     def middle(self, area: Convex) -> tuple[float, float]:
         """Return a position in the middle of a polygon: the mean of three distant corners, rounded once."""
@@ -139,54 +134,33 @@ class Lattice:
 
 
 class Walls:
-    """Segments that block the view between points.
-
-    Parameters
-    ----------
-    ends : (m, 2) int64
-        The segments, as pairs of points of the lattice.
-    lattice : Lattice
-    effort : Effort
-        Budget for the checks.
-    """
+    """Segments that block the view between points of a lattice, given as pairs of points (m, 2)."""
 
     def __init__(self, ends: IntArray, lattice: Lattice, effort: Effort) -> None:
         self._ends, self._lattice, self._effort = ends, lattice, effort
-        corners = lattice.near[ends.T].transpose(2, 0, 1)  # coordinate, end, wall
+        corners = lattice.approximate[ends.T].transpose(2, 0, 1)  # coordinate, end, wall
         self._low, self._high = corners.min(axis=1), corners.max(axis=1)
 
     def seeing(self, area: Convex, eyes: Sequence[int]) -> Convex | None:
-        """Return a part of ``area`` that sees all ``eyes``, or None if there is no such point.
+        """Return a part of ``area`` of positive area that sees all points ``eyes``, or None if no point does.
 
         A point sees an eye if the open segment between them meets no wall. Walls on the same line, or with an end at
         the eye, remove nothing from an open set. The search cuts the area along the shadow of one wall after another,
         removes the shadow, and examines the remaining parts.
-
-        Parameters
-        ----------
-        area : Convex
-            The area to search, of positive area.
-        eyes : sequence of int
-            Points that must be seen.
-
-        Returns
-        -------
-        Convex or None
-            A polygon of positive area, all points of which see every eye.
         """
-        near = self._lattice.corners(area)
-        met = self._met(np.concatenate([near, self._lattice.near[list(eyes)]]))
+        approximate = self._lattice.corners(area)
+        walls = self._walls_near(np.concatenate([approximate, self._lattice.approximate[list(eyes)]]))
         # Each entry has the walls that may hide the area from the first eyes; empty lists for eyes that see all of it.
-        waiting: list[tuple[Convex, FloatArray, list[IntArray]]] = [(area, near, [])]
+        waiting: list[tuple[Convex, FloatArray, list[IntArray]]] = [(area, approximate, [])]
         while waiting:
-            area, near, blocking = waiting.pop()
+            area, approximate, blocking = waiting.pop()
             parts = None
             blocking = list(blocking)
             for k, eye in enumerate(eyes):
                 if k == len(blocking):
-                    blocking.append(self._facing(eye, met))
+                    blocking.append(self._facing(eye, walls))
                 if len(blocking[k]):
-                    parts, blocking[k] = self._split(area, near, eye, blocking[k])
+                    parts, blocking[k] = self._split(area, approximate, eye, blocking[k])
                 if parts is not None:
                     break
             if parts is None:
@@ -194,7 +168,7 @@ class Walls:
             waiting += [(part, self._lattice.corners(part), blocking) for part in parts]
         return None
 
-    def _met(self, points: FloatArray) -> IntArray:
+    def _walls_near(self, points: FloatArray) -> IntArray:
         """Return walls that reach into the bounding box of some points, (m, 2) int64."""
         (x0, y0), (x1, y1) = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
         inside = (self._low[0] <= x1) & (self._high[0] >= x0) & (self._low[1] <= y1) & (self._high[1] >= y0)
@@ -203,29 +177,27 @@ class Walls:
     def _facing(self, eye: int, walls: IntArray) -> IntArray:
         """Return walls ordered from right to left as seen from an eye, without those that end at it; (m, 2) int64."""
         ends = walls[(walls[:, 0] != eye) & (walls[:, 1] != eye)]
-        p, q = self._lattice.near[ends.T] - self._lattice.near[eye]
+        p, q = self._lattice.approximate[ends.T] - self._lattice.approximate[eye]
         turned = p[:, 0] * q[:, 1] < p[:, 1] * q[:, 0]
         return np.where(turned[:, None], ends[:, ::-1], ends)
 
-    def _split(self, area: Convex, near: FloatArray, eye: int, walls: IntArray) -> tuple[list[Convex] | None, IntArray]:
+    def _split(
+        self, area: Convex, approximate: FloatArray, eye: int, walls: IntArray
+    ) -> tuple[list[Convex] | None, IntArray]:
         """Cut an area at the shadow of one of the walls.
 
-        Returns
-        -------
-        parts : list of Convex or None
-            The visible parts, the most promising last; None if no wall hides any of the area.
-        walls : (m, 2) int64
-            The walls that may still hide some of these parts.
+        Return the visible parts, the most promising last, and the walls that may still hide some of these parts. The
+        parts are None if no wall hides any of the area.
         """
-        self._effort.spend(100 + len(walls) * len(near) // 20)
-        here = self._lattice.near[eye]
-        p, q = self._lattice.near[walls.T]
-        right, left = cross((p - here)[:, None], near - here), cross((q - here)[:, None], near - here)
-        front = cross((q - p)[:, None], near - p[:, None])
-        in_the_way = (right.max(axis=1) > -MARGIN) & (left.min(axis=1) < MARGIN) & (front.min(axis=1) < MARGIN)
+        self._effort.spend(100 + len(walls) * len(approximate) // 20)
+        here = self._lattice.approximate[eye]
+        p, q = self._lattice.approximate[walls.T]
+        right, left = cross((p - here)[:, None], approximate - here), cross((q - here)[:, None], approximate - here)
+        front = cross((q - p)[:, None], approximate - p[:, None])
+        blocks = (right.max(axis=1) > -MARGIN) & (left.min(axis=1) < MARGIN) & (front.min(axis=1) < MARGIN)
         # Start with the walls that hide most corners: a wall that hides all of them ends the search.
-        hidden = ((right > 0) & (left < 0) & (front < 0)).sum(axis=1)[in_the_way]
-        walls = walls[in_the_way][np.argsort(-hidden, kind="stable")]
+        hidden = ((right > 0) & (left < 0) & (front < 0)).sum(axis=1)[blocks]
+        walls = walls[blocks][np.argsort(-hidden, kind="stable")]
         points = self._lattice.points
         for k, (i, j) in enumerate(walls.tolist()):
             parts = _past(area, points[eye], points[i], points[j])

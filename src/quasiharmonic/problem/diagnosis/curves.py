@@ -23,19 +23,14 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
 # Limit on the pairs of meeting edges to collect; a longer list would not help the user.
-MOST_CONTACTS = 10_000
+MAX_CONTACTS = 10_000
 
 
 def turning_number(loop: FloatArray) -> int:
-    """Return how often the direction of a closed polygon turns around, counterclockwise.
+    """Return how often the direction of a closed polygon (l, 2) turns around, counterclockwise.
 
-    A fold, where an edge reverses the direction of the previous one, counts as a turn by -π: the interior angle that
-    triangles can fill there is 2π.
-
-    Parameters
-    ----------
-    loop : (l, 2) float64
-        Corners, no two consecutive ones equal.
+    No two consecutive corners are equal. A fold, where an edge reverses the direction of the previous one, counts as a
+    turn by -π: the interior angle that triangles can fill there is 2π.
     """
     after = np.roll(loop, -1, axis=0)
     # Compare coordinates, which is exact, instead of subtracting them.
@@ -52,17 +47,12 @@ def turning_number(loop: FloatArray) -> int:
 class TargetCurves:
     """The boundary loops of a surface at their target positions.
 
-    Parameters
+    Attributes
     ----------
     positions : (n, 2) float64
         Positions of vertices, finite on the boundary.
     loops : list of (l,) int64
-        Boundary loops, with the surface to their left.
-
-    Attributes
-    ----------
-    loops : list of (l,) int64
-        The same loops, each starting at its lowest corner (the leftmost of several).
+        Boundary loops, with the surface to their left, each from its lowest corner (the leftmost of several).
     ends : (m, 2) int64
         Boundary edges, loop by loop, in order.
     loop_of : (m,) int64
@@ -107,7 +97,7 @@ class TargetCurves:
     @cached_property
     def contacts(self) -> Contacts:
         """Pairs of edges at which the curves meet themselves or each other."""
-        return contacts(self.positions, self.ends, MOST_CONTACTS)
+        return contacts(self.positions, self.ends, MAX_CONTACTS)
 
     @property
     def simple(self) -> bool:
@@ -135,13 +125,15 @@ class TargetCurves:
         # Crossing a curve from its right to its left increases the winding number by one.
         step = orientation(self.tails[other], self.heads[other], self.heads[edge])
         several = np.bincount(edge, minlength=len(self.ends))[edge] > 1
-        when = [self._when(e, o) if s else Fraction(0) for e, o, s in zip(edge, other, several, strict=True)]
+        position = [
+            self._crossing_position(e, o) if s else Fraction(0) for e, o, s in zip(edge, other, several, strict=True)
+        ]
         steps: list[dict[tuple[int, Fraction], int]] = [{} for _ in self.loops]
-        for k in sorted(range(len(edge)), key=lambda k: (edge[k], when[k])):
+        for k in sorted(range(len(edge)), key=lambda k: (edge[k], position[k])):
             heartbeat()
             # Add up all crossings at the same point.
             along = steps[self.loop_of[edge[k]]]
-            at = (int(edge[k]), when[k])
+            at = (int(edge[k]), position[k])
             along[at] = along.get(at, 0) + int(step[k])
         ranges = []
         for index, along in enumerate(steps):
@@ -149,7 +141,7 @@ class TargetCurves:
             ranges.append((left.min() - 1, left.max()))
         return np.array(ranges, dtype=np.int64)
 
-    def _when(self, edge: int, other: int) -> Fraction:
+    def _crossing_position(self, edge: int, other: int) -> Fraction:
         """Return the position along an edge where another crosses it, from 0 at its tail to 1 at its head."""
         heartbeat()
         (px, py), (qx, qy), (rx, ry), (sx, sy) = (

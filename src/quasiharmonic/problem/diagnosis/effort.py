@@ -13,28 +13,14 @@ class EffortSpentError(Exception):
 
 @dataclass
 class Effort:
-    """A budget of time, in units of about a microsecond.
+    """A budget of time, and the amount spent so far, in units of about a microsecond."""
 
-    Attributes
-    ----------
-    most : int
-        The budget.
-    spent : int
-        The amount spent so far.
-    """
-
-    most: int
+    limit: int
     spent: int = 0
 
     def spend(self, amount: int) -> None:
-        """Spend an amount; call this before the work.
-
-        Raises
-        ------
-        EffortSpentError
-            If the budget is exhausted; then every later call raises it too.
-        """
+        """Spend an amount before the work; raise `EffortSpentError`, now and later, if the budget is exhausted."""
         heartbeat()
         self.spent += amount
-        if self.spent > self.most:
+        if self.spent > self.limit:
             raise EffortSpentError

@@ -3,32 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
+from quasiharmonic.geometry.mesh.reference import Reference
+from quasiharmonic.io.adapters.objects import MeshLike
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.curves import Corners, TargetCurves
-from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
-from quasiharmonic.problem.diagnosis.elements import (
+from quasiharmonic.problem.diagnosis.defects import (
     collapsed_edges,
     half_planes,
     inverted_fixed_triangles,
     inverted_patches,
     misplaced_pins,
 )
+from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
 from quasiharmonic.problem.diagnosis.fixture import Fixture, stars
-from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, named_vertices
+from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, vertex_names
 from quasiharmonic.problem.diagnosis.shortcuts import Shortcuts
 from quasiharmonic.problem.diagnosis.sight import Sight, bad_chords
-from quasiharmonic.problem.diagnosis.witness import unplaced
-from quasiharmonic.util.arrays import IntArray, named, named_edges
+from quasiharmonic.problem.diagnosis.witness import find_unplaced
+from quasiharmonic.util.arrays import IntArray, edge_names, names_of
 
 # Budget for the visibility checks of free vertices, in about microseconds. Vertices beyond it are not checked.
-MOST_EFFORT = 3_000_000
+MAX_EFFORT = 3_000_000
 
 
-def diagnose(problem: Problem) -> Diagnosis:
+@overload
+def diagnose(
+    V: ArrayLike, F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, reference: Reference | None = None
+) -> Diagnosis: ...
+@overload
+def diagnose(V: MeshLike, fixed: ArrayLike, target: ArrayLike, *, reference: Reference | None = None) -> Diagnosis: ...
+@overload
+def diagnose(V: Problem) -> Diagnosis: ...
+def diagnose(V: Any, *arguments: Any, **options: Any) -> Diagnosis:
     """Check the known necessary conditions for a map.
 
     Every obstruction is proven, in exact arithmetic on the coordinates as stored. A reported obstruction excludes all
@@ -37,11 +49,19 @@ def diagnose(problem: Problem) -> Diagnosis:
 
     Parameters
     ----------
-    problem : Problem
+    V : (n, 2) or (n, 3) array, a mesh in place of ``V`` and ``F``, or a Problem in place of all arguments
+        Rest positions.
+    F, fixed, target, reference
+        As in `Problem`.
 
     Returns
     -------
     Diagnosis
+
+    Raises
+    ------
+    ValueError
+        If the input is malformed; see `Problem`.
 
     Notes
     -----
@@ -64,8 +84,8 @@ def diagnose(problem: Problem) -> Diagnosis:
       smallest number of segments of a path inside the target [2]_.
 
     Link distances are compared for targets with one loop and vertices up to eight edges apart. These checks and those
-    of visibility stop after some seconds; ``unchecked`` then lists the rest. Whether a curve that crosses itself bounds
-    an immersed surface is not checked (for a disk, Blank's theorem [1]_ decides).
+    of visibility stop after some seconds; ``unchecked`` then lists the rest. The diagnosis does not check
+    whether a self-crossing curve bounds an immersed surface. For a disk, Blank's theorem [1]_ answers this.
 
     References
     ----------
@@ -74,6 +94,9 @@ def diagnose(problem: Problem) -> Diagnosis:
     .. [2] S. Suri, A linear time algorithm for minimum link paths inside a simple polygon. Computer
        Vision, Graphics, and Image Processing 35 (1986).
     """
+    if isinstance(V, Problem) and (arguments or options):
+        raise TypeError("diagnose(problem) accepts no further arguments")
+    problem = V if isinstance(V, Problem) else Problem(V, *arguments, **options)
     fixture = Fixture.of(problem)
     curves = TargetCurves(fixture.positions, problem.domain.loops)
     euler = problem.n - len(problem.domain.edges.interior) - len(problem.domain.edges.boundary) + len(problem.F)
@@ -87,8 +110,8 @@ def diagnose(problem: Problem) -> Diagnosis:
         )
 
     proper = _proper(curves)
-    unchecked = list(_unchecked(curves, proper))
-    found = list(_global(problem, curves, euler, area))
+    unchecked = list(_list_unchecked(curves, proper))
+    found = list(_loop_obstructions(problem, curves, euler, area))
     found += misplaced_pins(problem, fixture, curves, proper)
     found += collapsed_edges(problem, fixture)
     found += inverted_fixed_triangles(problem, fixture)
@@ -102,9 +125,9 @@ def diagnose(problem: Problem) -> Diagnosis:
         chords = np.array([c for c in chords.tolist() if tuple(c) not in wrong], dtype=np.int64).reshape(-1, 2)
     # A target on a line parallel to an axis has no area; the checks above report that.
     if all(low < high for low, high in zip(fixture.lattice.low, fixture.lattice.high, strict=True)):
-        hidden, passed_over = _unplaced(problem, fixture, curves, corners, np.concatenate([curves.ends, chords]))
+        hidden, skipped = _find_unplaced(problem, fixture, curves, corners, np.concatenate([curves.ends, chords]))
         found += hidden
-        unchecked += passed_over
+        unchecked += skipped
     if corners is not None and len(problem.domain.loops) == 1:
         shortcuts = Shortcuts(problem, fixture, corners)
         found += shortcuts.find()
@@ -114,26 +137,26 @@ def diagnose(problem: Problem) -> Diagnosis:
     return Diagnosis(tuple(found), tuple(unchecked), problem)
 
 
-def _unplaced(
+def _find_unplaced(
     problem: Problem, fixture: Fixture, curves: TargetCurves, corners: Corners | None, walls: IntArray
 ) -> tuple[list[Obstruction], list[str]]:
     """Return obstructions of free vertices without a valid position, and descriptions of unchecked vertices."""
     around = stars(problem, fixture, curves.folds)
-    around = around.take(unplaced(around, fixture, corners, walls))
-    sight = None if corners is None else Sight(problem, fixture, corners, walls, Effort(MOST_EFFORT))
+    around = around.take(find_unplaced(around, fixture, corners, walls))
+    sight = None if corners is None else Sight(problem, fixture, corners, walls, Effort(MAX_EFFORT))
     found = []
-    passed_over = []
+    skipped = []
     for star in map(around.__getitem__, range(len(around))):
         obstruction = half_planes(star, fixture)
         if obstruction is None and sight is not None:
             try:
                 obstruction = sight.hidden(star)
             except EffortSpentError:
-                passed_over.append(star.vertex)
+                skipped.append(star.vertex)
         if obstruction is not None:
             found.append(obstruction)
-    which = named_vertices(np.array(passed_over))
-    return found, [f"whether a point of the target sees all fixed neighbours of {which}"] * bool(passed_over)
+    which = vertex_names(np.array(skipped))
+    return found, [f"whether a point of the target sees all fixed neighbours of {which}"] * bool(skipped)
 
 
 def _twice_area(fixture: Fixture, curves: TargetCurves) -> int:
@@ -158,17 +181,10 @@ def _proper(curves: TargetCurves) -> bool:
     return curves.turning.count(1) == 1 and bool((low >= 0).all() and (high <= 1).all())
 
 
-def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> Iterator[Obstruction]:
+def _loop_obstructions(problem: Problem, curves: TargetCurves, euler: int, area: int) -> Iterator[Obstruction]:
     """Yield obstructions by the loops as a whole.
 
-    Parameters
-    ----------
-    problem : Problem
-    curves : TargetCurves
-    euler : int
-        Euler characteristic of the surface.
-    area : int
-        Any number with the sign of the area that the loops enclose.
+    ``euler`` is the Euler characteristic of the surface. ``area`` has the sign of the area that the loops enclose.
     """
     every = np.arange(len(problem.domain.loops))
     turning, ranges = curves.turning, curves.winding_range
@@ -184,10 +200,10 @@ def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> It
         forbids = Forbids.INJECTIVE if proper else Forbids.BIJECTIVE
         yield Obstruction(Kind.GENUS, forbids, message)
     if ranges is not None and curves.simple and not proper:
-        yield _misnested(curves, euler)
+        yield _find_misnested(curves, euler)
     elif ranges is not None and (ranges[:, 0] < 0).any():
         loops = np.flatnonzero(ranges[:, 0] < 0)
-        message = f"Around some region beside {_named_loops(loops)} the target winds {ranges[:, 0].min()} times."
+        message = f"Around some region beside {_loop_names(loops)} the target winds {ranges[:, 0].min()} times."
         yield Obstruction(Kind.NEGATIVE_WINDING, Forbids.INJECTIVE, message, loops=loops)
     if turning is not None and sum(turning) != euler and not curves.simple:
         fewer = sum(turning) < euler
@@ -200,7 +216,7 @@ def _global(problem: Problem, curves: TargetCurves, euler: int, area: int) -> It
     yield from _meetings(curves)
 
 
-def _misnested(curves: TargetCurves, euler: int) -> Obstruction:
+def _find_misnested(curves: TargetCurves, euler: int) -> Obstruction:
     """Return the obstruction of simple disjoint loops that are not holes in one outer loop."""
     assert curves.winding_range is not None
     assert curves.turning is not None
@@ -210,18 +226,18 @@ def _misnested(curves: TargetCurves, euler: int) -> Obstruction:
         wrong = np.flatnonzero(np.array(curves.turning) == 1)
     # If the curves wind at most once, a map would be injective onto the enclosed region, which is not this surface. If
     # they wind more often, a map would cover a part repeatedly.
-    hopeless = low.min() < 0 or high.max() <= 1
-    forbids = Forbids.INJECTIVE if hopeless else Forbids.UNBRANCHED
-    if not hopeless and sum(curves.turning) == euler:
+    is_hopeless = low.min() < 0 or high.max() <= 1
+    forbids = Forbids.INJECTIVE if is_hopeless else Forbids.UNBRANCHED
+    if not is_hopeless and sum(curves.turning) == euler:
         forbids = Forbids.BIJECTIVE
-    message = f"The target's loops are not one outer loop with holes inside: see {_named_loops(wrong)}."
+    message = f"The target's loops are not one outer loop with holes inside: see {_loop_names(wrong)}."
     return Obstruction(Kind.NESTING, forbids, message, loops=wrong)
 
 
 def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
     """Yield obstructions where the curves fold, cross or touch; they forbid bijective maps only."""
     if curves.folds.size:
-        message = f"At the boundary {named_vertices(curves.folds)} the target folds back onto itself."
+        message = f"At the boundary {vertex_names(curves.folds)} the target folds back onto itself."
         yield Obstruction(Kind.FOLD, Forbids.BIJECTIVE, message, vertices=curves.folds)
     meet = curves.contacts
     consecutive = (curves.ends[meet.pairs][:, 0, :, None] == curves.ends[meet.pairs][:, 1, None, :]).any(axis=(1, 2))
@@ -230,20 +246,20 @@ def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
     for a, b in np.unique(loops, axis=0):
         here = (loops == [a, b]).all(axis=1)
         crossing = bool((relation[here] == SegmentRelation.CROSSING).any())
-        who = f"{_named_loops(np.array([a])).capitalize()} of the target"
+        who = f"{_loop_names(np.array([a])).capitalize()} of the target"
         whom = "itself" if a == b else f"loop {b}"
         count = f"{'' if meet.complete else 'at least '}{here.sum()} {'pair' if here.sum() == 1 else 'pairs'} of edges"
         involved = curves.ends[pairs[here]].reshape(-1, 2)
         message = (
             f"{who} {'crosses' if crossing else 'touches'} {whom} ({count}), among them "
-            f"{named_edges(involved[:1])} and {named_edges(involved[1:2])}."
+            f"{edge_names(involved[:1])} and {edge_names(involved[1:2])}."
         )
         yield Obstruction(
             Kind.CROSSING, Forbids.BIJECTIVE, message, edges=np.unique(involved, axis=0), loops=np.unique([a, b])
         )
 
 
-def _unchecked(curves: TargetCurves, proper: bool) -> Iterator[str]:
+def _list_unchecked(curves: TargetCurves, proper: bool) -> Iterator[str]:
     """Yield descriptions of the conditions that were not checked, and why."""
     if proper:
         return
@@ -254,6 +270,6 @@ def _unchecked(curves: TargetCurves, proper: bool) -> Iterator[str]:
         yield "winding numbers, as the target touches or overlaps itself, or crosses itself too often"
 
 
-def _named_loops(loops: IntArray) -> str:
+def _loop_names(loops: IntArray) -> str:
     """Return text that names the first few of some boundary loops."""
-    return named("loop", "loops", loops)
+    return names_of("loop", "loops", loops)

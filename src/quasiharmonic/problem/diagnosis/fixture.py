@@ -95,12 +95,10 @@ class Stars:
     ----------
     vertices : (s,) int64
         Ascending.
-    of_neighbour : (k,) int64
-        Index of the star of each neighbour, ascending.
-    neighbours : (k,) int64
-    of_opposite : (h,) int64
-        Index of the star of each edge, ascending.
-    opposite : (h, 2) int64
+    of_neighbour, neighbours : (k,) int64
+        Index of the star of each neighbour, ascending; the neighbour.
+    of_opposite, opposite : (h,), (h, 2) int64
+        Index of the star of each edge, ascending; the edge.
     """
 
     vertices: IntArray
@@ -131,14 +129,8 @@ def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Stars:
 
     Two kinds of free vertices always have one and are left out: those with a single fixed neighbour, and those whose
     fixed neighbours are the vertices of one or two consecutive boundary edges. The latter see all of these from a point
-    near the middle one.
-
-    Parameters
-    ----------
-    problem : Problem
-    fixture : Fixture
-    folds : (k,) int64
-        Vertices at which the boundary reverses its direction. There is no valid position near them.
+    near the middle one. At ``folds`` (k,), the vertices where the boundary reverses its direction, there is no such
+    point.
     """
     fixed = fixture.fixed
     interior = problem.domain.edges.interior

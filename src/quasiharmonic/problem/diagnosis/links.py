@@ -23,7 +23,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.triangulation import triangulate
+from quasiharmonic.geometry.exact.sweep import triangulate
 from quasiharmonic.problem.diagnosis.clipping import MARGIN
 from quasiharmonic.util.arrays import IntArray
 from quasiharmonic.util.progress import heartbeat
@@ -34,16 +34,11 @@ Point = tuple[int, int, int]
 # The degenerate line through a point and itself; every point is on it.
 _NOWHERE: Point = (0, 0, 0)
 # Number of corners whose comparison with a line costs as much as one step through a triangle.
-_AT_ONCE = 100
+_CORNERS_PER_STEP = 100
 
 
 class Polygon:
-    """A simple polygon, triangulated.
-
-    Parameters
-    ----------
-    corners : list of (int, int)
-        Corners in counterclockwise order, all distinct.
+    """A simple polygon, triangulated; its corners are distinct and in counterclockwise order.
 
     Attributes
     ----------
@@ -60,16 +55,16 @@ class Polygon:
         self.triangles = triangulate(corners)
         self._of_side = {side: t for t, (a, b, c) in enumerate(self.triangles) for side in ((a, b), (b, c), (c, a))}
         self._parent, self._depth = [-1] * len(self.triangles), [0] * len(self.triangles)
-        self._plant()
-        self._at = {corner: t for t, triangle in enumerate(self.triangles) for corner in triangle}
+        self._build_tree()
+        self._triangle_at = {corner: t for t, triangle in enumerate(self.triangles) for corner in triangle}
         xs, ys = zip(*corners, strict=True)
         self._centre = (min(xs) + max(xs)) // 2, (min(ys) + max(ys)) // 2
         self._unit = max(max(xs) - min(xs), max(ys) - min(ys))
         (x, y), unit = self._centre, self._unit
-        self._near = np.array([((px - x) / unit, (py - y) / unit) for px, py in corners])
+        self._approximate = np.array([((px - x) / unit, (py - y) / unit) for px, py in corners])
         self.work = len(corners)
 
-    def _plant(self) -> None:
+    def _build_tree(self) -> None:
         """Arrange the triangles as a tree."""
         reached = deque([0])
         while reached:
@@ -83,36 +78,23 @@ class Polygon:
                     reached.append(child)
 
     def link_distance(self, start: int, goal: int, limit: int) -> int:
-        """Return the smallest number of segments of a path from one corner to another.
-
-        Parameters
-        ----------
-        start, goal : int
-            Two corners.
-        limit : int
-            Largest number to count.
-
-        Returns
-        -------
-        int
-            The number, or ``limit + 1`` if it exceeds the limit.
-        """
-        window = [(self._points[start], self._at[start])]
+        """Return the smallest number of segments of a path between two corners, at most ``limit + 1``."""
+        window = [(self._points[start], self._triangle_at[start])]
         for count in range(1, limit + 1):
             heartbeat()
-            ways = [self._shortest(point, t, goal) for point, t in window]
-            common = _common_end(ways)
-            if common == 1 or any(len(way) == common for way in ways):
+            paths = [self._shortest_path(point, t, goal) for point, t in window]
+            common = _common_end(paths)
+            if common == 1 or any(len(path) == common for path in paths):
                 return count  # The paths meet only at the goal, so a point of the window sees it.
-            bend, after = ways[0][-common], ways[0][1 - common]
+            bend, after = paths[0][-common], paths[0][1 - common]
             # Of all lines from the window past the bend, take the one that has turned furthest.
-            before, other = ways[0][-common - 1], ways[-1][-common - 1]
+            before, other = paths[0][-common - 1], paths[-1][-common - 1]
             if _turn(bend, before, other) == _turn(before, bend, after):
                 before = other
-            window = [(bend, self._at[self._corner[bend]]), self._hit(before, bend)]
+            window = [(bend, self._triangle_at[self._corner[bend]]), self._extend_ray(before, bend)]
         return limit + 1
 
-    def _shortest(self, start: Point, t: int, goal: int) -> list[Point]:
+    def _shortest_path(self, start: Point, t: int, goal: int) -> list[Point]:
         """Return the shortest path from a point in a triangle to a corner: start, bends, goal [2]_."""
         left, right = self._portals(start, t, goal)
         path, k = [start], 0
@@ -140,8 +122,11 @@ class Polygon:
         return [p for k, p in enumerate(path) if k in (0, len(path) - 1) or _turn(path[k - 1], p, path[k + 1])]
 
     def _portals(self, start: Point, t: int, goal: int) -> tuple[list[Point], list[Point]]:
-        """Return left and right ends of the sides crossed between a point and a corner, including both points."""
-        up, down = [t], [self._at[goal]]
+        """Return the left and right ends of the sides that a path from a point to a corner crosses.
+
+        Both lists include the point and the corner.
+        """
+        up, down = [t], [self._triangle_at[goal]]
         while up[-1] != down[-1]:
             if self._depth[up[-1]] >= self._depth[down[-1]]:
                 up.append(self._parent[up[-1]])
@@ -162,7 +147,7 @@ class Polygon:
             right.append(self._points[c])
         return [*left, self._points[goal]], [*right, self._points[goal]]
 
-    def _hit(self, before: Point, bend: Point) -> tuple[Point, int]:
+    def _extend_ray(self, before: Point, bend: Point) -> tuple[Point, int]:
         """Return where the ray from a point through a corner leaves the polygon, and a triangle there."""
         along = _cross(before, bend)
         sides = self._sides(along)
@@ -177,7 +162,7 @@ class Polygon:
         exits: list[tuple[Fraction, Point, int]] = []
         beside = np.flatnonzero(sides)
         crossed = np.flatnonzero(sides[beside] != np.roll(sides[beside], -1))
-        self.work += crossed.size + len(sides) // _AT_ONCE
+        self.work += crossed.size + len(sides) // _CORNERS_PER_STEP
         n = len(sides)
         # The line crosses the boundary between corners on different sides of it: through a side, or through corners on
         # it.
@@ -189,7 +174,7 @@ class Polygon:
             else:
                 on = (self._points[m % n] for m in range(start + 1, end if end > start else end + n))
                 far = max(on, key=distance)
-                exits.append((distance(far), far, self._at[self._corner[far]]))
+                exits.append((distance(far), far, self._triangle_at[self._corner[far]]))
         _, point, t = min((e for e in exits if e[0] > 0), key=lambda e: e[0])
         return point, t
 
@@ -198,7 +183,7 @@ class Polygon:
         a, b, c = line
         (x, y), unit, size = self._centre, self._unit, max(abs(a), abs(b))
         # Python rounds quotients of integers once, for any size.
-        value = self._near @ (a / size, b / size) + (a * x + b * y + c) / (size * unit)
+        value = self._approximate @ (a / size, b / size) + (a * x + b * y + c) / (size * unit)
         sides = np.where(value > 0, 1, -1)
         for k in np.flatnonzero(np.abs(value) < MARGIN).tolist():
             sides[k] = _side(line, self._points[k])
@@ -230,12 +215,12 @@ def _turn(p: Point, q: Point, r: Point) -> int:
     return _side(_cross(p, q), r)
 
 
-def _common_end(ways: list[list[Point]]) -> int:
+def _common_end(paths: list[list[Point]]) -> int:
     """Return the number of points that paths share at their ends; a single path is counted without its start."""
-    if len(ways) == 1:
-        return len(ways[0]) - 1
+    if len(paths) == 1:
+        return len(paths[0]) - 1
     count = 0
-    for p, q in zip(reversed(ways[0]), reversed(ways[1]), strict=False):
+    for p, q in zip(reversed(paths[0]), reversed(paths[1]), strict=False):
         if p != q:
             break
         count += 1

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import IntArray, ReadOnly, named
+from quasiharmonic.util.arrays import IntArray, ReadOnly, names_of
 from quasiharmonic.util.display import Displayable
 
 if TYPE_CHECKING:
@@ -214,17 +214,8 @@ class Diagnosis(Displayable):
 def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list[int]:
     """Return a minimal conflict: conditions that cannot all hold, but can without any one of them.
 
-    Parameters
-    ----------
-    count : int
-        Number of conditions.
-    possible : callable
-        Returns whether the conditions with given indices can hold together; False for all of them.
-
-    Returns
-    -------
-    list of int
-        Indices, ascending. Each costs about ``log2(count)`` calls.
+    ``possible`` returns whether the conditions with given indices can hold together; False for all ``count`` of them.
+    Return ascending indices. Each costs about ``log2(count)`` calls.
     """
     chosen: list[int] = []
     end = count
@@ -242,6 +233,6 @@ def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list
     return chosen
 
 
-def named_vertices(vertices: IntArray) -> str:
+def vertex_names(vertices: IntArray) -> str:
     """Return text that names the first few of some vertices."""
-    return named("vertex", "vertices", vertices)
+    return names_of("vertex", "vertices", vertices)

@@ -16,36 +16,28 @@ from quasiharmonic.problem.diagnosis.clearance import clear
 from quasiharmonic.problem.diagnosis.curves import Corners
 from quasiharmonic.problem.diagnosis.fixture import Fixture
 from quasiharmonic.problem.diagnosis.links import Polygon
-from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices
+from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, vertex_names
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 # Largest number of edges between the vertices of a pair to check.
 LONGEST = 8
-# Limit on the steps in the triangulated target, of some microseconds each: a constant, and a number per boundary
-# vertex.
-_WORK, _WORK_PER_VERTEX = 50_000, 10
+# Limit on the steps in the triangulated target, of some microseconds each: a constant,
+_WORK = 50_000
+# and a number per boundary vertex.
+_WORK_PER_VERTEX = 10
 # Limit on the pairs to collect.
-_MOST_PAIRS = 10_000_000
+_MAX_PAIRS = 10_000_000
 # Offsets of trial points from the midpoint of two corners, as multiples of half their distance.
 _BESIDE = 0.05, 0.3, 1.0, -0.05, -0.3
 # Limit on the pairs of a segment and a nearby edge to check, for each call of `clear`.
-_MOST_NEAR = 1_000_000
+_MAX_NEAR_PAIRS = 1_000_000
 
 
 class Shortcuts:
     """Finds boundary vertices that are closer in the mesh than inside the target.
 
-    Parameters
-    ----------
-    problem : Problem
-        A problem with a single boundary loop, simple and counterclockwise in the target.
-    fixture : Fixture
-    corners : Corners
-
-    Attributes
-    ----------
-    unchecked : int
-        Not all pairs this many edges apart or more were checked. Valid after `find`.
+    The problem has a single boundary loop, simple and counterclockwise in the target. After `find`, not all pairs that
+    are ``unchecked`` or more edges apart were checked.
     """
 
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners) -> None:
@@ -55,13 +47,13 @@ class Shortcuts:
         inner = interior[free[interior].all(axis=1)]
         mixed = interior[free[interior[:, 0]] != free[interior[:, 1]]]
         mixed = np.where(free[mixed[:, :1]], mixed[:, ::-1], mixed)  # columns: fixed, free
-        place = np.full(problem.n, -1)
-        place[self._loop] = np.arange(len(self._loop))
-        mixed = mixed[place[mixed[:, 0]] >= 0]
+        index = np.full(problem.n, -1)
+        index[self._loop] = np.arange(len(self._loop))
+        mixed = mixed[index[mixed[:, 0]] >= 0]
         both = np.concatenate([inner, inner[:, ::-1]])
         self._inner = csr_array((np.ones(len(both)), both.T), shape=(problem.n, problem.n))
         self._ends = csr_array(
-            (np.ones(len(mixed)), (place[mixed[:, 0]], mixed[:, 1])), shape=(len(self._loop), problem.n)
+            (np.ones(len(mixed)), (index[mixed[:, 0]], mixed[:, 1])), shape=(len(self._loop), problem.n)
         )
         self._fixture = fixture
         self._corners = corners
@@ -76,7 +68,7 @@ class Shortcuts:
         reached, known = self._ends, np.empty(0, dtype=np.int64)
         at_ends = np.bincount(self._ends.indices, minlength=self._ends.shape[1])
         for k in range(2, LONGEST + 1):
-            if at_ends @ np.bincount(reached.indices, minlength=reached.shape[1]) > _MOST_PAIRS:
+            if at_ends @ np.bincount(reached.indices, minlength=reached.shape[1]) > _MAX_PAIRS:
                 self.unchecked = k
                 return
             pairs = (reached @ self._ends.T).tocoo()
@@ -92,7 +84,7 @@ class Shortcuts:
             i, j = i[far], j[far]
             if not i.size:
                 continue
-            hidden = ~self.within(i, j, k)
+            hidden = ~self.are_close(i, j, k)
             for a, b in zip(i[hidden].tolist(), j[hidden].tolist(), strict=True):
                 if self._polygon.work > budget:
                     self.unchecked = k
@@ -100,7 +92,7 @@ class Shortcuts:
                 if self._polygon.link_distance(a, b, k) > k:
                     yield self._obstruction(a, b, k)
 
-    def within(self, i: IntArray, j: IntArray, k: int) -> BoolArray:
+    def are_close(self, i: IntArray, j: IntArray, k: int) -> BoolArray:
         """Return whether corners are provably at most k > 2 segments apart.
 
         True if one corner sees the other, if one sees a third corner less than k sides from the other, or if both see
@@ -120,12 +112,12 @@ class Shortcuts:
         dx, dy = (q / 2 - p / 2).T
         left = np.stack([-dy * inward, dx * inward], axis=1)
         for height in _BESIDE:
-            open_ = np.flatnonzero(~result)
+            left_over = np.flatnonzero(~result)
             with np.errstate(over="ignore"):
-                place = p[open_] / 2 + q[open_] / 2 + height * left[open_]
-            once = self._clear(tails[open_], None, p[open_], place)
-            open_, place = open_[once], place[once]
-            result[open_] = self._clear(heads[open_], None, q[open_], place)
+                index = p[left_over] / 2 + q[left_over] / 2 + height * left[left_over]
+            once = self._clear(tails[left_over], None, p[left_over], index)
+            left_over, index = left_over[once], index[once]
+            result[left_over] = self._clear(heads[left_over], None, q[left_over], index)
         return result
 
     def _clear(self, tails: IntArray, heads: IntArray | None, p: FloatArray, q: FloatArray) -> BoolArray:
@@ -136,42 +128,42 @@ class Shortcuts:
         if heads is not None:
             inside[inside] = self._corners.opens_to(heads[inside], p[inside], where)
         ends = np.stack([tails, np.full(len(tails), -1) if heads is None else heads], axis=1)
-        inside[inside] = clear(p[inside], q[inside], ends[inside], self._sides, where, _MOST_NEAR)
+        inside[inside] = clear(p[inside], q[inside], ends[inside], self._sides, where, _MAX_NEAR_PAIRS)
         return inside
 
     def _obstruction(self, a: int, b: int, k: int) -> Obstruction:
         ends = self._loop[[a, b]]
         message = (
-            f"A path of {k} edges inside the mesh joins the boundary {named_vertices(ends)}, and inside the target "
+            f"A path of {k} edges inside the mesh joins the boundary {vertex_names(ends)}, and inside the target "
             f"every path from one to the other needs more than {k} segments."
         )
-        path = self._paths(a, b, k)
+        path = self._shortest_path_edges(a, b, k)
         return Obstruction(Kind.LINK_DISTANCE, Forbids.INJECTIVE, message, vertices=ends, edges=path, split=path)
 
-    def _paths(self, a: int, b: int, k: int) -> IntArray:
+    def _shortest_path_edges(self, a: int, b: int, k: int) -> IntArray:
         """Return all edges on shortest paths between two boundary vertices, (e, 2) int64."""
-        forth, back = self._rings(a, k), self._rings(b, k)
+        forth, back = self._find_rings(a, k), self._find_rings(b, k)
         start, end = self._loop[[a, b]]
         edges = [np.array([(start, v) for v in np.intersect1d(forth[0], back[k - 2])])]
         for step in range(1, k - 1):
             for v in np.intersect1d(forth[step - 1], back[k - 1 - step]).tolist():
-                onward = np.intersect1d(_row(self._inner, v), back[k - 2 - step])
+                onward = np.intersect1d(_row_columns(self._inner, v), back[k - 2 - step])
                 edges.append(np.array([(v, w) for w in onward.tolist()]))
         edges.append(np.array([(v, end) for v in np.intersect1d(forth[k - 2], back[0])]))
         return np.concatenate(edges)
 
-    def _rings(self, corner: int, k: int) -> list[IntArray]:
+    def _find_rings(self, corner: int, k: int) -> list[IntArray]:
         """Return free vertices that are exactly 1, 2, … k - 1 edges away from a boundary vertex."""
-        rings = [_row(self._ends, corner)]
+        rings = [_row_columns(self._ends, corner)]
         inside = rings[0]
         for _ in range(k - 2):
-            following = np.unique(np.concatenate([_row(self._inner, v) for v in rings[-1].tolist()]))
+            following = np.unique(np.concatenate([_row_columns(self._inner, v) for v in rings[-1].tolist()]))
             rings.append(np.setdiff1d(following, inside))
             inside = np.union1d(inside, rings[-1])
         return rings
 
 
-def _row(matrix: csr_array, k: int) -> IntArray:
+def _row_columns(matrix: csr_array, k: int) -> IntArray:
     """Return column indices of the entries in a row."""
     columns: IntArray = matrix.indices[matrix.indptr[k] : matrix.indptr[k + 1]].astype(np.int64)
     return columns

@@ -15,15 +15,15 @@ import numpy as np
 from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import Convex, Walls
-from quasiharmonic.problem.diagnosis.curves import MOST_CONTACTS, Corners, TargetCurves
+from quasiharmonic.problem.diagnosis.curves import MAX_CONTACTS, Corners, TargetCurves
 from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
-from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, named_vertices, smallest_conflict
+from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, smallest_conflict, vertex_names
 from quasiharmonic.problem.diagnosis.views import Views
-from quasiharmonic.util.arrays import IntArray, named_edges
+from quasiharmonic.util.arrays import IntArray, edge_names
 
 # Number of fixed vertices, far apart from each other, that are checked first.
-_APART = 8
+_FIRST_CHECKED = 8
 
 
 def bad_chords(problem: Problem, fixture: Fixture, curves: TargetCurves, corner: Corners) -> Iterator[Obstruction]:
@@ -33,25 +33,25 @@ def bad_chords(problem: Problem, fixture: Fixture, curves: TargetCurves, corner:
         return
     segments = np.concatenate([curves.ends, np.stack([problem.domain.pins, problem.domain.pins], axis=1), chords])
     first = len(segments) - len(chords)
-    met: dict[int, list[IntArray]] = {}
-    for i, j in contacts(where, segments, MOST_CONTACTS).pairs.tolist():
+    meeting: dict[int, list[IntArray]] = {}
+    for i, j in contacts(where, segments, MAX_CONTACTS).pairs.tolist():
         if j >= first:
             # Of two edges that cross each other, report one.
-            met.setdefault(j - first, []).append(segments[i])
+            meeting.setdefault(j - first, []).append(segments[i])
     outside = np.zeros(len(chords), dtype=bool)
     for end, other in (chords.T, chords[:, ::-1].T):
         outside |= corner.known[end] & ~corner.opens_to(end, where[other], where)
     for k, chord in enumerate(chords):
-        if k not in met and not outside[k]:
+        if k not in meeting and not outside[k]:
             continue
-        others = np.array(met.get(k, []), dtype=np.int64).reshape(-1, 2)
+        others = np.array(meeting.get(k, []), dtype=np.int64).reshape(-1, 2)
         edges, points = others[others[:, 0] != others[:, 1]], others[others[:, 0] == others[:, 1], 0]
-        what = [named_edges(edges)] * bool(len(edges)) + [named_vertices(points)] * bool(len(points))
-        place = f"meets {' and '.join(what)} there" if what else "lies outside the target"
+        what = [edge_names(edges)] * bool(len(edges)) + [vertex_names(points)] * bool(len(points))
+        reason = f"meets {' and '.join(what)} there" if what else "lies outside the target"
         yield Obstruction(
             Kind.CHORD,
             Forbids.INJECTIVE,
-            f"Both ends of the interior {named_edges(chord[None])} are fixed, and the segment between them {place}.",
+            f"Both ends of the interior {edge_names(chord[None])} are fixed, and the segment between them {reason}.",
             vertices=np.concatenate([chord, points]),
             edges=np.concatenate([chord[None], edges]),
             split=chord,
@@ -61,16 +61,8 @@ def bad_chords(problem: Problem, fixture: Fixture, curves: TargetCurves, corner:
 class Sight:
     """Checks whether a free vertex has a position that sees all its fixed neighbours.
 
-    Parameters
-    ----------
-    problem : Problem
-    fixture : Fixture
-    corners : Corners
-        Corners of a target that is simple and properly nested.
-    walls : (m, 2) int64
-        Edges that block the view: boundary edges, and interior edges with both ends fixed.
-    effort : Effort
-        Budget for all checks.
+    The target is simple and properly nested. ``walls`` (m, 2) are the edges that block the view: boundary edges, and
+    interior edges with both ends fixed. ``effort`` is the budget for all checks.
     """
 
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners, walls: IntArray, effort: Effort) -> None:
@@ -84,29 +76,30 @@ class Sight:
     def hidden(self, star: Star) -> Obstruction | None:
         """Return an obstruction if no point sees all fixed neighbours to the left of the fixed edges, else None.
 
-        Raises
-        ------
-        EffortSpentError
-            If the budget is exhausted before a decision.
+        Raise `EffortSpentError` if the budget is exhausted before a decision.
         """
         neighbours, opposite = self._apart_first(star.neighbours), star.opposite
-        if self._place(neighbours, opposite):
+        if self._has_position(neighbours, opposite):
             return None
         edges, seen = opposite, neighbours
         # If the budget ends before the conflict is minimal, a larger conflict is still valid.
         with suppress(EffortSpentError):
-            edges = opposite[smallest_conflict(len(opposite), lambda some: self._place(neighbours, opposite[some]))]
+            edges = opposite[
+                smallest_conflict(len(opposite), lambda chosen: self._has_position(neighbours, opposite[chosen]))
+            ]
             # Without neighbours to see, a position exists: otherwise `half_planes` has reported the edges.
             seen = neighbours[
-                smallest_conflict(len(neighbours), lambda some: not some or self._place(neighbours[some], edges))
+                smallest_conflict(
+                    len(neighbours), lambda chosen: not chosen or self._has_position(neighbours[chosen], edges)
+                )
             ]
         vertex = np.array([star.vertex])
-        beside = f", from the left of {named_edges(edges)}" if len(edges) else ""
+        beside = f", from the left of {edge_names(edges)}" if len(edges) else ""
         ends = np.unique(np.concatenate([seen, edges.ravel()]))
         return Obstruction(
             Kind.HIDDEN,
             Forbids.INJECTIVE,
-            f"{named_vertices(vertex).capitalize()} is joined to the fixed {named_vertices(seen)}, "
+            f"{vertex_names(vertex).capitalize()} is joined to the fixed {vertex_names(seen)}, "
             f"but no point of the target sees all of them{beside}.",
             vertices=np.concatenate([vertex, seen]),
             edges=edges,
@@ -118,18 +111,18 @@ class Sight:
 
         If they cannot all be seen, the check then fails early, before the area is cut into many small parts.
         """
-        near = self._fixture.lattice.near[self._fixture.row[vertices]]
+        approximate = self._fixture.lattice.approximate[self._fixture.row[vertices]]
         distance = np.full(len(vertices), np.inf)
         first = [0]
-        while len(first) < min(_APART, len(vertices)):
-            distance = np.minimum(distance, np.hypot(*(near - near[first[-1]]).T))
+        while len(first) < min(_FIRST_CHECKED, len(vertices)):
+            distance = np.minimum(distance, np.hypot(*(approximate - approximate[first[-1]]).T))
             distance[first] = -1.0
             first.append(int(np.argmax(distance)))
         return np.concatenate([vertices[first], np.delete(vertices, first)])
 
-    def _place(self, neighbours: IntArray, edges: IntArray) -> bool:
+    def _has_position(self, neighbours: IntArray, edges: IntArray) -> bool:
         """Return whether a point inside sees the neighbours and lies to the left of the edges."""
-        eyes, overlaps = self._least_in_common(self._fixture.row[neighbours].tolist())
+        eyes, overlaps = self._order_by_overlaps(self._fixture.row[neighbours].tolist())
         if overlaps is not None and not len(overlaps):
             return False
         area = self._fixture.left_of(self._fixture.extent(), edges)
@@ -137,7 +130,7 @@ class Sight:
             self._walls.seeing(part, eyes) is not None for part in self._in_view(area, eyes, overlaps)
         )
 
-    def _least_in_common(self, eyes: list[int]) -> tuple[list[int], IntArray | None]:
+    def _order_by_overlaps(self, eyes: list[int]) -> tuple[list[int], IntArray | None]:
         """Return eyes, the first two with few overlapping wedges, and the pairs of their wedges that may overlap."""
         order, least = eyes, None
         for k in range(1, len(eyes)):
@@ -157,22 +150,22 @@ class Sight:
             yield area
             return
         # Depth-first search without recursion, one level per eye.
-        ways = [self._parts(area, eyes[0], None if overlaps is None else overlaps[:, 0])]
-        while ways:
-            k, part = next(ways[-1], (-1, None))
+        levels = [self._parts(area, eyes[0], None if overlaps is None else overlaps[:, 0])]
+        while levels:
+            k, part = next(levels[-1], (-1, None))
             if part is None:
-                ways.pop()
-            elif len(ways) == len(eyes):
+                levels.pop()
+            elif len(levels) == len(eyes):
                 yield part
             else:
-                few = overlaps[overlaps[:, 0] == k, 1] if overlaps is not None and len(ways) == 1 else None
-                ways.append(self._parts(part, eyes[len(ways)], few))
+                few = overlaps[overlaps[:, 0] == k, 1] if overlaps is not None and len(levels) == 1 else None
+                levels.append(self._parts(part, eyes[len(levels)], few))
 
     def _parts(self, area: Convex, eye: int, wedges: IntArray | None) -> Iterator[tuple[int, Convex]]:
         """Return an iterator of the parts of an area in all or some wedges of an eye, with the index of the wedge."""
         view = self._views.wedges(eye)
         if wedges is None:
             return view.parts(area)
-        some = np.zeros(len(view), dtype=bool)
-        some[wedges] = True
-        return view.parts(area, some)
+        chosen = np.zeros(len(view), dtype=bool)
+        chosen[wedges] = True
+        return view.parts(area, chosen)

@@ -24,7 +24,7 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 SignArray = NDArray[np.int8]
 
 # Number of cached views.
-_MOST_KEPT = 200
+_MAX_CACHED = 200
 
 
 class Views:
@@ -50,7 +50,7 @@ class Views:
         self._ends, self._positions, self._lattice, self._corner = ends, positions, lattice, corner
         # For inexact computations: scaled to magnitude one, to avoid overflow.
         self._scaled = np.ldexp(positions, -int(np.frexp(np.abs(positions).max())[1]))
-        self._kept: dict[int, Wedges] = {}
+        self._cache: dict[int, Wedges] = {}
         self._effort = effort
 
     def wedges(self, eye: int) -> Wedges:
@@ -58,13 +58,13 @@ class Views:
 
         Walls that end at the point, or lie on a line with it, hide nothing.
         """
-        if eye not in self._kept:
-            while len(self._kept) >= _MOST_KEPT:
-                del self._kept[next(iter(self._kept))]
-            self._kept[eye] = self._look(eye)
-        return self._kept[eye]
+        if eye not in self._cache:
+            while len(self._cache) >= _MAX_CACHED:
+                del self._cache[next(iter(self._cache))]
+            self._cache[eye] = self._compute_wedges(eye)
+        return self._cache[eye]
 
-    def _look(self, eye: int) -> Wedges:
+    def _compute_wedges(self, eye: int) -> Wedges:
         """Compute the wedges of an eye; see `wedges`."""
         self._effort.spend(500 + len(self._ends))
         here, where = self._positions[eye], self._positions
@@ -72,7 +72,7 @@ class Views:
         turn[(self._ends == eye).any(axis=1)] = 0
         walls = np.where(turn[:, None] > 0, self._ends, self._ends[:, ::-1])[turn != 0]
         sides = self._corner[eye]
-        around, rank = self._sorted(eye, np.unique(np.append(walls, sides[sides >= 0])))
+        around, rank = self._sort(eye, np.unique(np.append(walls, sides[sides >= 0])))
         first, last = rank[walls.T]
         count, owner = len(around), np.arange(len(walls))
         # Split a wall that covers the first direction into two.
@@ -96,15 +96,11 @@ class Views:
             self._lattice, eye, around[begin[seen]], around[end[seen]], walls[owner[nearest[begin[seen]]]], self._effort
         )
 
-    def _sorted(self, eye: int, points: IntArray) -> tuple[IntArray, IntArray]:
+    def _sort(self, eye: int, points: IntArray) -> tuple[IntArray, IntArray]:
         """Sort points by direction from the eye, counterclockwise from the x axis.
 
-        Returns
-        -------
-        around : (r,) int64
-            One of the points in each direction, in order.
-        rank : (k,) int64
-            Index of a point's direction in this order; undefined for other points.
+        Return one of the points in each direction, in order, and the rank of each point's direction (k,). The rank is
+        undefined for other points.
         """
         here, where = self._positions[eye], self._positions
         low = (where[:, 1] < here[1]) | ((where[:, 1] == here[1]) & (where[:, 0] < here[0]))
@@ -144,24 +140,12 @@ class Views:
 
 
 def _nearest(first: IntArray, last: IntArray, tail: FloatArray, along: FloatArray, ray: FloatArray) -> IntArray:
-    """Return the nearest wall in each of a circle of directions.
+    """Return the nearest wall in each of a circle of directions ``ray`` (r, 2), -1 if there is none.
 
-    Each wall is stored at two overlapping runs of 2ᵏ directions that cover it. Walls do not cross, so the nearest wall
-    of a run is the same in all its directions. It is passed down from each run to its two halves.
-
-    Parameters
-    ----------
-    first, last : (m,) int64
-        Directions that each wall covers, from the first one up to, not including, the last.
-    tail, along : (m, 2) float64
-        Start of each wall relative to the eye, and the vector from its start to its end.
-    ray : (r, 2) float64
-        The directions.
-
-    Returns
-    -------
-    (r,) int64
-        Index of a wall, -1 if there is none.
+    A wall covers the directions from ``first`` up to, not including, ``last`` (m,). ``tail`` (m, 2) is its start
+    relative to the eye, ``along`` (m, 2) the vector from its start to its end. Each wall is stored at two overlapping
+    runs of 2ᵏ directions that cover it. Walls do not cross, so the nearest wall of a run is the same in all its
+    directions. It is passed down from each run to its two halves.
     """
     best = np.full(len(ray), -1)
     if not len(first):
@@ -174,16 +158,16 @@ def _nearest(first: IntArray, last: IntArray, tail: FloatArray, along: FloatArra
         return result
 
     def put(wall: IntArray, direction: IntArray) -> None:
-        held = best[direction]
-        nearer = (held < 0) | (distance(wall, direction) < distance(held, direction))
+        current = best[direction]
+        nearer = (current < 0) | (distance(wall, direction) < distance(current, direction))
         best[direction[nearer]] = wall[nearer]
 
     level = np.frexp((last - first).astype(np.float64))[1] - 1
     for k in range(int(level.max()), -1, -1):
         if k < level.max():
             # Each run of the previous level consists of two runs of this one.
-            whole = np.flatnonzero(best >= 0)
-            put(best[whole], whole + (1 << k))
+            covered = np.flatnonzero(best >= 0)
+            put(best[covered], covered + (1 << k))
         here = np.flatnonzero(level == k)
         wall, start = np.concatenate([here, here]), np.concatenate([first[here], last[here] - (1 << k)])
         order = np.lexsort([distance(wall, start), start])

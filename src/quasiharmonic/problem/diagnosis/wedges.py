@@ -15,7 +15,7 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 # Number of consecutive wedges that form a row for a first comparison.
 _ROW = 16
 # Limit on the pairs of rows that are compared wedge by wedge.
-_MOST_ROWS = 1024
+_MAX_ROWS = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +24,6 @@ class Wedges:
 
     Attributes
     ----------
-    lattice : Lattice
-    eye : int
     right, left : (c,) int64
         Points on the two rays that bound each wedge.
     wall : (c, 2) int64
@@ -63,7 +61,7 @@ class Wedges:
         """Return pairs of wedges that may overlap, (m, 2) int64, or None if there are too many candidates."""
         self.effort.spend(300)
         rows = np.argwhere(self._rows_may_reach(other) & other._rows_may_reach(self).T)
-        if len(rows) > _MOST_ROWS:
+        if len(rows) > _MAX_ROWS:
             return None
         self.effort.spend(len(rows) * _ROW**2 // 10)
         in_row = np.stack(np.divmod(np.arange(_ROW**2), _ROW), axis=1)
@@ -88,14 +86,14 @@ class Wedges:
     @cached_property
     def _triangles(self) -> FloatArray:
         """Triangles of the eye and a wall, which contain the wedges; (c, 3, 2), rounded."""
-        corners: FloatArray = self.lattice.near[np.column_stack([np.full(len(self), self.eye), self.wall])]
+        corners: FloatArray = self.lattice.approximate[np.column_stack([np.full(len(self), self.eye), self.wall])]
         return corners
 
     @cached_property
     def _rays(self) -> FloatArray:
         """Points on the right and the left ray, relative to the eye; (2, c, 2), rounded."""
-        near = self.lattice.near
-        rays: FloatArray = near[np.stack([self.right, self.left])] - near[self.eye]
+        points = self.lattice.approximate
+        rays: FloatArray = points[np.stack([self.right, self.left])] - points[self.eye]
         return rays
 
     @cached_property
@@ -115,7 +113,7 @@ class Wedges:
         first = np.arange(0, len(self), _ROW)
         last = np.minimum(first + _ROW, len(self)) - 1
         right, left = self._rays[0, first, None, None], self._rays[1, last, None, None]
-        from_eye = boxes - self.lattice.near[self.eye]
+        from_eye = boxes - self.lattice.approximate[self.eye]
         # Rows that span half a circle or more are not bounded by two rays.
         wide = cross(right, left)[..., 0] < MARGIN
         reach &= (cross(right, from_eye) > -MARGIN).any(axis=2) | wide

@@ -20,50 +20,43 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 _MARGINS = 0.1, 0.01, 0.001
 # Number of steps to move a trial position.
 _STEPS = 8
-# Limit on the pairs of a segment and a nearby wall to check in each trial: a constant, and a number per star.
-_PAIRS, _PAIRS_PER_STAR = 1_000_000, 100
+# Limit on the pairs of a segment and a nearby wall to check in each trial: a constant,
+_PAIRS = 1_000_000
+# and a number per star.
+_PAIRS_PER_STAR = 100
 
 
-def unplaced(stars: Stars, fixture: Fixture, corners: Corners | None, walls: IntArray) -> IntArray:
-    """Return stars for which no trial position is valid.
+def find_unplaced(stars: Stars, fixture: Fixture, corners: Corners | None, walls: IntArray) -> IntArray:
+    """Return the indices of stars for which no trial position is valid, ascending.
 
-    Parameters
-    ----------
-    stars : Stars
-    fixture : Fixture
-    corners : Corners or None
-        Corners of the target if it is simple and properly nested. None if vertices need not see their neighbours.
-    walls : (m, 2) int64
-        Edges that block the view.
-
-    Returns
-    -------
-    (k,) int64
-        Indices of stars, ascending.
+    ``corners`` are those of the target if it is simple and properly nested, or None if vertices need not see their
+    neighbours. ``walls`` (m, 2) are the edges that block the view.
     """
     waiting = np.arange(len(stars))
-    places = _middles(stars, fixture)
+    positions = _neighbour_means(stars, fixture)
     for margin in (0.0, *_MARGINS, None):
-        some = stars.take(waiting)
+        stars_left = stars.take(waiting)
         if margin is None:
-            places = _middles_of_rooms(some, fixture, corners)
+            positions = _area_middles(stars_left, fixture, corners)
         elif margin > 0:
-            places = _shifted(some, places, fixture, corners, margin)
-        left = ~_suits(some, places, fixture, corners, walls)
-        waiting, places = waiting[left], places[left]
+            positions = _move_inward(stars_left, positions, fixture, corners, margin)
+        left = ~_are_valid(stars_left, positions, fixture, corners, walls)
+        waiting, positions = waiting[left], positions[left]
         if not waiting.size:
             break
     return waiting
 
 
-def _middles(stars: Stars, fixture: Fixture) -> FloatArray:
+def _neighbour_means(stars: Stars, fixture: Fixture) -> FloatArray:
     """Return the mean of each star's neighbours, (s, 2) float64."""
     number = np.bincount(stars.of_neighbour, minlength=len(stars))
     share = fixture.positions[stars.neighbours] / number[stars.of_neighbour, None]
     return np.stack([np.bincount(stars.of_neighbour, share[:, c], minlength=len(stars)) for c in (0, 1)], axis=1)
 
 
-def _shifted(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corners | None, margin: float) -> FloatArray:
+def _move_inward(
+    stars: Stars, positions: FloatArray, fixture: Fixture, corners: Corners | None, margin: float
+) -> FloatArray:
     """Return positions moved to the left of the edges that bound them, one edge after another."""
     where = fixture.positions
     of, edge = _sides(stars, fixture, corners)
@@ -71,30 +64,30 @@ def _shifted(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corner
         along = where[edge[:, 1]] - where[edge[:, 0]]
         inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
         size = np.zeros(len(stars))
-        np.maximum.at(size, stars.of_neighbour, np.hypot(*(where[stars.neighbours] - places[stars.of_neighbour]).T))
+        np.maximum.at(size, stars.of_neighbour, np.hypot(*(where[stars.neighbours] - positions[stars.of_neighbour]).T))
         for _ in range(_STEPS):
-            lacking = margin * size[of] - np.einsum("ij,ij->i", places[of] - where[edge[:, 0]], inward)
+            lacking = margin * size[of] - np.einsum("ij,ij->i", positions[of] - where[edge[:, 0]], inward)
             order = np.lexsort([-lacking, of])
             worst = order[np.append(True, of[order[1:]] != of[order[:-1]])[: len(order)]]
             worst = worst[lacking[worst] > 0]
             if not worst.size:
                 break
-            places = places.copy()
-            places[of[worst]] += lacking[worst, None] * inward[worst]
-    return places
+            positions = positions.copy()
+            positions[of[worst]] += lacking[worst, None] * inward[worst]
+    return positions
 
 
-def _middles_of_rooms(stars: Stars, fixture: Fixture, corners: Corners | None) -> FloatArray:
+def _area_middles(stars: Stars, fixture: Fixture, corners: Corners | None) -> FloatArray:
     """Return the middle of the area to the left of each star's edges, NaN if it is empty."""
-    places = np.full((len(stars), 2), np.nan)
+    positions = np.full((len(stars), 2), np.nan)
     of, edge = _sides(stars, fixture, corners)
     edge = edge[np.argsort(of, kind="stable")]
     ends = np.cumsum(np.bincount(of, minlength=len(stars)))
     for k, (begin, end) in enumerate(pairwise([0, *ends.tolist()])):
-        room = fixture.left_of(fixture.extent(), edge[begin:end])
-        if room is not None:
-            places[k] = fixture.lattice.middle(room)
-    return places
+        area = fixture.left_of(fixture.extent(), edge[begin:end])
+        if area is not None:
+            positions[k] = fixture.lattice.middle(area)
+    return positions
 
 
 def _sides(stars: Stars, fixture: Fixture, corners: Corners | None) -> tuple[IntArray, IntArray]:
@@ -111,24 +104,26 @@ def _sides(stars: Stars, fixture: Fixture, corners: Corners | None) -> tuple[Int
     return of, np.concatenate([edge, np.stack([corners.before[v], v], 1), np.stack([v, corners.after[v]], 1)])
 
 
-def _suits(stars: Stars, places: FloatArray, fixture: Fixture, corners: Corners | None, walls: IntArray) -> BoolArray:
+def _are_valid(
+    stars: Stars, positions: FloatArray, fixture: Fixture, corners: Corners | None, walls: IntArray
+) -> BoolArray:
     """Return whether positions are valid, exact if True; (s,) bool."""
     where = fixture.positions
     fixed = where[fixture.fixed]
     # A map without inverted triangles stays inside the bounding box of the fixed vertices. NaN fails this test.
-    good: BoolArray = np.all((fixed.min(axis=0) < places) & (places < fixed.max(axis=0)), axis=1)
-    places = np.where(good[:, None], places, 0.0)
+    good: BoolArray = np.all((fixed.min(axis=0) < positions) & (positions < fixed.max(axis=0)), axis=1)
+    positions = np.where(good[:, None], positions, 0.0)
     of, edge = stars.of_opposite, stars.opposite
-    good[of[orientation(where[edge[:, 0]], where[edge[:, 1]], places[of]) <= 0]] = False
+    good[of[orientation(where[edge[:, 0]], where[edge[:, 1]], positions[of]) <= 0]] = False
     if corners is None:
         return good
     of, eye = stars.of_neighbour, stars.neighbours
     known = corners.known[eye]
-    shut = ~corners.opens_to(eye[known], places[of[known]], where)
+    shut = ~corners.opens_to(eye[known], positions[of[known]], where)
     good[of[known][shut]] = False
-    look = np.flatnonzero(good[of])
-    ends = np.stack([eye[look], np.full(len(look), -1)], axis=1)
-    most = _PAIRS + _PAIRS_PER_STAR * len(stars)
-    seen = clear(where[eye[look]], places[of[look]], ends, walls, where, most)
-    good[of[look[~seen]]] = False
+    candidates = np.flatnonzero(good[of])
+    ends = np.stack([eye[candidates], np.full(len(candidates), -1)], axis=1)
+    max_pairs = _PAIRS + _PAIRS_PER_STAR * len(stars)
+    seen = clear(where[eye[candidates]], positions[of[candidates]], ends, walls, where, max_pairs)
+    good[of[candidates[~seen]]] = False
     return good

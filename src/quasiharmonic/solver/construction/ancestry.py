@@ -11,22 +11,10 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def as_refined(V: FloatArray, F: IntArray, triangles: IntArray, shares: Sequence[dict[int, float]]) -> Refined:
-    """Return the relation of the vertices and triangles of a refined mesh to the original mesh.
+    """Return the relation of a refined mesh to the original mesh ``V``, ``F``.
 
-    Parameters
-    ----------
-    V : (n, d) float64
-        The original mesh's vertices.
-    F : (f, 3) int64
-        Its triangles.
-    triangles : (t, 3) int64
-        The new triangles, each within an original one, in any order.
-    shares : sequence of dict
-        For each added vertex, in order, the original vertices that it lies between and their weights.
-
-    Returns
-    -------
-    Refined
+    ``triangles`` (t, 3) are the new ones, each within an original one, in any order. For each added vertex, in order,
+    ``shares`` has the original vertices that it lies between and their weights.
     """
     n = len(V)
     support = [*({vertex} for vertex in range(n)), *(set(row) for row in shares)]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.problem import Problem
-from quasiharmonic.solver.construction.embedding import tutte
+from quasiharmonic.solver.construction.embedding import embed_tutte
 from quasiharmonic.solver.construction.halfedges import Edge
 from quasiharmonic.solver.construction.regions import Regions
 from quasiharmonic.solver.construction.sheet import Sheet
-from quasiharmonic.solver.construction.sides import along_sides
+from quasiharmonic.solver.construction.sides import edges_along_sides
 from quasiharmonic.solver.construction.walks import walk
 from quasiharmonic.util.arrays import ComplexArray
 from quasiharmonic.util.progress import heartbeat
@@ -29,7 +29,7 @@ class Cutting:
         has no handles.
     guide : (n,) complex128, optional
         A map that determines the path of cuts. Without it, the mesh is mapped into a circle as soon as it is a disk.
-    most : int, optional
+    max_added : int, optional
         Maximum number of added vertices.
 
     Raises
@@ -43,80 +43,80 @@ class Cutting:
         The mesh, cut, and split if needed.
     regions : Regions
         The target.
-    places : dict
+    positions : dict
         The position of every vertex on a cut.
     """
 
-    def __init__(self, problem: Problem, guide: ComplexArray | None = None, most: int | None = None) -> None:
-        self._most = most
+    def __init__(self, problem: Problem, guide: ComplexArray | None = None, max_added: int | None = None) -> None:
+        self._max_added = max_added
         domain = problem.domain
         point = np.full(problem.n, -1)
         point[problem.fixed] = np.arange(len(problem.fixed))
         self.regions = Regions(problem.target, [point[loop] for loop in domain.loops], point[domain.pins])
         self.sheet = Sheet(problem.F, problem.n, domain.pins.tolist())
-        self.places: dict[int, complex] = {}
+        self.positions: dict[int, complex] = {}
         self._target = (problem.target @ np.array([1, 1j])).tolist()
         # The copy at each corner of the target's triangles, keyed by the half-edge that begins there.
         fixed = problem.fixed.tolist()
-        self._at = {(a, b): fixed[a] for a, b in self.regions.apex}
+        self._copy_at = {(a, b): fixed[a] for a, b in self.regions.apex}
         self._closed = set[Edge]()
         bridges = self.regions.bridges()
         if guide is not None or bridges:
-            self._place = (_harmonic(problem) if guide is None else guide).tolist()
+            self._guide = (_tutte_embedding(problem) if guide is None else guide).tolist()
         for a, b in bridges:
             self._cut(a, b)
         if guide is None:
-            self._place = _on_circle(self.sheet)
+            self._guide = _circle_embedding(self.sheet)
         for a, b in self.regions.diagonals(bridges):
             self._cut(a, b)
-        for a, b in along_sides(self.sheet, self.regions, point.tolist()):
+        for a, b in edges_along_sides(self.sheet, self.regions, point.tolist()):
             self.sheet.split(a, b)
 
     def _cut(self, a: int, b: int) -> None:
         """Cut the target and the sheet between two points of the target."""
         heartbeat()
-        if self._most is not None and len(self.sheet.parents) > self._most:
+        if self._max_added is not None and len(self.sheet.parents) > self._max_added:
             raise TooManyError
         self._closed |= {(a, b), (b, a)}
-        start, end = self._at[a, b], self._at[b, a]
-        way = walk(self.sheet, self._place, start, end)
-        self._spread(way, self._target[a], self._target[b])
-        right = self.sheet.cut(way)
-        self._place += [self._place[copy] for copy in way[: len(self.sheet.vertex) - len(self._place)]]
+        start, end = self._copy_at[a, b], self._copy_at[b, a]
+        path = walk(self.sheet, self._guide, start, end)
+        self._place_along(path, self._target[a], self._target[b])
+        right = self.sheet.cut(path)
+        self._guide += [self._guide[copy] for copy in path[: len(self.sheet.vertex) - len(self._guide)]]
         # To the right of the cut, corners use the right copies: iterate clockwise around a and counterclockwise around
         # b.
         apex = self.regions.apex
         head = apex[b, a]
-        self._at[a, head] = right[0]
+        self._copy_at[a, head] = right[0]
         while (a, head) not in self._closed and (head, a) in apex:
             head = apex[head, a]
-            self._at[a, head] = right[0]
+            self._copy_at[a, head] = right[0]
         if right[-1] != end:
             head = a
-            self._at[b, head] = right[-1]
+            self._copy_at[b, head] = right[-1]
             while (b, (head := apex[b, head])) in apex and (b, head) not in self._closed:
-                self._at[b, head] = right[-1]
+                self._copy_at[b, head] = right[-1]
 
-    def _spread(self, way: list[int], start: complex, end: complex) -> None:
+    def _place_along(self, path: list[int], start: complex, end: complex) -> None:
         """Assign positions on the segment to the vertices of a walk: half by their current spacing, half evenly."""
-        steps = np.abs(np.diff([self._place[copy] for copy in way]))
+        steps = np.abs(np.diff([self._guide[copy] for copy in path]))
         steps = steps / (steps.sum() or 1.0) + 1 / len(steps)
         share = np.cumsum(steps)[:-1] / steps.sum()
-        for copy, t in zip(way[1:-1], share.tolist(), strict=True):
-            self.places[self.sheet.vertex[copy]] = (1 - t) * start + t * end
+        for copy, t in zip(path[1:-1], share.tolist(), strict=True):
+            self.positions[self.sheet.vertex[copy]] = (1 - t) * start + t * end
 
 
-def _harmonic(problem: Problem) -> ComplexArray:
+def _tutte_embedding(problem: Problem) -> ComplexArray:
     """Return Tutte's embedding of the problem, which may have inverted triangles."""
     w = np.zeros(problem.n, dtype=np.complex128)
     w[problem.fixed] = problem.target @ np.array([1, 1j])
-    return tutte(problem.F, w, problem.fixed)
+    return embed_tutte(problem.F, w, problem.fixed)
 
 
-def _on_circle(sheet: Sheet) -> list[complex]:
+def _circle_embedding(sheet: Sheet) -> list[complex]:
     """Return positions of the copies of a disk whose boundary is spread evenly along a circle."""
     (loop,) = sheet.loops()
     w = np.zeros(len(sheet.vertex), dtype=np.complex128)
     w[loop] = np.exp(2j * np.pi * np.arange(len(loop)) / len(loop))
-    placed: list[complex] = tutte(sheet.rows(), w, np.array(loop)).tolist()
-    return placed
+    positions: list[complex] = embed_tutte(sheet.rows(), w, np.array(loop)).tolist()
+    return positions

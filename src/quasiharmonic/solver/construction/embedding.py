@@ -16,83 +16,66 @@ from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import LocalRepair, RandomRestarts, Untangling
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# Number of weight updates; exponent of the areas in the weights; maximum ratio of weights in one update.
-_RENEWALS, _POWER, _SPAN = 4, 0.5, 1e6
+# Number of weight updates.
+_WEIGHT_UPDATES = 4
+# Exponent of the areas in the weights.
+_AREA_POWER = 0.5
+# Maximum ratio of weights in one update.
+_MAX_RATIO = 1e6
 # Methods that untangle the last triangles and may also move vertices on cuts. Each is limited, because double precision
 # may be insufficient.
-_REPAIRS = LocalRepair(tries=30), Untangling(iterations=200), RandomRestarts(in_vain=20, tries=20)
+_REPAIRS = LocalRepair(tries=30), Untangling(iterations=200), RandomRestarts(max_failures=20, tries=20)
 
 
-def tutte(F: IntArray, w: ComplexArray, held: IntArray, weights: FloatArray | float = 1.0) -> ComplexArray:
-    """Place every free vertex at the weighted mean of its neighbours.
+def embed_tutte(F: IntArray, w: ComplexArray, fixed: IntArray, weights: FloatArray | float = 1.0) -> ComplexArray:
+    """Place every free vertex of w (n,) at the weighted mean of its neighbours; only fixed positions are read.
 
-    Parameters
-    ----------
-    F : (f, 3) int64
-    w : (n,) complex128
-        Positions; only those of fixed vertices are read.
-    held : (k,) int64
-        Fixed vertices, at least one on every component of the mesh.
-    weights : (f,) float64
-        Positive; the weight of an edge is the sum over its triangles.
-
-    Returns
-    -------
-    (n,) complex128
+    ``fixed`` (k,) has at least one vertex on every component of the mesh. ``weights`` (f,) are positive; the weight of
+    an edge is the sum over its triangles.
 
     Raises
     ------
     quasiharmonic.linsolve.NotPositiveDefinite
         If the system is not positive definite after rounding.
     """
-    if len(np.unique(held)) == len(w):
+    if len(np.unique(fixed)) == len(w):
         return w
-    alike = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
-    stiffness = ReferenceMesh(np.zeros((len(w), 2)), F, "equilateral").edge_stiffness(alike * weights)
-    return Laplacian(F, len(w), held).factor(stiffness).extend(w)
+    identity = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
+    stiffness = ReferenceMesh(np.zeros((len(w), 2)), F, "equilateral").edge_stiffness(identity * weights)
+    return Laplacian(F, len(w), fixed).factor(stiffness).extend(w)
 
 
-def embedded(problem: Problem, w: ComplexArray, held: IntArray) -> ComplexArray:
+def embed_pieces(problem: Problem, w: ComplexArray, fixed: IntArray) -> ComplexArray:
     """Embed convex pieces into their polygons, and untangle triangles that rounding has inverted.
 
-    Parameters
-    ----------
-    problem : Problem
-    w : (n,) complex128
-        Positions of the fixed vertices in the problem's frame.
-    held : (k,) int64
-        Vertices on the boundaries of pieces.
-
-    Returns
-    -------
-    (n,) complex128
-        The map with the fewest inverted triangles found, counted at its final positions.
+    ``w`` (n,) has the positions of the vertices on the boundaries of pieces, ``fixed`` (k,), in the problem's frame.
+    Return the map with the fewest inverted triangles found, counted at its final positions.
     """
-    best, least = w, len(problem.F) + 1
-    for now in _candidates(problem, w, held):
-        inverted = inverted_triangles(problem.F, problem.positions(now)).size
-        if inverted < least:
-            best, least = now, inverted
-        if least == 0:
+    best, fewest = w, len(problem.F) + 1
+    for candidate in _candidates(problem, w, fixed):
+        inverted = inverted_triangles(problem.F, problem.positions(candidate)).size
+        if inverted < fewest:
+            best, fewest = candidate, inverted
+        if fewest == 0:
             break
     return best
 
 
-def _candidates(problem: Problem, w: ComplexArray, held: IntArray) -> Iterator[ComplexArray]:
+def _candidates(problem: Problem, w: ComplexArray, fixed: IntArray) -> Iterator[ComplexArray]:
     """Yield embeddings with different weights, then maps from untangling the best of them."""
-    weights, best, least = np.ones(len(problem.F)), w, np.inf
-    for _ in range(1 + _RENEWALS):
+    weights, best, fewest = np.ones(len(problem.F)), w, np.inf
+    for _ in range(1 + _WEIGHT_UPDATES):
         try:
-            w = tutte(problem.F, w, held, weights)
+            w = embed_tutte(problem.F, w, fixed, weights)
         except NotPositiveDefinite:
             break
         yield w
         inverted = inverted_triangles(problem.F, problem.positions(w)).size
-        if inverted < least:
-            best, least = w, inverted
+        if inverted < fewest:
+            best, fewest = w, inverted
         # Small triangles get smaller weights.
         areas = np.abs(signed_areas(problem.F, w))
-        weights = weights * np.clip(areas / areas.max(), 1 / _SPAN, 1.0) ** _POWER
+        weights = weights * np.clip(areas / areas.max(), 1 / _MAX_RATIO, 1.0) ** _AREA_POWER
     objective = Objective(problem)
     here = objective.of_map(best)
     for repair in _REPAIRS:

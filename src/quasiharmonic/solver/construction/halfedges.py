@@ -11,12 +11,7 @@ Triangle = tuple[int, int, int]
 
 
 class HalfEdges:
-    """An oriented surface with boundary.
-
-    Parameters
-    ----------
-    F : (f, 3) int64
-        Its triangles.
+    """An oriented surface with boundary, made from triangles ``F`` (f, 3).
 
     Attributes
     ----------
@@ -29,16 +24,16 @@ class HalfEdges:
     def __init__(self, F: IntArray) -> None:
         self.apex: dict[Edge, int] = {}
         # The head of one half-edge from each vertex.
-        self._some: dict[int, int] = {}
+        self._neighbour: dict[int, int] = {}
         self.add(F.tolist())
         self.following = {a: b for a, b in self.apex if (b, a) not in self.apex}
 
     def add(self, triangles: Iterable[Iterable[int]]) -> None:
         """Add counterclockwise triangles."""
-        apex, some = self.apex, self._some
+        apex, neighbour = self.apex, self._neighbour
         for a, b, c in triangles:
             apex[a, b], apex[b, c], apex[c, a] = c, a, b
-            some[a], some[b], some[c] = b, c, a
+            neighbour[a], neighbour[b], neighbour[c] = b, c, a
 
     def remove(self, triangles: Iterable[Triangle]) -> None:
         """Remove triangles; others must replace them."""
@@ -51,7 +46,7 @@ class HalfEdges:
 
     def link(self, vertex: int) -> Iterator[Edge]:
         """Yield the sides opposite to a vertex in its triangles, counterclockwise."""
-        first = tail = self.following.get(vertex, self._some[vertex])
+        first = tail = self.following.get(vertex, self._neighbour[vertex])
         while (head := self.apex.get((vertex, tail))) is not None:
             yield tail, head
             tail = head

@@ -13,31 +13,23 @@ from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.solver.construction.ancestry import as_refined, shares_of
 from quasiharmonic.solver.construction.thinning import Thinning
 from quasiharmonic.solver.methods.local_repair import Patch
-from quasiharmonic.solver.methods.untangling import GRADINGS, opened, untangled
+from quasiharmonic.solver.methods.untangling import GRADINGS, open_triangles, untangle
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
-# Maximum number of rounds of evening out and thinning. Then more expensive tries: maximum number of vertices, rings
-# around each that are untangled, and steps.
-_ROUNDS, _TRIES, _RINGS, _STEPS = 6, 30, 2, 20
+# Maximum number of rounds of evening out and thinning.
+_ROUNDS = 6
+# Maximum number of vertices that are then removed by untangling around them.
+_TRIES = 30
+# Rings around such a vertex that are untangled.
+_RINGS = 2
+# Maximum number of untangling steps.
+_STEPS = 20
 
 
-def thinned(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined, FloatArray]:
-    """Remove vertices from a refinement as long as its map stays bijective.
+def thin_refinement(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined, FloatArray]:
+    """Remove vertices from a refinement of the problem's mesh as long as its map ``uv`` (n + s, 2) stays bijective.
 
-    Parameters
-    ----------
-    problem : Problem
-        On the original mesh.
-    refined : Refined
-    uv : (n + s, 2) float64
-        A bijective map of it.
-
-    Returns
-    -------
-    refined : Refined
-        With as many vertices or fewer.
-    uv : (n + s, 2) float64
-        A bijective map of it; exactly the given one if no vertex was removed.
+    Return the new refinement and its map, which is exactly the given one if no vertex was removed.
     """
     # Scale to a magnitude of about one, so that no product overflows.
     exponent = int(np.frexp(np.abs(problem.target).max())[1])
@@ -48,30 +40,30 @@ def thinned(problem: Problem, refined: Refined, uv: FloatArray) -> tuple[Refined
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent))
     gradings = cycle(GRADINGS)
     for _ in range(_ROUNDS):
-        refined, uv = _taken_out(unit, refined, uv)
+        refined, uv = _remove_vertices(unit, refined, uv)
         if not len(refined.parents):
             break
-        uv = _opened(unit, refined, uv, next(gradings))
-    refined, uv = _taken_out(unit, refined, uv, _TRIES)
+        uv = _open_triangles(unit, refined, uv, next(gradings))
+    refined, uv = _remove_vertices(unit, refined, uv, _TRIES)
     uv = np.ldexp(uv, exponent)
     uv[problem.fixed] = problem.target
     return refined, uv
 
 
-def _opened(problem: Problem, refined: Refined, uv: FloatArray, grading: float) -> FloatArray:
+def _open_triangles(problem: Problem, refined: Refined, uv: FloatArray, grading: float) -> FloatArray:
     """Return the map with evened out triangles, or the given map if rounding would invert one."""
-    loose = problem.frame.outward(opened(refined.F, problem.frame.inward(uv), problem.fixed, grading=grading))
-    loose[problem.fixed] = problem.target
-    return loose if is_injective(refined.F, loose) else uv
+    evened = problem.frame.outward(open_triangles(refined.F, problem.frame.inward(uv), problem.fixed, grading=grading))
+    evened[problem.fixed] = problem.target
+    return evened if is_injective(refined.F, evened) else uv
 
 
-def _taken_out(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 0) -> tuple[Refined, FloatArray]:
+def _remove_vertices(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 0) -> tuple[Refined, FloatArray]:
     """Remove vertices by thinning, and by untangling around up to ``tries`` of the rest."""
     shares = shares_of(refined)
     thinning = Thinning(problem.F, problem.fixed, refined.F, shares, uv @ np.array([1, 1j]))
     thinning.thin()
     for vertex in sorted(thinning.left, reverse=True)[:tries]:
-        thinning.try_hard(vertex, partial(_untangled, problem.frame), _RINGS)
+        thinning.remove_by_untangling(vertex, partial(_untangle_patch, problem.frame), _RINGS)
     if len(thinning.left) == len(shares):
         return refined, uv
     left = sorted(thinning.left)
@@ -84,9 +76,9 @@ def _taken_out(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 
     return refined, thinning.w[kept].view(np.float64).reshape(-1, 2)
 
 
-def _untangled(frame: Frame, patch: Patch, w: ComplexArray) -> ComplexArray:
+def _untangle_patch(frame: Frame, patch: Patch, w: ComplexArray) -> ComplexArray:
     """Untangle a map of a patch, in units of the target; return the last map."""
     inward = frame.inward(w.view(np.float64).reshape(-1, 2))
-    steps = untangled(patch.F, inward, np.flatnonzero(patch.held), grading=GRADINGS[0])
+    steps = untangle(patch.F, inward, np.flatnonzero(patch.fixed), grading=GRADINGS[0])
     *_, last = inward, *islice(steps, _STEPS)
-    return np.where(patch.held, w, frame.outward(last).view(np.complex128).ravel())
+    return np.where(patch.fixed, w, frame.outward(last).view(np.complex128).ravel())

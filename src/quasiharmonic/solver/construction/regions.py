@@ -31,29 +31,29 @@ class Regions:
     Parameters
     ----------
     points : (k, 2) float64
-        Positions, pairwise distinct, of magnitude about one.
+        Positions, pairwise distinct, of magnitude about one. Every point is on a loop or a pin.
     loops : sequence of (l,) int64
         Loops of points, the region to their left; simple, disjoint and nested.
     pins : (p,) int64
-        Points strictly inside. Every point is on a loop or a pin.
+        Points strictly inside.
 
     Attributes
     ----------
     apex : dict
         The third corner of the triangle to the left of a half-edge of the triangulation.
-    kept : set of (int, int)
+    cuts : set of (int, int)
         The cuts as half-edges, in both directions.
     """
 
     def __init__(self, points: FloatArray, loops: Sequence[IntArray], pins: IntArray) -> None:
         self.points = points
         self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
-        self._off = _ROUNDINGS * float(np.spacing(np.abs(points).max()))
+        self._tolerance = _ROUNDINGS * float(np.spacing(np.abs(points).max()))
         rim = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
         self.apex: dict[Edge, int] = {}
         for a, b, c in _triangles_within(points, rim).tolist():
             self.apex[a, b], self.apex[b, c], self.apex[c, a] = c, a, b
-        self.kept = {(a, b) for a, b in self.apex if (b, a) in self.apex}
+        self.cuts = {(a, b) for a, b in self.apex if (b, a) in self.apex}
         self._join()
         self._loop = np.full(len(points), -1)
         for number, loop in enumerate([*loops, *pins[:, None]]):
@@ -66,7 +66,7 @@ class Regions:
         ux, uy, vx, vy = x[c] - x[a], y[c] - y[a], x[b] - x[a], y[b] - y[a]
         cross = vx * uy - vy * ux
         # Straight ahead, not back.
-        if abs(cross) <= self._off * np.hypot(ux, uy) and vx * (ux - vx) + vy * (uy - vy) > 0:
+        if abs(cross) <= self._tolerance * np.hypot(ux, uy) and vx * (ux - vx) + vy * (uy - vy) > 0:
             return 0
         return self.exact_turn(a, b, c)
 
@@ -81,7 +81,7 @@ class Regions:
     def bridges(self) -> list[Edge]:
         """Return cuts that connect all loops, each from the part connected to the first loop to another loop."""
         at: dict[int, list[tuple[float, int, int]]] = {}
-        for a, b in sorted(self.kept):
+        for a, b in sorted(self.cuts):
             if self._loop[a] != self._loop[b]:
                 at.setdefault(int(self._loop[a]), []).append((self.length(a, b), a, b))
         connected, found = {0}, list[Edge]()
@@ -101,14 +101,14 @@ class Regions:
     def diagonals(self, bridges: Sequence[Edge]) -> list[Edge]:
         """Return the other cuts, ordered so that each divides its remaining part into halves of similar size."""
         closed = set(bridges) | {(b, a) for a, b in bridges}
-        region = self._numbered()
+        region = self._number_regions()
         beside: dict[int, list[tuple[int, Edge]]] = {}
         weight = dict.fromkeys(region.values(), 0)
         for (a, b), number in region.items():
             weight[number] += 1
-            if (a, b) in self.kept and (a, b) not in closed:
+            if (a, b) in self.cuts and (a, b) not in closed:
                 beside.setdefault(number, []).append((region[b, a], (a, b)))
-        return _halving(weight, beside)
+        return _order_by_halves(weight, beside)
 
     def _join(self) -> None:
         """Join neighbouring triangles and regions if the result is convex, across the longest edges first."""
@@ -118,25 +118,25 @@ class Regions:
         for (a, b), c in self.apex.items():
             after.setdefault(a, {})[b] = c
             before.setdefault(a, {})[c] = b
-        inner = sorted((edge for edge in self.kept if edge[0] < edge[1]), key=lambda e: (-self.length(*e), e))
+        inner = sorted((edge for edge in self.cuts if edge[0] < edge[1]), key=lambda e: (-self.length(*e), e))
         for a, b in inner:
-            if self._may_go(a, before[a][b], after[a][b]) and self._may_go(b, before[b][a], after[b][a]):
-                self.kept -= {(a, b), (b, a)}
+            if self._is_removable(a, before[a][b], after[a][b]) and self._is_removable(b, before[b][a], after[b][a]):
+                self.cuts -= {(a, b), (b, a)}
                 for at, other in ((a, b), (b, a)):
                     low, high = before[at].pop(other), after[at].pop(other)
                     after[at][low], before[at][high] = high, low
 
-    def _may_go(self, at: int, low: int, high: int) -> bool:
+    def _is_removable(self, at: int, low: int, high: int) -> bool:
         """Whether the counterclockwise angle between two edges is at most straight."""
-        return low != high and self.turn(low, at, high) <= 0 and not self._folded(at, low, high)
+        return low != high and self.turn(low, at, high) <= 0 and not self._turns_back(at, low, high)
 
-    def _folded(self, at: int, low: int, high: int) -> bool:
+    def _turns_back(self, at: int, low: int, high: int) -> bool:
         x, y = self._x, self._y
         flat = orientation(self.points[low], self.points[at], self.points[high]) == 0
         along = (x[low] - x[at]) * (x[high] - x[at]) + (y[low] - y[at]) * (y[high] - y[at])
         return bool(flat) and along > 0
 
-    def _numbered(self) -> dict[Edge, int]:
+    def _number_regions(self) -> dict[Edge, int]:
         """Number of the region to the left of each half-edge."""
         region: dict[Edge, int] = {}
         for count, first in enumerate(sorted(self.apex)):
@@ -148,7 +148,7 @@ class Regions:
                 region[a, b] = count
                 c = self.apex[a, b]
                 waiting += [(b, c), (c, a)]
-                if (b, a) in self.apex and (a, b) not in self.kept:
+                if (b, a) in self.apex and (a, b) not in self.cuts:
                     waiting.append((b, a))
         return region
 
@@ -174,25 +174,20 @@ def _triangles_within(points: FloatArray, rim: IntArray) -> IntArray:
     return T[inside]
 
 
-def _halving(weight: dict[int, int], beside: dict[int, list[tuple[int, Edge]]]) -> list[Edge]:
+def _order_by_halves(weight: dict[int, int], beside: dict[int, list[tuple[int, Edge]]]) -> list[Edge]:
     """Return the edges of a tree, ordered so that each divides its remaining part into two of similar weight.
 
-    Parameters
-    ----------
-    weight : dict
-        Weight of every node.
-    beside : dict
-        Neighbours of a node, with the name of the edge as seen from it.
+    ``weight`` is that of every node; ``beside`` has the neighbours of a node and the name of the edge as seen from it.
     """
     found: list[Edge] = []
-    gone: set[Edge] = set()
+    cut: set[Edge] = set()
     trees = [next(iter(weight))] if weight else []
     while trees:
         root = trees.pop()
         order, up = [root], {root: (root, (-1, -1))}
         for node in order:
             for other, edge in beside.get(node, []):
-                if edge not in gone and other not in up:
+                if edge not in cut and other not in up:
                     up[other] = node, edge
                     order.append(other)
         if len(order) == 1:
@@ -202,7 +197,7 @@ def _halving(weight: dict[int, int], beside: dict[int, list[tuple[int, Edge]]]) 
             below[up[node][0]] += below[node]
         best = min(order[1:], key=lambda node: abs(2 * below[node] - below[root]))
         a, b = up[best][1]
-        gone |= {(a, b), (b, a)}
+        cut |= {(a, b), (b, a)}
         found.append((a, b))
         trees += [root, best]
     return found

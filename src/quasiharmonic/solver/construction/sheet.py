@@ -45,7 +45,7 @@ class Sheet(HalfEdges):
         self.parents: list[Edge] = []
         self.preceding = {b: a for a, b in self.following.items()}
 
-    def is_held(self, copy: int) -> bool:
+    def is_fixed(self, copy: int) -> bool:
         """Whether a copy is on the boundary or is a pin."""
         return copy in self.following or copy in self._pins
 
@@ -75,15 +75,8 @@ class Sheet(HalfEdges):
     def cut(self, walk: Sequence[int]) -> list[int]:
         """Cut along interior edges, from a copy on the boundary to another, or to a pin that is still uncut.
 
-        Parameters
-        ----------
-        walk : sequence of int
-            Copies, each once; all but the ends are interior.
-
-        Returns
-        -------
-        list of int
-            The copies to the right of the walk; the old copies stay to its left. A pin at the end is not duplicated.
+        All copies of the walk but its ends are interior; none occurs twice. Return the copies to the right of the walk;
+        the old copies stay to its left. A pin at the end is not duplicated.
         """
         doubled = walk if walk[-1] in self.following else walk[:-1]
         right = dict(zip(doubled, range(len(self.vertex), len(self.vertex) + len(doubled)), strict=True))
@@ -97,17 +90,17 @@ class Sheet(HalfEdges):
             while tail != end:
                 head = self.apex[copy, tail]
                 corners = (copy, tail, head)
-                least = corners.index(min(corners))
-                triangle = (corners[least], corners[least - 2], corners[least - 1])
+                smallest = corners.index(min(corners))
+                triangle = (corners[smallest], corners[smallest - 2], corners[smallest - 1])
                 renamed.setdefault(triangle, list(triangle))[triangle.index(copy)] = right[copy]
                 tail = head
         self.remove(renamed)
         self.add(renamed.values())
         back = [right.get(copy, copy) for copy in walk]
-        self._mend_boundary(walk, back)
+        self._update_boundary(walk, back)
         return back
 
-    def _mend_boundary(self, walk: Sequence[int], right: Sequence[int]) -> None:
+    def _update_boundary(self, walk: Sequence[int], right: Sequence[int]) -> None:
         """Update the boundary: from the start of a cut along its left side, and back along its right side."""
         after, before = self.following[walk[0]], self.preceding.get(walk[-1])
         pairs = [*pairwise(walk), *zip(right[:0:-1], right[-2::-1], strict=True)]

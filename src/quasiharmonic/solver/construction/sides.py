@@ -9,22 +9,11 @@ from quasiharmonic.solver.construction.regions import Regions
 from quasiharmonic.solver.construction.sheet import Sheet
 
 
-def along_sides(sheet: Sheet, regions: Regions, point: Sequence[int]) -> list[Edge]:
+def edges_along_sides(sheet: Sheet, regions: Regions, point: Sequence[int]) -> list[Edge]:
     """Return interior edges with both ends on one side of their piece, behind which triangles would be degenerate.
 
-    Parameters
-    ----------
-    sheet : Sheet
-        After all cuts.
-    regions : Regions
-        Its target.
-    point : sequence of int
-        The target's point of every vertex of the mesh, -1 for none.
-
-    Returns
-    -------
-    list of (int, int)
-        Pairs of copies. Sides that are straight only up to rounding are included.
+    ``sheet`` has all cuts. ``point`` is the target's point of every vertex of the mesh, -1 for none. The edges are
+    pairs of copies. Sides that are straight only up to rounding are included.
     """
     side: dict[int, set[int]] = {}
     count = 0

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.loops import judge_loops
+from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.problem import Problem
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def is_simple(problem: Problem) -> bool:
-    """Whether a surface can be mapped bijectively onto its target if its mesh is fine enough.
+    """Whether a surface can be mapped bijectively onto its target if its mesh is fine enough, determined exactly.
 
-    Parameters
-    ----------
-    problem : Problem
-
-    Returns
-    -------
-    bool
-        True if the surface has no handles and the target is simple, determined exactly. Its loops must be simple,
-        disjoint, nested as an outer one around all others, and wound as the mesh's. Pins must be distinct and strictly
-        inside.
+    True if the surface has no handles and the target is simple. Its loops must be simple, disjoint, nested as an outer
+    one around all others, and wound as the mesh's. Pins must be distinct and strictly inside.
     """
     domain = problem.domain
     edges = len(domain.edges.interior) + len(domain.edges.boundary)
@@ -32,7 +24,7 @@ def is_simple(problem: Problem) -> bool:
         return False
     uv = np.zeros((problem.n, 2))
     uv[problem.fixed] = problem.target
-    if judge_loops(domain.loops, uv)[1]:
+    if check_loops(domain.loops, uv)[1]:
         return False
     return all(_strictly_inside(uv[pin], uv, domain.edges.boundary) for pin in domain.pins.tolist())
 

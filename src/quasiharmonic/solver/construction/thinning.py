@@ -1,8 +1,8 @@
 """Remove added vertices from a map as long as it stays injective.
 
 The polygon left by a removed vertex is triangulated so that every triangle is positive in the map and lies within a
-triangle of the original mesh. If possible, dynamic programming finds the triangulation with the best worst shape [1]_.
-Otherwise the best triangulation at rest is used, and the map is untangled around it.
+triangle of the original mesh. If possible, dynamic programming finds the triangulation whose worst triangle is best
+[1]_. Otherwise the best triangulation at rest is used, and the map is untangled around it.
 
 References
 ----------
@@ -25,24 +25,22 @@ from quasiharmonic.util.progress import heartbeat
 # Rounding of a determinant relative to the sum of its terms' magnitudes, with a margin.
 _FLAT = 1e-15
 # Vertices with more neighbours are not removed.
-_MOST = 24
+_MAX_NEIGHBOURS = 24
 
 
 class Thinning:
-    """A refined mesh, its map, and the positions of its vertices in the original mesh.
+    """A refined mesh, its injective map, and the positions of its vertices in the original mesh.
 
     Parameters
     ----------
     F : (f, 3) int64
         The original mesh.
     fixed : (k,) int64
-        Fixed vertices.
     triangles : (t, 3) int64
         The refined mesh.
     shares : sequence of dict
         For each added vertex, the original vertices that it lies between, with their weights.
     w : (n + s,) complex128
-        An injective map.
 
     Attributes
     ----------
@@ -77,42 +75,33 @@ class Thinning:
             for vertex in sorted(waiting, reverse=True):
                 heartbeat()
                 waiting.discard(vertex)
-                cut = self._without(vertex, self._in_map)
+                cut = self._retriangulate(vertex, self._quality_in_map)
                 if cut is not None:
                     beside = {tail for tail, _ in self.mesh.link(vertex)}
-                    self._take_out(vertex, cut)
+                    self._replace_star(vertex, cut)
                     waiting |= beside & self.left
 
-    def try_hard(self, vertex: int, untangle: Callable[[Patch, ComplexArray], ComplexArray], rings: int) -> bool:
-        """Remove a vertex if the map can be untangled around its former position.
+    def remove_by_untangling(
+        self, vertex: int, untangle: Callable[[Patch, ComplexArray], ComplexArray], rings: int
+    ) -> bool:
+        """Remove one of the vertices ``left`` if the map around it can be untangled; return whether it was removed.
 
-        Parameters
-        ----------
-        vertex : int
-            One of ``left``.
-        untangle : callable
-            Function from a patch and its map to another map of it.
-        rings : int
-            Number of rings around it whose vertices may move.
-
-        Returns
-        -------
-        bool
-            Whether the vertex was removed; if not, nothing has changed.
+        ``untangle`` returns another map of a patch from a map of it; the patch has this many rings. If the vertex was
+        not removed, nothing has changed.
         """
         heartbeat()
-        cut = self._without(vertex, self._bent)
+        cut = self._retriangulate(vertex, self._quality_untangled)
         if cut is None:
             return False
         ring = [tail for tail, _ in self.mesh.link(vertex)]
         star = [(vertex, a, b) for a, b in self.mesh.link(vertex)]
-        self._take_out(vertex, cut)
+        self._replace_star(vertex, cut)
         before = self.w
         patch = self._patch(ring, rings)
         if patch is not None:
             self.w = before.copy()
             self.w[patch.vertices] = untangle(patch, before[patch.vertices])
-            if all(self._in_map(*corners) > 0 for corners in patch.vertices[patch.F].tolist()):
+            if all(self._quality_in_map(*corners) > 0 for corners in patch.vertices[patch.F].tolist()):
                 return True
         self.w = before
         self.mesh.remove(cut)
@@ -120,14 +109,14 @@ class Thinning:
         self.left.add(vertex)
         return False
 
-    def _take_out(self, vertex: int, cut: list[Triangle]) -> None:
+    def _replace_star(self, vertex: int, cut: list[Triangle]) -> None:
         """Replace the triangles around a vertex by others."""
         self.mesh.remove([(vertex, a, b) for a, b in self.mesh.link(vertex)])
         self.mesh.add(cut)
         self.left.remove(vertex)
 
-    def _without(self, vertex: int, worth: Callable[[int, int, int], float]) -> list[Triangle] | None:
-        """Triangulate the star of an added vertex without it; None if no triangulation has positive worth."""
+    def _retriangulate(self, vertex: int, measure: Callable[[int, int, int], float]) -> list[Triangle] | None:
+        """Triangulate the star of an added vertex without the vertex; None if no triangulation has positive quality."""
         ring = [tail for tail, _ in self.mesh.link(vertex)]
         polygons = [ring]
         edge = self._shares[vertex].keys()
@@ -137,30 +126,30 @@ class Thinning:
             polygons = [ring[i : j + 1], ring[j:] + ring[: i + 1]]
         found = []
         for polygon in polygons:
-            cut = best_triangles(polygon, worth) if len(polygon) <= _MOST else None
+            cut = triangulate_best(polygon, measure) if len(polygon) <= _MAX_NEIGHBOURS else None
             if cut is None:
                 return None
             found += cut
         return found
 
-    def _in_map(self, a: int, b: int, c: int) -> float:
-        """Return the worse of a triangle's shape in the map and in the original triangle that contains it."""
-        there = shape(*(complex(self.w[vertex]) for vertex in (a, b, c)))
-        return min(there, self._at_rest(a, b, c)) if there > 0 else there
+    def _quality_in_map(self, a: int, b: int, c: int) -> float:
+        """Return the worse of a triangle's qualities in the map and in the original triangle that contains it."""
+        there = quality(*(complex(self.w[vertex]) for vertex in (a, b, c)))
+        return min(there, self._quality_at_rest(a, b, c)) if there > 0 else there
 
-    def _bent(self, a: int, b: int, c: int) -> float:
-        """As `_in_map`, but positive for triangles that are inverted in the map, and lower than for any others."""
-        rest = self._at_rest(a, b, c)
-        there = shape(*(complex(self.w[vertex]) for vertex in (a, b, c)))
+    def _quality_untangled(self, a: int, b: int, c: int) -> float:
+        """Return a quality that is positive also for triangles that are inverted in the map, but lower for these."""
+        rest = self._quality_at_rest(a, b, c)
+        there = quality(*(complex(self.w[vertex]) for vertex in (a, b, c)))
         return 1.0 + there if rest > 0 else rest
 
-    def _at_rest(self, a: int, b: int, c: int) -> float:
-        """Return the shape of a triangle within its original triangle, drawn as half a square; 0 if there is none."""
+    def _quality_at_rest(self, a: int, b: int, c: int) -> float:
+        """Return the quality of a triangle in its original triangle, drawn as half a square; 0 if it spans several."""
         rows = [self._shares[vertex] for vertex in (a, b, c)]
         old = self._old.get(frozenset().union(*rows))
         if old is None:
             return 0.0
-        return shape(*(complex(row.get(old[1], 0.0), row.get(old[2], 0.0)) for row in rows))
+        return quality(*(complex(row.get(old[1], 0.0), row.get(old[2], 0.0)) for row in rows))
 
     def _patch(self, ring: list[int], rings: int) -> Patch | None:
         """Return the triangles within some rings of some vertices; None if no vertex of them is free."""
@@ -175,12 +164,12 @@ class Thinning:
         ]
         vertices, F = np.unique(np.array(rows), return_inverse=True)
         F = F.reshape(-1, 3).astype(np.int64)
-        held = np.isin(vertices, self._fixed)
-        held[boundary_edges(F, len(vertices))] = True
-        return None if held.all() else Patch(F, vertices, held)
+        fixed = np.isin(vertices, self._fixed)
+        fixed[boundary_edges(F, len(vertices))] = True
+        return None if fixed.all() else Patch(F, vertices, fixed)
 
 
-def shape(p: complex, q: complex, r: complex) -> float:
+def quality(p: complex, q: complex, r: complex) -> float:
     """Return twice a triangle's signed area over the sum of its squared sides, up to 0.58; the sign is exact."""
     left = (p.real - r.real) * (q.imag - r.imag)
     right = (p.imag - r.imag) * (q.real - r.real)
@@ -193,8 +182,8 @@ def shape(p: complex, q: complex, r: complex) -> float:
     return 1e-300 * ((difference > 0) - (difference < 0))
 
 
-def best_triangles(polygon: list[int], worth: Callable[[int, int, int], float]) -> list[Triangle] | None:
-    """Return the triangulation of a polygon with the best worst triangle; None if its worth is not positive."""
+def triangulate_best(polygon: list[int], measure: Callable[[int, int, int], float]) -> list[Triangle] | None:
+    """Return the triangulation of a polygon with the best worst triangle; None if its quality is not positive."""
     k = len(polygon)
     best = {(i, i + 1): (float("inf"), -1) for i in range(k - 1)}
     for span in range(2, k):
@@ -204,7 +193,7 @@ def best_triangles(polygon: list[int], worth: Callable[[int, int, int], float]) 
             for m in range(i + 1, j):
                 value = min(best[i, m][0], best[m, j][0])
                 if value > choice[0]:
-                    value = min(value, worth(polygon[i], polygon[m], polygon[j]))
+                    value = min(value, measure(polygon[i], polygon[m], polygon[j]))
                     if value > choice[0]:
                         choice = value, m
             best[i, j] = choice

@@ -17,26 +17,29 @@ from quasiharmonic.solver.construction.sheet import Sheet
 # A node of a walk: a copy, or an interior edge to be split.
 Node = int | Edge
 
-# Factor on length per distance from the segment, relative to its length. Then costs in lengths of the segment: a step,
-# a split of an edge that must be split at some point, and another split.
-_STRAY, _STEP, _SPLIT, _SPLIT_MORE = 8.0, 1e-3, 0.5, 1.0
+# Factor on length per distance from the segment, relative to its length.
+_DEVIATION_COST = 8.0
+# Costs in lengths of the segment: a step,
+_STEP_COST = 1e-3
+# a split of an edge that must be split at some point,
+_NEEDED_SPLIT_COST = 0.5
+# and another split.
+_OTHER_SPLIT_COST = 1.0
 # Minimum length of a segment in costs, to avoid overflow.
 _SHORTEST = 1e-60
 
 
-def walk(sheet: Sheet, place: list[complex], start: int, end: int) -> list[int]:
+def walk(sheet: Sheet, positions: list[complex], start: int, end: int) -> list[int]:
     """Find a walk near the segment between two vertices, and split the edges that it passes through.
 
     Parameters
     ----------
     sheet : Sheet
-    place : list of complex
+    positions : list of complex
         Position of each copy in a plane in which walks should be short and straight. Positions of added copies are
         appended.
-    start : int
-        A copy on the boundary.
-    end : int
-        Another one, or an interior copy at which no other walk ends.
+    start, end : int
+        A copy on the boundary; another one, or an interior copy at which no other walk ends.
 
     Returns
     -------
@@ -46,30 +49,30 @@ def walk(sheet: Sheet, place: list[complex], start: int, end: int) -> list[int]:
     copies: list[int] = []
     # If a walk uses three midpoints in one triangle, two are not joined after splitting, and another walk is needed. If
     # all directions cost the same, the second of the three is a detour.
-    for stray in (_STRAY, _STRAY, 0.0):
-        nodes = _shortest(sheet, place, start, end, stray)
-        copies = [node if isinstance(node, int) else _split(sheet, place, node) for node in nodes]
+    for weight in (_DEVIATION_COST, _DEVIATION_COST, 0.0):
+        nodes = _find_path(sheet, positions, start, end, weight)
+        copies = [node if isinstance(node, int) else _split(sheet, positions, node) for node in nodes]
         if all(sheet.is_inner(a, b) for a, b in pairwise(copies)):
             break
     return copies
 
 
-def _split(sheet: Sheet, place: list[complex], edge: Edge) -> int:
-    place.append((place[edge[0]] + place[edge[1]]) / 2)
+def _split(sheet: Sheet, positions: list[complex], edge: Edge) -> int:
+    positions.append((positions[edge[0]] + positions[edge[1]]) / 2)
     return sheet.split(*edge)
 
 
-def _shortest(sheet: Sheet, place: list[complex], start: int, end: int, weight: float) -> list[Node]:
-    """Return the cheapest path of nodes between two copies (Dijkstra)."""
-    chord = place[end] - place[start]
+def _find_path(sheet: Sheet, positions: list[complex], start: int, end: int, weight: float) -> list[Node]:
+    """Return the path of lowest cost between two copies of vertices (see `Sheet`), found by Dijkstra's algorithm."""
+    chord = positions[end] - positions[start]
     axis = chord / (abs(chord) or 1.0)
     size = max(abs(chord), _SHORTEST)
 
     def where(node: Node) -> complex:
-        at = place[node] if isinstance(node, int) else (place[node[0]] + place[node[1]]) / 2
-        return (at - place[start]) * axis.conjugate() / size
+        at = positions[node] if isinstance(node, int) else (positions[node[0]] + positions[node[1]]) / 2
+        return (at - positions[start]) * axis.conjugate() / size
 
-    def stray(z: complex) -> float:
+    def deviation(z: complex) -> float:
         beyond = max(0.0, -z.real, z.real - 1.0)
         return (z.imag * z.imag + beyond * beyond) ** 0.5
 
@@ -89,9 +92,11 @@ def _shortest(sheet: Sheet, place: list[complex], start: int, end: int, weight: 
             if other in done:
                 continue
             there = where(other)
-            further = abs(there - here) * (1 + weight * (stray(here) + stray(there))) + _STEP
+            further = abs(there - here) * (1 + weight * (deviation(here) + deviation(there))) + _STEP_COST
             if not isinstance(other, int):
-                further += _SPLIT if sheet.is_held(other[0]) and sheet.is_held(other[1]) else _SPLIT_MORE
+                further += (
+                    _NEEDED_SPLIT_COST if sheet.is_fixed(other[0]) and sheet.is_fixed(other[1]) else _OTHER_SPLIT_COST
+                )
             if so_far + further < cost.get(other, float("inf")):
                 cost[other], last[other] = so_far + further, node
                 count += 1
@@ -107,22 +112,22 @@ def _neighbours(sheet: Sheet, node: Node, start: int, end: int) -> Iterator[Node
     if isinstance(node, tuple):
         for a, b in (node, node[::-1]):
             c = sheet.apex[a, b]
-            if c == end or not sheet.is_held(c):
+            if c == end or not sheet.is_fixed(c):
                 yield c
-            yield from _middles(sheet, (b, c), (c, a))
+            yield from _inner_edges(sheet, (b, c), (c, a))
         if end in node:
             yield end
         return
     for a, b in sheet.link(node):
         for copy in (a, b):
-            if not sheet.is_held(copy) or (copy == end and sheet.is_inner(node, copy)):
+            if not sheet.is_fixed(copy) or (copy == end and sheet.is_inner(node, copy)):
                 yield copy
-        yield from _middles(sheet, (a, b))
+        yield from _inner_edges(sheet, (a, b))
         if node == start:
-            yield from _middles(sheet, (node, a), (node, b))
+            yield from _inner_edges(sheet, (node, a), (node, b))
 
 
-def _middles(sheet: Sheet, *sides: Edge) -> Iterator[Edge]:
+def _inner_edges(sheet: Sheet, *sides: Edge) -> Iterator[Edge]:
     """Yield the interior ones of some edges, the smaller end first."""
     for a, b in sides:
         if sheet.is_inner(a, b):

@@ -42,13 +42,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
 
 
 class Functional(ABC):
-    """A functional V of the tensor field, for one problem.
-
-    Parameters
-    ----------
-    problem : Problem
-    mesh : ReferenceMesh
-    """
+    """A functional V of the tensor field, for one problem and its `ReferenceMesh`."""
 
     name: str
     #: Whether the value is non-negative, and zero only for injective maps with pins and loops at their target
@@ -61,31 +55,14 @@ class Functional(ABC):
 
     @abstractmethod
     def value(self, at: QuasiHarmonicMap) -> float:
-        """Return V at a tensor field and its map.
+        """Return V at a tensor field and its map, in units of area of the problem's frame.
 
-        Parameters
-        ----------
-        at : QuasiHarmonicMap
-
-        Returns
-        -------
-        float
-            In units of area of the problem's frame; the unit of V₁ depends on the mesh.
+        The unit of V₁ depends on the mesh.
         """
 
     @abstractmethod
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
-        """Return the gradient of V in ξ; the map depends on ξ through its tensors.
-
-        Parameters
-        ----------
-        at : QuasiHarmonicMap
-
-        Returns
-        -------
-        (f,) complex128
-            ``∂V/∂Re ξ + i ∂V/∂Im ξ``.
-        """
+        """Return the gradient of V in ξ, ``∂V/∂Re ξ + i ∂V/∂Im ξ``; the map depends on ξ through its tensors."""
 
 
 class QuasiHarmonicMap(Protocol):
@@ -167,20 +144,20 @@ class Poisson(Functional):
 
     def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
         super().__init__(problem, mesh)
-        self._one_held: Laplacian | None = None
-        self._known: tuple[TensorField, ComplexArray] | None = None
+        self._one_fixed: Laplacian | None = None
+        self._cached: tuple[TensorField, ComplexArray] | None = None
 
     def response(self, at: QuasiHarmonicMap) -> ComplexArray:
         """Return ``L† g`` up to a constant, the map with the target's Neumann data; (n,) complex128."""
         # Return a local variable, because another thread may overwrite the cache at any time.
-        known = self._known
-        if known is None or known[0] is not at.field:
-            if self._one_held is None:
-                first, solver = self.problem.fixed[:1], at.operator.pattern.solver.name
-                self._one_held = Laplacian(self.problem.F, self.problem.n, first, solver)
-            held = self._one_held.factor(self.mesh.edge_stiffness(at.field.entries()))
-            known = self._known = at.field, held.respond(neumann_target(self.problem, at.w))
-        return known[1]
+        cached = self._cached
+        if cached is None or cached[0] is not at.field:
+            if self._one_fixed is None:
+                first, solver = self.problem.fixed[:1], at.operator.laplacian.solver.name
+                self._one_fixed = Laplacian(self.problem.F, self.problem.n, first, solver)
+            factored = self._one_fixed.factor(self.mesh.edge_stiffness(at.field.entries()))
+            cached = self._cached = at.field, factored.respond(neumann_target(self.problem, at.w))
+        return cached[1]
 
     def value(self, at: QuasiHarmonicMap) -> float:
         return 0.5 * work(neumann_target(self.problem, at.w), self.response(at) - at.w)
@@ -211,38 +188,38 @@ class EdgePoisson(Functional):
         #: Edge opposite to each corner, (f, 3).
         self._edges = number.reshape(-1, 3)
         self._tail, self._head = problem.domain.edges.boundary.T
-        self._rim = np.searchsorted(keys, edge_keys(self._tail, self._head, n))
+        self._boundary_edges = np.searchsorted(keys, edge_keys(self._tail, self._head, n))
         # The same triangles with separate corners.
-        self._apart = copy(mesh)
-        self._apart.F = np.arange(F.size).reshape(-1, 3)
-        self._apart.n = F.size
-        self._one_held: Laplacian | None = None
-        self._known: tuple[TensorField, ComplexArray] | None = None
+        self._separate_mesh = copy(mesh)
+        self._separate_mesh.F = np.arange(F.size).reshape(-1, 3)
+        self._separate_mesh.n = F.size
+        self._one_fixed: Laplacian | None = None
+        self._cached: tuple[TensorField, ComplexArray] | None = None
 
     def response(self, at: QuasiHarmonicMap) -> ComplexArray:
         """Return ``L† g`` at the midpoints of edges, up to a constant; (e,) complex128, edges sorted by their ends."""
         # See `Poisson.response`.
-        known = self._known
-        if known is None or known[0] is not at.field:
+        cached = self._cached
+        if cached is None or cached[0] is not at.field:
             size = int(self._edges.max()) + 1
-            if self._one_held is None:
-                solver = at.operator.pattern.solver.name
-                self._one_held = Laplacian(self._edges, size, self._rim[:1], solver)
+            if self._one_fixed is None:
+                solver = at.operator.laplacian.solver.name
+                self._one_fixed = Laplacian(self._edges, size, self._boundary_edges[:1], solver)
             # The basis function of an edge has −2 times the gradient of the opposite corner's hat function.
-            held = self._one_held.factor(4 * self.mesh.edge_stiffness(at.field.entries()))
+            factored = self._one_fixed.factor(4 * self.mesh.edge_stiffness(at.field.entries()))
             load = np.zeros(size, dtype=np.complex128)
-            load[self._rim] = self._neumann_target(at.w)
-            known = self._known = at.field, held.respond(load)
-        return known[1]
+            load[self._boundary_edges] = self._neumann_target(at.w)
+            cached = self._cached = at.field, factored.respond(load)
+        return cached[1]
 
     def value(self, at: QuasiHarmonicMap) -> float:
         middle = 0.5 * (at.w[self._tail] + at.w[self._head])
-        return 0.5 * work(self._neumann_target(at.w), self.response(at)[self._rim] - middle)
+        return 0.5 * work(self._neumann_target(at.w), self.response(at)[self._boundary_edges] - middle)
 
     def gradient(self, at: QuasiHarmonicMap) -> ComplexArray:
         middles = self.response(at)[self._edges]
         corners = middles.sum(axis=1, keepdims=True) - 2 * middles
-        d = self._apart.derivatives(corners.ravel())
+        d = self._separate_mesh.derivatives(corners.ravel())
         return -0.5 * at.field.pull(at.field.pull_twist(*twist(self.mesh, d, d)))
 
     def _neumann_target(self, w: ComplexArray) -> ComplexArray:
@@ -271,39 +248,17 @@ FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev
 
 
 def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
-    """Return V₃ of any map, its A-Dirichlet energy minus its signed area (eq. 27).
+    """Return V₃ of any map: its A-Dirichlet energy minus its signed area, in the target's units of area (eq. 27).
 
-    Parameters
-    ----------
-    mesh : ReferenceMesh
-    field : TensorField
-    dw : Derivatives
-        Derivatives of the map; see `ReferenceMesh.derivatives`.
-
-    Returns
-    -------
-    float
-        ``Σ 2m |q − μp|² / (1 − |μ|²)``, in the target's units of area; non-negative.
+    It is ``Σ 2m |q − μp|² / (1 − |μ|²)``, which is non-negative. ``dw`` are the derivatives of the map.
     """
     return beltrami_gradient(mesh, field, dw)[0]
 
 
 def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> tuple[float, ComplexArray]:
-    """Return V₃ of any map and its partial gradient in μ for the fixed map.
+    """Return V₃ of any map and its partial gradient in μ for the fixed map, ``−4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²``.
 
-    At the quasi-harmonic map of the tensors this is the total gradient.
-
-    Parameters
-    ----------
-    mesh, field, dw
-        See `beltrami_energy`.
-
-    Returns
-    -------
-    energy : float
-        ``Σ 2m |q − μp|² / (1 − |μ|²)``, the map's A-Dirichlet energy minus its signed area.
-    gradient : (f,) complex128
-        ``−4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²``.
+    At the quasi-harmonic map of the tensors this is the total gradient. See `beltrami_energy`.
     """
     density, gradient = beltrami_terms(mesh.m, field, dw.p, dw.q)
     return 2.0 * float(density.sum()), gradient
@@ -346,16 +301,7 @@ def twist(mesh: ReferenceMesh, dx: Derivatives, dy: Derivatives) -> tuple[FloatA
 def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
     """Return the target's Neumann data ``R (g_u + i g_v)`` with ``g_u = C b_v``, ``g_v = −C b_u`` (Theorem 6.4).
 
-    Parameters
-    ----------
-    problem : Problem
-    w : (n,) complex128
-        A map; only its boundary values are used.
-
-    Returns
-    -------
-    (n,) complex128
-        Zero except at the boundary.
+    Only the boundary values of the map w (n,) are used. The data (n,) are zero except at the boundary.
     """
     g = np.zeros(problem.n, dtype=np.complex128)
     for loop in problem.domain.loops:
@@ -365,20 +311,9 @@ def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
 
 
 def neumann_residual(problem: Problem, operator: FactoredLaplacian, w: ComplexArray) -> ComplexArray:
-    """Return the Neumann residual of a map, ``L w − R g`` (eq. 24).
+    """Return the Neumann residual ``L w − R g`` (n,) of a quasi-harmonic map w (eq. 24).
 
-    Parameters
-    ----------
-    problem : Problem
-    operator : FactoredLaplacian
-        The Laplacian of the tensors.
-    w : (n,) complex128
-        Their quasi-harmonic map.
-
-    Returns
-    -------
-    (n,) complex128
-        Zero except at the fixed vertices.
+    It is zero except at fixed vertices.
     """
     # A boundary vertex is fixed, so both terms are zero at free vertices.
     return operator.flux(w) - neumann_target(problem, w)

@@ -9,14 +9,14 @@ from weakref import ref
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.reference import Derivatives, Reference
+from quasiharmonic.geometry.mesh.reference import Derivatives, Reference, ReferenceMesh
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.linsolve.laplacian import FactoredLaplacian
+from quasiharmonic.linsolve.laplacian import FactoredLaplacian, Laplacian
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.functionals import FUNCTIONALS, Functional
 from quasiharmonic.solver.field.passes import clip_moduli, stiffness_of, sweep
 from quasiharmonic.solver.field.tensor import PARAMETERISATIONS, TANH, TensorField, own_tensor
-from quasiharmonic.util.arrays import ComplexArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 
 class Objective:
@@ -36,8 +36,8 @@ class Objective:
 
     Attributes
     ----------
-    problem, mesh, laplacian, parameterisation, functional
-        The components of the objective; constant.
+    problem, reference, mesh, laplacian, parameterisation, functional
+        Constant. The mesh, the Laplacian and the functional are made on first use.
     """
 
     def __init__(
@@ -49,10 +49,24 @@ class Objective:
         linear_solver: str = "auto",
     ) -> None:
         self.problem = problem
-        self.mesh = problem.domain.mesh(problem.reference or reference)
+        self.reference = problem.reference or reference
         self.parameterisation = PARAMETERISATIONS[parameterisation]
-        self.laplacian = problem.domain.laplacian(linear_solver)
-        self.functional: Functional = FUNCTIONALS[functional](problem, self.mesh)
+        self._functional, self._linear_solver = functional, linear_solver
+
+    @cached_property
+    def mesh(self) -> ReferenceMesh:
+        """The mesh with its reference triangles."""
+        return self.problem.domain.mesh(self.reference)
+
+    @cached_property
+    def laplacian(self) -> Laplacian:
+        """The Laplacian, analysed."""
+        return self.problem.domain.laplacian(self._linear_solver)
+
+    @cached_property
+    def functional(self) -> Functional:
+        """The functional of this problem."""
+        return FUNCTIONALS[self._functional](self.problem, self.mesh)
 
     def descending(self, functional: Functional) -> Objective:
         """Return a copy with another functional, which must belong to this problem and mesh."""
@@ -61,15 +75,7 @@ class Objective:
         return other
 
     def evaluate(self, xi: ComplexArray) -> Iterate:
-        """Compute the map of ``xi``.
-
-        Parameters
-        ----------
-        xi : (f,) complex128
-
-        Returns
-        -------
-        Iterate
+        """Compute the map of ``xi`` (f,) complex128.
 
         Raises
         ------
@@ -78,7 +84,7 @@ class Objective:
         """
         field = self.parameterisation.field(xi)
         operator = self.operator(field)
-        w = operator.extend(self.problem.held)
+        w = operator.extend(self.problem.fixed_positions)
         if not np.isfinite(w.view(np.float64)).all():
             raise NotPositiveDefinite("the solution is not finite")
         return Iterate(self, field, w, operator)
@@ -131,24 +137,23 @@ class Objective:
 
 
 class Iterate:
-    """A map, its tensors, and the objective's value and gradient there.
+    """A map w (n,) in the problem's frame, its tensors, and the objective's value and gradient there.
 
-    Parameters
-    ----------
-    objective : Objective
-    field : TensorField
-    w : (n,) complex128
-        The quasi-harmonic map in the problem's frame.
-    operator : FactoredLaplacian, optional
-        The factored Laplacian of ``field``; factored on demand if not given.
+    The factored Laplacian of ``field`` and the sums over the triangles are computed on demand if they are not given.
     """
 
     def __init__(
-        self, objective: Objective, field: TensorField, w: ComplexArray, operator: FactoredLaplacian | None = None
+        self,
+        objective: Objective,
+        field: TensorField,
+        w: ComplexArray,
+        operator: FactoredLaplacian | None = None,
+        sums: Sums | None = None,
     ) -> None:
         self.objective = objective
         self.field = field
         self.w = w
+        self._given_sums = sums
         # A weak reference: the pattern keeps the last operator. Most iterates do not need theirs again, and it is
         # large.
         self._operator = None if operator is None else ref(operator)
@@ -173,32 +178,35 @@ class Iterate:
         return self.objective.mesh.derivatives(self.w)
 
     @cached_property
-    def _sweep(self) -> _Sweep:
-        """All quantities that the descent of V₃ needs, computed in one pass over the triangles."""
-        everything = np.array([0, self.xi.size])
-        sums, gradient = sweep(self.objective.mesh, self.field.parameterisation, self.xi, self.w, everything)
-        inverted, energy, area, covered = sums[0].tolist()
-        return _Sweep(int(inverted), energy, area if area > 0 else covered, gradient)
+    def _sweep(self) -> tuple[Sums, ComplexArray]:
+        """The sums and the gradient of V₃, computed in one pass over the triangles."""
+        one_mesh = np.array([0, self.xi.size])
+        sums, gradient = sweep(self.objective.mesh, self.field.parameterisation, self.xi, self.w, one_mesh)
+        return sums_of(sums)[0], gradient
+
+    @property
+    def _sums(self) -> Sums:
+        return self._given_sums or self._sweep[0]
 
     @property
     def inverted(self) -> int:
         """Number of triangles whose image does not have positive area, in floating point."""
-        return self._sweep.inverted
+        return self._sums.inverted
 
     @property
     def dirichlet(self) -> float:
         """V₃, independent of the objective's functional."""
-        return self._sweep.dirichlet
+        return self._sums.dirichlet
 
     @property
     def dirichlet_gradient(self) -> ComplexArray:
         """The gradient of V₃ in ξ; (f,) complex128."""
-        return self._sweep.gradient
+        return self._sweep[1]
 
     @cached_property
     def energy(self) -> float:
         """V₃ divided by the map's signed area, or by the sum of unsigned areas if that is not positive."""
-        area = self._sweep.area
+        area = self._sums.area
         return self.dirichlet / area if area > 0 else np.inf
 
     @cached_property
@@ -212,8 +220,26 @@ class Iterate:
         return self.objective.functional.gradient(self)
 
 
-class _Sweep(NamedTuple):
+class Sums(NamedTuple):
+    """Sums over the triangles of a map.
+
+    Attributes
+    ----------
+    inverted : int
+        Number of triangles whose image does not have positive area, in floating point.
+    dirichlet : float
+        V₃.
+    area : float
+        The map's signed area, or the sum of unsigned areas if that is not positive.
+    """
+
     inverted: int
     dirichlet: float
     area: float
-    gradient: ComplexArray
+
+
+def sums_of(rows: FloatArray) -> list[Sums]:
+    """Convert the sums (k, 4) of `sweep`."""
+    return [
+        Sums(int(inverted), energy, area if area > 0 else covered) for inverted, energy, area, covered in rows.tolist()
+    ]

@@ -19,18 +19,7 @@ from quasiharmonic.util.kernels import compiled
 
 
 def stiffness_of(mesh: ReferenceMesh, parameterisation: Parameterisation, xi: ComplexArray) -> FloatArray:
-    """Compute the edge stiffness of the tensors of ξ; see `ReferenceMesh.edge_stiffness`.
-
-    Parameters
-    ----------
-    mesh : ReferenceMesh
-    parameterisation : Parameterisation
-    xi : (f,) complex128
-
-    Returns
-    -------
-    (3, f) float64
-    """
+    """Compute the edge stiffness (3, f) of the tensors of ξ; see `ReferenceMesh.edge_stiffness`."""
     stiffness = np.empty((3, xi.size))
     fill_stiffness(xi, parameterisation.number, mesh.stiffness_by_entry, stiffness)
     return stiffness
@@ -43,11 +32,8 @@ def sweep(
 
     Parameters
     ----------
-    mesh : ReferenceMesh
-    parameterisation : Parameterisation
-    xi : (f,) complex128
-    w : (n,) complex128
-        Their quasi-harmonic map.
+    mesh, parameterisation, xi, w
+        ``w`` (n,) is the quasi-harmonic map of ``xi`` (f,).
     starts : (k + 1,) int64
         Index of the first triangle of each mesh, and the total number of triangles. Every mesh has triangles.
 
@@ -67,14 +53,7 @@ def sweep(
 
 
 def own_sweep(mesh: ReferenceMesh, w: ComplexArray, starts: IntArray) -> tuple[FloatArray, ComplexArray]:
-    """Compute V₃ of one or several maps at their own tensors, clipped to the range of tanh.
-
-    Parameters
-    ----------
-    mesh : ReferenceMesh
-    w : (n,) complex128
-    starts : (k + 1,) int64
-        See `sweep`.
+    """Compute V₃ of one or several maps at their own tensors, clipped to the range of tanh; see `sweep`.
 
     Returns
     -------

@@ -30,48 +30,17 @@ class Conformal:
         self.share = share
 
     def value(self, field: TensorField) -> float:
-        """Return R₁ of a tensor field.
-
-        Parameters
-        ----------
-        field : TensorField
-
-        Returns
-        -------
-        float
-            The mean over the rest area, dimensionless.
-        """
+        """Return R₁ of a tensor field, the mean over the rest area; dimensionless."""
         square = field.mu.real**2 + field.mu.imag**2
         return 4.0 * float(np.sum(self.share * square / field.defect))
 
     def of_map(self, dw: Derivatives) -> float:
-        """Return R₁ at a map's own tensors, where V₃ vanishes: the MIPS energy of the map.
-
-        Parameters
-        ----------
-        dw : Derivatives
-            Derivatives of the map.
-
-        Returns
-        -------
-        float
-            ``inf`` if a triangle is inverted.
-        """
+        """Return R₁ at a map's own tensors, where V₃ vanishes: its MIPS energy, ``inf`` if a triangle is inverted."""
         p, q = np.abs(dw.p), np.abs(dw.q)
         if not np.all(q < p):
             return np.inf
         return 4.0 * float(np.sum(self.share * q * q / ((p - q) * (p + q))))
 
     def gradient(self, field: TensorField) -> ComplexArray:
-        """Return the gradient of R₁ in ξ.
-
-        Parameters
-        ----------
-        field : TensorField
-
-        Returns
-        -------
-        (f,) complex128
-            ``∂R₁/∂Re ξ + i ∂R₁/∂Im ξ``.
-        """
+        """Return the gradient of R₁ in ξ (f,), ``∂R₁/∂Re ξ + i ∂R₁/∂Im ξ``."""
         return field.pull(8.0 * (self.share / field.defect**2) * field.mu)

@@ -15,10 +15,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, named
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, names_of
 
 # Replaces a divisor of zero whose dividend is zero too, to avoid NaN.
 _TINY = 1e-300
+# Largest |ξ| of the parameterisation tanh; above it the rounded tensor is not positive definite.
+TANH_BOUND = 8.8
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Parameterisation:
         ``ρ ↦ (r/ρ, 1 − r², r')`` elementwise, with limits at ρ = 0.
     inverse : callable
         ``r ↦ ρ`` elementwise.
-    bend : callable
+    second_derivative : callable
         ``ρ ↦ r''`` elementwise.
     """
 
@@ -46,33 +48,14 @@ class Parameterisation:
     bound: float
     radial: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
     inverse: Callable[[FloatArray], FloatArray]
-    bend: Callable[[FloatArray], FloatArray]
+    second_derivative: Callable[[FloatArray], FloatArray]
 
     def field(self, xi: ComplexArray) -> TensorField:
-        """Return the tensor field of ξ.
-
-        Parameters
-        ----------
-        xi : (f,) complex128
-
-        Returns
-        -------
-        TensorField
-        """
+        """Return the tensor field of ξ (f,) complex128."""
         return TensorField(xi, self)
 
     def invert(self, mu: ComplexArray) -> ComplexArray:
-        """Return the ξ of Beltrami coefficients.
-
-        Parameters
-        ----------
-        mu : (f,) complex128
-
-        Returns
-        -------
-        (f,) complex128
-            Clipped where ``|μ| ≥ 1`` or ξ would exceed the bound.
-        """
+        """Return the ξ of Beltrami coefficients (f,) complex128, clipped where ``|μ| ≥ 1`` or ξ exceeds the bound."""
         modulus = np.sqrt(mu.real**2 + mu.imag**2)
         safe = np.where(modulus > 0, modulus, 1.0)
         rho = self.inverse(np.minimum(modulus, np.nextafter(1.0, 0.0)))
@@ -127,13 +110,7 @@ class TensorField:
         return self.ratio * self.xi
 
     def entries(self) -> FloatArray:
-        """Return the tensors (eq. 33), without the area factor.
-
-        Returns
-        -------
-        (3, f) float64
-            Rows a11, a12, a22.
-        """
+        """Return the tensors (eq. 33) without the area factor: rows a11, a12, a22 of (3, f) float64."""
         a = np.empty((3, self.mu.size))
         double = 2.0 / self.defect
         real = double * self.mu.real
@@ -146,39 +123,19 @@ class TensorField:
     def pull_twist(self, by_c: FloatArray, by_w: ComplexArray) -> ComplexArray:
         """Return the gradient in μ from the derivatives by c and w: apply the transpose of d(c, w)/dμ.
 
-        Parameters
-        ----------
-        by_c : (f,) float64
-        by_w : (f,) complex128
-            ``∂/∂Re w + i ∂/∂Im w``.
-
-        Returns
-        -------
-        (f,) complex128
-            ``∂/∂Re μ + i ∂/∂Im μ``.
+        All are (f,); gradients in complex numbers are ``∂/∂Re + i ∂/∂Im``.
         """
         # c = 2/D − 1 and w = 2μ/D with D = 1 − |μ|², so dD = −2 Re(μ̄ dμ).
         double = 2.0 / self.defect
         inner = by_c + (np.conj(self.mu) * by_w).real
         return double * (by_w + double * inner * self.mu)
 
-    def pull(self, grad: ComplexArray) -> ComplexArray:
-        """Return the gradient in ξ from the gradient in μ: apply the transpose of dμ/dξ, which is symmetric.
-
-        Parameters
-        ----------
-        grad : (f,) complex128
-            ``∂/∂Re μ + i ∂/∂Im μ``.
-
-        Returns
-        -------
-        (f,) complex128
-            ``∂/∂Re ξ + i ∂/∂Im ξ``.
-        """
+    def pull(self, gradient: ComplexArray) -> ComplexArray:
+        """Return the gradient in ξ from the gradient in μ: apply the transpose of dμ/dξ, which is symmetric."""
         # If ρ² is zero, only the division needs protection: the dividend is zero too.
         radial = (self.slope - self.ratio) / np.maximum(self._square, _TINY)
-        radial *= (self.xi.conj() * grad).real
-        out: ComplexArray = self.ratio * grad
+        radial *= (self.xi.conj() * gradient).real
+        out: ComplexArray = self.ratio * gradient
         out += radial * self.xi
         return out
 
@@ -196,32 +153,23 @@ def beltrami_coefficients(mu: ArrayLike | None, f: int) -> ComplexArray:
         raise ValueError(f"mu must contain {f} numbers, one for each triangle, not an array of {coefficients.shape}")
     bad = np.flatnonzero(~(np.abs(coefficients) < 1))
     if bad.size:
-        raise ValueError(f"mu is not below 1 in modulus at {named('triangle', 'triangles', bad)}")
+        raise ValueError(f"mu is not below 1 in modulus at {names_of('triangle', 'triangles', bad)}")
     return coefficients.astype(np.complex128)
 
 
 def own_tensor(p: ComplexArray, q: ComplexArray) -> ComplexArray:
-    """Return the μ that minimises V₃ for a fixed map (eq. 39).
+    """Return the μ (f,) that minimises V₃ for a fixed map with the derivatives p, q (f,) (eq. 39).
 
     The energy ``2m |q − μp|² / (1 − |μ|²)`` of a triangle is least at its own Beltrami coefficient ``μ = q/p`` if it is
-    positive, and at ``conj(p/q)`` if it is inverted. The minima are 0 and twice the inverted area.
-
-    Parameters
-    ----------
-    p, q : (f,) complex128
-        Derivatives ``∂w/∂z`` and ``∂w/∂z̄`` of the map on each triangle.
-
-    Returns
-    -------
-    (f,) complex128
-        Modulus 1 for degenerate triangles; 0 if the image is a point, or too small to divide by.
+    positive, and at ``conj(p/q)`` if it is inverted. The minima are 0 and twice the inverted area. The modulus is 1 for
+    degenerate triangles. μ is 0 if the image is a point, or too small to divide by.
     """
     inverted = np.abs(q) > np.abs(p)
     small, large = np.where(inverted, p.conj(), q), np.where(inverted, q.conj(), p)
     return np.divide(small, large, out=np.zeros_like(p), where=np.abs(large) >= np.finfo(np.float64).tiny)
 
 
-def _tanh(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _radial_tanh(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     decay = np.exp(-2.0 * rho)
     defect = 4.0 * decay
     decay += 1.0
@@ -231,18 +179,18 @@ def _tanh(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return np.tanh(rho) / rho, defect, defect
 
 
-def _si_log(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _radial_si_log(rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     log = np.log1p(rho)
     omega = 1.0 / (1.0 + log)
     ratio = np.where(rho > 0, log * omega / np.maximum(rho, _TINY), 1.0)
     return ratio, omega * (2.0 - omega), omega**2 / (1.0 + rho)
 
 
-def _bend_tanh(rho: FloatArray) -> FloatArray:
-    return -2.0 * np.tanh(rho) * _tanh(rho)[1]
+def _second_derivative_tanh(rho: FloatArray) -> FloatArray:
+    return -2.0 * np.tanh(rho) * _radial_tanh(rho)[1]
 
 
-def _bend_si_log(rho: FloatArray) -> FloatArray:
+def _second_derivative_si_log(rho: FloatArray) -> FloatArray:
     omega = 1.0 / (1.0 + np.log1p(rho))
     return -((omega / (1.0 + rho)) ** 2) * (1.0 + 2.0 * omega)
 
@@ -256,8 +204,8 @@ def _invert_si_log(r: FloatArray) -> FloatArray:
 # For tanh the eigenvalues of 𝒜 are e^{±2ρ}, and its entries have rounding errors of e^{2ρ} · 1e-16. Beyond ρ = 9 the
 # smaller eigenvalue is lost. For si-log the bound keeps |ξ|² finite and corresponds to |μ| = 0.997; maps with more
 # distortion need tanh.
-TANH = Parameterisation("tanh", 0, 8.8, _tanh, np.arctanh, _bend_tanh)
-SI_LOG = Parameterisation("si-log", 1, 1e150, _si_log, _invert_si_log, _bend_si_log)
+TANH = Parameterisation("tanh", 0, TANH_BOUND, _radial_tanh, np.arctanh, _second_derivative_tanh)
+SI_LOG = Parameterisation("si-log", 1, 1e150, _radial_si_log, _invert_si_log, _second_derivative_si_log)
 PARAMETERISATIONS = {p.name: p for p in (TANH, SI_LOG)}
 
 

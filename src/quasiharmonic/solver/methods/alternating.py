@@ -18,7 +18,7 @@ from quasiharmonic.solver.methods.base import Iterates, TensorDescent
 class Alternating(TensorDescent):
     """Descend V₃ by alternation; each half step lowers it."""
 
-    word: ClassVar[str] = "alternating"
+    label: ClassVar[str] = "alternating"
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`."""

@@ -9,17 +9,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, TypeAlias, get_args
+from typing import ClassVar, TypeAlias, get_args
 
 import numpy as np
 
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.result import Status
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
-from quasiharmonic.util.arrays import ComplexArray, check_choice, whole_number
+from quasiharmonic.util.arrays import ComplexArray, check_choice, check_integer
 
 Iterates: TypeAlias = Generator[Iterate, None, bool]
 
@@ -43,27 +42,8 @@ class SearchState:
     lowest_energy: Iterate | None
 
 
-class StageRunner(Protocol):
-    """Operations of a search that a stage may call. Each returns the status of the search after the stage."""
-
-    def attempt(self, stage: Descent, before: Status) -> Status:
-        """Descend on the mesh itself; ``before`` is the status before the stage."""
-
-    def attempt_on_coarse(self, stage: SearchStage, before: Status) -> Status:
-        """Search on a coarse mesh, starting with ``stage.begins_with``, and transfer the map to the fine mesh."""
-
-    def attempt_tentatively(self, stage: Descent, before: Status) -> Status:
-        """Descend on the mesh itself; if that finds no map, later stages continue from the state before."""
-
-    def attempt_where_many(self, stage: Descent, before: Status) -> Status:
-        """Descend on the mesh itself if many triangles are inverted."""
-
-    def take_over(self, begun: Any) -> Status:
-        """Continue from the state of a stage that ran elsewhere."""
-
-
 class SearchStage(ABC):
-    """One stage of a strategy."""
+    """One stage of a strategy; `quasiharmonic.solver.search.search.Search` runs it."""
 
     #: Whether the stage searches on a coarse mesh instead of the mesh itself.
     coarse: ClassVar[bool] = False
@@ -79,10 +59,6 @@ class SearchStage(ABC):
     @abstractmethod
     def begins_with(self) -> Descent:
         """The first descent of the stage, on the coarse mesh or the mesh itself."""
-
-    @abstractmethod
-    def run(self, search: StageRunner, before: Status) -> Status:
-        """Run this stage in a search; return the status afterwards."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,30 +79,27 @@ class Descent(SearchStage):
     resume: bool = False
 
     #: Name of the method in reports.
-    word: ClassVar[str]
+    label: ClassVar[str]
     #: Whether the method moves vertices and derives the tensors from them.
     moves_vertices: ClassVar[bool] = False
 
     @property
     def name(self) -> str:
         """Name of this stage in reports."""
-        return self.word
+        return self.label
 
     @property
     def begins_with(self) -> Descent:
         """The stage itself."""
         return self
 
-    def run(self, search: StageRunner, before: Status) -> Status:
-        """See `SearchStage`."""
-        return search.attempt(self, before)
-
     @property
     def patience(self) -> tuple[int, float] | None:
         """Number of iterates and relative decrease that define a stall.
 
-        The stage has stalled if within that many iterates no triangle is untangled and the objective falls by less than
-        that fraction. None for methods that detect the end themselves.
+        The count restarts at each improvement: a triangle is untangled, or the objective falls by at least that
+        fraction. The stage has stalled after more than that many iterates without one. None for methods that detect
+        the end themselves.
         """
         return None
 
@@ -146,23 +119,10 @@ class Descent(SearchStage):
 
     @abstractmethod
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
-        """Descend.
+        """Yield every map on the way, without ``start``.
 
-        Parameters
-        ----------
-        objective : Objective
-        start : Iterate
-
-        Yields
-        ------
-        Iterate
-            Every map on the way, without ``start``. An iterate with the same ``w`` object as the previous one reports
-            failed work worth one iteration; a search counts these separately.
-
-        Returns
-        -------
-        bool
-            True if the method converged or stalled, False if its iterations are used up.
+        Return True if the method converged or stalled, False if its iterations are used up. An iterate with the same
+        ``w`` object as the previous one reports failed work worth one iteration; a search counts these separately.
 
         Raises
         ------
@@ -172,47 +132,36 @@ class Descent(SearchStage):
 
 
 class Patience:
-    """Counter of consecutive steps without progress.
-
-    Parameters
-    ----------
-    limits : (int, float) or None
-        See `Descent.patience`.
-    """
+    """Counter of consecutive steps without progress, with the limits of `Descent.patience`."""
 
     def __init__(self, limits: tuple[int, float] | None) -> None:
-        self._most: float
-        self._most, self._progress = limits or (np.inf, 0.0)
-        self._flipped, self._value, self._low_enough, self._in_vain = np.inf, np.inf, np.inf, 0
+        self._limit: float
+        self._limit, self._progress = limits or (np.inf, 0.0)
+        self._inverted = self._value = self._threshold = np.inf
+        self._failures = 0
 
     def is_over(self, inverted: int, value: float) -> bool:
         """Whether too many consecutive steps untangled no triangle and lowered the objective too little."""
-        if inverted < self._flipped or value < self._low_enough:
-            self._flipped, self._value = min(inverted, self._flipped), min(value, self._value)
+        if inverted < self._inverted or value < self._threshold:
+            self._inverted, self._value = min(inverted, self._inverted), min(value, self._value)
             # V₄ may be negative.
             fraction = self._progress * abs(self._value) if np.isfinite(self._value) else 0.0
-            self._low_enough = self._value - fraction
-            self._in_vain = 0
+            self._threshold = self._value - fraction
+            self._failures = 0
         else:
-            self._in_vain += 1
-        return self._in_vain > self._most
+            self._failures += 1
+        return self._failures > self._limit
 
 
 class Steps:
-    """Iterates of a descent; after the last one, ``at_rest`` is the return value of the generator.
-
-    Attributes
-    ----------
-    at_rest : bool
-        Whether the descent converged or stalled.
-    """
+    """Iterates of a descent; after the last one, ``converged`` tells whether the descent converged or stalled."""
 
     def __init__(self, iterates: Iterates) -> None:
         self._iterates = iterates
-        self.at_rest = False
+        self.converged = False
 
     def __iter__(self) -> Iterator[Iterate]:
-        self.at_rest = yield from self._iterates
+        self.converged = yield from self._iterates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,12 +189,12 @@ class TensorDescent(Descent):
     def __post_init__(self) -> None:
         check_choice("parameterisation", self.parameterisation, PARAMETERISATIONS)
         check_choice("reference", self.reference, get_args(Reference))
-        whole_number("iterations", self.iterations, least=1)
+        check_integer("iterations", self.iterations, minimum=1)
 
     @property
     def name(self) -> str:
         """Name of this stage in reports."""
-        return f"{self.word}, {self.parameterisation}"
+        return f"{self.label}, {self.parameterisation}"
 
     @property
     def patience(self) -> tuple[int, float] | None:
@@ -263,7 +212,7 @@ class TensorDescent(Descent):
             return objective.near_map(found.given)
         if best is None:
             mu = np.zeros(len(objective.problem.F), dtype=np.complex128)
-        elif best.objective.mesh is objective.mesh:
+        elif best.objective.reference == objective.reference:
             mu = best.field.mu
         else:
             mu = objective.own_tensor(best.w)
@@ -289,7 +238,7 @@ class FunctionalDescent(TensorDescent):
     @property
     def name(self) -> str:
         """Name of this stage in reports."""
-        return f"{self.word}, {self.parameterisation}, {self.functional}"
+        return f"{self.label}, {self.parameterisation}, {self.functional}"
 
     def objective(self, problem: Problem, linear_solver: str) -> Objective:
         """Return the objective of the chosen functional."""
@@ -311,11 +260,11 @@ class VertexDescent(Descent):
     def start(self, objective: Objective, found: SearchState) -> Iterate:
         """Start at the map with the fewest inverted triangles, or at Tutte's embedding."""
         if self.resume and found.lowest_energy is not None:
-            return objective.of_map(self.resumed(found.best_map, found.lowest_energy))
+            return objective.of_map(self.select_start(found.best_map, found.lowest_energy))
         if found.given is not None:
             return objective.near_map(found.given)
         return objective.evaluate(np.zeros(len(objective.problem.F), dtype=np.complex128))
 
-    def resumed(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
+    def select_start(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
         """Return which of two maps to continue from."""
         return best_map

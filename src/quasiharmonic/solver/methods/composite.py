@@ -22,19 +22,19 @@ import numpy as np
 from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay, delaunay_of_polygon
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.geometry.exact.point_location import PointLocator
-from quasiharmonic.geometry.mesh.topology import edge_keys, linked
+from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates
 from quasiharmonic.solver.methods.vector_adam import VectorAdam
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer
 
 # Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
-_EVENLY = 0.5
+_EVEN_SHARE = 0.5
 # Margin between the target and the box of its triangulation, as a fraction of its extent.
 _MARGIN = 0.1
 # Up to this number of corners a direct triangulation is as fast and avoids loading SciPy's Qhull. For so small a mesh,
 # loading takes longer than all other work.
-_FEW = 100
+_DIRECT_UP_TO = 100
 # Schedule after the composite: short steps suffice, and long ones would leave its neighbourhood.
 NEARBY_STEPS = ((0, 0.2), (39, 0.2), (40, 0.05))
 
@@ -51,11 +51,11 @@ class Composite(VectorAdam):
 
     direct: int = 6
 
-    word: ClassVar[str] = "composite"
+    label: ClassVar[str] = "composite"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        whole_number("direct", self.direct, least=0)
+        check_integer("direct", self.direct, minimum=0)
 
     @property
     def patience(self) -> tuple[int, float]:
@@ -79,30 +79,22 @@ class Composite(VectorAdam):
             iterations=left,
             schedule=self.schedule or NEARBY_STEPS,
             momenta=self.momenta,
-            placing=self.placing,
+            relocation=self.relocation,
         )
         return (yield from nearby.iterates(objective, there))
 
 
 def composite_map(objective: Objective) -> ComplexArray | None:
-    """Map every vertex through a disk to the target.
+    """Map every vertex through a disk to the target; fixed vertices lie at their target positions.
 
-    Parameters
-    ----------
-    objective : Objective
-        Only its problem's loop, target and Laplacian are used.
-
-    Returns
-    -------
-    (n,) complex128 or None
-        In the problem's frame, fixed vertices at their target positions. None if there are several loops or pins, or if
-        the target's outline intersects itself or is too narrow for doubles.
+    Return None if there are several loops or pins, or if the target's outline intersects itself or is too narrow for
+    doubles.
     """
     problem = objective.problem
     if len(problem.domain.loops) != 1 or problem.domain.pins.size:
         return None
     loop = problem.domain.loops[0]
-    w = problem.held.copy()
+    w = problem.fixed_positions.copy()
     outline = w[loop]
     F = polygon_triangles(outline)
     if F is None:
@@ -113,8 +105,8 @@ def composite_map(objective: Objective) -> ComplexArray | None:
     onto_disk = objective.operator(unit).extend(onto_disk)
     free = objective.laplacian.free
     corners = onto_disk[loop][F]
-    locator = PointLocator(_points(corners))
-    points = _points(onto_disk[free])
+    locator = PointLocator(_to_points(corners))
+    points = _to_points(onto_disk[free])
     triangle = locator.find(points)
     if (triangle < 0).any():
         return None
@@ -123,24 +115,16 @@ def composite_map(objective: Objective) -> ComplexArray | None:
 
 
 def polygon_triangles(outline: ComplexArray) -> IntArray | None:
-    """Triangulate a simple polygon without additional vertices.
+    """Triangulate a simple polygon without additional vertices; corners (k,) are of magnitude about one.
 
-    Parameters
-    ----------
-    outline : (k,) complex128
-        Its corners, of magnitude about one.
-
-    Returns
-    -------
-    (k - 2, 3) int64 or None
-        Strictly positive triangles. None if the polygon intersects itself or runs clockwise.
+    Return strictly positive triangles (k - 2, 3), or None if the polygon intersects itself or runs clockwise.
     """
     k = len(outline)
     ring = np.arange(k)
-    points = _points(outline)
+    points = _to_points(outline)
     if not simple_loops([ring], points).all():
         return None
-    if k <= _FEW:
+    if k <= _DIRECT_UP_TO:
         return delaunay_of_polygon(points)
     low, high = points.min(axis=0), points.max(axis=0)
     low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
@@ -151,11 +135,11 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
     except (BlockedError, ValueError):
         return None
     # If the polygon runs clockwise, the rest of the box is to its left, and the number of triangles differs.
-    F = F[_within(F, k)]
+    F = F[_select_inside(F, k)]
     return F if len(F) == k - 2 else None
 
 
-def _within(F: IntArray, k: int) -> BoolArray:
+def _select_inside(F: IntArray, k: int) -> BoolArray:
     """Select the triangles to the left of the sides 0→1→…→k−1→0, and those connected to them across other edges."""
     tails, heads, owner = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.repeat(np.arange(len(F)), 3)
     corners = (tails < k) & (heads < k)
@@ -165,7 +149,7 @@ def _within(F: IntArray, k: int) -> BoolArray:
     order = np.argsort(keys, kind="stable")
     pair = np.flatnonzero(keys[order][1:] == keys[order][:-1])
     one, other = owner[open_[order[pair]]], owner[open_[order[pair + 1]]]
-    part = linked(one, other, len(F))
+    part = label_components(one, other, len(F))
     inside: BoolArray = np.zeros(len(F), dtype=bool)
     inside[part[owner[forward]]] = True
     return inside[part]
@@ -175,10 +159,10 @@ def _corners_of_disk(outline: ComplexArray) -> ComplexArray:
     """Return points of the unit circle for the corners of an outline."""
     k = len(outline)
     length = np.abs(np.roll(outline, -1) - outline)
-    share = (1 - _EVENLY) * length / length.sum() + _EVENLY / k
+    share = (1 - _EVEN_SHARE) * length / length.sum() + _EVEN_SHARE / k
     along: ComplexArray = np.exp(2j * np.pi * (np.cumsum(share) - share))
     return along
 
 
-def _points(w: ComplexArray) -> FloatArray:
+def _to_points(w: ComplexArray) -> FloatArray:
     return np.stack([w.real, w.imag], axis=-1)

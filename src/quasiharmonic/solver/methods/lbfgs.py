@@ -21,9 +21,10 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
 
 # Number of pairs of steps and gradient changes in memory.
 _MEMORY = 10
-# Maximum step of a triangle's ξ as a multiple of 1 + |ξ|; the second value is for steps along a gradient alone. With
-# si-log, |μ| = 0.9 is at |ξ| = 8,102.
-_LONGEST, _FIRST = 1.0, 0.1
+# Maximum step of a triangle's ξ as a multiple of 1 + |ξ|. With si-log, |μ| = 0.9 is at |ξ| = 8,102.
+_LONGEST = 1.0
+# The same for steps along a gradient alone.
+_FIRST = 0.1
 # Maximum number of trial steps per direction.
 _TRIES = 20
 # Number of steps whose total decrease is compared with the tolerance.
@@ -40,14 +41,14 @@ class LBFGS(FunctionalDescent):
         Maximum number of evaluations, including those of the line search.
     stiffness : (f,) float64, optional
         Diagonal of the initial Hessian approximation, up to a factor; positive. Default: all equal.
-    tolerance : float
+    tol : float
         Converged if ten steps lower the objective by less than this fraction of it.
     """
 
     stiffness: FloatArray | None = None
-    tolerance: float = 0.0
+    tol: float = 0.0
 
-    word: ClassVar[str] = "l-bfgs"
+    label: ClassVar[str] = "l-bfgs"
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; values decrease strictly. Converged also if no step lowers the value."""
@@ -90,7 +91,7 @@ class LBFGS(FunctionalDescent):
                     return left > 0
                 pairs.clear()
                 continue
-            there = taken.there
+            there = taken.state
             step, change = there.xi - here.xi, there.gradient - here.gradient
             curvature = work(step, change)
             if curvature > 1e-10 * np.sqrt(work(step, step) * work(change, change)):
@@ -98,7 +99,7 @@ class LBFGS(FunctionalDescent):
             here = there
             yield here
             values.append(here.value)
-            if len(values) > _WINDOW and values[0] - values[-1] < self.tolerance * abs(values[-1]):
+            if len(values) > _WINDOW and values[0] - values[-1] < self.tol * abs(values[-1]):
                 return True
         return False
 

@@ -26,26 +26,31 @@ import numpy as np
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
-from quasiharmonic.solver.methods.local_repair import Effort, Patch, patch_around, remapped
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
+from quasiharmonic.solver.methods.local_repair import Effort, Patch, patch_around, remap_patches
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer
 from quasiharmonic.util.progress import heartbeat
 
 Generator = np.random.Generator
 
-# Rings around an inverted triangle, one drawn per patch. Maximum number of triangles of a patch, and of a patch with
-# the fewest rings, which is large around a vertex with very many neighbours.
+# Rings around an inverted triangle, one drawn per patch.
 _RINGS = 3, 8, 24
-_MOST_TRIANGLES, _MOST_NEAR = 2000, 20000
-# Least value δ. For a positive triangle: a fraction of its height over its widest side, at most the given number of
-# widths. For an inverted triangle: the last value.
-_KEPT, _ENOUGH, _RIGHTED = 0.1, 1.0, 1e-3
+# Maximum number of triangles of a patch,
+_MAX_TRIANGLES = 2000
+# and of a patch with the fewest rings, which is large around a vertex with very many neighbours.
+_MAX_NEAR = 20000
+# Least value δ of a positive triangle, as a fraction of its height over its widest side,
+_MIN_SHARE = 0.1
+# and at most this number of widths.
+_MAX_WIDTHS = 1.0
+# Least value δ of an inverted triangle.
+_MIN_UNTANGLED = 1e-3
 # Maximum move of a vertex, in widths of the triangles around it.
-_REACH = 20.0
+_MAX_MOVE = 20.0
 # Maximum number of simplex steps times triangles: each step takes time proportional to the triangles. The total is
 # about 0.1 to 0.2 CPU seconds.
 _PIVOTS_TIMES_TRIANGLES = 4_000_000
 # Cost of a programme, in steps of untangling the patch.
-_STEPS_A_PROGRAMME = 100
+_STEPS_PER_PROGRAMME = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,81 +61,56 @@ class LineShift(VertexDescent):
 
     Attributes
     ----------
-    in_vain : int
+    max_failures : int
         Maximum number of consecutive programmes that untangle no triangle.
     """
 
-    in_vain: int = 5
+    max_failures: int = 5
 
-    word: ClassVar[str] = "combing"
+    label: ClassVar[str] = "line shift"
     quick: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        whole_number("in_vain", self.in_vain, least=1)
+        check_integer("max_failures", self.max_failures, minimum=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; yields a map after every programme that reduces the number of inverted triangles."""
         problem, effort = objective.problem, Effort(len(objective.problem.F))
         rng = np.random.default_rng(0)
 
-        def other(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:
+        def attempt(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:
             triangle, rings = int(rng.choice(left)), int(rng.choice(_RINGS))
-            patch = patch_around(problem, triangle, rings, _MOST_TRIANGLES)
-            patch = patch or patch_around(problem, triangle, _RINGS[0], _MOST_NEAR)
+            patch = patch_around(problem, triangle, rings, _MAX_TRIANGLES)
+            patch = patch or patch_around(problem, triangle, _RINGS[0], _MAX_NEAR)
             if patch is None:
                 return None
-            effort.count(len(patch.F), _STEPS_A_PROGRAMME)
-            return patch, combed(rng, patch.F, w[patch.vertices], patch.held)
+            effort.count(len(patch.F), _STEPS_PER_PROGRAMME)
+            return patch, shift_along_lines(rng, patch.F, w[patch.vertices], patch.fixed)
 
         left = inverted_triangles(problem.F, problem.positions(start.w))
-        yield from remapped(objective, start.w, left, other, patience=self.in_vain, effort=effort)
+        yield from remap_patches(objective, start.w, left, attempt, patience=self.max_failures, effort=effort)
         return True
 
 
-def combed(rng: Generator, F: IntArray, w: ComplexArray, held: BoolArray) -> ComplexArray:
-    """Return a map with the least inverted area, as defined above, along one random direction.
+def shift_along_lines(rng: Generator, F: IntArray, w: ComplexArray, fixed: BoolArray) -> ComplexArray:
+    """Return a map of a patch with the least inverted area, as defined above, along one random direction.
 
-    Parameters
-    ----------
-    rng : Generator
-        Draws the direction.
-    F : (p, 3) int64
-        Triangles of a patch.
-    w : (v,) complex128
-        Its map.
-    held : (v,) bool
-        Fixed vertices.
-
-    Returns
-    -------
-    (v,) complex128
-        ``w`` if the solver finds no solution.
+    ``F`` (p, 3) are the triangles of the patch, ``w`` (v,) its map, and ``fixed`` (v,) bool marks its fixed vertices.
+    Return ``w`` if the solver finds no solution.
     """
-    places = frame_along(w, rng.uniform(0, np.pi))
-    if places is None:
+    frame = frame_along(w, rng.uniform(0, np.pi))
+    if frame is None:
         return w
-    x, y, along = places
-    step = best_shift(F, x, y, held)
+    x, y, along = frame
+    step = best_shift(F, x, y, fixed)
     return w if step is None else w + step * along
 
 
 def frame_along(w: ComplexArray, angle: float) -> tuple[FloatArray, FloatArray, complex] | None:
-    """Return coordinates along a direction and across it, in which the points are as wide as they are long.
+    """Return coordinates x, y (v,) in which points are as wide as they are long, and the step that adds 1 to x.
 
-    Parameters
-    ----------
-    w : (v,) complex128
-    angle : float
-        Angle of the direction in those coordinates.
-
-    Returns
-    -------
-    x, y : (v,) float64
-        With the same orientation as the points.
-    along : complex
-        The step that adds one to ``x``.
-
-    None if the points lie on a line.
+    ``angle`` is that of the direction of x. The coordinates have the same orientation as the points w (v,). None if the
+    points lie on a line.
     """
     centred = np.stack([w.real, w.imag], axis=1)
     centred -= centred.mean(axis=0)
@@ -146,20 +126,10 @@ def frame_along(w: ComplexArray, angle: float) -> tuple[FloatArray, FloatArray, 
     return x, y, complex(step[0], step[1])
 
 
-def best_shift(F: IntArray, x: FloatArray, y: FloatArray, held: BoolArray) -> FloatArray | None:
-    """Return the steps along x that leave the least inverted area.
+def best_shift(F: IntArray, x: FloatArray, y: FloatArray, fixed: BoolArray) -> FloatArray | None:
+    """Return the steps (v,) along x that leave the least inverted area, zero at ``fixed`` (v,) vertices.
 
-    Parameters
-    ----------
-    F : (p, 3) int64
-    x, y : (v,) float64
-    held : (v,) bool
-        Fixed vertices.
-
-    Returns
-    -------
-    (v,) float64 or None
-        Zero for fixed vertices. None if the solver finds no solution.
+    None if the solver finds no solution.
     """
     from scipy.optimize import linprog
     from scipy.sparse import csr_array
@@ -168,28 +138,28 @@ def best_shift(F: IntArray, x: FloatArray, y: FloatArray, held: BoolArray) -> Fl
     dy = y[np.roll(F, -1, axis=1)] - y[np.roll(F, -2, axis=1)]
     wide = np.repeat(np.ptp(x[F], axis=1), 3)
     unit = np.bincount(F.ravel(), wide, len(x)) / np.maximum(np.bincount(F.ravel(), minlength=len(x)), 1)
-    free = np.flatnonzero(~held)
+    free = np.flatnonzero(~fixed)
     column = np.full(len(x), -1)
     column[free] = np.arange(free.size)
-    entry = np.where(held[F], 0.0, dy * unit[F])
+    entry = np.where(fixed[F], 0.0, dy * unit[F])
     scale = np.abs(entry).max(axis=1)
     concerned = np.flatnonzero(scale > 0)
     if not concerned.size:
         return None
     count, scale = concerned.size, scale[concerned]
-    row, corner = np.nonzero(~held[F[concerned]])
+    row, corner = np.nonzero(~fixed[F[concerned]])
     t, every = concerned[row], np.arange(count)
     value = np.concatenate([entry[t, corner] / scale[row], np.ones(count)])
     where = np.concatenate([row, every]), np.concatenate([column[F[t, corner]], free.size + every])
     A = csr_array((value, where), shape=(count, free.size + count))
     area = (x[F] * dy).sum(axis=1)[concerned] / scale
-    least = np.where(area > 0, np.minimum(_KEPT * area, _ENOUGH), _RIGHTED)
+    bound = np.where(area > 0, np.minimum(_MIN_SHARE * area, _MAX_WIDTHS), _MIN_UNTANGLED)
     heartbeat()
     result = linprog(
         np.repeat([0.0, 1.0], [free.size, count]),
         A_ub=-A,
-        b_ub=area - least,
-        bounds=np.repeat([[-_REACH, _REACH], [0.0, np.inf]], [free.size, count], axis=0),
+        b_ub=area - bound,
+        bounds=np.repeat([[-_MAX_MOVE, _MAX_MOVE], [0.0, np.inf]], [free.size, count], axis=0),
         method="highs-ds",
         options={"maxiter": max(1, _PIVOTS_TIMES_TRIANGLES // count)},
     )

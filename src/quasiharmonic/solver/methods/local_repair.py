@@ -18,24 +18,31 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
-from quasiharmonic.solver.methods.untangling import untangled
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, whole_number
+from quasiharmonic.solver.methods.untangling import untangle
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer
 
 # Maximum number of inverted triangles for which local repair begins.
-MOST_FLIPS = 50
+MAX_INVERTED = 50
 # Maximum number of triangles of a patch,
-MOST_TRIANGLES = 1000
+MAX_TRIANGLES = 1000
 # and maximum as a fraction of the mesh: above it, untangling the whole mesh is as fast.
-_MOST_SHARE = 0.25
+_MAX_SHARE = 0.25
 # Rings of triangles around an inverted one, tried in this order.
 _RINGS = 2, 4, 8, 16
-# A wide patch: rings around an inverted triangle, maximum number of triangles, and maximum as a fraction of the mesh.
-_WIDE_RINGS, _MOST_WIDE, _MOST_WIDE_SHARE = 24, 5000, 0.5
+# Rings around an inverted triangle in a wide patch.
+_WIDE_RINGS = 24
+# Maximum number of triangles of a wide patch,
+_MAX_WIDE = 5000
+# and maximum as a fraction of the mesh.
+_MAX_WIDE_SHARE = 0.5
 # The grading of untangling that solves most wide patches.
 _WIDE_GRADING = 0.5
-# Overhead of a step on a patch and of an iteration on a mesh, as an equivalent number of triangles. The last value is
-# the maximum mesh size in the cost of an iteration, because patches do not grow with the mesh.
-_BESIDES, _BESIDES_AN_ITERATION, _LARGE = 400, 200, 4 * MOST_TRIANGLES
+# Overhead of a step on a patch, as an equivalent number of triangles.
+_STEP_OVERHEAD = 400
+# The same of an iteration on a mesh.
+_ITERATION_OVERHEAD = 200
+# Maximum mesh size in the cost of an iteration, because patches do not grow with the mesh.
+_LARGE = 4 * MAX_TRIANGLES
 
 
 class Patch(NamedTuple):
@@ -47,39 +54,34 @@ class Patch(NamedTuple):
         The triangles.
     vertices : (v,) int64
         The mesh's index of each vertex.
-    held : (v,) bool
+    fixed : (v,) bool
         Fixed vertices: those of the problem and those on the patch's boundary.
     """
 
     F: IntArray
     vertices: IntArray
-    held: BoolArray
+    fixed: BoolArray
 
 
 class Effort:
-    """Cost of patch repairs, in units of iterations on the whole mesh.
+    """Cost of patch repairs, in units of iterations on the whole mesh with this number of triangles.
 
     The cost is counted in steps and triangles and not in seconds, so that a search is reproducible.
-
-    Parameters
-    ----------
-    triangles : int
-        Number of triangles of the whole mesh.
     """
 
     def __init__(self, triangles: int) -> None:
-        self._iteration = min(triangles, _LARGE) + _BESIDES_AN_ITERATION
+        self._iteration = min(triangles, _LARGE) + _ITERATION_OVERHEAD
         self._spent = 0.0
 
     def count(self, triangles: int, steps: int = 1) -> None:
         """Add the cost of steps on a patch with this number of triangles."""
-        self._spent += steps * (triangles + _BESIDES) / self._iteration
+        self._spent += steps * (triangles + _STEP_OVERHEAD) / self._iteration
 
-    def due(self) -> int:
-        """Return the whole iterations spent since the last call."""
-        whole = int(self._spent)
-        self._spent -= whole
-        return whole
+    def take_iterations(self) -> int:
+        """Return the full iterations spent since the last call."""
+        iterations = int(self._spent)
+        self._spent -= iterations
+        return iterations
 
 
 #: Function from a map and its inverted triangles to a patch and another map of it.
@@ -98,29 +100,29 @@ class LocalRepair(VertexDescent):
 
     tries: int = 30
 
-    word: ClassVar[str] = "patches"
+    label: ClassVar[str] = "local repair"
     quick: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        whole_number("tries", self.tries, least=1)
+        check_integer("tries", self.tries, minimum=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; yields a map after every patch that reduces the number of inverted triangles."""
         problem, solver = objective.problem, objective.laplacian.solver.name
         w, tries = start.w, self.tries
         left = inverted_triangles(problem.F, problem.positions(w))
-        most = min(MOST_TRIANGLES, int(_MOST_SHARE * len(problem.F)))
+        max_triangles = min(MAX_TRIANGLES, int(_MAX_SHARE * len(problem.F)))
         for rings in _RINGS:
             for triangle in left.tolist():
-                if not 0 < left.size <= MOST_FLIPS or tries <= 0:
+                if not 0 < left.size <= MAX_INVERTED or tries <= 0:
                     return True
-                patch = patch_around(problem, triangle, rings, most) if triangle in left else None
+                patch = patch_around(problem, triangle, rings, max_triangles) if triangle in left else None
                 if patch is None:
                     continue
                 tries -= 1
-                moved, now = _with_patch_untangled(problem, w, patch, 0.0, solver)
-                if now.size < left.size:
-                    w, left = moved, now
+                moved, remaining = _untangle_patch(problem, w, patch, 0.0, solver)
+                if remaining.size < left.size:
+                    w, left = moved, remaining
                     yield objective.of_map(w)
         return True
 
@@ -139,43 +141,43 @@ class WideRepair(VertexDescent):
 
     tries: int = 2
 
-    word: ClassVar[str] = "wide patches"
+    label: ClassVar[str] = "wide patches"
 
     def __post_init__(self) -> None:
-        whole_number("tries", self.tries, least=1)
+        check_integer("tries", self.tries, minimum=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """Yield a map after every patch that leaves fewer inverted triangles."""
         problem, solver = objective.problem, objective.laplacian.solver.name
         w, left = start.w, inverted_triangles(problem.F, problem.positions(start.w))
-        most = min(_MOST_WIDE, int(_MOST_WIDE_SHARE * len(problem.F)))
+        max_triangles = min(_MAX_WIDE, int(_MAX_WIDE_SHARE * len(problem.F)))
         tried = np.zeros(len(problem.F), dtype=bool)
         for _ in range(self.tries):
-            open_ = left[~tried[left]]
-            if left.size > MOST_FLIPS or not open_.size:
+            untried = left[~tried[left]]
+            if left.size > MAX_INVERTED or not untried.size:
                 return True
-            patch = patch_around(problem, int(open_[0]), _WIDE_RINGS, most)
-            tried[open_[0]] = True
+            patch = patch_around(problem, int(untried[0]), _WIDE_RINGS, max_triangles)
+            tried[untried[0]] = True
             if patch is None:
                 continue
             tried |= np.isin(problem.F, patch.vertices).all(axis=1)
-            moved, now = _with_patch_untangled(problem, w, patch, _WIDE_GRADING, solver)
-            if now.size < left.size:
-                w, left = moved, now
+            moved, remaining = _untangle_patch(problem, w, patch, _WIDE_GRADING, solver)
+            if remaining.size < left.size:
+                w, left = moved, remaining
                 yield objective.of_map(w)
         return True
 
 
-def _with_patch_untangled(
+def _untangle_patch(
     problem: Problem, w: ComplexArray, patch: Patch, grading: float, solver: str
 ) -> tuple[ComplexArray, IntArray]:
     """Return the map with one patch untangled, and the triangles that are then inverted."""
     moved = w.copy()
-    moved[patch.vertices] = last_untangled(patch, w[patch.vertices], patch.held, grading, solver)
+    moved[patch.vertices] = untangle_fully(patch, w[patch.vertices], patch.fixed, grading, solver)
     return moved, inverted_triangles(problem.F, problem.positions(moved))
 
 
-def patch_around(problem: Problem, triangle: int, rings: int, most: int) -> Patch | None:
+def patch_around(problem: Problem, triangle: int, rings: int, max_triangles: int) -> Patch | None:
     """Return the triangles within some rings of one; None if they are too many or have no free vertex."""
     inside = np.zeros(problem.n, dtype=bool)
     inside[problem.F[triangle]] = True
@@ -183,24 +185,24 @@ def patch_around(problem: Problem, triangle: int, rings: int, most: int) -> Patc
         inside[problem.F[inside[problem.F].any(axis=1)]] = True
         # Connected triangles have at most two vertices each, plus one; this bound avoids visiting all triangles at a
         # hub.
-        if np.count_nonzero(inside) > 2 * most + 1:
+        if np.count_nonzero(inside) > 2 * max_triangles + 1:
             return None
     F = problem.F[inside[problem.F].all(axis=1)]
     vertices, renumbered = np.unique(F, return_inverse=True)
     renumbered = renumbered.reshape(-1, 3).astype(np.int64)
-    held = np.isin(vertices, problem.fixed)
-    held[boundary_edges(renumbered, vertices.size)] = True
-    return None if len(F) > most or held.all() else Patch(renumbered, vertices, held)
+    fixed = np.isin(vertices, problem.fixed)
+    fixed[boundary_edges(renumbered, vertices.size)] = True
+    return None if len(F) > max_triangles or fixed.all() else Patch(renumbered, vertices, fixed)
 
 
-def remapped(
+def remap_patches(
     objective: Objective,
     w: ComplexArray,
     left: IntArray,
-    other: Attempt,
+    attempt: Attempt,
     *,
     patience: int,
-    most: int | None = None,
+    max_inverted: int | None = None,
     tries: int | None = None,
     effort: Effort | None = None,
 ) -> Iterator[Iterate]:
@@ -213,16 +215,16 @@ def remapped(
         Initial map.
     left : (k,) int64
         Its inverted triangles.
-    other : callable
+    attempt : callable
         Function from a map and its inverted triangles to a patch and another map (v,) complex128 of it, or None.
     patience : int
         Maximum number of consecutive patches that untangle no triangle.
-    most : int, optional
+    max_inverted : int, optional
         Maximum number of inverted triangles.
     tries : int, optional
         Maximum number of patches.
     effort : Effort, optional
-        Cost account of ``other``.
+        Cost account of ``attempt``.
 
     Yields
     ------
@@ -232,37 +234,39 @@ def remapped(
     """
     problem, effort = objective.problem, effort or Effort(len(objective.problem.F))
     first, here = w, None
-    in_vain, done = 0, 0
-    while left.size and (most is None or left.size <= most) and in_vain < patience and done != tries:
-        in_vain, done = in_vain + 1, done + 1
-        found = other(w, left)
+    failures, done = 0, 0
+    while left.size and (max_inverted is None or left.size <= max_inverted) and failures < patience and done != tries:
+        failures, done = failures + 1, done + 1
+        found = attempt(w, left)
         if found is not None:
             patch, there = found
             moved = w.copy()
             moved[patch.vertices] = there
-            now = inverted_triangles(problem.F, problem.positions(moved))
-            if now.size <= left.size:
-                fewer, w, left = now.size < left.size, moved, now
+            remaining = inverted_triangles(problem.F, problem.positions(moved))
+            if remaining.size <= left.size:
+                fewer, w, left = remaining.size < left.size, moved, remaining
                 if fewer:
-                    in_vain, here = 0, objective.of_map(w)
+                    failures, here = 0, objective.of_map(w)
                     yield here
-        for _ in range(effort.due()):
+        for _ in range(effort.take_iterations()):
             here = here or objective.of_map(first)
             yield here
 
 
-def last_untangled(
+def untangle_fully(
     patch: Patch,
     w: ComplexArray,
-    held: BoolArray,
+    fixed: BoolArray,
     grading: float,
     linear_solver: str,
     weights: FloatArray | None = None,
     effort: Effort | None = None,
 ) -> ComplexArray:
     """Untangle a map of a patch (v,) complex128 with fixed vertices (v,) bool and weights (p,); return the last map."""
-    last, stay, steps = w, np.flatnonzero(held), 1
-    for step in untangled(patch.F, w, stay, grading=grading, linear_solver=linear_solver, weights=weights):
+    last, steps = w, 1
+    for step in untangle(
+        patch.F, w, np.flatnonzero(fixed), grading=grading, linear_solver=linear_solver, weights=weights
+    ):
         last = step
         steps += 1
     if effort is not None:

@@ -1,5 +1,7 @@
 """Newton's method in the joint space of map and tensor (§F.2), for the last inverted triangles.
 
+It has a trust region and no line search. Newton's method on positions, for distortion energies, is `energies.newton`.
+
 The energy ``P(u, v, ξ) = Σ m [c (|p|² + |q|²) − 2 Re(t p q̄)]`` with ``c(|ξ|)`` and ``t = s(|ξ|) ξ/|ξ|`` couples ξ and
 the map triangle by triangle. In the directions along and across ξ, ``δξ = (α + iβ) ξ/|ξ|``:
 
@@ -29,10 +31,10 @@ from quasiharmonic.solver.methods.base import Iterates, TensorDescent
 from quasiharmonic.util.arrays import ComplexArray
 
 _FIRST_DAMPING = 1e-2
-_MOST_DAMPING = 1e12
+_MAX_DAMPING = 1e12
 # Least eigenvalue of a triangle's block K, as a fraction of the largest of all. The block of a triangle that has shrunk
 # to a point is zero and not invertible.
-_LEAST = 1e-100
+_MIN_EIGENVALUE = 1e-100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +47,7 @@ class Newton(TensorDescent):
         Maximum number of steps tried; rejected steps yield nothing.
     """
 
-    word: ClassVar[str] = "newton"
+    label: ClassVar[str] = "newton"
 
     @property
     def patience(self) -> tuple[int, float] | None:
@@ -75,17 +77,13 @@ class Newton(TensorDescent):
                 here = there
                 yield here
                 model = SecondOrderModel(here)
-            elif damping > _MOST_DAMPING:
+            elif damping > _MAX_DAMPING:
                 return True
         return False
 
 
 class SecondOrderModel:
     """Second-order model of P around a quasi-harmonic map.
-
-    Parameters
-    ----------
-    here : Iterate
 
     Attributes
     ----------
@@ -107,13 +105,17 @@ class SecondOrderModel:
         unit = np.divide(field.xi, field.rho, out=np.ones_like(field.xi), where=field.rho > 0)
         self.unit = unit
         r = field.ratio * field.rho
-        D, slope, bend = field.defect, field.slope, here.objective.parameterisation.bend(field.rho)
+        D, slope, second_derivative = (
+            field.defect,
+            field.slope,
+            here.objective.parameterisation.second_derivative(field.rho),
+        )
         rho = np.where(field.rho > 0, field.rho, 1.0)
         # Derivatives of c and s by |ξ|, through r.
         c1 = 4 * r / D**2 * slope
-        c2 = 4 * (1 + 3 * r**2) / D**3 * slope**2 + 4 * r / D**2 * bend
+        c2 = 4 * (1 + 3 * r**2) / D**3 * slope**2 + 4 * r / D**2 * second_derivative
         s1 = 2 * (1 + r**2) / D**2 * slope
-        s2 = 4 * r * (3 + r**2) / D**3 * slope**2 + 2 * (1 + r**2) / D**2 * bend
+        s2 = 4 * r * (3 + r**2) / D**3 * slope**2 + 2 * (1 + r**2) / D**2 * second_derivative
         s_over = 2 * field.ratio / D
         c1_over = np.where(field.rho > 0, c1 / rho, 4.0)
         twist = np.where(field.rho > 0, (s1 - s_over) / rho, 0.5 * s2)
@@ -139,7 +141,7 @@ class SecondOrderModel:
         # An inverted triangle may have a concave block: take absolute eigenvalues and bound them away from zero.
         mean, half = 0.5 * (k11 + k22), np.hypot(0.5 * (k11 - k22), k12)
         high, low = np.abs(mean + half), np.abs(mean - half)
-        floor = 1e-10 * np.maximum(high, low) + _LEAST * high.max()
+        floor = 1e-10 * np.maximum(high, low) + _MIN_EIGENVALUE * high.max()
         high, low = np.maximum(high, floor), np.maximum(low, floor)
         # Keep the eigenvectors: scale the deviator to the new half difference, which may have either sign.
         swapped = np.abs(mean - half) > np.abs(mean + half)

@@ -25,116 +25,102 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
 from quasiharmonic.util.kernels import compiled
 
 # Maximum number of inverted triangles for a try: with more it usually fails, and without compiled kernels it is slower
-# than a step. The second value is for the first map, from which the descent may be long.
-_MOST_FLIPS, _MOST_AT_FIRST = 12, 100
+# than a step.
+_MAX_INVERTED = 12
+# The same for the first map, from which the descent may be long.
+_MAX_AT_FIRST = 100
 # After a failed try, the next is made when the number of inverted triangles has fallen to this fraction, or when the
 # number of steps has doubled plus two.
 _FEWER = 0.75
-# Maximum number of sweeps over the vertices of inverted triangles, and of consecutive sweeps without progress.
-_SWEEPS, _IN_VAIN = 8, 3
+# Maximum number of sweeps over the vertices of inverted triangles.
+_SWEEPS = 8
+# Maximum number of consecutive sweeps without progress.
+_IN_VAIN = 3
 # Number of sweeps over moved vertices and their neighbours after success, to even out the heights.
 _SHARING = 2
 # Maximum number of triangles around a vertex: 16 have 560 triples.
 _MOST_AROUND = 16
-# If a group has at least this many vertices, it is divided by the number of triangles around them, at these sizes (6
-# have 20 triples, 12 have 220). The last value limits the heights computed at once, so that arrays stay in the cache.
-_MANY, _SIZES, _HEIGHTS = 16, (6, 8), 30_000
+# A group with at least this many vertices is divided by the number of triangles around them,
+_LARGE_GROUP = 16
+# at these numbers: 6 triangles have 20 triples, 12 have 220.
+_SIZES = 6, 8
+# Maximum number of heights computed at once, so that arrays stay in the cache.
+_HEIGHTS = 30_000
 
 
 class RetrySchedule:
     """Schedule of tries during a descent."""
 
     def __init__(self) -> None:
-        self._seen = self._next = 0
-        self._few_enough = 0.0
+        self._steps = self._retry_step = 0
+        self._retry_below = 0.0
 
-    def due(self, inverted: int) -> bool:
+    def is_due(self, inverted: int) -> bool:
         """Whether to try the next map of the descent, given its number of inverted triangles."""
-        seen, self._seen = self._seen, self._seen + 1
-        if not 0 < inverted <= (_MOST_FLIPS if seen else _MOST_AT_FIRST):
+        step, self._steps = self._steps, self._steps + 1
+        if not 0 < inverted <= (_MAX_INVERTED if step else _MAX_AT_FIRST):
             return False
-        if inverted > self._few_enough and seen < self._next:
+        if inverted > self._retry_below and step < self._retry_step:
             return False
-        self._few_enough, self._next = _FEWER * inverted, 2 * seen + 2
+        self._retry_below, self._retry_step = _FEWER * inverted, 2 * step + 2
         return True
 
 
-def placed(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None:
-    """Relocate the vertices of inverted triangles until none is inverted.
+def relocate(F: IntArray, w: ComplexArray, fixed: IntArray) -> ComplexArray | None:
+    """Relocate the vertices of inverted triangles until none is inverted in floating point; None if some stay inverted.
 
-    Parameters
-    ----------
-    F : (f, 3) int64
-    w : (n,) complex128
-    fixed : (k,) int64
-        Fixed vertices, including the whole boundary.
-
-    Returns
-    -------
-    (n,) complex128 or None
-        A map without inverted triangles, in floating point; None if some stay inverted.
+    ``fixed`` includes the whole boundary.
     """
-    moved, righted = placed_each(F, w, fixed, np.zeros(len(F), dtype=np.int64))
-    return moved if righted.all() else None
+    moved, untangled = relocate_each(F, w, fixed, np.zeros(len(F), dtype=np.int64))
+    return moved if untangled.all() else None
 
 
-def placed_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -> tuple[ComplexArray, BoolArray]:
-    """Apply `placed` to many meshes in a batch.
+def relocate_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray) -> tuple[ComplexArray, BoolArray]:
+    """Apply `relocate` to many meshes that share no vertices; ``mesh`` (f,) is the mesh of each triangle, ascending.
 
-    Parameters
-    ----------
-    F, w, fixed
-        Of all meshes, which share no vertices.
-    mesh : (f,) int64
-        The mesh of each triangle, ascending.
-
-    Returns
-    -------
-    w : (n,) complex128
-    righted : (m,) bool
-        Which meshes have no inverted triangle.
+    Return the map (n,) of all meshes, and which meshes (m,) have no inverted triangle.
     """
-    moves = np.ones(len(w), dtype=bool)
-    moves[fixed] = False
-    moved, righted = np.empty_like(w), np.empty(int(mesh[-1]) + 1, dtype=bool)
-    place_inverted(np.ascontiguousarray(F), moves, mesh, w, moved, righted)
-    return moved, righted
+    free = np.ones(len(w), dtype=bool)
+    free[fixed] = False
+    moved, untangled = np.empty_like(w), np.empty(int(mesh[-1]) + 1, dtype=bool)
+    place_inverted(np.ascontiguousarray(F), free, mesh, w, moved, untangled)
+    return moved, untangled
 
 
 @compiled
 def place_inverted(
-    F: IntArray, moves: BoolArray, mesh: IntArray, given: ComplexArray, w: ComplexArray, righted: BoolArray
+    F: IntArray, free: BoolArray, mesh: IntArray, given: ComplexArray, w: ComplexArray, untangled: BoolArray
 ) -> None:
-    """Fill in the results of `placed_each`; ``moves`` (n,) marks the free vertices."""
+    """Fill in the results of `relocate_each`; ``free`` (n,) marks the free vertices."""
     w[:] = given
-    fewest, in_vain = np.full(righted.size, len(F) + 1), np.zeros(righted.size, dtype=np.int64)
+    fewest, failures = np.full(untangled.size, len(F) + 1), np.zeros(untangled.size, dtype=np.int64)
     vertices, groups = np.empty(0, dtype=np.int64), list[_Stars]()
-    T, of, looked_at = F, mesh, np.ones(fewest.size, dtype=bool)
+    T, of, active = F, mesh, np.ones(fewest.size, dtype=bool)
     for sweep in range(_SWEEPS + 1):
         left = np.flatnonzero(~(signed_areas(T, w) > 0))
         count = np.bincount(of[left], minlength=fewest.size)
-        in_vain = np.where(count < fewest, 0, in_vain + 1)
-        fewest = np.where(looked_at, np.minimum(count, fewest), fewest)
-        looked_at = (count > 0) & (in_vain < _IN_VAIN)
-        before, vertices = vertices, np.unique(T[left[looked_at[of[left]]]])
-        vertices = vertices[moves[vertices]]
+        failures = np.where(count < fewest, 0, failures + 1)
+        fewest = np.where(active, np.minimum(count, fewest), fewest)
+        active = (count > 0) & (failures < _IN_VAIN)
+        before, vertices = vertices, np.unique(T[left[active[of[left]]]])
+        vertices = vertices[free[vertices]]
         if not vertices.size or sweep == _SWEEPS:
             break
-        T, of = T[looked_at[of]], of[looked_at[of]]
+        T, of = T[active[of]], of[active[of]]
         if not np.array_equal(vertices, before):
-            groups = _apart(T, vertices, len(w))
-        _place(w, groups)
-    np.equal(fewest, 0, out=righted)
-    if righted.any():
+            groups = _divide(T, vertices, len(w))
+        _relocate_groups(w, groups)
+    np.equal(fewest, 0, out=untangled)
+    if untangled.any():
         # Relocate the moved vertices again, together with their neighbours.
         near = np.zeros(len(w), dtype=bool)
-        T, of = F[righted[mesh]], mesh[righted[mesh]]
+        T, of = F[untangled[mesh]], mesh[untangled[mesh]]
         near[T[_any_corner((w != given)[T])]] = True
-        groups, there = _apart(T, np.flatnonzero(near & moves), len(w)), w.copy()
+        groups, there = _divide(T, np.flatnonzero(near & free), len(w)), w.copy()
         for _ in range(_SHARING):
-            _place(there, groups)
+            _relocate_groups(there, groups)
         # Except for rounding, no height falls below the least of those around it.
-        spoilt = np.bincount(of[~(signed_areas(T, there) > 0)], minlength=righted.size) > 0
+        spoilt = np.bincount(of[~(signed_areas(T, there) > 0)], minlength=untangled.size) > 0
         back = T[spoilt[of]]
         there[back] = w[back]
         w[:] = there
@@ -146,10 +132,10 @@ def _any_corner(marked: BoolArray) -> BoolArray:
     return some
 
 
-def _place(w: ComplexArray, groups: list[_Stars]) -> None:
+def _relocate_groups(w: ComplexArray, groups: list[_Stars]) -> None:
     """Relocate vertices in place, group by group."""
     for some in groups:
-        w[some.vertices] = roomiest(w[some.vertices], w[some.tails], w[some.heads])
+        w[some.vertices] = highest_positions(w[some.vertices], w[some.tails], w[some.heads])
 
 
 class _Stars(NamedTuple):
@@ -160,7 +146,7 @@ class _Stars(NamedTuple):
     heads: IntArray
 
 
-def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
+def _divide(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     """Divide interior vertices, in ascending order, into groups whose vertices share no triangle."""
     number = np.full(n, -1)
     number[vertices] = np.arange(vertices.size)
@@ -185,14 +171,14 @@ def _apart(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     return [
         _Stars(vertices[alike], tails[rows], heads[rows])
         for k in groups
-        for alike in _alike(np.flatnonzero(bit == 1 << k), count)
+        for alike in _divide_by_size(np.flatnonzero(bit == 1 << k), count)
         for rows in [first[alike, None] + np.minimum(np.arange(count[alike].max()), count[alike, None] - 1)]
     ]
 
 
-def _alike(members: IntArray, count: IntArray) -> list[IntArray]:
+def _divide_by_size(members: IntArray, count: IntArray) -> list[IntArray]:
     """Divide a large group by the number of triangles around its vertices, and into parts of limited size."""
-    if members.size < _MANY:
+    if members.size < _LARGE_GROUP:
         return [members]
     size, some = np.searchsorted(_SIZES, count[members]), list[IntArray]()
     for k in range(len(_SIZES) + 1):
@@ -203,20 +189,11 @@ def _alike(members: IntArray, count: IntArray) -> list[IntArray]:
     return some
 
 
-def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> ComplexArray:
-    """Return the positions that maximise the least signed height of the triangles around each vertex.
+def highest_positions(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> ComplexArray:
+    """Return the positions (m,) that maximise the least signed height of the triangles around each vertex.
 
-    Parameters
-    ----------
-    w : (m,) complex128
-        Positions of the vertices.
-    tails, heads : (m, k) complex128
-        The edges opposite to each vertex, which form a closed loop; some may be repeated.
-
-    Returns
-    -------
-    (m,) complex128
-        ``w`` if rounding leaves no such position.
+    ``tails`` and ``heads`` (m, k) are the edges opposite to each vertex, which form a closed loop; some may be
+    repeated. A vertex keeps its position in ``w`` (m,) if rounding leaves no such position.
     """
     height = np.empty((3, *tails.shape))
     with np.errstate(all="ignore"):
@@ -224,19 +201,19 @@ def roomiest(w: ComplexArray, tails: ComplexArray, heads: ComplexArray) -> Compl
         # The height of (x, y) is the first component times x plus the second times y minus the third.
         height[0], height[1] = -along.imag, along.real
         height[2] = height[0] * tails.real + height[1] * tails.imag
-        three = height[:, :, _threes(tails.shape[1])]
+        three = height[:, :, _triples(tails.shape[1])]
         (ax, ay, p), (bx, by, q) = three[:, :, 0] - three[:, :, 1], three[:, :, 0] - three[:, :, 2]
-        place = np.stack([p * by - q * ay, ax * q - bx * p], axis=1) / (ax * by - ay * bx)[:, None]
-        least = (height[:2].transpose(1, 2, 0) @ place - height[2][:, :, None]).min(axis=1)
-    least[~np.isfinite(least)] = -np.inf
-    best, rows = least.argmax(axis=1), np.arange(len(w))
+        position = np.stack([p * by - q * ay, ax * q - bx * p], axis=1) / (ax * by - ay * bx)[:, None]
+        lowest = (height[:2].transpose(1, 2, 0) @ position - height[2][:, :, None]).min(axis=1)
+    lowest[~np.isfinite(lowest)] = -np.inf
+    best, rows = lowest.argmax(axis=1), np.arange(len(w))
     # Built from real and imaginary parts, because infinity times 1j gives NaN.
-    found = np.stack([place[rows, 0, best], place[rows, 1, best]], axis=1).view(np.complex128)[:, 0]
-    return np.where(np.isfinite(least[rows, best]), found, w)
+    found = np.stack([position[rows, 0, best], position[rows, 1, best]], axis=1).view(np.complex128)[:, 0]
+    return np.where(np.isfinite(lowest[rows, best]), found, w)
 
 
 @cache
-def _threes(count: int) -> IntArray:
+def _triples(count: int) -> IntArray:
     """Return all triples of ``count`` indices; (3, …) int64."""
     threes: IntArray = np.array(list(combinations(range(count), 3)), dtype=np.int64).T
     return threes

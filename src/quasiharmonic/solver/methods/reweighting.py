@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.solver.methods.local_repair import Effort, Patch, last_untangled
+from quasiharmonic.solver.methods.local_repair import Effort, Patch, untangle_fully
 from quasiharmonic.solver.methods.untangling import GRADINGS
 from quasiharmonic.util.arrays import ComplexArray
 
@@ -22,30 +22,16 @@ _FACTORS = 3.0, 10.0
 # Maximum number of rounds.
 _ROUNDS = 15
 # If a map has this many more inverted triangles than the first, it does not recover, and the rounds end.
-_WILD = 15
+_MAX_EXTRA = 15
 
 
-def reweighted(
+def reweight(
     rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str, effort: Effort | None = None
 ) -> ComplexArray:
     """Return another map of a patch, found by weighting its inverted triangles.
 
-    Parameters
-    ----------
-    rng : Generator
-        Draws the factor and the grading of every round.
-    patch : Patch
-    w : (v,) complex128
-        Its map.
-    linear_solver : str
-        A name of `quasiharmonic.linsolve`, or ``"auto"``.
-    effort : Effort, optional
-        Cost account of the steps.
-
-    Returns
-    -------
-    (v,) complex128
-        The first map without inverted triangles, or else the last one with no more of them than ``w``.
+    It is the first map without inverted triangles, or else the last one with no more of them than ``w`` (v,). ``rng``
+    draws the factor and the grading of every round.
     """
     factor = float(rng.choice(_FACTORS))
     weights = np.ones(len(patch.F))
@@ -53,10 +39,10 @@ def reweighted(
     first, last = inverted.sum(), w
     for _ in range(_ROUNDS):
         weights[inverted] *= factor
-        w = last_untangled(patch, w, patch.held, float(rng.choice(GRADINGS)), linear_solver, weights, effort)
+        w = untangle_fully(patch, w, patch.fixed, float(rng.choice(GRADINGS)), linear_solver, weights, effort)
         inverted = signed_areas(patch.F, w) <= 0
         if inverted.sum() <= first:
             last = w
-        if not inverted.any() or inverted.sum() > first + _WILD:
+        if not inverted.any() or inverted.sum() > first + _MAX_EXTRA:
             break
     return last

@@ -29,24 +29,31 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, whole_number
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_integer
 
 # Powers of the boundary edges' lengths, tried in this order.
 GRADINGS = 0.5, 0.0, 1.0
 # Weight of areas relative to angles.
 _LAMBDA = 1e-4
-# First ε, as a fraction of the absolute least determinant; maximum number of steps at each ε; relative decrease of the
-# energy below which ε is reduced.
-_FIRST, _STEPS, _WORTHWHILE = 0.2, 20, 1e-3
+# First ε, as a fraction of the absolute least determinant.
+_FIRST_EPSILON = 0.2
+# Maximum number of steps at each ε.
+_STEPS = 20
+# Relative decrease of the energy below which ε is reduced.
+_MIN_DECREASE = 1e-3
 # If ε falls below this fraction of the least determinant, hardly any triangle is untangled any more.
-_HOPELESS = 5e-3
+_MIN_EPSILON = 5e-3
 # Smaller determinants belong to triangles as small as the rounding of positions. A determinant of zero would never end
 # the loop over ε.
-_FLAT = 1e-30
-# For `opened`: an ε so small that the energy is a barrier; the least relative decrease per step.
-_BARRIER, _NOTICEABLE = 1e-9, 1e-2
-# Smallest reference triangle, relative to the largest, and absolute: squared areas must not underflow.
-_SMALLEST, _LEAST = 1e-70, 1e-140
+_MIN_DETERMINANT = 1e-30
+# For `open_triangles`: an ε so small that the energy is a barrier,
+_BARRIER_EPSILON = 1e-9
+# and the least relative decrease per step.
+_MIN_OPENING_DECREASE = 1e-2
+# Smallest reference triangle relative to the largest,
+_MIN_RELATIVE_SIZE = 1e-70
+# and absolute: squared areas must not underflow.
+_MIN_SIZE = 1e-140
 # Shifts of the diagonal, tried in this order until a factorisation exists.
 _SHIFTS = 0.0, 1e-10, 1e-6, 1e-3
 # Maximum number of halvings of a step.
@@ -56,10 +63,7 @@ _HALVINGS = 24
 class Regularised(Isotropic):
     """The energy above; ``φ`` in ``a = |p|²`` and ``b = |q|²``.
 
-    Parameters
-    ----------
-    epsilon : float
-        ε > 0: inverted triangles with a determinant of −ε or below have a high energy.
+    Inverted triangles with a determinant of −ε (``epsilon`` > 0) or below have a high energy.
     """
 
     def __init__(self, epsilon: float) -> None:
@@ -104,12 +108,12 @@ class Untangling(VertexDescent):
 
     iterations: int = 300
 
-    word: ClassVar[str] = "untangling"
+    label: ClassVar[str] = "untangling"
 
     def __post_init__(self) -> None:
-        whole_number("iterations", self.iterations, least=1)
+        check_integer("iterations", self.iterations, minimum=1)
 
-    def resumed(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
+    def select_start(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
         """Return the map of lowest V₃: the whole mesh moves, so its overall closeness to a solution matters."""
         return lowest_energy.w
 
@@ -118,7 +122,7 @@ class Untangling(VertexDescent):
         problem, solver = objective.problem, objective.laplacian.solver.name
         left = self.iterations
         for grading in GRADINGS:
-            for w in untangled(problem.F, start.w, problem.fixed, grading=grading, linear_solver=solver):
+            for w in untangle(problem.F, start.w, problem.fixed, grading=grading, linear_solver=solver):
                 yield objective.of_map(w)
                 left -= 1
                 if left <= 0:
@@ -126,10 +130,10 @@ class Untangling(VertexDescent):
         return True
 
 
-def untangled(
+def untangle(
     F: IntArray,
     w: ComplexArray,
-    held: IntArray,
+    fixed: IntArray,
     *,
     grading: float = 0.0,
     linear_solver: str = "auto",
@@ -144,8 +148,7 @@ def untangled(
         Triangles; every vertex belongs to one.
     w : (n,) complex128
         Initial map.
-    held : (k,) int64
-        Fixed vertices.
+    fixed : (k,) int64
     grading : float
         Power of the boundary edges' lengths.
     linear_solver : str
@@ -160,15 +163,15 @@ def untangled(
     (n,) complex128
         The map after every step, until no triangle is inverted in floating point or no further progress is expected.
     """
-    references = _even(F, w, grading, linear_solver) if rest is None else _References.at(rest, F)
+    references = _equilateral_references(F, w, grading, linear_solver) if rest is None else _References.at(rest, F)
     if references is None:
         return
     # Enclose only the computation: around a yield, the setting would affect the caller.
     with np.errstate(all="ignore"):
-        descent = RegularisedDescent(F, w, held, references, linear_solver, 1.0 if weights is None else weights)
-    least = descent.least
-    descent.energy.epsilon = np.hypot(1e-9, _FIRST * least)
-    while not least > 0 and descent.energy.epsilon > _HOPELESS * max(abs(least), _FLAT):
+        descent = RegularisedDescent(F, w, fixed, references, linear_solver, 1.0 if weights is None else weights)
+    min_det = descent.min_det
+    descent.energy.epsilon = np.hypot(1e-9, _FIRST_EPSILON * min_det)
+    while not min_det > 0 and descent.energy.epsilon > _MIN_EPSILON * max(abs(min_det), _MIN_DETERMINANT):
         before = descent.value()
         for _ in range(_STEPS):
             with np.errstate(all="ignore"):
@@ -176,62 +179,46 @@ def untangled(
             if after is None:
                 break
             yield descent.w
-            if descent.least > 0:
+            if descent.min_det > 0:
                 return
-            if after > (1 - _WORTHWHILE) * before:
+            if after > (1 - _MIN_DECREASE) * before:
                 break
             before = after
-        least = descent.least
-        if not np.isfinite(least):
+        min_det = descent.min_det
+        if not np.isfinite(min_det):
             return
-        root = np.hypot(least, descent.energy.epsilon)
-        descent.energy.epsilon *= 1 - 0.5 * root / (abs(least) + root)
+        root = np.hypot(min_det, descent.energy.epsilon)
+        descent.energy.epsilon *= 1 - 0.5 * root / (abs(min_det) + root)
 
 
-def opened(
-    F: IntArray, w: ComplexArray, held: IntArray, *, grading: float, linear_solver: str = "auto", steps: int = 10
+def open_triangles(
+    F: IntArray, w: ComplexArray, fixed: IntArray, *, grading: float, linear_solver: str = "auto", steps: int = 10
 ) -> ComplexArray:
     """Take Newton steps from a map without inverted triangles towards triangles of even shape and size.
 
-    Parameters
-    ----------
-    F, w, held, grading, linear_solver
-        See `untangled`.
-    steps : int
-        Maximum number; fewer if they no longer lower the energy noticeably.
-
-    Returns
-    -------
-    (n,) complex128
-        A map without inverted triangles, in floating point.
+    See `untangle`. At most ``steps`` steps are taken, fewer if they no longer lower the energy noticeably. The result
+    has no inverted triangles in floating point.
     """
-    references = _even(F, w, grading, linear_solver)
+    references = _equilateral_references(F, w, grading, linear_solver)
     if references is None:
         return w
     with np.errstate(all="ignore"):
-        descent = RegularisedDescent(F, w, held, references, linear_solver, 1.0)
-        descent.energy.epsilon = _BARRIER
+        descent = RegularisedDescent(F, w, fixed, references, linear_solver, 1.0)
+        descent.energy.epsilon = _BARRIER_EPSILON
         before = descent.value()
         for _ in range(steps):
             after = descent.step(before)
-            if after is None or not descent.least > 0:
+            if after is None or not descent.min_det > 0:
                 break
             w = descent.w
-            if after > (1 - _NOTICEABLE) * before:
+            if after > (1 - _MIN_OPENING_DECREASE) * before:
                 break
             before = after
     return w
 
 
 class _References(NamedTuple):
-    """Reference triangles.
-
-    Attributes
-    ----------
-    corners : (f, 3, 2) float64
-    areas : (f,) float64
-        Up to a common factor.
-    """
+    """Corners (f, 3, 2) of reference triangles, and their areas (f,) up to a common factor."""
 
     corners: FloatArray
     areas: FloatArray
@@ -242,7 +229,7 @@ class _References(NamedTuple):
         return cls(rest[F], signed_areas(F, rest.view(np.complex128).ravel()))
 
 
-def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _References | None:
+def _equilateral_references(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _References | None:
     """Return equilateral reference triangles; None if the map has no extent or squares would underflow.
 
     The logarithms of the boundary edges' lengths are extended to the interior as in Tutte's embedding. The total area
@@ -265,9 +252,9 @@ def _even(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _
     sizes: FloatArray = np.exp(log.real[F].mean(axis=1))
     # Scale to a magnitude of about one, so that no square underflows.
     sizes = np.ldexp(sizes, -int(np.frexp(sizes.max())[1]))
-    sizes = np.maximum(sizes, _SMALLEST * sizes.max())
+    sizes = np.maximum(sizes, _MIN_RELATIVE_SIZE * sizes.max())
     sizes = sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
-    if not sizes.min() > _LEAST:
+    if not sizes.min() > _MIN_SIZE:
         return None
     corners = np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]])
     return _References(sizes[:, None, None] * corners, sizes**2)
@@ -280,7 +267,7 @@ class RegularisedDescent:
         self,
         F: IntArray,
         w: ComplexArray,
-        held: IntArray,
+        fixed: IntArray,
         references: _References,
         linear_solver: str,
         weights: FloatArray | float,
@@ -289,28 +276,28 @@ class RegularisedDescent:
         rest = references.corners.reshape(-1, 2)
         # Triangles of equal weight contribute equally, whatever their size.
         weights = weights * references.areas.mean() / references.areas
-        self._deformed = DeformationEnergy(
+        self._deformation_energy = DeformationEnergy(
             rest, F, self.energy, weights=weights, rest_F=np.arange(3 * len(F)).reshape(-1, 3)
         )
-        self._system = NewtonSystem(F, self._deformed.g, len(w), held, linear_solver)
+        self._system = NewtonSystem(F, self._deformation_energy.g, len(w), fixed, linear_solver)
         self.w = w
-        self._at = self._deformed.deform(w)
+        self._deformation = self._deformation_energy.deform(w)
 
     @property
-    def least(self) -> float:
+    def min_det(self) -> float:
         """Least determinant."""
-        return float(self._at.det.min())
+        return float(self._deformation.det.min())
 
     def value(self) -> float:
         """Energy of the map."""
         with np.errstate(all="ignore"):
-            return self._deformed.value_of(self._at)
+            return self._deformation_energy.value_of(self._deformation)
 
     def step(self, before: float) -> float | None:
         """Take a step from energy ``before``; return the new energy, or None if no step lowers it."""
         system = self._system
-        gradient = self._deformed.gradient_of(self._at, self.w.size)[system.free]
-        system.assemble(self._deformed.curvature_of(self._at))
+        gradient = self._deformation_energy.gradient_of(self._deformation, self.w.size)[system.free]
+        system.assemble(self._deformation_energy.curvature_of(self._deformation))
         found = system.descent(gradient, _SHIFTS)
         if found is None or not found[1] > 0:
             return None
@@ -321,12 +308,12 @@ class RegularisedDescent:
 
         def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
             w = start + t * full
-            at = self._deformed.deform(w)
-            value = self._deformed.value_of(at)
+            at = self._deformation_energy.deform(w)
+            value = self._deformation_energy.value_of(at)
             return value, (w, at) if value < bound else None
 
         taken = backtrack(trial, before, expected_decrease, tries=_HALVINGS)
         if taken is None:
             return None
-        _, after, (self.w, self._at) = extend(trial, taken)
+        _, after, (self.w, self._deformation) = extend(trial, taken)
         return after

@@ -15,7 +15,7 @@ import numpy as np
 from quasiharmonic.geometry.mesh.reference import blocks
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import FunctionalDescent, Iterates
-from quasiharmonic.solver.methods.relocation import RetrySchedule, placed
+from quasiharmonic.solver.methods.relocation import RetrySchedule, relocate
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.kernels import compiled
 
@@ -42,16 +42,16 @@ class VectorAdam(FunctionalDescent):
         Decay rates of the mean gradient and of its mean square, Adam's β₁ and β₂; at least 0 and below 1. The paper
         names none; Adam's usual ones are 0.9 and 0.999. With these and the paper's steps the method is
         ``VectorAdam(schedule=[(0, 0.1)], momenta=(0.9, 0.999))``.
-    placing : bool
+    relocation : bool
         From time to time, try to untangle the last inverted triangles at once by moving their vertices
         (`quasiharmonic.solver.methods.relocation`). A failed try does not affect the descent.
     """
 
     schedule: Sequence[tuple[int, float]] = ()
     momenta: tuple[float, float] = MOMENTA
-    placing: bool = False
+    relocation: bool = False
 
-    word: ClassVar[str] = "vector-adam"
+    label: ClassVar[str] = "vector-adam"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,35 +75,29 @@ class VectorAdam(FunctionalDescent):
     def _steps(self) -> Sequence[tuple[int, float]]:
         return self.schedule or (TANH_STEPS if self.parameterisation == "tanh" else SI_LOG_STEPS)
 
-    def pace(self, triangles: int) -> AdamState:
+    def make_state(self, triangles: int) -> AdamState:
         """Return the Adam state for this number of triangles."""
         times, lengths = zip(*self._steps, strict=True)
         return AdamState(triangles, self.momenta, times, lengths)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; a step is shortened if the Laplacian is not positive definite after it."""
-        pace = self.pace(start.xi.size)
-        problem, tries, here = objective.problem, RetrySchedule(), start
+        state = self.make_state(start.xi.size)
+        problem, retries, here = objective.problem, RetrySchedule(), start
         for _ in range(self.iterations):
-            if self.placing and tries.due(here.inverted):
-                w = placed(problem.F, here.w, problem.fixed)
+            if self.relocation and retries.is_due(here.inverted):
+                w = relocate(problem.F, here.w, problem.fixed)
                 if w is not None:
                     yield objective.of_map(w)
-            here = objective.step(here, pace.step(here.gradient))
+            here = objective.step(here, state.step(here.gradient))
             yield here
         return False
 
 
 class AdamState:
-    """Mean gradient and mean square per triangle, and the resulting steps.
+    """Mean gradient and mean square per triangle, and the resulting steps; see `VectorAdam` for the settings.
 
     Triangles do not interact, so they may belong to one mesh or several.
-
-    Parameters
-    ----------
-    triangles : int
-    momenta, times, lengths
-        See `VectorAdam`.
     """
 
     def __init__(
@@ -119,10 +113,10 @@ class AdamState:
         return self._with(self._mean[triangles], self._square[triangles])
 
     @staticmethod
-    def joined(paces: Sequence[AdamState]) -> AdamState:
+    def join(paces: Sequence[AdamState]) -> AdamState:
         """Concatenate states that have made equally many steps."""
         return paces[0]._with(
-            np.concatenate([pace._mean for pace in paces]), np.concatenate([pace._square for pace in paces])
+            np.concatenate([state._mean for state in paces]), np.concatenate([state._square for state in paces])
         )
 
     def _with(self, mean: ComplexArray, square: FloatArray) -> AdamState:

@@ -6,14 +6,16 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.refinement import Refined, composed, split_edges
+from quasiharmonic.geometry.mesh.refinement import Refined, compose, split_edges
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.problem import Problem
+from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
+from quasiharmonic.util.arrays import check_integer
+from quasiharmonic.util.outcome import Outcome
 
 
-@dataclass(frozen=True, eq=False)
-class RefinedProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class RefinedProblem(Outcome):
     """A problem on a refined mesh.
 
     Attributes
@@ -32,6 +34,16 @@ class RefinedProblem:
     refined: Refined
     diagnosis: Diagnosis
     rounds: int
+
+    @property
+    def success(self) -> bool:
+        """Whether no known obstruction to an injective map remains."""
+        return not self.diagnosis.forbids_injective
+
+    @property
+    def message(self) -> str:
+        """The summary of the diagnosis."""
+        return self.diagnosis.summary()
 
 
 @accepts_mesh
@@ -99,12 +111,14 @@ def refine_problem(problem: Problem, *, max_rounds: int = 20) -> RefinedProblem:
     refine : splits edges that the caller names.
     quasiharmonic.diagnose : names them.
     """
-    whole = split_edges(problem.V, problem.F, [])
+    check_problem("refine_problem", problem)
+    check_integer("max_rounds", max_rounds, minimum=0)
+    refined = split_edges(problem.V, problem.F, [])
     diagnosis = diagnose(problem)
     rounds = 0
     while rounds < max_rounds and len(diagnosis.split):
-        whole = composed(whole, split_edges(whole.V, whole.F, diagnosis.split))
-        problem = Problem(whole.V, whole.F, problem.fixed, problem.target, reference=problem.reference)
+        refined = compose(refined, split_edges(refined.V, refined.F, diagnosis.split))
+        problem = Problem(refined.V, refined.F, problem.fixed, problem.target, reference=problem.reference)
         diagnosis = diagnose(problem)
         rounds += 1
-    return RefinedProblem(problem, whole, diagnosis, rounds)
+    return RefinedProblem(problem, refined, diagnosis, rounds)

@@ -1,4 +1,5 @@
-"""Run stages one after another until an injective map is found: `solve`, `injective_maps`, `harmonise`.
+"""Run stages one after another until an injective map is found.
 
-The package builds on `solver.methods`. Start reading in `stages`, then `strategy` for the lists of stages.
+The package builds on `solver.methods`. Start reading in `search`, then `stage_run` for the loop and `strategy` for the
+lists of stages.
 """

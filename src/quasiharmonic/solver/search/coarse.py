@@ -13,73 +13,59 @@ import numpy as np
 
 from quasiharmonic.geometry.coarsening.levels import coarsen
 from quasiharmonic.geometry.coarsening.prolongation import prolong
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 # Vertices of the coarse mesh, as a fraction of the fine mesh's.
 _SHARE = 1 / 8
 # Maximum number of vertices of the coarse mesh,
-_MOST = 1500
+_MAX_VERTICES = 1500
 # unless the fixed vertices, all of which are kept, require more. This many vertices per fixed vertex suffice to grade
 # the triangles from the boundary to the interior.
 _PER_FIXED = 3
 # Coarsening to this fraction of the vertices or more saves too little.
 _WORTHWHILE = 0.5
 # Meshes with fewer vertices are not coarsened, because searching them is fast.
-_LEAST = 1500
+_MIN_VERTICES = 1500
 # Coarse triangles whose height is below this fraction of their longest side carry no useful shape, and their weights in
-# an energy exceed double precision. Their corners are moved by up to this fraction of the shortest edge there.
-_LOWEST, _STIRRED = 1e-3, 0.2
+# an energy exceed double precision.
+_MIN_HEIGHT = 1e-3
+# Corners of such triangles are moved by up to this fraction of the shortest edge there.
+_PERTURBATION = 0.2
 
 
 #: Coarse meshes of the domains in use; None if a domain has none.
-_MADE: WeakKeyDictionary[Domain, CoarseMesh | None] = WeakKeyDictionary()
+_COARSE_MESHES: WeakKeyDictionary[Domain, CoarseMesh | None] = WeakKeyDictionary()
 
 
 class CoarseMesh:
     """A coarse mesh that keeps the fixed vertices of a fine one, with the prolongation to the fine mesh.
 
-    Parameters
-    ----------
-    fine : Domain
-    goal : int
-        Approximate number of vertices.
-
-    Attributes
-    ----------
-    domain : Domain
-        The coarse mesh, with the same fixed vertices in the same order.
+    ``goal`` is the approximate number of vertices. ``domain`` is the coarse mesh, with the same fixed vertices in the
+    same order.
     """
 
     def __init__(self, fine: Domain, goal: int) -> None:
-        self._held = np.zeros(fine.n, dtype=bool)
-        self._held[fine.fixed] = True
-        self._coarsening = coarsen(fine.F, fine.n, self._held, goal)
+        self._fixed = np.zeros(fine.n, dtype=bool)
+        self._fixed[fine.fixed] = True
+        self._coarsening = coarsen(fine.F, fine.n, self._fixed, goal)
         used = np.zeros(fine.n, dtype=bool)
         used[self._coarsening.F] = True
         self._vertices = np.flatnonzero(used)
         number = np.full(fine.n, -1)
         number[self._vertices] = np.arange(self._vertices.size)
         F = number[self._coarsening.F]
-        self.domain = Domain(_not_flat(fine.V[self._vertices], F), F, number[fine.fixed])
+        self.domain = Domain(_perturb_flat(fine.V[self._vertices], F), F, number[fine.fixed])
 
     def prolong(self, w: ComplexArray) -> ComplexArray:
-        """Extend a map of the coarse mesh to the fine mesh.
+        """Extend a map of the coarse mesh to the fine mesh, in the same frame.
 
-        Parameters
-        ----------
-        w : (nc,) complex128
-            ``u + i v``, in any frame.
-
-        Returns
-        -------
-        (n,) complex128
-            In the same frame; injective if ``w`` is, except for rounding.
+        The result is injective if ``w`` is, except for rounding.
         """
-        fine = np.zeros(self._held.size, dtype=np.complex128)
+        fine = np.zeros(self._fixed.size, dtype=np.complex128)
         fine[self._vertices] = w
-        return prolong(fine, self._coarsening, self._held)
+        return prolong(fine, self._coarsening, self._fixed)
 
 
 def coarse_mesh(problem: Problem) -> CoarseMesh | None:
@@ -90,25 +76,21 @@ def coarse_mesh(problem: Problem) -> CoarseMesh | None:
     if problem.reference not in (None, "equilateral"):
         return None
     fine = problem.domain
-    if fine not in _MADE:
-        goal = int(max(_PER_FIXED * fine.fixed.size, min(_SHARE * fine.n, _MOST)))
-        worthwhile = fine.n >= _LEAST and goal < _WORTHWHILE * fine.n
-        _MADE[fine] = CoarseMesh(fine, goal) if worthwhile else None
-    return _MADE[fine]
+    if fine not in _COARSE_MESHES:
+        goal = int(max(_PER_FIXED * fine.fixed.size, min(_SHARE * fine.n, _MAX_VERTICES)))
+        worthwhile = fine.n >= _MIN_VERTICES and goal < _WORTHWHILE * fine.n
+        _COARSE_MESHES[fine] = CoarseMesh(fine, goal) if worthwhile else None
+    return _COARSE_MESHES[fine]
 
 
-def _not_flat(V: FloatArray, F: IntArray) -> FloatArray:
+def _perturb_flat(V: FloatArray, F: IntArray) -> FloatArray:
     """Return positions in space, perturbed slightly at the corners of triangles that have almost no area.
 
     The shape of a coarse triangle is only a rough guide to the size of the fine triangles.
-
-    Returns
-    -------
-    (n, 2) or (n, 3) float64
     """
     shapes = rest_shapes(V, F)
     lengths = np.abs(shapes.sides)
-    low = ~(2 * shapes.m >= _LOWEST * lengths.max(axis=0) ** 2)
+    low = ~(2 * shapes.m >= _MIN_HEIGHT * lengths.max(axis=0) ** 2)
     if not low.any():
         return V
     space = np.zeros((len(V), 3))
@@ -118,6 +100,6 @@ def _not_flat(V: FloatArray, F: IntArray) -> FloatArray:
         for corner in ends:
             np.minimum.at(shortest, F[:, corner], np.where(length > 0, length, np.inf))
     corners = np.unique(F[low])
-    by = _STIRRED * shapes.unit * shortest[corners, None]
+    by = _PERTURBATION * shapes.unit * shortest[corners, None]
     space[corners] += by * np.random.default_rng(0).uniform(-1, 1, (corners.size, 3))
     return space

@@ -28,13 +28,16 @@ from quasiharmonic.solver.methods.base import Steps
 from quasiharmonic.solver.search.harmonised import Harmonised
 from quasiharmonic.util.arrays import FloatArray
 
-# Fraction of a round's evaluations for VectorAdam; its step length, halved when a step leaves the energy's domain;
-# decay rate of its mean squares.
-_PROBING, _LENGTH, _MEMORY = 0.4, 0.1, 0.9
+# Fraction of a round's evaluations for VectorAdam.
+_PROBING = 0.4
+# Its step length, halved when a step leaves the energy's domain.
+_LENGTH = 0.1
+# Decay rate of its mean squares.
+_MEMORY = 0.9
 # Smallest stiffness of a triangle, as a fraction of the mean stiffness.
 _SOFTEST = 1e-3
 # Newton steps, and local repairs, for the last inverted triangles.
-RIGHTING = 40
+UNTANGLING_STEPS = 40
 
 
 class HarmonicDescent:
@@ -57,8 +60,6 @@ class HarmonicDescent:
         The map with the fewest inverted triangles so far, and among those of least distortion.
     best : (int, float)
         Its number of inverted triangles and its ``E + κR₁``.
-    history : list of Step
-    stages : list of Stage
     """
 
     def __init__(
@@ -75,17 +76,17 @@ class HarmonicDescent:
         self.history: list[Step] = []
         self.stages: list[Stage] = []
         self._squares = np.zeros(len(self._problem.F))
-        self.back()
+        self.return_to_best()
         inverted = inverted_triangles(self._problem.F, uv).size
         distortion = self._measure.distortion if inverted else self._measure.distortion_of_map
         self.best = inverted, distortion(self._last)
         self._report(self.best)
 
-    def back(self) -> None:
+    def return_to_best(self) -> None:
         """Return to the best map."""
         self._last = self._objective.of_map(self._problem.frame.inward(self.uv))
 
-    def run(self, name: str, eta: float, iterations: int, tolerance: float) -> bool:
+    def run(self, name: str, eta: float, iterations: int, tol: float) -> bool:
         """Run one round; return whether it converged."""
         objective = self._objective.descending(self._energy(eta))
         with self._stage(name):
@@ -103,19 +104,19 @@ class HarmonicDescent:
             self._last = lowest
             if left < 1:
                 return False
-            method = LBFGS(iterations=left, stiffness=stiffness, tolerance=tolerance)
+            method = LBFGS(iterations=left, stiffness=stiffness, tol=tol)
             steps = Steps(method.iterates(objective, lowest))
             for at in steps:
                 self._visit(at)
-            return steps.at_rest
+            return steps.converged
         return False
 
-    def right(self) -> bool:
+    def untangle(self) -> bool:
         """Untangle the last inverted triangles by descending V₃ alone; return whether none is left."""
         if self.history[-1].inverted == 0:
             return True
-        for method in (Newton(iterations=RIGHTING), LocalRepair(tries=RIGHTING)):
-            with self._stage(f"{method.word}, tanh"):
+        for method in (Newton(iterations=UNTANGLING_STEPS), LocalRepair(tries=UNTANGLING_STEPS)):
+            with self._stage(f"{method.label}, tanh"):
                 self._last = self._objective.evaluate(self._last.xi)
                 for at in method.iterates(self._objective, self._last):
                     self._visit(at)
@@ -136,7 +137,7 @@ class HarmonicDescent:
             self.stages.append(
                 Stage(
                     name=name,
-                    iterations=len(self.history) - done,
+                    n_iterations=len(self.history) - done,
                     seconds=time.perf_counter() - began,
                     inverted=(first.inverted, last.inverted),
                     energy=(first.energy, last.energy),

@@ -59,7 +59,7 @@ class Harmonised(Functional):
         self.regulariser = regulariser
         self.eta = eta
         self.conformal = conformal
-        self._known: tuple[ComplexArray, Deformation] | None = None
+        self._cached: tuple[ComplexArray, Deformation] | None = None
 
     def value(self, at: QuasiHarmonicMap) -> float:
         return at.dirichlet / self.area + self.eta * self.distortion(at)
@@ -95,7 +95,7 @@ class Harmonised(Functional):
     def _deformation(self, energy: DeformationEnergy, at: QuasiHarmonicMap) -> Deformation:
         """The map's Jacobians, which value and gradient both need."""
         # Return a local variable, because another thread may overwrite the cache; see `Poisson.response`.
-        known = self._known
-        if known is None or known[0] is not at.w:
-            known = self._known = at.w, energy.deform(at.w)
-        return known[1]
+        cached = self._cached
+        if cached is None or cached[0] is not at.w:
+            cached = self._cached = at.w, energy.deform(at.w)
+        return cached[1]

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.energies import polishing
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.energies.energies import ARAP, MIPS, AreaPreserving, Energy, SymmetricDirichlet, UnsignedARAP
+from quasiharmonic.energies.energies import ARAP, AreaPreserving, Energy, UnsignedARAP
 from quasiharmonic.energies.springs import MassSpring
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.reference import Reference
@@ -29,30 +30,51 @@ from quasiharmonic.solver.search.harmonised import Harmonised
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
+    check_bool,
     check_callback,
     check_choice,
-    kind_of,
+    check_integer,
+    check_non_negative,
+    describe,
     map_array,
-    named,
-    not_negative,
+    names_of,
     real_array,
-    true_or_false,
-    whole_number,
 )
 from quasiharmonic.util.progress import reports_progress
 
-#: Energies by name: each entry makes its energy from the rest mesh.
+
+def _without_mesh(energy: Energy) -> Callable[[FloatArray, IntArray], Energy]:
+    """Return a function of the rest mesh that returns an energy which does not depend on it."""
+    return lambda V, F: energy
+
+
+#: Energies by name, those of `polish` included: each entry makes its energy from the rest mesh.
 ENERGIES: dict[str, Callable[[FloatArray, IntArray], Energy]] = {
     "arap": lambda V, F: ARAP(),
     "arap-unsigned": lambda V, F: UnsignedARAP(),
     "area": lambda V, F: AreaPreserving(),
     "springs": MassSpring,
-    "mips": lambda V, F: MIPS(),
-    "symmetric-dirichlet": lambda V, F: SymmetricDirichlet(),
+    **{name: _without_mesh(energy) for name, energy in polishing.ENERGIES.items()},
 }
 #: η of each round. Barriers keep the map injective by themselves; for other energies V₃ must dominate at the end.
 BARRIER_ETA = (0.1, 1.0, 1.0, 1.0)
 ETA = (0.1, 0.1, 0.01, 0.001)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HarmoniseOptions:
+    """Options of `harmonise`, as the functions inside the library pass them on."""
+
+    energy: str | Energy | None = "arap"
+    eta: float | Sequence[float] | None = None
+    conformal: float = 1e-3
+    weights: ArrayLike | None = None
+    scaled: bool = True
+    max_iterations: int = 40
+    tol: float = 1e-3
+    reference: Reference = "rest"
+    linear_solver: str = "auto"
+    callback: Callable[[Step], object] | None = None
 
 
 @accepts_mesh
@@ -62,14 +84,14 @@ def harmonise(
     F: ArrayLike,
     uv: ArrayLike,
     *,
-    fixed: ArrayLike,
+    fixed: ArrayLike | None = None,
     energy: str | Energy | None = "arap",
     eta: float | Sequence[float] | None = None,
     conformal: float = 1e-3,
     weights: ArrayLike | None = None,
     scaled: bool = True,
     max_iterations: int = 40,
-    tolerance: float = 1e-3,
+    tol: float = 1e-3,
     reference: Reference = "rest",
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
@@ -88,8 +110,9 @@ def harmonise(
     uv : (n, 2) array
         Initial map, for instance from `quasiharmonic.injective_map`. It must be injective only if the energy is a
         barrier.
-    fixed : (k,) array of int
-        Fixed vertices, which keep exactly their positions in ``uv``: the whole boundary and any pins.
+    fixed : (k,) array of int, optional
+        Fixed vertices, which keep exactly their positions in ``uv``: the whole boundary and any pins. Default: the
+        boundary.
     energy : str, Energy or None
         E, the mean over the surface's area:
 
@@ -97,8 +120,7 @@ def harmonise(
         - ``"arap-unsigned"``: the same with σ₂ ≥ 0 as in the paper; inversion has no cost;
         - ``"area"``: (σ₁σ₂ − 1)², areas only;
         - ``"springs"``: (l − l⁰)² summed over the mesh's edges;
-        - ``"mips"``: σ₁/σ₂ + σ₂/σ₁ − 2, angles only;
-        - ``"symmetric-dirichlet"``: σ₁² + σ₂² + σ₁⁻² + σ₂⁻² − 4, lengths.
+        - the barriers ``"symmetric-dirichlet"``, ``"mips"``, ``"blend"`` and ``"arap-barrier"`` of `polish`.
 
         Or any `Energy`. None lowers R₁ alone: MIPS for injective maps, but finite for other maps.
     eta : float or sequence of float, optional
@@ -114,7 +136,7 @@ def harmonise(
         so that weighted triangles can keep their size while the others fill the remaining area.
     max_iterations : int
         Maximum number of linear solves per round.
-    tolerance : float
+    tol : float
         A round has converged if ten steps lower its objective by less than this fraction. Not negative.
     reference : {"equilateral", "rest", "corrected"}
         Reference triangles of V₃ and R₁. R₁ measures the surface's angles only with ``"rest"``.
@@ -149,7 +171,7 @@ def harmonise(
     >>> from quasiharmonic.surfaces import disk
     >>> V, F = disk(6)
     >>> crowded = V * np.linalg.norm(V, axis=1, keepdims=True)
-    >>> result = harmonise(V, F, crowded, fixed=np.arange(len(V) - 36, len(V)), energy="area")
+    >>> result = harmonise(V, F, crowded, energy="area")
     >>> result.injective, bool(distortion(V, F, result.uv).area_ratio.std() < 0.1)
     (True, True)
     """
@@ -158,65 +180,48 @@ def harmonise(
     domain.check_boundary_fixed()
     if energy is None and reference == "rest":
         domain.check_areas()
-    result = harmonise_map(
-        domain,
-        uv,
+    options = HarmoniseOptions(
         energy=energy,
         eta=eta,
         conformal=conformal,
         weights=weights,
         scaled=scaled,
         max_iterations=max_iterations,
-        tolerance=tolerance,
+        tol=tol,
         reference=reference,
         linear_solver=linear_solver,
         callback=callback,
     )
-    return replace(result, seconds=time.perf_counter() - began)
+    return replace(harmonise_map(domain, uv, options), seconds=time.perf_counter() - began)
 
 
-@reports_progress
-def harmonise_map(
-    domain: Domain,
-    uv: ArrayLike,
-    *,
-    energy: str | Energy | None = "arap",
-    eta: float | Sequence[float] | None = None,
-    conformal: float = 1e-3,
-    weights: ArrayLike | None = None,
-    scaled: bool = True,
-    max_iterations: int = 40,
-    tolerance: float = 1e-3,
-    reference: Reference = "rest",
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
-) -> MapResult:
-    """Quasi-harmonise a map of a `Domain`; see `harmonise` for the options.
+def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> MapResult:
+    """Quasi-harmonise a map of a `Domain`; results and errors as in `harmonise`.
 
     The domain's ``fixed`` vertices keep their positions in ``uv``.
     """
     began = time.perf_counter()
-    chosen = _energy(energy, domain)
+    chosen = _find_energy(options.energy, domain)
     barrier = chosen is not None and chosen.barrier
-    schedule = _schedule(eta, barrier)
-    not_negative("conformal", conformal)
-    if chosen is None and conformal == 0:
+    schedule = _eta_schedule(options.eta, barrier)
+    check_non_negative("conformal", options.conformal)
+    if chosen is None and options.conformal == 0:
         raise ValueError("conformal must be positive if energy is None, not 0")
-    if weights is not None and chosen is None:
+    if options.weights is not None and chosen is None:
         raise ValueError("weights belong to the energy, but energy is None")
-    check_choice("reference", reference, get_args(Reference))
-    whole_number("max_iterations", max_iterations, least=1)
-    not_negative("tolerance", tolerance)
-    true_or_false("scaled", scaled)
-    check_callback(callback)
+    check_choice("reference", options.reference, get_args(Reference))
+    check_integer("max_iterations", options.max_iterations, minimum=1)
+    check_non_negative("tol", options.tol)
+    check_bool("scaled", options.scaled)
+    check_callback(options.callback)
     start = map_array("uv", uv, domain.n)
     inverted = inverted_triangles(domain.F, start)
     if barrier and inverted.size:
         raise ValueError(
-            f"uv is not injective: {named('triangle', 'triangles', inverted)} inverted or degenerate, where "
+            f"uv is not injective: {names_of('triangle', 'triangles', inverted)} inverted or degenerate, where "
             "this energy is infinite; start from an injective map, or lower R₁ (energy=None)"
         )
-    name = energy if isinstance(energy, str) else "R₁" if energy is None else type(energy).__name__
+    name = options.energy if isinstance(options.energy, str) else "R₁" if chosen is None else type(chosen).__name__
     problem = Problem.on(domain, start[domain.fixed])
     with problem.exclusive() as own, np.errstate(all="ignore"):
         area = float(signed_areas(own.F, own.frame.inward(start)).sum())
@@ -226,27 +231,28 @@ def harmonise_map(
         if chosen is not None:
             # The map is in the frame's unit. Scale the surface accordingly so that both compare as in the caller's
             # units.
-            V, asked = (own.V, area) if scaled else (own.frame.lengths(own.V), None)
-            deformation = DeformationEnergy(V, own.F, chosen, area=asked, weights=weights)
-        objective = Objective(own, "dirichlet", "tanh", reference, linear_solver)
+            V, scaled_to = (own.V, area) if options.scaled else (own.frame.lengths(own.V), None)
+            deformation = DeformationEnergy(V, own.F, chosen, area=scaled_to, weights=options.weights)
+        objective = Objective(own, "dirichlet", "tanh", options.reference, options.linear_solver)
         regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
 
-        def descended(eta: float) -> Harmonised:
-            return Harmonised(own, objective.mesh, area, deformation, regulariser, eta=eta, conformal=conformal)
+        def descend(eta: float) -> Harmonised:
+            return Harmonised(own, objective.mesh, area, deformation, regulariser, eta=eta, conformal=options.conformal)
 
-        descent = HarmonicDescent(objective, descended, start, callback)
+        descent = HarmonicDescent(objective, descend, start, options.callback)
         first, status = descent.best, Status.STILL_FALLING
         try:
             for values in (schedule, len(schedule) * schedule[-1:]):
                 for value in values:
-                    rest = descent.run(f"harmonise, {name}, η = {value:g}", value, max_iterations, tolerance)
-                    status = Status.POLISHED if rest else Status.STILL_FALLING
-                done = descent.right() and (descent.best < first or status is Status.POLISHED)
+                    stage = f"harmonise, {name}, η = {value:g}"
+                    at_minimum = descent.run(stage, value, options.max_iterations, options.tol)
+                    status = Status.POLISHED if at_minimum else Status.STILL_FALLING
+                done = descent.untangle() and (descent.best < first or status is Status.POLISHED)
                 if done or values == len(schedule) * schedule[-1:]:
                     break
                 # The schedule's long steps left inverted triangles that could not be untangled, or the result is worse
                 # than the initial map. Restart from the best map with the last η alone.
-                descent.back()
+                descent.return_to_best()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
     certificate = certify(domain.F, descent.uv)
@@ -274,16 +280,16 @@ def harmonise_map(
     )
 
 
-def _energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
+def _find_energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
     """Return the named energy for this mesh, or the given energy itself."""
     if energy is None or isinstance(energy, Energy):
         return energy
-    if energy not in ENERGIES:
-        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {kind_of(energy)}")
+    if not isinstance(energy, str) or energy not in ENERGIES:
+        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {describe(energy)}")
     return ENERGIES[energy](domain.V, domain.F)
 
 
-def _schedule(eta: float | Sequence[float] | None, barrier: bool) -> tuple[float, ...]:
+def _eta_schedule(eta: float | Sequence[float] | None, barrier: bool) -> tuple[float, ...]:
     if eta is None:
         return BARRIER_ETA if barrier else ETA
     schedule = np.atleast_1d(real_array("eta", eta))

@@ -15,16 +15,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.energies import Energy
-from quasiharmonic.energies.polishing import energy_named, polished
+from quasiharmonic.energies.polishing import PolishOptions, find_energy, polish_result
 from quasiharmonic.geometry.mesh.reference import Reference
+from quasiharmonic.io.adapters.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.batched import posed_each
+from quasiharmonic.problem.problem_batch import set_up_batch
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.solver.search.batched import GROUP, SMALL, Patterns, beginning_alike, first_stage
-from quasiharmonic.solver.search.solving import solve
-from quasiharmonic.solver.search.stages import ResumedStage, Stages
-from quasiharmonic.solver.search.strategy import STRATEGIES, stages_of
-from quasiharmonic.util.arrays import check_callback, check_choice, whole_number
+from quasiharmonic.solver.field.objective_batch import Patterns
+from quasiharmonic.solver.search.first_stage import GROUP, SMALL, group_by_first_stage, run_first_stage
+from quasiharmonic.solver.search.options import MAX_ITERATIONS, SearchOptions
+from quasiharmonic.solver.search.search import Search
+from quasiharmonic.solver.search.solving import finish_search, search_map
+from quasiharmonic.solver.search.stages import Stages
+from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.util.arrays import check_callback, check_choice, check_integer, check_sequence
 
 #: A problem as arrays: ``V, F, fixed, target`` as `quasiharmonic.Problem` takes them.
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
@@ -44,7 +48,7 @@ def injective_maps(
     reference: Reference | None = None,
     strategy: str | Stages = "speed",
     polish: str | Energy | None = None,
-    max_iterations: int = 2000,
+    max_iterations: int = MAX_ITERATIONS,
     linear_solver: str = "auto",
     jobs: int | None = None,
     errors: str = "raise",
@@ -105,18 +109,19 @@ def injective_maps(
     >>> sum(result.injective for result in results)
     20
     """
-    whole_number("max_iterations", max_iterations, least=1)
+    check_integer("max_iterations", max_iterations, minimum=1)
     if jobs is not None:
-        whole_number("jobs", jobs, least=1)
+        check_integer("jobs", jobs, minimum=1)
     check_choice("errors", errors, ("raise", "yield"))
     check_callback(callback)
     if reference is not None:
         check_choice("reference", reference, get_args(Reference))
     if isinstance(strategy, str):
         check_choice("strategy", strategy, STRATEGIES)
-    lower = None if polish is None else energy_named(polish)
-    settings = _Settings(reference, strategy, lower, max_iterations, linear_solver)
-    return _results(iter(problems), settings, jobs or _cores(), errors == "raise", callback)
+    search = SearchOptions(strategy=strategy, max_iterations=max_iterations, linear_solver=linear_solver)
+    settings = _Settings(reference, search, None if polish is None else find_energy(polish))
+    check_sequence("problems", problems, "problems")
+    return _solve_groups(iter(problems), settings, jobs or _count_cores(), errors == "raise", callback)
 
 
 @dataclass(frozen=True)
@@ -124,13 +129,11 @@ class _Settings:
     """Options that apply to all problems."""
 
     reference: Reference | None
-    strategy: str | Stages
-    lower: Energy | None
-    max_iterations: int
-    linear_solver: str
+    search: SearchOptions
+    polish: Energy | None
 
 
-def _results(
+def _solve_groups(
     problems: Iterator[Any], settings: _Settings, jobs: int, raising: bool, callback: Callable[[int], object] | None
 ) -> Iterator[MapResult | ValueError]:
     """Solve groups in threads and yield their results in order; submit a few more groups than there are threads."""
@@ -143,7 +146,7 @@ def _results(
         own: _Worker = workers.own
         return own.solve(first, group)
 
-    groups, waiting, done = _groups(problems), deque[Future[list[MapResult | Exception]]](), 0
+    groups, waiting, done = _group_problems(problems), deque[Future[list[MapResult | Exception]]](), 0
     pool = ThreadPoolExecutor(jobs, thread_name_prefix="injective_maps")
     try:
         while True:
@@ -151,11 +154,11 @@ def _results(
                 waiting.append(pool.submit(work, *group))
             if not waiting:
                 return
-            for found in _awaited(waiting.popleft(), done, callback):
-                if isinstance(found, Exception) and (raising or not isinstance(found, ValueError)):
-                    raise found
+            for result in _wait_for(waiting.popleft(), done, callback):
+                if isinstance(result, Exception) and (raising or not isinstance(result, ValueError)):
+                    raise result
                 done += 1
-                yield found
+                yield result
             if callback is not None:
                 callback(done)
     finally:
@@ -163,7 +166,7 @@ def _results(
         pool.shutdown(cancel_futures=True)
 
 
-def _awaited(
+def _wait_for(
     future: Future[list[Any]], done: int, callback: Callable[[int], object] | None
 ) -> list[MapResult | ValueError]:
     """Wait for the results of a group; meanwhile call the callback regularly and allow Ctrl-C."""
@@ -175,13 +178,13 @@ def _awaited(
                 callback(done)
 
 
-def _groups(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
+def _group_problems(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
     """Yield the number of the first problem of each group and the problems of the group, in order."""
     first, group, size, before = 0, list[Any](), 0, 0
     for given in problems:
-        triangles = _triangles(given)
-        most = GROUP * min(max(before // (_PART * GROUP), 1), _GROUPS)
-        if group and (size + triangles > most or triangles > SMALL):
+        triangles = _count_triangles(given)
+        limit = GROUP * min(max(before // (_PART * GROUP), 1), _GROUPS)
+        if group and (size + triangles > limit or triangles > SMALL):
             yield first, group
             before += size
             first, group, size = first + len(group), [], 0
@@ -191,7 +194,7 @@ def _groups(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
         yield first, group
 
 
-def _triangles(given: Any) -> int:
+def _count_triangles(given: Any) -> int:
     """Number of triangles of a problem that is not yet checked; 0 if it cannot be determined."""
     try:
         return len(given.F if isinstance(given, Problem) else given[1])
@@ -204,35 +207,30 @@ class _Worker:
 
     def __init__(self, settings: _Settings, stop: threading.Event) -> None:
         self._settings = settings
+        self._search = replace(settings.search, callback=self._check_wanted)
         self._stop = stop
-        self._patterns = Patterns(settings.linear_solver)
+        self._patterns = Patterns(settings.search.linear_solver)
         self._last: Problem | None = None
 
     def solve(self, first: int, group: Sequence[Any]) -> list[MapResult | Exception]:
         """Return the result or the exception of each problem; ``first`` is the number of the first problem."""
-        ready = self._posed_at_once(group)
-        posed = [self._posed(first + k, given, ready.get(k)) for k, given in enumerate(group)]
-        begun: dict[int, MapResult | ResumedStage] = {}
+        ready = self._set_up_batch(group)
+        posed = [self._set_up(first + k, given, ready.get(k)) for k, given in enumerate(group)]
+        begun: dict[int, MapResult | Search] = {}
         problems = {k: one for k, one in enumerate(posed) if not isinstance(one, Exception)}
-        for descent, some in beginning_alike(problems, self._settings.strategy).items():
-            found = first_stage(
-                [problems[k] for k in some],
-                descent,
-                self._patterns,
-                self._settings.max_iterations,
-                self._still_wanted,
-            )
-            begun |= {k: one for k, one in zip(some, found, strict=True) if one is not None}
+        for descent, keys in group_by_first_stage(problems, self._search.strategy):
+            outcomes = run_first_stage([problems[k] for k in keys], descent, self._patterns, self._search)
+            begun |= {k: one for k, one in zip(keys, outcomes, strict=True) if one is not None}
         return [
-            problem if isinstance(problem, Exception) else self._finished(first + k, problem, begun.get(k))
+            problem if isinstance(problem, Exception) else self._finish(first + k, problem, begun.get(k))
             for k, problem in enumerate(posed)
         ]
 
-    def _posed_at_once(self, group: Sequence[Any]) -> dict[int, Problem]:
+    def _set_up_batch(self, group: Sequence[Any]) -> dict[int, Problem]:
         """Set up problems with small meshes given as arrays in one batch; return {} if one of them is invalid."""
         if self._settings.reference is not None:
             return {}
-        fresh = dict[int, Any]()
+        new = dict[int, Any]()
         before: Sequence[Any] | None = None
         if self._last is not None:
             before = self._last.V, self._last.F, self._last.fixed
@@ -241,76 +239,68 @@ class _Worker:
                 continue
             if not isinstance(given, Sequence) or len(given) != 4:
                 return {}
-            if not all(isinstance(array, np.ndarray) for array in given) or _triangles(given) > SMALL:
+            if not all(isinstance(array, np.ndarray) for array in given) or _count_triangles(given) > SMALL:
                 return {}
-            if before is None or not all(map(_same, before, given[:3])):
-                fresh[k] = given
+            if before is None or not all(map(_is_same, before, given[:3])):
+                new[k] = given
             before = given[:3]
-        posed = posed_each(list(fresh.values())) if len(fresh) > 1 else None
-        return {} if posed is None else dict(zip(fresh, posed, strict=True))
+        posed = set_up_batch(list(new.values())) if len(new) > 1 else None
+        return {} if posed is None else dict(zip(new, posed, strict=True))
 
-    def _posed(self, number: int, given: Any, ready: Problem | None) -> Problem | Exception:
+    def _set_up(self, number: int, given: Any, ready: Problem | None) -> Problem | Exception:
         """Set up a problem, on the previous problem's domain if it is the same, or use ``ready`` if it is given."""
-        self._still_wanted()
+        self._check_wanted()
         if isinstance(given, Problem):
             return given
         try:
+            if isinstance(given, Sequence) and len(given) == 3 and stands_for_mesh(given[0]):
+                given = (*mesh_arrays(given[0]), *given[1:])
             if not isinstance(given, Sequence) or len(given) != 4:
-                raise ValueError("give each as a Problem or as V, F, fixed, target")
+                raise ValueError("give each as a Problem, as V, F, fixed, target or as mesh, fixed, target")
             V, F, fixed, target = given
             last, reference = self._last, self._settings.reference
-            if last is not None and _same(last.V, V) and _same(last.F, F) and _same(last.fixed, fixed):
+            if last is not None and _is_same(last.V, V) and _is_same(last.F, F) and _is_same(last.fixed, fixed):
                 return last.with_target(target)
             self._last = Problem(V, F, fixed, target, reference=reference) if ready is None else ready
         except Exception as error:
-            return _numbered(number, error)
+            return _add_number(number, error)
         return self._last
 
-    def _finished(self, number: int, problem: Problem, begun: MapResult | ResumedStage | None) -> MapResult | Exception:
-        """Complete the search for one problem from the result or stage in ``begun``."""
-        settings = self._settings
+    def _finish(self, number: int, problem: Problem, begun: MapResult | Search | None) -> MapResult | Exception:
+        """Complete the search for one problem, from its result or its search after the first stage."""
+        energy = self._settings.polish
         try:
             if isinstance(begun, MapResult):
-                if settings.lower is None:
-                    return begun
-                return polished(
-                    problem,
-                    begun,
-                    energy=settings.lower,
-                    linear_solver=settings.linear_solver,
-                    callback=self._still_wanted,
+                result = begun
+            elif begun is None:
+                result = search_map(problem, self._search)
+            else:
+                result = finish_search(begun, self._search.strategy, begun.stages[0].seconds)
+            if energy is not None and result.status is Status.INJECTIVE:
+                polishing = PolishOptions(
+                    energy=energy, linear_solver=self._search.linear_solver, callback=self._check_wanted
                 )
-            stages: str | Stages = settings.strategy
-            if begun is not None:
-                stages = [begun, *stages_of(stages, problem)[1:]]
-            result = solve(
-                problem,
-                strategy=stages,
-                polish=settings.lower,
-                max_iterations=settings.max_iterations,
-                linear_solver=settings.linear_solver,
-                callback=self._still_wanted,
-            )
+                result = polish_result(problem, result, polishing)
             if result.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
         except Exception as error:
-            return _numbered(number, error)
-        return result if begun is None else replace(result, seconds=result.seconds + begun.stage.seconds)
+            return _add_number(number, error)
+        return result
 
-    def _still_wanted(self, _: Step | None = None) -> None:
+    def _check_wanted(self, _: Step | None = None) -> None:
         """Raise KeyboardInterrupt if the caller no longer waits for results."""
         if self._stop.is_set():
             raise KeyboardInterrupt
 
 
-def _same(array: np.ndarray[Any, Any], given: Any) -> bool:
+def _is_same(array: np.ndarray[Any, Any], given: Any) -> bool:
     """Whether ``given`` is an array of the same shape and values."""
     if given is array:
         return True
     return isinstance(given, np.ndarray) and given.shape == array.shape and np.array_equal(array, given)
 
 
-def _numbered(number: int, error: Exception) -> Exception:
+def _add_number(number: int, error: Exception) -> Exception:
     """Add the number of the problem to an error."""
     if isinstance(error, ValueError):
         numbered = ValueError(f"problem {number}: {error}")
@@ -320,7 +310,7 @@ def _numbered(number: int, error: Exception) -> Exception:
     return error
 
 
-def _cores() -> int:
+def _count_cores() -> int:
     """Number of cores available to this process."""
     try:
         return len(os.sched_getaffinity(0))

@@ -20,18 +20,20 @@ from quasiharmonic.solver.methods import (
     WideRepair,
 )
 from quasiharmonic.solver.methods.base import SearchStage
-from quasiharmonic.solver.search.stages import CoarseToFine, Stages, TentativeStage, WhereMany
-from quasiharmonic.util.arrays import kind_of
+from quasiharmonic.solver.search.stages import CoarseToFine, IfManyInverted, Stages, TentativeStage
+from quasiharmonic.util.arrays import describe
 
 # Number of vertices from which a coarse-to-fine start pays. Making, solving and refining the coarse mesh is then faster
 # than ten iterations on the fine mesh.
-_LARGE = 6000
+_COARSE_FROM = 6000
 # Number of triangles from which wide patches are tried before the whole mesh is untangled.
 _WIDE_FROM = 4000
-# Up to this number of triangles, or of triangles per boundary edge, the composite costs more time than it saves.
-_SMALL, _SLIM = 1000, 4
+# Up to this number of triangles the composite costs more time than it saves,
+_COMPOSITE_FROM = 1000
+# and up to this number of triangles per boundary edge.
+_COMPOSITE_FROM_PER_EDGE = 4
 # Repetitions of alternation and Newton's method in the paper's pipeline.
-_TURNS = 10
+_REPETITIONS = 10
 
 
 def speed(problem: Problem) -> Stages:
@@ -46,59 +48,51 @@ def speed(problem: Problem) -> Stages:
       than changing tensors. Otherwise parts of the map are far from a solution, and Newton's method is used.
     - On a large mesh a coarse mesh is searched first; on a small mesh it is searched after the first repairs.
     - On a large mesh, wide patches are untangled before the whole mesh.
-
-    Parameters
-    ----------
-    problem : Problem
-
-    Returns
-    -------
-    list of Descent or CoarseToFine
-        Stages in the order in which they run.
     """
     domain = problem.domain
     pinned, triangles = bool(domain.pins.size), len(problem.F)
-    alone = len(domain.loops) == 1 and not pinned
-    composed = alone and triangles > max(_SMALL, _SLIM * domain.loops[0].size)
-    return list(_speed(pinned, alone, composed, problem.n >= _LARGE, triangles >= _WIDE_FROM))
+    is_disk = len(domain.loops) == 1 and not pinned
+    composed = is_disk and triangles > max(_COMPOSITE_FROM, _COMPOSITE_FROM_PER_EDGE * domain.loops[0].size)
+    return list(_speed(pinned, is_disk, composed, problem.n >= _COARSE_FROM, triangles >= _WIDE_FROM))
 
 
 @cache
-def _speed(pinned: bool, alone: bool, composed: bool, large: bool, wide: bool) -> Stages:
-    """Stages for a mesh with pins or not, with one loop and no pins or not, composite first or not, large or not.
+def _speed(pinned: bool, is_disk: bool, composed: bool, large: bool, wide: bool) -> Stages:
+    """Return the stages of `speed` for these properties of a mesh.
 
-    ``wide`` adds wide patches before the whole mesh is untangled.
+    It has pins, is a disk without pins, is mapped by the composite first, or is large; ``wide`` adds wide patches
+    before the whole mesh is untangled.
     """
     other: Stages = ()
     if pinned:
-        first: Descent = VectorAdam(parameterisation="si-log", iterations=400, placing=True)
+        first: Descent = VectorAdam(parameterisation="si-log", iterations=400, relocation=True)
         newton = Newton(parameterisation="si-log", iterations=60, resume=True)
     else:
-        first, newton = VectorAdam(iterations=100, placing=True), Newton(iterations=300, resume=True)
+        first, newton = VectorAdam(iterations=100, relocation=True), Newton(iterations=300, resume=True)
     # Most successful local repairs succeed within the first tries, and a failed try costs as much as many Newton steps.
     repair: Stages = (LineShift(resume=True), LocalRepair(tries=15, resume=True))
-    if alone:
+    if is_disk:
         # Two different starts: if one fails, the other may succeed.
-        composite = Composite(iterations=100, placing=True)
+        composite = Composite(iterations=100, relocation=True)
         first, second = (composite, first) if composed else (first, composite)
         other = (second, *repair)
     coarse = CoarseToFine(first)
-    soon: Stages = (first, *repair, coarse)
+    first_stages: Stages = (first, *repair, coarse)
     if large:
         # Newton steps untangle thousands of triangles at once, local repair only one patch at a time.
-        soon = (coarse, first, *((WhereMany(newton),) if alone else ()), *repair)
+        first_stages = (coarse, first, *((IfManyInverted(newton),) if is_disk else ()), *repair)
     return (
-        *soon,
+        *first_stages,
         *((WideRepair(resume=True),) if wide else ()),
         Untangling(iterations=400, resume=True),
-        LineShift(in_vain=10, resume=True),
+        LineShift(max_failures=10, resume=True),
         *other,
         newton,
         Untangling(iterations=600, resume=True),
-        LineShift(in_vain=10, resume=True),
-        RandomRestarts(in_vain=30, resume=True),
-        RandomRestarts(in_vain=30),
-        RandomRestarts(in_vain=60, resume=True),
+        LineShift(max_failures=10, resume=True),
+        RandomRestarts(max_failures=30, resume=True),
+        RandomRestarts(max_failures=30),
+        RandomRestarts(max_failures=60, resume=True),
     )
 
 
@@ -109,10 +103,6 @@ def paper(_: Problem) -> Stages:
     turns for the last few triangles, and failed alternations are discarded. All stages run on the mesh itself, with the
     surface's triangles as reference and angles below π/6 corrected (§F.1). The paper does not give the iterations of
     tanh and of each turn; those used here add up to 2000. The steps are the defaults of `VectorAdam`.
-
-    Returns
-    -------
-    list of Descent or TentativeStage
     """
     turn: list[SearchStage] = [
         TentativeStage(Alternating(reference="corrected", iterations=20, resume=True)),
@@ -121,7 +111,7 @@ def paper(_: Problem) -> Stages:
     return [
         VectorAdam(parameterisation="si-log", reference="corrected", iterations=1000),
         VectorAdam(reference="corrected", iterations=600),
-        *_TURNS * turn,
+        *_REPETITIONS * turn,
     ]
 
 
@@ -129,13 +119,7 @@ STRATEGIES: dict[str, Callable[[Problem], Stages]] = {"speed": speed, "paper": p
 
 
 def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
-    """Return the stages of a named strategy, or the given list of stages.
-
-    Raises
-    ------
-    ValueError
-        If the strategy is unknown, or the list is empty or contains other objects.
-    """
+    """Return the stages of a named strategy, or the given list of stages; raise a ValueError if neither is valid."""
     if isinstance(strategy, str):
         if strategy not in STRATEGIES:
             raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
@@ -144,16 +128,16 @@ def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
     stages = [stage for stage in given if isinstance(stage, SearchStage)]
     if not stages or len(stages) < len(given):
         raise ValueError(
-            f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {kind_of(strategy)}"
+            f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {describe(strategy)}"
         )
     return stages
 
 
-def soonest(stages: Stages) -> Stages:
+def quick_stages(stages: Stages) -> Stages:
     """Return the first stages of a strategy: up to the first on the mesh itself, and the quick ones after it."""
     before = list(takewhile(lambda stage: stage.coarse, stages))
     first = stages[len(before) : len(before) + 1]
-    rest = [stage for stage in stages[len(before) + 1 :] if not isinstance(stage, WhereMany)]
+    rest = [stage for stage in stages[len(before) + 1 :] if not isinstance(stage, IfManyInverted)]
     return [*before, *first, *takewhile(lambda stage: stage.quick, rest)]
 
 

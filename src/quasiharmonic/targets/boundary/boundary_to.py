@@ -12,20 +12,20 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.exact.loops import judge_loops, listed
+from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
+from quasiharmonic.geometry.exact.loops import check_loops, join_items
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.targets.boundary.chords import chords_of
-from quasiharmonic.targets.boundary.corner_fit import pins_by_angle
-from quasiharmonic.targets.boundary.correspondence import arc, seen_flat
-from quasiharmonic.targets.boundary.holes import least_stretch, match_holes
-from quasiharmonic.targets.boundary.pins import Corners, Pins
+from quasiharmonic.targets.boundary.corner_pins import Corners, Pins, pins_by_angle
+from quasiharmonic.targets.boundary.correspondence import arc_parameters, project_loop
+from quasiharmonic.targets.boundary.holes import choose_least_stretch, match_holes
 from quasiharmonic.targets.boundary.placement import Placement
 from quasiharmonic.targets.boundary.turning import boundary_turning, in_space, outermost
 from quasiharmonic.targets.outlines.contours import from_corner, in_unit
-from quasiharmonic.targets.outlines.nesting import Arranged, arranged, filled
+from quasiharmonic.targets.outlines.nesting import NestedContour, arrange, filled
 from quasiharmonic.targets.specification import outline as specified
-from quasiharmonic.util.arrays import FloatArray, IntArray, kind_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, describe
 
 
 @accepts_mesh
@@ -86,15 +86,16 @@ def boundary_to(
         - When a corner vertex is not on the boundary, its target is not on the outline, or vertices and targets follow
           each other in different orders.
     """
+    check_corner_angle(corner_angle)
     surface = Domain(V, F, [])
     count = surface.n
     # Corner numbers refer to the user's outline in its own orientation, so its first corner stays the first.
     given = _contours(outline, surface)
-    found = arranged(given)
+    found = arrange(given)
     if not found:
         raise ValueError("the outline has no contour")
     _check_fit(surface, found)
-    contours, exponent = in_unit([one.wound for one in found])
+    contours, exponent = in_unit([one.oriented for one in found])
     contours = [from_corner(c, corner_angle, one.reversed) for c, one in zip(contours, found, strict=True)]
     loops = surface.loops
     space = in_space(surface.V)
@@ -116,20 +117,20 @@ def boundary_to(
         free = [i for i in range(len(loops)) if i not in to]
         to[free[outermost([loops[i] for i in free], space)]] = 0
     outer = next(i for i, contour in to.items() if contour == 0)
-    flat = seen_flat(space[loops[outer]], contours[0])
+    flat = project_loop(space[loops[outer]], contours[0])
 
     def placement(i: int) -> Placement:
         chords = chords_of(loops[i], surface.edges.interior, count)
-        held = pins.along(i, to[i])
+        given_pins = pins.along(i, to[i])
         if by_angle and i == outer:
-            held = pins_by_angle(boundary_turning(surface.V, surface.F)[i], flat, contours[0], corner_angle)
-        return Placement(arc(space[loops[i]]), contours[to[i]], held, chords, loops[i], corner_angle)
+            given_pins = pins_by_angle(boundary_turning(surface.V, surface.F)[i], flat, contours[0], corner_angle)
+        return Placement(arc_parameters(space[loops[i]]), contours[to[i]], given_pins, chords, loops[i], corner_angle)
 
-    places = {outer: placement(outer).fitted(flat)}
+    positions = {outer: placement(outer).fit(flat)}
     if len(loops) > 1:
-        to |= match_holes(surface, outer, places[outer], contours, to)
-        places |= least_stretch(surface, places, {i: placement(i).choices() for i in to if i != outer})
-    target = np.ldexp(np.concatenate([places[i] for i in range(len(loops))]), exponent)
+        to |= match_holes(surface, outer, positions[outer], contours, to)
+        positions |= choose_least_stretch(surface, positions, {i: placement(i).choices() for i in to if i != outer})
+    target = np.ldexp(np.concatenate([positions[i] for i in range(len(loops))]), exponent)
     _check_simple(loops, target, count)
     return np.concatenate(loops), target
 
@@ -137,16 +138,16 @@ def boundary_to(
 def _contours(outline: Sequence[ArrayLike] | FloatArray | str | PathLike[str], surface: Domain) -> list[ArrayLike]:
     """The given contours, or those that the specification describes."""
     if isinstance(outline, str | PathLike):
-        meant = specified(outline)
-        return list(filled(meant)) if len(surface.loops) == 1 else list(meant)
+        described = specified(outline)
+        return list(filled(described)) if len(surface.loops) == 1 else list(described)
     if not isinstance(outline, Iterable):
-        raise ValueError(f'outline must be contours (k, 2), or words as "letter:R", not {kind_of(outline)}')
+        raise ValueError(f'outline must be contours (k, 2), or words as "letter:R", not {describe(outline)}')
     contours = list(outline)
     # A list of pairs of numbers is a single contour.
     return [contours] if contours and all(np.ndim(row) == 1 for row in contours) else contours
 
 
-def _check_fit(surface: Domain, contours: list[Arranged]) -> None:
+def _check_fit(surface: Domain, contours: list[NestedContour]) -> None:
     """Raise unless the surface and the region inside the contours have the same topology."""
     loops, f = len(surface.loops), len(surface.F)
     euler = surface.n - len(surface.edges.interior) - len(surface.edges.boundary) + f
@@ -158,7 +159,7 @@ def _check_fit(surface: Domain, contours: list[Arranged]) -> None:
         )
     pieces = [one.points[0].tolist() for one in contours if one.depth % 2 == 0]
     if len(pieces) > 1:
-        where = listed([f"({x:g}, {y:g})" for x, y in pieces])
+        where = join_items([f"({x:g}, {y:g})" for x, y in pieces])
         raise ValueError(
             f"the outline is in {len(pieces)} separate pieces (beginning at {where}), and a connected surface can fill "
             "only one: join them, or map a surface onto each"
@@ -182,9 +183,9 @@ def _check_fit(surface: Domain, contours: list[Arranged]) -> None:
 
 def _check_simple(loops: list[IntArray], target: FloatArray, n: int) -> None:
     """Raise if the target does not bound a region, because too few vertices cut off parts of the outline."""
-    places = np.zeros((n, 2))
-    places[np.concatenate(loops)] = target
-    _, reasons = judge_loops(loops, places)
+    positions = np.zeros((n, 2))
+    positions[np.concatenate(loops)] = target
+    _, reasons = check_loops(loops, positions)
     if reasons:
         raise ValueError(
             f"the boundary placed along the outline crosses or touches itself: {reasons[0]}. Its vertices are too few "

@@ -11,50 +11,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.targets.boundary.correspondence import Held, Stretch, arc, stretches
+from quasiharmonic.targets.boundary.correspondence import Held, Stretch, arc_parameters, stretches
 from quasiharmonic.targets.outlines.contours import corners, turns
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 # Minimum left turn in radians, larger than that of a rounded straight line.
-_BEND = 1e-9
+_MIN_TURN = 1e-9
 # Maximum shift of a vertex to a corner, as a share of the loop. Beyond it, the target no longer resembles the surface,
 # and splitting edges is better.
 FARTHEST = 0.2
 
 
-def make_room(
+def clear_chords(
     s: FloatArray, contour: FloatArray, pins: Held, *, corner_angle: float, chords: IntArray
 ) -> list[tuple[int, float]] | None:
     """Choose vertices for the convex corners of a contour, near them along the loop, so that chords have space.
 
-    Parameters
-    ----------
-    s : (n,) float64
-        Parameters of the vertices along their loop.
-    contour : (k, 2) float64
-    pins : sequence of (int, float)
-        Vertices with given parameters along the contour, in order around; at least one.
-    corner_angle : float
-        Degrees.
-    chords : (c, 2) int64
-        Pairs of vertices of the loop.
-
-    Returns
-    -------
-    list of (int, float) or None
-        The pins, and the chosen vertices with their corners, in order around. None if no choice leaves space for all
-        chords, or only one that shifts a vertex by more than a fifth of the loop. Chords across a pin are ignored.
+    ``s`` (n,) are the vertices' parameters along their loop, and ``chords`` (c, 2) pairs of them. The result contains
+    the ``pins`` and the chosen vertices with their corners, in order around. It is None if no choice leaves space for
+    all chords, or only one that shifts a vertex by more than a fifth of the loop. Chords across a pin are ignored.
     """
-    t, bends = arc(contour), turns(contour)
+    t, bends = arc_parameters(contour), turns(contour)
     sharp = corners(contour, corner_angle)
-    left = np.flatnonzero(bends > _BEND)
+    left = np.flatnonzero(bends > _MIN_TURN)
     found: list[tuple[int, float]] = []
     for stretch in stretches(s, pins):
         here, wanted = stretch.within(t, sharp[bends[sharp] > 0])
         spare = _between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
         straight = _between(wanted, stretch.within(t, left)[1]) == 0
-        room = ChordRoom(reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
-        chosen = choose(stretch.along, wanted, room)
+        conditions = ChordConditions(reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
+        chosen = choose(stretch.along, wanted, conditions)
         if chosen is None:
             return None
         found.append((int(stretch.run[0]), stretch.begin))
@@ -63,29 +49,18 @@ def make_room(
 
 
 @dataclass(frozen=True)
-class ChordRoom:
-    """Conditions on the vertices at convex corners of a stretch.
+class ChordConditions:
+    """Conditions on the vertices at convex corners of a stretch."""
 
-    Attributes
-    ----------
-    reach : (c + 1,) int64
-        For every vertex of the stretch, the smallest end of a chord that begins there or later. Ascending.
-    straight : (w + 1,) bool
-        Whether each side, from one convex corner to the next, has no left turn.
-    spare : (w + 1,) int64
-        Number of vertices that each side needs for other corners.
-    farthest : float
-        Maximum distance of a vertex from the corner that it takes.
-    """
-
+    # (c + 1,): for every vertex of the stretch, the smallest end of a chord that begins there or later. Ascending.
     reach: IntArray
-    straight: BoolArray
-    spare: IntArray
-    farthest: float
+    straight: BoolArray  # (w + 1,): whether each side, from one convex corner to the next, has no left turn
+    spare: IntArray  # (w + 1,): number of vertices that each side needs for other corners
+    farthest: float  # Maximum distance of a vertex from the corner that it takes
 
 
 def reach(stretch: Stretch, chords: IntArray, n: int) -> IntArray:
-    """Compute `ChordRoom.reach` for a stretch of a loop with ``n`` vertices; c + 1 where no chord is left."""
+    """Compute `ChordConditions.reach` for a stretch of a loop with ``n`` vertices; c + 1 where no chord is left."""
     count = len(stretch.run) - 1
     # Chords in both directions around the loop; those that leave the stretch are ignored.
     begin = (np.concatenate([chords[:, 0], chords[:, 1]]) - stretch.run[0]) % n
@@ -102,7 +77,7 @@ def _between(wanted: FloatArray, others: FloatArray) -> IntArray:
     return np.searchsorted(others, ends[1:], side="left") - np.searchsorted(others, ends[:-1], side="right")
 
 
-def choose(along: FloatArray, wanted: FloatArray, room: ChordRoom) -> IntArray | None:
+def choose(along: FloatArray, wanted: FloatArray, conditions: ChordConditions) -> IntArray | None:
     """Choose vertices for wanted parameters with the least sum of squared distances that leave space, or None.
 
     Row j + 1 of ``cost`` has, for every vertex, the lowest cost of the parameters up to j if j takes that vertex. On a
@@ -113,12 +88,17 @@ def choose(along: FloatArray, wanted: FloatArray, room: ChordRoom) -> IntArray |
     # Row 0: before the first parameter there is only the pin at the start.
     cost = [np.where(vertex == 0, 0.0, np.inf)]
     for j in range(len(wanted) + 1):
-        # Candidates before this vertex that leave space for a chord up to it, and vertices for other corners.
-        low = np.searchsorted(room.reach, vertex, side="right") if room.straight[j] else np.zeros(count + 1, np.int64)
-        best = _least(cost[j], low, vertex - room.spare[j])
+        # Consider only earlier candidates that leave space for a chord to this vertex and enough vertices for the other
+        # corners.
+        low = (
+            np.searchsorted(conditions.reach, vertex, side="right")
+            if conditions.straight[j]
+            else np.zeros(count + 1, np.int64)
+        )
+        best = _range_minima(cost[j], low, vertex - conditions.spare[j])
         if j < len(wanted):
             away = np.abs(along - wanted[j])
-            best += np.where(away <= room.farthest, away**2, np.inf)
+            best += np.where(away <= conditions.farthest, away**2, np.inf)
             best[count] = np.inf
         cost.append(best)
     if not np.isfinite(cost[-1][count]):
@@ -126,14 +106,14 @@ def choose(along: FloatArray, wanted: FloatArray, room: ChordRoom) -> IntArray |
     chosen = np.empty(len(wanted), dtype=np.int64)
     end = count
     for j in reversed(range(len(wanted))):
-        options = np.where(vertex < end - room.spare[j + 1], cost[j + 1], np.inf)
-        if room.straight[j + 1]:
-            options[room.reach <= end] = np.inf
+        options = np.where(vertex < end - conditions.spare[j + 1], cost[j + 1], np.inf)
+        if conditions.straight[j + 1]:
+            options[conditions.reach <= end] = np.inf
         end = chosen[j] = int(np.argmin(options))
     return chosen
 
 
-def _least(values: FloatArray, low: IntArray, high: IntArray) -> FloatArray:
+def _range_minima(values: FloatArray, low: IntArray, high: IntArray) -> FloatArray:
     """Minimum of ``values[low[i]:high[i]]`` for every i; infinite where the range is empty."""
     # Row k has the minimum of every 2ᵏ successive values. Two overlapping ranges of this length cover any range.
     rows = [values]

@@ -13,9 +13,10 @@ from quasiharmonic.targets.outlines.contours import as_complex
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    held_places,
-    held_vertices,
-    named,
+    check_non_negative,
+    fixed_vertices,
+    names_of,
+    target_positions,
     triangle_array,
     triangle_rows,
 )
@@ -25,15 +26,7 @@ STRAIGHT = 1e-9
 
 
 def chords_of(loop: IntArray, interior: IntArray, n: int) -> IntArray:
-    """Interior edges between two vertices of a loop, as positions in the loop, smaller first; (c, 2) int64.
-
-    Parameters
-    ----------
-    loop : (l,) int64
-    interior : (e, 2) int64
-    n : int
-        Number of vertices of the mesh.
-    """
+    """Return the interior edges (e, 2) between two vertices of a loop, as positions in it, smaller first; (c, 2)."""
     position = np.full(n, -1)
     position[loop] = np.arange(len(loop))
     found = position[interior]
@@ -69,32 +62,33 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     ValueError
         When an array is malformed, or a boundary vertex is not in ``fixed``.
     """
+    check_non_negative("tolerance", tolerance)
     F = triangle_rows(mesh_triangles(F))
     n = int(F.max(initial=-1)) + 1
     F = triangle_array(F, n)
-    fixed = held_vertices(fixed, n)
-    places = held_places(target, len(fixed))
+    fixed = fixed_vertices(fixed, n)
+    places = target_positions(target, len(fixed))
     found = edges(F, n)
     missing = np.setdiff1d(found.boundary, fixed)
     if missing.size:
-        raise ValueError(f"the boundary {named('vertex', 'vertices', missing)} not in fixed")
+        raise ValueError(f"the boundary {names_of('vertex', 'vertices', missing)} not in fixed")
     # Scale to magnitude about one, to avoid overflow and underflow.
     places = np.ldexp(places, -int(np.frexp(np.abs(places).max(initial=0))[1]))
     position = np.full((n, 2), np.nan)
     position[fixed] = places
-    least = tolerance * float(np.ptp(places, axis=0).max()) if len(places) else 0.0
+    min_bulge = tolerance * float(np.ptp(places, axis=0).max()) if len(places) else 0.0
     flat = [np.empty((0, 2), dtype=np.int64)]
     for loop in trace_loops(found.boundary):
         chords = chords_of(loop, found.interior, n)
-        flat.append(np.sort(loop[chords[list(flat_chords(chords, position[loop], least))]], axis=1))
+        flat.append(np.sort(loop[chords[list(flat_chords(chords, position[loop], min_bulge))]], axis=1))
     return np.concatenate(flat)
 
 
-def flat_chords(chords: IntArray, places: FloatArray, least: float) -> Iterator[int]:
-    """Yield rows of chords between whose ends the loop bends outwards by at most ``least``."""
-    w = as_complex(places)
+def flat_chords(chords: IntArray, positions: FloatArray, min_bulge: float) -> Iterator[int]:
+    """Yield rows of chords between whose ends the loop bends outwards by at most ``min_bulge``."""
+    w = as_complex(positions)
     for k, (i, j) in enumerate(chords.tolist()):
-        if min(_bulge(w[i : j + 1]), _bulge(np.concatenate([w[j:], w[: i + 1]]))) <= least:
+        if min(_bulge(w[i : j + 1]), _bulge(np.concatenate([w[j:], w[: i + 1]]))) <= min_bulge:
             yield k
 
 

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.io.textual import integer
-from quasiharmonic.targets.boundary.pins import Corners
+from quasiharmonic.io.lowlevel.textual import integer
+from quasiharmonic.targets.boundary.corner_pins import Corners
 from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array
 
 FORMS = "V, V:K and V:X:Y, where near:x,y,z may stand for the vertex V"
@@ -25,31 +25,19 @@ Goal: TypeAlias = int | tuple[float, float]
 
 
 @dataclass(frozen=True)
-class AskedCorners:
-    """User-specified corners, independent of the surface.
+class CornerSpec:
+    """User-specified corners, independent of the surface."""
 
-    Attributes
-    ----------
-    entries : tuple of (int or (x, y, z), int or (x, y) or None), or "auto"
-        Each entry has a vertex and its target. The vertex may be given by a position in space, which stands for the
-        nearest boundary vertex. The target is a corner's number or a point of the outline. If the vertices go to the
-        outline's corners in order, all targets are None.
-    """
-
+    # Each entry has a vertex and its target. The vertex may be given by a position in space, which stands for the
+    # nearest boundary vertex. The target is a corner's number or a point of the outline. If the vertices go to the
+    # outline's corners in order, all targets are None.
     entries: tuple[tuple[int | Place, Goal | None], ...] | Literal["auto"]
 
-    def within(self, vertices: IntArray) -> AskedCorners | None:
-        """Return the corners of one island, with vertices in the island's numbering.
+    def within(self, vertices: IntArray) -> CornerSpec | None:
+        """Return the corners of one island, with vertices in the island's numbering; None if no corner is left.
 
-        Parameters
-        ----------
-        vertices : (m,) int64
-            Mesh vertex of each island vertex, ascending. If a mesh vertex occurs twice, the first is used.
-
-        Returns
-        -------
-        AskedCorners or None
-            Without corners of other islands; None if no corner is left.
+        ``vertices`` (m,) is the mesh vertex of each island vertex, ascending. If a mesh vertex occurs twice, the first
+        is used.
         """
         if isinstance(self.entries, str) or np.array_equal(vertices, np.arange(len(vertices))):
             return self
@@ -58,25 +46,14 @@ class AskedCorners:
             for who, goal in self.entries
             if not isinstance(who, int) or who in vertices
         ]
-        return AskedCorners(tuple(own)) if own else None
+        return CornerSpec(tuple(own)) if own else None
 
     def on(self, V: ArrayLike, F: ArrayLike) -> Corners | Literal["auto"]:
-        """Return the corners for a surface, in the form that `boundary_to` accepts.
-
-        Parameters
-        ----------
-        V : (n, 2) or (n, 3) array
-        F : (f, 3) array of int
-
-        Raises
-        ------
-        ValueError
-            When a vertex is specified twice.
-        """
+        """Return the corners for a surface, as `boundary_to` accepts them; ValueError when a vertex occurs twice."""
         if isinstance(self.entries, str):
             return "auto"
-        places = [who for who, _ in self.entries if isinstance(who, tuple)]
-        found = iter(nearest_on_boundary(V, F, places).tolist() if places else [])
+        positions = [who for who, _ in self.entries if isinstance(who, tuple)]
+        found = iter(nearest_on_boundary(V, F, positions).tolist() if positions else [])
         named: dict[int, str] = {}
         for who, _ in self.entries:
             vertex = next(found) if isinstance(who, tuple) else who
@@ -90,7 +67,7 @@ class AskedCorners:
         return goals or list(named)
 
 
-def read_corners(text: str) -> AskedCorners:
+def read_corners(text: str) -> CornerSpec:
     """Parse corners from a string, or from the text file that it names.
 
     Parameters
@@ -103,7 +80,7 @@ def read_corners(text: str) -> AskedCorners:
 
     Returns
     -------
-    AskedCorners
+    CornerSpec
 
     Raises
     ------
@@ -116,20 +93,20 @@ def read_corners(text: str) -> AskedCorners:
     (((0.0, 0.5, 0.0), 2), (17, 3))
     """
     if text == "auto":
-        return AskedCorners("auto")
+        return CornerSpec("auto")
     if os.path.isfile(text):
         lines = Path(text).read_text(encoding="utf-8", errors="replace").splitlines()
         words = [re.sub(r"\s*,\s*", ",", line.split("#")[0]).replace(":", " ").split() for line in lines]
         entries = [_entry(":".join(line)) for line in words if line]
     else:
-        entries = [_entry(part) for part in _parted(text)]
+        entries = [_entry(part) for part in _split(text)]
     if not entries:
         raise ValueError(f"the file names no corners: each line needs one of {FORMS}")
     lone = [who for who, goal in entries if goal is None]
     if lone and len(lone) < len(entries):
         who = f"vertex {lone[0]}" if isinstance(lone[0], int) else f"the vertex near {lone[0]}"
         raise ValueError(f"{who} has no corner or point, but other vertices have one: give one for each")
-    return AskedCorners(tuple(entries))
+    return CornerSpec(tuple(entries))
 
 
 @accepts_mesh
@@ -171,7 +148,7 @@ def _spatial(points: FloatArray) -> FloatArray:
     return points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
 
 
-def _parted(text: str) -> list[str]:
+def _split(text: str) -> list[str]:
     """Split a list of entries at commas; a position contains two commas of its own."""
     parts, entries = [part.strip() for part in text.split(",")], []
     while parts:

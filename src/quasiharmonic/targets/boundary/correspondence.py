@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.targets.outlines.contours import checked, corners, signed_area
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
+from quasiharmonic.targets.outlines.contours import check_contour, corners, signed_area
+from quasiharmonic.util.arrays import FloatArray, IntArray, describe
 
 # Vertices of a loop with their parameters along a contour.
 Held = Sequence[tuple[int, float]]
@@ -52,15 +54,16 @@ def arc_length(
         When an array is not a curve of finite points, the loop has fewer vertices than the outline has corners, two
         successive vertices of the loop (almost) coincide, or ``start`` is out of range.
     """
-    points = checked(loop, "loop", (2, 3))
-    contour = checked(outline, "outline")
+    points = check_contour(loop, "loop", (2, 3))
+    contour = check_contour(outline, "outline")
     n = len(points)
-    s = arc(points)
+    check_corner_angle(corner_angle)
+    s = arc_parameters(points)
     if start is None:
-        start = best_start(s, seen_flat(points, contour), contour)
-    elif not 0 <= start < n:
-        raise ValueError(f"start = {start}, but the loop has vertices 0 to {n - 1}")
-    return at(contour, places_along(s, contour, [(start, 0.0)], corner_angle=corner_angle))
+        start = find_start(s, project_loop(points, contour), contour)
+    elif not isinstance(start, Integral) or not 0 <= start < n:
+        raise ValueError(f"start = {describe(start)}, but the loop has vertices 0 to {n - 1}")
+    return points_at(contour, places_along(s, contour, [(start, 0.0)], corner_angle=corner_angle))
 
 
 def places_along(
@@ -73,30 +76,13 @@ def places_along(
 ) -> FloatArray:
     """Find parameters along a contour for a loop with given pins; each corner gets the vertex nearest along the loop.
 
-    Parameters
-    ----------
-    s : (n,) float64
-        Parameters of the vertices along their loop, as returned by `arc`.
-    contour : (k, 2) float64
-    pins : sequence of (int, float)
-        Vertices of the loop and their parameters along the contour, both in order around; at least one.
-    corner_angle : float
-        Degrees.
-    names : (n,) int64, optional
-        Vertex numbers for messages; by default positions in the loop.
-
-    Returns
-    -------
-    (n,) float64
-        Parameters of the vertices along the contour, from 0 to 1, as in `arc`; input of `at`.
-
-    Raises
-    ------
-    ValueError
-        When there are fewer vertices than corners between two pins, or two vertices coincide.
+    ``s`` (n,) are the vertices' parameters along their loop, as from `arc_parameters`. The ``pins``, at least one, are
+    vertices of the loop and their parameters along the contour, in order around. The result (n,) is an input of
+    `points_at`. Messages use the vertex numbers ``names`` (n,). ValueError when there are fewer vertices than corners
+    between two pins, or two vertices coincide.
     """
     names = np.arange(len(s)) if names is None else names
-    t = arc(contour)
+    t = arc_parameters(contour)
     sharp = corners(contour, corner_angle)
     place = np.empty(len(s))
     for stretch in stretches(s, pins):
@@ -123,24 +109,12 @@ def places_along(
 
 @dataclass(frozen=True)
 class Stretch:
-    """The part of a loop from one pin to the next, both included.
+    """The part of a loop from one pin to the next, both included."""
 
-    Attributes
-    ----------
-    run : (c + 1,) int64
-        Vertices of the loop.
-    along : (c + 1,) float64
-        Their parameters along the stretch, from 0 to 1.
-    begin : float
-        Parameter of the first pin along the contour.
-    gap : float
-        Distance along the contour from the first pin to the last.
-    """
-
-    run: IntArray
-    along: FloatArray
-    begin: float
-    gap: float
+    run: IntArray  # (c + 1,): vertices of the loop
+    along: FloatArray  # (c + 1,): their parameters along the stretch, from 0 to 1
+    begin: float  # Parameter of the first pin along the contour
+    gap: float  # Distance along the contour from the first pin to the last
 
     def within(self, t: FloatArray, some: IntArray) -> tuple[IntArray, FloatArray]:
         """Return the given contour points strictly inside this stretch, in order, with local parameters from 0 to 1."""
@@ -174,7 +148,7 @@ def _too_few(first: int, last: int, free: int, wanted: int) -> ValueError:
     )
 
 
-def arc(points: FloatArray) -> FloatArray:
+def arc_parameters(points: FloatArray) -> FloatArray:
     """Parameters of points along their closed curve of total length 1; (n,) from 0."""
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     ends = np.cumsum(steps)
@@ -183,29 +157,23 @@ def arc(points: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], ends[:-1] / ends[-1]])
 
 
-def at(contour: FloatArray, place: FloatArray) -> FloatArray:
+def points_at(contour: FloatArray, place: FloatArray) -> FloatArray:
     """Points of a contour at parameters from 0 to 1; (n, 2)."""
-    t = np.append(arc(contour), 1.0)
+    t = np.append(arc_parameters(contour), 1.0)
     closed = np.concatenate([contour, contour[:1]])
     return np.stack([np.interp(place, t, closed[:, axis]) for axis in range(2)], axis=1)
 
 
-def off(contour: FloatArray, along: FloatArray, places: FloatArray) -> float:
-    """Maximum distance of a contour's points from the sides of the polygon formed by a loop's target positions.
+def max_deviation(contour: FloatArray, along: FloatArray, positions: FloatArray) -> float:
+    """Maximum distance of a contour's points from the sides of the polygon of a loop's target positions (n, 2).
 
-    Parameters
-    ----------
-    contour : (k, 2) float64
-    along : (n,) float64
-        Parameters of the vertices along the contour, in order around.
-    places : (n, 2) float64
-        Target positions of the vertices.
+    ``along`` (n,) are the parameters of the vertices along the contour, in order around.
     """
     order = np.argsort(along, kind="stable")
     # Points before the first vertex belong to the side from the last vertex to it.
-    last = order[np.searchsorted(along[order], arc(contour), side="right") - 1]
-    begin = places[last]
-    side = places[(last + 1) % len(places)] - begin
+    last = order[np.searchsorted(along[order], arc_parameters(contour), side="right") - 1]
+    begin = positions[last]
+    side = positions[(last + 1) % len(positions)] - begin
     length = np.maximum((side**2).sum(axis=1), np.finfo(np.float64).tiny)
     share = np.clip(((contour - begin) * side).sum(axis=1) / length, 0, 1)
     return float(np.linalg.norm(begin + share[:, None] * side - contour, axis=1).max())
@@ -232,21 +200,14 @@ def _match(along: FloatArray, wanted: FloatArray) -> IntArray:
     return chosen
 
 
-def best_start(s: FloatArray, flat: FloatArray, contour: FloatArray) -> int:
+def find_start(s: FloatArray, flat: FloatArray, contour: FloatArray) -> int:
     """Return the start vertex for which a loop and a contour are closest.
 
-    With the curves z and w as complex functions of arc length, ∫ |z(s + δ) − w(s)|² ds is minimal where Re ∫ z(s + δ)
-    w̄(s) ds is maximal. This correlation is computed for all δ at once by FFT.
-
-    Parameters
-    ----------
-    s : (n,) float64
-        Parameters of the vertices along the loop.
-    flat : (n, 2) float64
-        The loop projected to the plane.
-    contour : (k, 2) float64
+    ``s`` (n,) are parameters along the loop, ``flat`` (n, 2) the projected loop. With the curves z and w as complex
+    functions of arc length, ∫ |z(s + δ) − w(s)|² ds is minimal where Re ∫ z(s + δ) w̄(s) ds is maximal. This
+    correlation is computed for all δ at once by FFT.
     """
-    t = arc(contour)
+    t = arc_parameters(contour)
     m = max(1024, 4 * len(s))
     z, w = (
         np.interp(np.arange(m) / m, np.append(where, 1.0), np.append(curve, curve[0]))
@@ -259,25 +220,20 @@ def best_start(s: FloatArray, flat: FloatArray, contour: FloatArray) -> int:
     return int(np.argmin(np.minimum(away, 1 - away)))
 
 
-def seen_flat(points: FloatArray, contour: FloatArray) -> FloatArray:
+def project_loop(points: FloatArray, contour: FloatArray) -> FloatArray:
     """Project a loop to the plane from the side where it has the contour's orientation, y-axis upwards; (n, 2)."""
     if points.shape[1] == 2:
         return points
     centred = points - points.mean(axis=0)
     normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
-    return np.asarray(centred @ upright(normal * np.sign(signed_area(contour)))[:2].T)
+    return np.asarray(centred @ viewer_axes(normal * np.sign(signed_area(contour)))[:2].T)
 
 
-def upright(normal: FloatArray) -> FloatArray:
-    """Right, up and towards-the-viewer axes of a viewer who looks against ``normal``, with the y-axis upwards.
+def viewer_axes(normal: FloatArray) -> FloatArray:
+    """Right, up and towards-the-viewer axes of a viewer who looks against ``normal``, as orthonormal rows.
 
-    For a viewer along the y-axis, up is −z from above and z from below. For a zero normal the viewer looks against the
-    z-axis.
-
-    Returns
-    -------
-    (3, 3) float64
-        Orthonormal rows.
+    Up is the y-axis as far as possible; for a viewer along the y-axis it is −z from above and z from below. For a zero
+    normal the viewer looks against the z-axis.
     """
     size = np.linalg.norm(normal)
     towards = normal / size if size > 0 else np.array([0.0, 0.0, 1.0])

@@ -12,33 +12,17 @@ from quasiharmonic.targets.outlines.contours import as_complex
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 # Number of choices per loop for which the full energy is computed.
-_PROMISING = 8
+_CANDIDATES = 8
 
 
 def match_holes(
-    surface: Domain, outer: int, places: FloatArray, contours: list[FloatArray], to: Mapping[int, int]
+    surface: Domain, outer: int, positions: FloatArray, contours: list[FloatArray], to: Mapping[int, int]
 ) -> dict[int, int]:
-    """Assign a nearby contour to every loop that has none.
+    """Assign a nearby contour to every loop that has none in ``to``, which has ``outer``; return these only.
 
-    The surface, its holes filled, is mapped into the outer contour by Tutte's embedding. The assignment minimises the
-    sum of squared distances between the centres of its holes and those of the contours.
-
-    Parameters
-    ----------
-    surface : Domain
-        The mesh; its positions are not used.
-    outer : int
-        The loop that goes to the outer contour.
-    places : (l, 2) float64
-        Target positions of this loop.
-    contours : list of (k, 2) float64
-    to : mapping of int to int
-        Contours of loops that are already assigned, including ``outer``.
-
-    Returns
-    -------
-    dict of int to int
-        Contours of the other loops.
+    The surface, its holes filled, is mapped into the outer contour by Tutte's embedding with the outer loop at
+    ``positions`` (l, 2). The assignment minimises the sum of squared distances between the centres of its holes and
+    those of the contours. The positions of ``surface`` are not used.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -46,63 +30,50 @@ def match_holes(
     holes = [c for c in range(len(contours)) if c not in to.values()]
     if len(loops) < 2:
         return dict(zip(loops, holes, strict=True))
-    middles = _middles(surface, outer, places)
+    middles = _middles(surface, outer, positions)
     centres = np.array([_centroid(contours[c]) for c in holes])
     rows, columns = linear_sum_assignment(np.abs(middles[loops, None] - centres) ** 2)
     return {loops[i]: holes[c] for i, c in zip(rows, columns, strict=True)}
 
 
-def least_stretch(
+def choose_least_stretch(
     surface: Domain, given: Mapping[int, FloatArray], choices: Mapping[int, list[FloatArray]]
 ) -> dict[int, FloatArray]:
     """Choose positions of loops for which Tutte's embedding has the least Dirichlet energy.
 
-    A hole that is rotated against the surrounding surface twists the embedding, which increases the energy. The energy
-    is a quadratic form in the boundary's positions. Its part linear in one loop's positions, with the other loops given
-    or shrunk to points, needs one solve for all choices. It selects the few most promising choices, for which the whole
-    form is computed. Then each loop in turn takes its best choice until none changes.
-
-    Parameters
-    ----------
-    surface : Domain
-        The mesh; its positions are not used.
-    given : mapping of int to (l, 2) float64
-        Positions of some loops.
-    choices : mapping of int to list of (l, 2) float64
-        Possible positions of every other loop.
-
-    Returns
-    -------
-    dict of int to (l, 2) float64
-        The chosen positions.
+    ``given`` has the positions of some loops, ``choices`` the possible positions of every other one. A hole that is
+    rotated against the surrounding surface twists the embedding, which increases the energy. The energy is a quadratic
+    form in the boundary's positions. Its part linear in one loop's positions, with the other loops given or shrunk to
+    points, needs one solve for all choices. It selects the few most promising choices, for which the whole form is
+    computed. Then each loop in turn takes its best choice until none changes.
     """
     loops = surface.loops
-    if all(len(places) == 1 for places in choices.values()):
-        return {i: places[0] for i, places in choices.items()}
+    if all(len(positions) == 1 for positions in choices.values()):
+        return {i: positions[0] for i, positions in choices.items()}
     pattern = Laplacian(surface.F, surface.n, np.concatenate(loops))
     # Weights of equilateral triangles, up to a factor.
     laplacian = pattern.factor(np.full((3, len(surface.F)), -1.0))
 
-    def forces(places: Mapping[int, ComplexArray]) -> ComplexArray:
+    def forces(positions: Mapping[int, ComplexArray]) -> ComplexArray:
         w = np.zeros(surface.n, dtype=np.complex128)
-        for i, points in places.items():
+        for i, points in positions.items():
             w[loops[i]] = points
         return laplacian.flux(laplacian.extend(w))
 
     def work(i: int, offsets: list[ComplexArray], force: ComplexArray) -> FloatArray:
         return np.array([np.vdot(offset, force[loops[i]]).real for offset in offsets])
 
-    of_given = {i: as_complex(places) for i, places in given.items()}
+    of_given = {i: as_complex(positions) for i, positions in given.items()}
     offsets = {}
-    for i, places in choices.items():
-        turned = [as_complex(points) for points in places]
+    for i, positions in choices.items():
+        turned = [as_complex(points) for points in positions]
         of_given[i] = np.full(len(loops[i]), np.mean([points.mean() for points in turned]))
         offsets[i] = [points - of_given[i] for points in turned]
     pull = forces(of_given)
     kept, answers, own = {}, {}, {}
     for i in choices:
         linear = 2 * work(i, offsets[i], pull)
-        kept[i] = np.argsort(linear, kind="stable")[:_PROMISING]
+        kept[i] = np.argsort(linear, kind="stable")[:_CANDIDATES]
         offsets[i] = [offsets[i][k] for k in kept[i]]
         answers[i] = [forces({i: offset}) for offset in offsets[i]]
         # The quadratic part of each choice by itself.
@@ -120,7 +91,7 @@ def least_stretch(
     return {i: choices[i][kept[i][k]] for i, k in taken.items()}
 
 
-def _middles(surface: Domain, outer: int, places: FloatArray) -> ComplexArray:
+def _middles(surface: Domain, outer: int, positions: FloatArray) -> ComplexArray:
     """Positions of the centres of the holes, each filled by a fan; one complex number for every loop."""
     fans = [surface.F]
     for i, loop in enumerate(surface.loops):
@@ -133,7 +104,7 @@ def _middles(surface: Domain, outer: int, places: FloatArray) -> ComplexArray:
     fixed = np.append(surface.loops[outer], surface.n + outer)
     laplacian = Laplacian(F, n, fixed).factor(np.full((3, len(F)), -1.0))
     w = np.zeros(n, dtype=np.complex128)
-    w[surface.loops[outer]] = as_complex(places)
+    w[surface.loops[outer]] = as_complex(positions)
     return laplacian.extend(w)[surface.n :]
 
 

@@ -24,14 +24,14 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.util.arrays import FloatArray, IntArray, triangle_array, vertex_array, whole_number
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, triangle_array, vertex_array
 
 # Total turning in radians that is added, spread evenly, so that corners divide a straight side evenly.
-_BEND = 0.01
+_ADDED_TURNING = 0.01
 # Maximum number of passes of moves. The first few give nearly all of the decrease.
-_MOST_ROUNDS = 50
+_MAX_ROUNDS = 50
 # Minimum relative decrease of the sum for a move, larger than rounding errors.
-_LEAST = 1e-9
+_MIN_DECREASE = 1e-9
 # Minimum edge length, as a share of the loop's length.
 _SHORTEST = 1e-12
 
@@ -75,7 +75,7 @@ class BoundaryLoop:
         ValueError
             When the loop has fewer vertices, or all its vertices coincide.
         """
-        whole_number("count", count, least=1)
+        check_integer("count", count, minimum=1)
         if count > len(self.vertices):
             raise ValueError(
                 f"the loop has {len(self.vertices)} vertices, too few for {count} corners: split boundary edges"
@@ -85,8 +85,8 @@ class BoundaryLoop:
             raise ValueError(f"all vertices of the boundary loop at vertex {self.vertices[0]} coincide")
         lengths = np.maximum(self.lengths / longest, _SHORTEST)
         lengths /= lengths.sum()
-        bent = self.turning + _BEND * (lengths + np.roll(lengths, 1)) / 2
-        found = _settled(lengths, bent, _left_over(lengths, bent, count))
+        bent = self.turning + _ADDED_TURNING * (lengths + np.roll(lengths, 1)) / 2
+        found = _improve(lengths, bent, _remove_until(lengths, bent, count))
         return found, mean_turns(lengths, self.turning, found)
 
 
@@ -177,28 +177,16 @@ def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
 
 
 def mean_turns(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> FloatArray:
-    """Angles between the mean directions of the runs before and after each corner of a closed curve.
+    """Return the angle from the mean direction of the run before each corner to that of the run after it, (k,) radians.
 
-    Parameters
-    ----------
-    lengths : (l,) float64
-        Lengths of the edges from each vertex to the next; positive.
-    turning : (l,) float64
-        Turning angles in radians.
-    corners : (k,) int64
-        Ascending.
-
-    Returns
-    -------
-    (k,) float64
-        Radians; their sum is that of ``turning``.
+    ``lengths`` and ``turning`` (l,) are edge lengths and turning angles. The sum of the result is that of ``turning``.
     """
-    mean, whole = np.empty(len(corners)), np.empty(len(corners))
+    mean, total = np.empty(len(corners)), np.empty(len(corners))
     for j, run in enumerate(_runs(corners, len(lengths))):
         # Relative to the direction at the start of the run.
         direction = np.cumsum(turning[run]) - turning[run[0]]
-        mean[j], whole[j] = (lengths[run] * direction).sum() / lengths[run].sum(), direction[-1]
-    return np.asarray(np.roll(whole - mean, 1) + turning[corners] + mean)
+        mean[j], total[j] = (lengths[run] * direction).sum() / lengths[run].sum(), direction[-1]
+    return np.asarray(np.roll(total - mean, 1) + turning[corners] + mean)
 
 
 def outermost(loops: Sequence[IntArray], space: FloatArray) -> int:
@@ -234,7 +222,7 @@ def _runs(corners: IntArray, n: int) -> list[IntArray]:
     return [(c + np.arange((d - c) % n or n)) % n for c, d in zip(corners.tolist(), after.tolist(), strict=True)]
 
 
-def _left_over(lengths: FloatArray, turning: FloatArray, count: int) -> IntArray:
+def _remove_until(lengths: FloatArray, turning: FloatArray, count: int) -> IntArray:
     """Remove corners, each time the one that increases the sum least, until ``count`` are left."""
     n = len(lengths)
     # ``run`` has the length of the run that begins at each corner, ``turn`` the corner's turning angle.
@@ -266,13 +254,13 @@ def _left_over(lengths: FloatArray, turning: FloatArray, count: int) -> IntArray
     return np.array(sorted(left), dtype=np.int64)
 
 
-def _settled(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> IntArray:
+def _improve(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> IntArray:
     """Move each corner to the best vertex between its neighbours until all corners have converged."""
     n, count = len(lengths), len(corners)
     if count == 1:
         return corners
     corners = corners.copy()
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         before = corners.copy()
         for j in range(count):
             first = int(corners[j - 1])
@@ -283,7 +271,7 @@ def _settled(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> Int
             so_far, along = np.cumsum(length * direction)[:-1], np.cumsum(length)[:-1]
             lowered = so_far**2 * length.sum() / (along * (length.sum() - along))
             here, best = (int(corners[j]) - first) % n - 1, int(np.argmax(lowered))
-            if lowered[best] > lowered[here] + _LEAST * (length * direction**2).sum():
+            if lowered[best] > lowered[here] + _MIN_DECREASE * (length * direction**2).sum():
                 corners[j] = run[best + 1]
         if np.array_equal(corners, before):
             break

@@ -2,22 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
 from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.opening import opened_along
-from quasiharmonic.geometry.mesh.surface import manifold_edges
+from quasiharmonic.geometry.mesh.fans import open_along
+from quasiharmonic.geometry.mesh.surface_checks import manifold_edges
 from quasiharmonic.geometry.mesh.topology import components, edge_keys
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
-from quasiharmonic.targets.cuts.reaching import reached
-from quasiharmonic.targets.cuts.shortening import shortened
+from quasiharmonic.targets.cuts.levels import cut_by_levels
+from quasiharmonic.targets.cuts.reaching import extend_cuts
+from quasiharmonic.targets.cuts.shortening import shorten_cuts
 from quasiharmonic.targets.cuts.topological import opening_cuts
-from quasiharmonic.util.arrays import IntArray, check_range, index_array, triangle_array, vertex_array
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_range,
+    index_array,
+    names_of,
+    real_array,
+    triangle_array,
+    vertex_array,
+)
 
+# A surface with more vertices is cut on a coarse mesh first.
+_LARGE = 15_000
+# `crease_costs` saves this share of the cost where the surface bends inwards by this angle or more.
+_SAVED, _CONCAVE = 0.75, np.pi / 3
+# Rings of triangles by which cuts may move on each finer mesh. Longer moves would shorten cuts at the expense of
+# distortion; cuts that only make disks may move further.
+_RINGS, _RINGS_OF_SHORTEST = 3, 10
 # Cost factor of forbidden edges; it exceeds the length of any detour.
 _DEAR = 1e6
 
@@ -29,6 +47,7 @@ def find_cuts(
     *,
     edges: ArrayLike | None = None,
     forbidden_edges: ArrayLike | None = None,
+    edge_costs: ArrayLike | None = None,
     min_gain: float = 0.1,
 ) -> IntArray:
     """Find edges along which to cut a surface so that each part is a disk and flattens with little distortion.
@@ -36,7 +55,8 @@ def find_cuts(
     First, cuts are made that the topology requires. They open handles and connect boundary loops; a closed surface
     without handles is cut along a long path. Then cuts are extended to protruding or saddle-shaped parts, where a map
     would otherwise shrink or stretch most, as long as the gain justifies their length. Finally all cuts are shortened.
-    Cuts prefer creases, above all concave ones.
+    Cuts prefer creases, above all concave ones. On surfaces of more than 15,000 vertices, cuts are found on a coarse
+    mesh, carried to the surface, and shortened there.
 
     Parameters
     ----------
@@ -49,6 +69,10 @@ def find_cuts(
         the interior opens nothing and is ignored.
     forbidden_edges : (d, 2) array of int, optional
         Edges not to cut, such as diagonals of quadrilateral faces. Every vertex must have other edges.
+    edge_costs : (f, 3) array, optional
+        Cost of a cut along each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0, relative to a cut of the
+        same length elsewhere. An edge has the mean of its two sides. Positive; 1 by default. For example, costs above 1
+        keep cuts away from visible parts. `crease_costs` returns costs that keep cuts in creases.
     min_gain : float
         Minimum decrease of the mean symmetric Dirichlet energy (0 without distortion) per unit length of a cut. The
         unit is the square root of the surface's area. A loose end of a cut in the interior counts as a tenth of this
@@ -63,9 +87,9 @@ def find_cuts(
     Raises
     ------
     ValueError
-        When an array has the wrong shape or an index is out of range, a coordinate is not finite, or ``min_gain`` is
-        not positive. When the triangles are not a surface: an edge has three triangles, the winding is inconsistent, or
-        a triangle repeats a vertex. The message lists the first elements.
+        When an array has the wrong shape or an index is out of range, a coordinate is not finite, or ``min_gain`` or a
+        cost is not positive. When the triangles are not a surface: an edge has three triangles, the winding is
+        inconsistent, or a triangle repeats a vertex. The message lists the first elements.
 
     Examples
     --------
@@ -87,27 +111,94 @@ def find_cuts(
     if not isinstance(min_gain, Real) or not float(min_gain) > 0:
         raise ValueError(f"min_gain must be a positive number, not {min_gain!r}")
     inner = manifold_edges(F, len(V)).interior
-    inner_key = edge_keys(inner[:, 0], inner[:, 1], len(V))
     # Open along the given edges. Surfaces that touch at a vertex are also separated.
-    FT, origin = opened_along(F, given, len(V))
-    found = [inner[np.isin(inner_key, _open_keys(F, FT, given, len(V)))]]
-    for vertices, triangles in _parts(FT, len(origin)):
-        number = np.zeros(len(origin), dtype=np.int64)
-        number[vertices] = np.arange(vertices.size)
-        graph = edge_graph(V[origin[vertices]], number[FT[triangles]])
-        ends = origin[vertices[graph.ends]]
-        dear = np.isin(_keys(ends, len(V)), _keys(spared, len(V)))
-        cut = _cut_part(replace(graph, cost=np.where(dear, _DEAR, 1.0) * graph.cost), float(min_gain))
-        found.append(np.sort(origin[vertices[cut]], axis=1))
+    FT, origin = open_along(F, given, len(V))
+    found = [inner[np.isin(_keys(inner, len(V)), _open_keys(F, FT, given, len(V)))]] if given.size else [given]
+    costs = _costs_of_sides(F, len(V), spared, edge_costs)
+    rings = _RINGS if np.isfinite(min_gain) else _RINGS_OF_SHORTEST
+    for vertices, triangles, T in _parts(FT, len(origin)):
+        names, own = origin[vertices], None if costs is None else costs[triangles]
+        if vertices.size > _LARGE:
+            cut = cut_by_levels(V[names], T, own, lambda graph: _cut_part(graph, float(min_gain)), rings)
+        else:
+            graph = edge_graph(V[names], T, own)
+            cut = graph.ends[_cut_part(graph, float(min_gain))]
+        found.append(np.sort(names[cut], axis=1))
     return np.unique(np.concatenate(found), axis=0)
 
 
-def _cut_part(graph: EdgeGraph, min_gain: float) -> IntArray:
-    """Return the edges (k, 2) along which to cut a connected surface."""
-    cut = shortened(graph, opening_cuts(graph))
+@accepts_mesh
+def crease_costs(V: ArrayLike, F: ArrayLike) -> FloatArray:
+    """Return costs with which `find_cuts` keeps cuts in concave creases, where seams are least visible.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Vertices.
+    F : (f, 3) array of int
+        Triangles of any number of surfaces.
+
+    Returns
+    -------
+    (f, 3) float64
+        Cost of each side of each triangle, as for ``edge_costs`` of `find_cuts`: 1 where the surface is flat or convex,
+        and less the more it is concave, down to 0.25 from a bend of 60 degrees.
+
+    Raises
+    ------
+    ValueError
+        As `find_cuts`.
+
+    Examples
+    --------
+    Costs can be combined with others, such as costs of visible vertices:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import crease_costs, find_cuts
+    >>> from quasiharmonic.surfaces import starfish
+    >>> V, F = starfish(3, 8)
+    >>> visible = np.where(V[:, 2] > 0, 3.0, 1.0)
+    >>> costs = crease_costs(V, F) * (visible[F] + visible[np.roll(F, -1, axis=1)]) / 2
+    >>> cut = find_cuts(V, F, edge_costs=costs)
+    """
+    V = vertex_array(V)
+    F = triangle_array(F, len(V))
+    manifold_edges(F, len(V))
+    graph = edge_graph(V, F)
+    return 1 - (_SAVED * np.clip(-graph.bends / _CONCAVE, 0, 1))[graph.side.T]
+
+
+def side_costs(edge_costs: ArrayLike, count: int) -> FloatArray:
+    """Return a copy of the costs (f, 3) of the sides of all triangles, after checking them."""
+    costs = real_array("edge_costs", edge_costs)
+    if costs.shape != (count, 3):
+        raise ValueError(f"edge_costs must have shape ({count}, 3), not {costs.shape}")
+    wrong = np.flatnonzero(~((costs > 0) & np.isfinite(costs)).all(axis=1))
+    if wrong.size:
+        raise ValueError(f"edge_costs must be positive and finite: {names_of('triangle', 'triangles', wrong)}")
+    return costs
+
+
+def _costs_of_sides(F: IntArray, n: int, spared: IntArray, edge_costs: ArrayLike | None) -> FloatArray | None:
+    """Return the costs (f, 3) of all sides, high at the spared edges (d, 2); None if all are 1."""
+    costs = np.ones(F.shape) if edge_costs is None else side_costs(edge_costs, len(F))
+    if spared.size:
+        marked = np.zeros(n, dtype=bool)
+        marked[spared] = True
+        side = marked[F] & marked[F[:, (1, 2, 0)]]
+        keys = edge_keys(F[side], F[:, (1, 2, 0)][side], n)
+        costs[side] *= np.where(np.isin(keys, _keys(spared, n)), _DEAR, 1.0)
+    elif edge_costs is None:
+        return None
+    return costs
+
+
+def _cut_part(graph: EdgeGraph, min_gain: float) -> BoolArray:
+    """Return the edges (e,) along which to cut a connected surface."""
+    cut = shorten_cuts(graph, opening_cuts(graph))
     if np.isfinite(min_gain):
-        cut = reached(graph, cut, min_gain)
-    return graph.ends[cut]
+        cut = extend_cuts(graph, cut, min_gain)
+    return cut
 
 
 def _edge_array(name: str, edges: ArrayLike | None) -> IntArray:
@@ -133,9 +224,18 @@ def _open_keys(F: IntArray, FT: IntArray, given: IntArray, n: int) -> IntArray:
     return key[there][count[which] == 1]
 
 
-def _parts(F: IntArray, n: int) -> list[tuple[IntArray, IntArray]]:
-    """Return vertices and triangles of every connected surface, ordered by smallest vertex."""
-    label = components(F, n)[F[:, 0]]
-    order = np.argsort(label, kind="stable")
-    pieces = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
-    return [(np.unique(F[triangles]), triangles) for triangles in pieces]
+def _parts(F: IntArray, n: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
+    """Yield vertices (m,), triangles (k,) and the triangles' corners (k, 3), as indices into these vertices.
+
+    There is one entry for every connected surface, in the order of smallest vertices.
+    """
+    label = components(F, n)
+    label[np.bincount(F.ravel(), minlength=n) == 0] = n
+    by_vertex, by_triangle = np.argsort(label, kind="stable"), np.argsort(label[F[:, 0]], kind="stable")
+    first = np.unique(label[F[:, 0]])
+    starts = np.searchsorted(label[by_vertex], np.append(first, n))
+    number = np.empty(n, dtype=np.int64)
+    number[by_vertex] = np.arange(n)
+    stops = np.searchsorted(label[F[by_triangle, 0]], first, side="right")
+    for k, triangles in enumerate(np.split(by_triangle, stops[:-1])):
+        yield by_vertex[starts[k] : starts[k + 1]], triangles, number[F[triangles]] - starts[k]

@@ -6,13 +6,14 @@ the curvature. Creases at most halve the cost, so no path is longer than twice t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
@@ -56,13 +57,61 @@ class EdgeGraph:
     @cached_property
     def rim_vertices(self) -> BoolArray:
         """Mask (n,) of the boundary vertices."""
-        return self.touched(self.rim)
+        return self.mark_vertices(self.rim)
 
-    def touched(self, chosen: BoolArray) -> BoolArray:
+    @property
+    def bends(self) -> FloatArray:
+        """Angles (e,) in radians by which the surface bends at edges: positive if convex, negative if concave."""
+        corners = self.V[self.F]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(np.float64).tiny)[:, None]
+        # ``left`` is the triangle in which the edge runs from the smaller vertex to the larger, ``right`` the other.
+        rises = self.F.T[(1, 2, 0), :] > self.F.T
+        triangle = np.broadcast_to(np.arange(len(self.F)), self.side.shape)
+        left, right = np.zeros(len(self.ends), dtype=np.int64), np.zeros(len(self.ends), dtype=np.int64)
+        left[self.side[rises]], right[self.side[~rises]] = triangle[rises], triangle[~rises]
+        along = self.V[self.ends[:, 1]] - self.V[self.ends[:, 0]]
+        sine = (np.cross(normal[left], normal[right]) * along).sum(axis=1) / self.length
+        cosine = (normal[left] * normal[right]).sum(axis=1)
+        return np.where(self.rim, 0, np.arctan2(sine, cosine))
+
+    def mark_vertices(self, chosen: BoolArray) -> BoolArray:
         """Mask (n,) of the vertices that belong to any of the chosen edges (e,)."""
         found = np.zeros(self.n, dtype=bool)
         found[self.ends[chosen]] = True
         return found
+
+    @cached_property
+    def _stars(self) -> tuple[IntArray, IntArray]:
+        """Triangles around the vertices: where those of each vertex start (n + 1,), and the triangles (3 f,)."""
+        order = np.argsort(self.F.ravel(), kind="stable")
+        return np.searchsorted(self.F.ravel()[order], np.arange(self.n + 1)), order // 3
+
+    def part_near(self, vertices: IntArray, rings: int) -> tuple[EdgeGraph, IntArray]:
+        """Return the graph of the triangles around vertices (k,), and the indices of its edges here.
+
+        Its rim contains only edges of the surface's rim. No path leads to its outer vertices, where triangles of the
+        surface are missing: edges there cost infinitely.
+        """
+        start, star = self._stars
+        triangles = np.empty(0, dtype=np.int64)
+        for _ in range(rings):
+            count = start[vertices + 1] - start[vertices]
+            first = np.repeat(start[vertices] - np.cumsum(count) + count, count)
+            triangles = distinct(star[first + np.arange(first.size)])
+            vertices = distinct(self.F[triangles])
+        side = self.side[:, triangles]
+        own = distinct(side)
+        number = np.searchsorted(own, side)
+        ends = np.searchsorted(vertices, self.ends[own])
+        F = np.searchsorted(vertices, self.F[triangles])
+        graph = EdgeGraph(self.V[vertices], F, ends, number, self.rim[own], self.length[own], self.cost[own])
+        return graph.without_paths_at(np.bincount(number.ravel()) == 1), own
+
+    def without_paths_at(self, outer: BoolArray) -> EdgeGraph:
+        """Return the graph with infinite costs around those of the outer edges (e,) that are not the rim."""
+        outside = self.mark_vertices(outer & ~self.rim)
+        return replace(self, cost=np.where(outside[self.ends].any(axis=1), np.inf, self.cost))
 
     def numbers(self, tail: IntArray, head: IntArray) -> IntArray:
         """Indices of the edges between pairs of vertices; every pair must be an edge."""
@@ -103,7 +152,21 @@ class EdgeGraph:
         return self.numbers(np.array(way[:-1], dtype=np.int64), np.array(way[1:], dtype=np.int64))
 
 
-def edge_graph(V: FloatArray, F: IntArray) -> EdgeGraph:
+def triangles_near(F: IntArray, marked: BoolArray, rings: int) -> BoolArray:
+    """Mask (f,) of the triangles around marked vertices (n,): for one ring, all that have a marked corner."""
+    marked = marked.copy()
+    for _ in range(rings - 1):
+        marked[F[has_marked_corner(F, marked)]] = True
+    return has_marked_corner(F, marked)
+
+
+def distinct(values: IntArray) -> IntArray:
+    """Return the distinct values in ascending order; for few values faster than `numpy.unique`."""
+    values = np.sort(values, axis=None)
+    return values[np.flatnonzero(np.diff(values, prepend=-1))]
+
+
+def edge_graph(V: FloatArray, F: IntArray, costs: FloatArray | None = None) -> EdgeGraph:
     """Build the `EdgeGraph` of a surface, with lengths and costs.
 
     Parameters
@@ -112,6 +175,9 @@ def edge_graph(V: FloatArray, F: IntArray) -> EdgeGraph:
         Rest positions, of any size.
     F : (f, 3) int64
         Triangles of surfaces, closed or not.
+    costs : (f, 3) float64, optional
+        Factor of the cost at each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0. An edge between two
+        triangles has the mean of its two factors.
 
     Returns
     -------
@@ -120,12 +186,11 @@ def edge_graph(V: FloatArray, F: IntArray) -> EdgeGraph:
     space = np.zeros((len(V), 3))
     space[:, : V.shape[1]] = np.ldexp(V, -int(np.frexp(np.abs(V).max(initial=0))[1]))
     corners = space[F]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double = np.linalg.norm(normal, axis=1)
-    area = 0.5 * float(double.sum())
+    area = 0.5 * float(
+        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    )
     if area > 0:
         space /= np.sqrt(area)
-    normal /= np.maximum(double, np.finfo(np.float64).tiny)[:, None]
 
     found = edges(F, len(V))
     ends = np.concatenate([found.interior, np.sort(found.boundary, axis=1)])
@@ -140,12 +205,10 @@ def edge_graph(V: FloatArray, F: IntArray) -> EdgeGraph:
     length = np.linalg.norm(along, axis=1)
     # Lengths must be positive, because zeros are not edges in a sparse graph.
     length = np.maximum(length, max(1e-12 * float(length.mean()), np.finfo(np.float64).tiny))
-    # ``left`` is the triangle in which the edge runs from the smaller vertex to the larger, ``right`` the other.
-    triangle = np.broadcast_to(np.arange(len(F)), side.shape)
-    left, right = np.zeros(len(ends), dtype=np.int64), np.zeros(len(ends), dtype=np.int64)
-    left[side[tail < head]], right[side[tail > head]] = triangle[tail < head], triangle[tail > head]
-    across = np.cross(normal[left], normal[right])
-    sine, cosine = (across * along).sum(axis=1) / length, (normal[left] * normal[right]).sum(axis=1)
-    bend = np.where(rim, 0, np.arctan2(sine, cosine))
+    graph = EdgeGraph(space, F, ends, side, rim, length, length)
+    bend = graph.bends
     sharpness = np.minimum(np.maximum(-bend, 0.5 * bend) / _SHARP, 1)
-    return EdgeGraph(space, F, ends, side, rim, length, length * (1 - _SAVED * sharpness))
+    cost = length * (1 - _SAVED * sharpness)
+    if costs is not None:
+        cost *= np.bincount(side.ravel(), costs.T.ravel()) / np.bincount(side.ravel())
+    return replace(graph, cost=cost)

@@ -18,22 +18,24 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.targets.cuts.graph import EdgeGraph
-from quasiharmonic.targets.cuts.shortening import shortened, stretches
+from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches
 from quasiharmonic.targets.cuts.shrinking import Shrinking
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 # A loose end costs as much as a cut of this length, in units in which the surface has area 1.
 _END = 0.1
-# Stop after this many successive tips whose cuts do not lower the price. After a failure, also skip vertices closer to
-# the tip than this share of its distance from the cuts.
-_FAILURES, _NEAR = 6, 0.5
-# Scale changes below the first value need no cut. Vertices whose scale is within the second value of the largest count
-# as equal.
-_EVEN, _TIES = 1e-3, 1e-6
+# The search stops after this many successive tips whose cuts do not lower the price.
+_MAX_FAILURES = 6
+# After a failure, it skips vertices closer to the tip than this share of the distance of the tip from the cuts.
+_NEAR = 0.5
+# Smaller changes of scale need no cut.
+_EVEN = 1e-3
+# Vertices whose scale is within this share of the largest count as equal.
+_TIES = 1e-6
 _ROUNDS = 3
 
 
-def reached(graph: EdgeGraph, cut: BoolArray, min_gain: float) -> BoolArray:
+def extend_cuts(graph: EdgeGraph, cut: BoolArray, min_gain: float) -> BoolArray:
     """Extend cuts to protruding parts as far as the gain justifies their length, and shorten them.
 
     Parameters
@@ -54,7 +56,7 @@ def reached(graph: EdgeGraph, cut: BoolArray, min_gain: float) -> BoolArray:
     if not balance.shrinking.area.any():
         return cut
     for _ in range(_ROUNDS):
-        tried = balance.pruned(shortened(graph, balance.extended(cut), balance.price))
+        tried = balance.prune(shorten_cuts(graph, balance.extend(cut), balance.price))
         if not balance.price(tried) < balance.price(cut):
             break
         cut = tried
@@ -80,7 +82,7 @@ class _Balance:
 
     def _weigh(self, cut: BoolArray) -> FloatArray:
         """Return the scale w under given cuts, and store their price."""
-        w = self.shrinking.of(self._rim | self.graph.touched(cut))
+        w = self.shrinking.of(self._rim | self.graph.mark_vertices(cut))
         length = float(self.graph.length[cut].sum()) + _END * int(self._loose(cut).sum())
         self._prices[np.packbits(cut).tobytes()] = self.shrinking.energy(w) + self.min_gain * length
         return w
@@ -89,18 +91,18 @@ class _Balance:
         """Mask (n,) of the vertices that are loose ends of cuts."""
         return (np.bincount(self.graph.ends[cut].ravel(), minlength=self.graph.n) == 1) & ~self._rim
 
-    def extended(self, cut: BoolArray) -> BoolArray:
+    def extend(self, cut: BoolArray) -> BoolArray:
         """Extend cuts to the vertices with the largest scale, while that lowers the price."""
         w = self._weigh(cut)
         given_up = np.zeros(self.graph.n, dtype=bool)
         failures = 0
-        while failures < _FAILURES:
+        while failures < _MAX_FAILURES:
             height = np.where(given_up, 0.0, np.abs(w))
             if not height.max() > _EVEN:
                 break
             # The first of the vertices that are equal up to rounding.
             tip = int(np.argmax(height >= (1 - _TIES) * height.max()))
-            opened = np.flatnonzero(self._rim | self.graph.touched(cut))
+            opened = np.flatnonzero(self._rim | self.graph.mark_vertices(cut))
             distance, before = self.graph.distances(opened, self.graph.cost)
             longer = cut.copy()
             longer[self.graph.way_back(before, tip)] = True
@@ -113,7 +115,7 @@ class _Balance:
                 failures += 1
         return cut
 
-    def pruned(self, cut: BoolArray) -> BoolArray:
+    def prune(self, cut: BoolArray) -> BoolArray:
         """Remove stretches to loose ends that raise the price, shortest first."""
         kept = set[bytes]()
         while fresh := [way for way in self._twigs(cut) if way.tobytes() not in kept]:

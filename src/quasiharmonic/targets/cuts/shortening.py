@@ -4,6 +4,9 @@ A stretch is a path between two nodes, where cuts branch, end or meet the bounda
 turns the disk into a ring. Every path across the ring opens it again, and the cheapest replaces the stretch. That path
 may begin and end anywhere, so the nodes move too. A stretch with a loose end keeps that end and gets the cheapest path
 from there to the other cuts.
+
+On large surfaces only paths close to the stretch are considered. Each end of such a path must lie on cuts that are
+connected to the stretch's own end nearby, so both ends are on different borders of the ring.
 """
 
 from __future__ import annotations
@@ -14,8 +17,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from quasiharmonic.geometry.mesh.opening import opened_along
-from quasiharmonic.targets.cuts.graph import EdgeGraph
+from quasiharmonic.geometry.coarsening.levels import has_marked_corner
+from quasiharmonic.geometry.mesh.fans import open_along
+from quasiharmonic.targets.cuts.graph import EdgeGraph, distinct
 from quasiharmonic.util.arrays import BoolArray, IntArray
 
 # Minimum relative saving for which a stretch is exchanged.
@@ -24,7 +28,9 @@ _SAVES = 1e-6
 _ROUNDS = 8
 
 
-def shortened(graph: EdgeGraph, cut: BoolArray, price: Callable[[BoolArray], float] | None = None) -> BoolArray:
+def shorten_cuts(
+    graph: EdgeGraph, cut: BoolArray, price: Callable[[BoolArray], float] | None = None, rings: int | None = None
+) -> BoolArray:
     """Exchange stretches of cuts for cheaper ones until none can be improved.
 
     Parameters
@@ -34,6 +40,9 @@ def shortened(graph: EdgeGraph, cut: BoolArray, price: Callable[[BoolArray], flo
         Cut edges that make a connected surface a disk.
     price : callable, optional
         Price of all cuts (e,) together; every exchange must lower it.
+    rings : int, optional
+        Consider only paths within this many rings of triangles around a stretch. The graph may then be that of a part
+        of the surface, without paths at its outer vertices.
 
     Returns
     -------
@@ -41,27 +50,47 @@ def shortened(graph: EdgeGraph, cut: BoolArray, price: Callable[[BoolArray], flo
         Cut edges that make the surface a disk, with the same loose ends.
     """
     lowest = np.inf if price is None else price(cut)
-    disk = _Disk(graph, cut)
+    cut = cut.copy()
+    degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
+    optimal = set[bytes]()
     for _ in range(_ROUNDS):
-        before, tried = disk, set[bytes]()
-        # Costliest first. Stretches are computed again after each exchange, because it may change the others.
-        while fresh := [way for way in stretches(graph, disk.cut) if way.tobytes() not in tried]:
-            way = max(fresh, key=lambda way: (graph.cost[way].sum(), -way[0]))
-            tried.add(way.tobytes())
-            instead = disk.cheapest(way)
-            if instead is None:
+        changed = False
+        # Costliest first.
+        for way in sorted(stretches(graph, cut), key=lambda way: (-graph.cost[way].sum(), way[0])):
+            if way.tobytes() in optimal or not _is_stretch(graph, cut, degree, way):
                 continue
-            exchanged = disk.cut.copy()
-            exchanged[way] = False
-            exchanged[instead] = True
+            instead = _cheapest(graph, cut, way) if rings is None else _cheapest_near(graph, cut, way, rings)
+            if instead is None:
+                if rings is not None:
+                    optimal.add(way.tobytes())
+                continue
+            exchanged = _exchange(graph, cut, way, instead)
             if price is not None:
                 if not (now := price(exchanged)) < lowest:
                     continue
                 lowest = now
-            disk = _Disk(graph, exchanged)
-        if disk is before:
+            cut, changed = exchanged, True
+            degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
+        if not changed:
             break
-    return disk.cut
+    return cut
+
+
+def _exchange(graph: EdgeGraph, cut: BoolArray, way: IntArray, instead: IntArray) -> BoolArray:
+    """Replace a stretch; what it alone connected to other cuts is removed, too."""
+    cut = cut.copy()
+    cut[way] = False
+    others = graph.mark_vertices(cut)
+    cut[instead] = True
+    for node in distinct(graph.ends[way[[0, -1]]]).tolist():
+        while others[node] and not graph.rim_vertices[node]:
+            chosen = np.flatnonzero(cut)
+            at_node = chosen[(graph.ends[chosen] == node).any(axis=1)]
+            if at_node.size != 1:
+                break
+            cut[at_node] = False
+            node = int(graph.ends[at_node[0]].sum()) - node
+    return cut
 
 
 def stretches(graph: EdgeGraph, cut: BoolArray) -> list[IntArray]:
@@ -87,73 +116,108 @@ def stretches(graph: EdgeGraph, cut: BoolArray) -> list[IntArray]:
     return found
 
 
-class _Disk:
-    """A surface cut into a disk, which can be closed along one stretch and opened elsewhere.
+def _is_stretch(graph: EdgeGraph, cut: BoolArray, degree: IntArray, way: IntArray) -> bool:
+    """Whether edges still are a stretch of cuts after exchanges of other stretches; ``degree`` (n,) is that of cuts."""
+    if not cut[way].all():
+        return False
+    ends = graph.ends[way]
+    node = (degree[ends] != 2) | graph.rim_vertices[ends]
+    if way.size == 1:
+        return bool(node.all())
+    inside = (ends[:-1, :, None] == ends[1:, None, :]).any(axis=2)
+    return bool(node[0].any() and node[-1].any() and not node[:-1][inside].any())
 
-    For every edge, the vertex copies at its ends are stored for its left side, seen from the smaller to the larger
-    vertex, and for its right side. They are -1 outside the surface.
+
+def _cheapest_near(graph: EdgeGraph, cut: BoolArray, way: IntArray, rings: int) -> IntArray | None:
+    """Return edges close to a stretch that replace it at lower cost, or None."""
+    part, own = graph.part_near(distinct(graph.ends[way]), rings)
+    instead = _cheapest(part, cut[own], np.searchsorted(own, way))
+    return None if instead is None else own[instead]
+
+
+def _cheapest(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntArray | None:
+    """Return edges that replace a stretch at lower cost, or None."""
+    others = cut.copy()
+    others[way] = False
+    held = graph.mark_vertices(others) | graph.rim_vertices
+    degree = np.bincount(graph.ends[way].ravel(), minlength=graph.n)
+    loose = np.flatnonzero((degree == 1) & ~held)
+    limit = (1 - _SAVES) * float(graph.cost[way].sum())
+    if loose.size == 0:
+        return _across(graph, cut, way, others, held, limit)
+    goals = np.flatnonzero(held) if loose.size == 1 else loose[1:]
+    distance, before = graph.distances(goals, graph.cost, limit=limit)
+    if np.isinf(distance[loose[0]]):
+        return None
+    instead = graph.way_back(before, int(loose[0]))
+    # A single edge between interior vertices opens nothing.
+    return None if loose.size == 2 and instead.size == 1 else instead
+
+
+def _across(
+    graph: EdgeGraph, cut: BoolArray, way: IntArray, others: BoolArray, held: BoolArray, limit: float
+) -> IntArray | None:
+    """Cheapest path across the ring that remains without a stretch; None if all cost more than ``limit``."""
+    left, right, copied = _open(graph, cut)
+    m = copied.size
+    sewn = _label(np.concatenate([left[way], right[way]], axis=1)[:, [0, 2, 1, 3]].reshape(-1, 2), m)
+    border = others | graph.rim
+    sides = np.concatenate([left[border], right[border]])
+    sides = sewn[sides[sides[:, 0] >= 0]]
+    loop = _label(sides, m)
+    on_border = np.zeros(m, dtype=bool)
+    on_border[sides] = True
+    # The two ends of the stretch lie on different borders of the ring.
+    first, last = held[graph.ends[way[0]]], held[graph.ends[way[-1]]]
+    one, other = int(np.argmax(first)), 1 - int(np.argmax(last[::-1]))
+    start, goal = sewn[left[way[0], one]], sewn[left[way[-1], other]]
+    near, far = on_border & (loop == loop[start]), on_border & (loop == loop[goal])
+    inner = sewn[np.where(left < 0, right, left)[~border]]
+    blocked = on_border & ~near & ~far
+    usable = ~blocked[inner].any(axis=1)
+    ring = csr_array((graph.cost[~border][usable], tuple(inner[usable].astype(np.int32).T)), shape=(m, m))
+    distance, before, _ = dijkstra(
+        ring, directed=False, indices=np.flatnonzero(near), return_predecessors=True, min_only=True, limit=limit
+    )
+    distance[~far] = np.inf
+    end = int(np.argmin(distance))
+    if np.isinf(distance[end]):
+        return None
+    path = [end]
+    while before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    origin = np.empty(m, dtype=np.int64)
+    origin[sewn] = copied
+    return graph.numbers(origin[path[:-1]], origin[path[1:]])
+
+
+def _open(graph: EdgeGraph, cut: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Open a surface along cuts.
+
+    Returns
+    -------
+    left, right : (e, 2) int64
+        Vertex copies at the ends of every edge on its left side, seen from the smaller to the larger vertex, and on its
+        right side; -1 outside the surface.
+    origin : (m,) int64
+        The vertex of each copy.
     """
-
-    def __init__(self, graph: EdgeGraph, cut: BoolArray) -> None:
-        self.graph = graph
-        self.cut = cut
-        FT, self._origin = opened_along(graph.F, graph.ends[cut], graph.n)
-        copies = np.stack([FT.T, FT.T[(1, 2, 0), :]], axis=2)
-        tail, head = graph.F.T, graph.F.T[(1, 2, 0), :]
-        leads_up = tail < head
-        self._left = np.full(graph.ends.shape, -1)
-        self._right = np.full(graph.ends.shape, -1)
-        self._left[graph.side[leads_up]] = copies[leads_up]
-        self._right[graph.side[~leads_up]] = copies[~leads_up][:, ::-1]
-
-    def cheapest(self, way: IntArray) -> IntArray | None:
-        """Return edges that replace a stretch at lower cost, or None."""
-        graph = self.graph
-        others = self.cut.copy()
-        others[way] = False
-        held = graph.touched(others) | graph.rim_vertices
-        degree = np.bincount(graph.ends[way].ravel(), minlength=graph.n)
-        loose = np.flatnonzero((degree == 1) & ~held)
-        limit = (1 - _SAVES) * float(graph.cost[way].sum())
-        if loose.size == 0:
-            return self._across(way, others, held, limit)
-        if loose.size == 2:
-            return None
-        distance, before = graph.distances(np.flatnonzero(held), graph.cost, limit=limit)
-        return graph.way_back(before, int(loose[0])) if np.isfinite(distance[loose[0]]) else None
-
-    def _across(self, way: IntArray, others: BoolArray, held: BoolArray, limit: float) -> IntArray | None:
-        """Cheapest path across the ring that remains without a stretch; None if all cost more than ``limit``."""
-        graph, m = self.graph, self._origin.size
-        sewn = _joined(np.concatenate([self._left[way], self._right[way]], axis=1)[:, [0, 2, 1, 3]].reshape(-1, 2), m)
-        border = others | graph.rim
-        sides = np.concatenate([self._left[border], self._right[border]])
-        sides = sewn[sides[sides[:, 0] >= 0]]
-        loop = _joined(sides, m)
-        on_border = np.zeros(m, dtype=bool)
-        on_border[sides] = True
-        # The two ends of the stretch lie on different loops of the ring.
-        first = graph.ends[way[0]]
-        start = sewn[self._left[way[0], int(np.argmax(held[first]))]]
-        near = on_border & (loop == loop[start])
-        inner = sewn[self._left[~border]]
-        ring = csr_array((graph.cost[~border], tuple(inner.astype(np.int32).T)), shape=(m, m))
-        distance, before, _ = dijkstra(
-            ring, directed=False, indices=np.flatnonzero(near), return_predecessors=True, min_only=True, limit=limit
-        )
-        distance[near | ~on_border] = np.inf
-        end = int(np.argmin(distance))
-        if np.isinf(distance[end]):
-            return None
-        path = [end]
-        while before[path[-1]] >= 0:
-            path.append(int(before[path[-1]]))
-        origin = np.empty(m, dtype=np.int64)
-        origin[sewn] = self._origin
-        return graph.numbers(origin[path[:-1]], origin[path[1:]])
+    on_border = graph.mark_vertices(cut) | graph.rim_vertices
+    near = has_marked_corner(graph.F, on_border)
+    # Some triangles around other vertices are missing, so their copies are not used.
+    opened, origin = open_along(graph.F[near], graph.ends[cut], graph.n)
+    FT = graph.F.copy()
+    FT[near] = np.where(on_border[FT[near]], opened, FT[near])
+    copies = np.stack([FT.T, FT.T[(1, 2, 0), :]], axis=2)
+    tail, head = graph.F.T, graph.F.T[(1, 2, 0), :]
+    leads_up = tail < head
+    left, right = np.full(graph.ends.shape, -1), np.full(graph.ends.shape, -1)
+    left[graph.side[leads_up]] = copies[leads_up]
+    right[graph.side[~leads_up]] = copies[~leads_up][:, ::-1]
+    return left, right, origin
 
 
-def _joined(pairs: IntArray, m: int) -> IntArray:
+def _label(pairs: IntArray, m: int) -> IntArray:
     """Component labels of ``m`` elements connected by pairs."""
     ones = np.ones(len(pairs), dtype=np.int8)
     return connected_components(csr_array((ones, pairs.T), shape=(m, m)), directed=False)[1].astype(np.int64)

@@ -18,7 +18,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_
 Pieces = list[FloatArray]
 
 # Limit that protects against malicious files; no real outline needs more.
-MOST_POINTS = 1_000_000
+MAX_POINTS = 1_000_000
 
 
 def signed_area(contour: ArrayLike) -> float:
@@ -32,8 +32,8 @@ def signed_area(contour: ArrayLike) -> float:
     -------
     float
     """
-    contour = np.asarray(contour, dtype=np.float64)
-    x, y = (contour - contour[0]).T
+    points = check_contour(contour, "contour")
+    x, y = (points - points[0]).T
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
@@ -45,18 +45,13 @@ def as_complex(points: FloatArray) -> ComplexArray:
 def in_unit(contours: Sequence[FloatArray]) -> tuple[list[FloatArray], int]:
     """Scale contours to coordinates of at most about 1, so that squares neither overflow nor underflow.
 
-    Returns
-    -------
-    contours : list of (k, 2) float64
-        The contours divided by a power of two, which causes no rounding.
-    exponent : int
-        Exponent of that power.
+    The scale is a power of two, which causes no rounding; the second result is its exponent.
     """
     exponent = max(int(np.frexp(np.abs(c).max())[1]) for c in contours)
     return [np.ldexp(c, -exponent) for c in contours], exponent
 
 
-def checked(curve: ArrayLike, name: str, widths: tuple[int, ...] = (2,)) -> FloatArray:
+def check_contour(curve: ArrayLike, name: str, widths: tuple[int, ...] = (2,)) -> FloatArray:
     """Return a closed curve as float64; raise ValueError unless it has at least three points, all finite."""
     points = real_array(name, curve)
     if points.ndim != 2 or points.shape[1] not in widths or len(points) < 3:
@@ -93,24 +88,15 @@ def from_corner(contour: FloatArray, angle: float, backwards: bool = False) -> F
 
 
 def flatten(pieces: Pieces, tolerance: float) -> FloatArray:
-    """Convert a closed path of lines and Bézier curves to a contour.
+    """Convert a closed path of lines and Bézier curves to a contour; a straight line closes an open path.
 
-    Parameters
-    ----------
-    pieces : list of (degree + 1, 2) float64
-        Each begins where the one before ends; if needed, a straight line closes the path.
-    tolerance : float
-        Maximum deviation of the contour from the path. Points closer than this to the one before are dropped.
-
-    Raises
-    ------
-    ValueError
-        When the contour would have more than a million points.
+    The contour deviates from the path by at most the tolerance, and points closer than it to the one before are
+    dropped. ValueError when the contour would have more than a million points.
     """
     steps = [_steps(control, tolerance) for control in pieces]
-    if sum(steps) > MOST_POINTS:
+    if sum(steps) > MAX_POINTS:
         raise ValueError(
-            f"the outline has more than {MOST_POINTS:,} points at a tolerance of {tolerance:.3g}: raise the tolerance"
+            f"the outline has more than {MAX_POINTS:,} points at a tolerance of {tolerance:.3g}: raise the tolerance"
         )
     points = [pieces[0][:1], *(_bezier(control, n) for control, n in zip(pieces, steps, strict=True))]
     return distinct(np.concatenate(points), tolerance)
@@ -141,14 +127,14 @@ def _bezier(control: FloatArray, steps: float) -> FloatArray:
     return np.asarray(points[0])
 
 
-def distinct(contour: FloatArray, least: float) -> FloatArray:
-    """Drop points within ``least`` of the last kept point, cyclically; the first point is always kept."""
+def distinct(contour: FloatArray, min_distance: float) -> FloatArray:
+    """Drop points within ``min_distance`` of the last kept point, cyclically; the first point is always kept."""
     kept = [0]
     # Python floats, because reading array elements one by one is several times slower.
     x, y = contour[:, 0].tolist(), contour[:, 1].tolist()
     for i in range(1, len(x)):
-        if abs(x[i] - x[kept[-1]]) > least or abs(y[i] - y[kept[-1]]) > least:
+        if abs(x[i] - x[kept[-1]]) > min_distance or abs(y[i] - y[kept[-1]]) > min_distance:
             kept.append(i)
-    while len(kept) > 1 and max(abs(x[kept[-1]] - x[0]), abs(y[kept[-1]] - y[0])) <= least:
+    while len(kept) > 1 and max(abs(x[kept[-1]] - x[0]), abs(y[kept[-1]] - y[0])) <= min_distance:
         kept.pop()
     return contour[kept]

@@ -1,4 +1,4 @@
-"""Outlines of letters in any font that matplotlib can read."""
+"""Outlines of letters in TrueType and OpenType fonts."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.targets.outlines import truetype
+from quasiharmonic.io.errors import check_path
 from quasiharmonic.targets.outlines.contours import Pieces, flatten, signed_area
 from quasiharmonic.targets.outlines.nesting import nested
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, check_positive, describe
 
 Font = str | PathLike[str]
 _FONT_FILES = ".ttf", ".otf", ".ttc"
-# Folder within matplotlib's data.
-_BUNDLED = "fonts", "ttf"
 
 
 def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4) -> list[FloatArray]:
@@ -47,11 +45,12 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
     FileNotFoundError
         When the font file does not exist.
     """
-    if len(character) != 1:
-        raise ValueError(f"character must be a single character, not {character!r}")
-    found = _contours(character, font, tolerance)
+    if not isinstance(character, str) or len(character) != 1:
+        raise ValueError(f"character must be a single character, not {describe(character)}")
+    check_positive(tolerance=tolerance)
+    found = [flatten(path, tolerance) for path in glyph_paths(character, font)]
     try:
-        contours = nested(found)
+        contours = nested([contour for contour in found if len(contour) > 2 and signed_area(contour) != 0])
     except ValueError as error:
         raise ValueError(f"the glyph of {character!r}: {error}") from error
     if not contours:
@@ -59,77 +58,79 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
     return contours
 
 
-def _contours(character: str, font: Font | None, tolerance: float) -> list[FloatArray]:
-    """Contours of a character, in the font's orientation."""
-    contours = [flatten(pieces, tolerance) for pieces in glyph_paths(character, font)]
-    return [contour for contour in contours if len(contour) > 2 and signed_area(contour) != 0]
-
-
 def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
-    """Closed paths of lines and Bézier curves of a character; raises as `letter`."""
+    """Closed paths of lines and Bézier curves of a character, in units of the font size; raises as `letter`."""
+    import logging
+
+    from fontTools.pens.basePen import BasePen
+    from fontTools.ttLib import TTFont
+
+    class Pen(BasePen):  # type: ignore[misc]
+        """Collect the pieces of each contour, without lines of length zero."""
+
+        def __init__(self, glyphs: Any) -> None:
+            super().__init__(glyphs)
+            self.paths: list[Pieces] = []
+
+        def _moveTo(self, point: tuple[float, float]) -> None:
+            self.paths.append([])
+
+        def _lineTo(self, point: tuple[float, float]) -> None:
+            if point != self._getCurrentPoint():
+                self._curve(point)
+
+        def _curve(self, *points: tuple[float, float]) -> None:
+            self.paths[-1].append(np.array([self._getCurrentPoint(), *points], dtype=np.float64))
+
+        _curveToOne = _qCurveToOne = _curve  # noqa: N815
+
+        def _closePath(self) -> None:
+            if self.paths[-1]:
+                self._lineTo(tuple(self.paths[-1][0][0]))
+
+    # Without a handler, messages of fontTools about odd fonts would appear on the screen.
+    if not (log := logging.getLogger("fontTools")).handlers:
+        log.addHandler(logging.NullHandler())
     file = _font_file(font)
-    plain = truetype.glyph(file, character)
-    return _by_matplotlib(file, character) if plain is None else plain
-
-
-def _by_matplotlib(file: FilePath, character: str) -> list[Pieces]:
-    """Read the paths of a character in any font with matplotlib, or raise a ValueError that states the problem."""
-    from matplotlib.font_manager import FontProperties, get_font
-    from matplotlib.path import Path
-    from matplotlib.textpath import text_to_path
-
     try:
-        face = get_font(file)
-    except RuntimeError as error:
+        with file.open("rb") as data, TTFont(data, fontNumber=0, lazy=True) as face:
+            name = (face.getBestCmap() or {}).get(ord(character))
+            pen = Pen(glyphs := face.getGlyphSet())
+            if name is not None:
+                glyphs[name].draw(pen)
+            em = face["head"].unitsPerEm
+    except Exception as error:  # a damaged font may raise any error
         raise ValueError(f"{file} is not a readable font: {error}") from error
-    if not face.get_char_index(ord(character)):
+    if name is None:
         raise ValueError(f"{file.name} has no glyph for {character!r}")
-    points, codes = text_to_path.get_text_path(FontProperties(fname=file), character)
-    if len(codes) == 0:
-        return []
-    return _pieces(Path(np.asarray(points) / text_to_path.FONT_SCALE, codes))
-
-
-def _pieces(path: Any) -> list[Pieces]:
-    """Split a matplotlib path of lines and Bézier curves into closed parts."""
-    parts: list[Pieces] = []
-    here = np.zeros((0, 2))
-    for flat, code in path.iter_segments(simplify=False):
-        control = flat.reshape(-1, 2)
-        if code == path.MOVETO:
-            parts.append([])
-        elif code == path.CLOSEPOLY:  # its point has no meaning
-            continue
-        else:
-            parts[-1].append(np.concatenate([here, control]))
-        here = control[-1:]
-    return [part for part in parts if part]
+    return [[piece / em for piece in path] for path in pen.paths if path]
 
 
 def _font_file(font: Font | None) -> FilePath:
     if font is None:
-        return _bundled("DejaVuSans-Bold.ttf")
+        return _find_default()
+    check_path("font", font)
     file = FilePath(font)
     if file.is_file():
         return file
     if file.suffix.lower() in _FONT_FILES or len(file.parts) > 1:
         raise FileNotFoundError(f"there is no font file {file}")
-    return _installed(str(font))
+    return _find_installed(str(font))
 
 
-def _bundled(name: str) -> FilePath:
-    """Path of a font that comes with matplotlib; imports matplotlib only if its data are not in its own folder."""
+def _find_default() -> FilePath:
+    """Path of the default font; imports matplotlib, which is slow, only if its data are not in its own folder."""
+    font = FilePath("fonts", "ttf", "DejaVuSans-Bold.ttf")
     found = find_spec("matplotlib")
     for folder in (found and found.submodule_search_locations) or []:
-        file = FilePath(folder, "mpl-data", *_BUNDLED, name)
-        if file.is_file():
+        if (file := FilePath(folder, "mpl-data", font)).is_file():
             return file
     import matplotlib
 
-    return FilePath(matplotlib.get_data_path(), *_BUNDLED, name)
+    return FilePath(matplotlib.get_data_path(), font)
 
 
-def _installed(name: str) -> FilePath:
+def _find_installed(name: str) -> FilePath:
     """Path of the file of an installed font."""
     from difflib import get_close_matches
 

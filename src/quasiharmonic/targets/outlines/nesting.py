@@ -10,29 +10,19 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.loops import contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
-from quasiharmonic.targets.outlines.contours import checked, distinct, in_unit, signed_area
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.targets.outlines.contours import check_contour, distinct, in_unit, signed_area
+from quasiharmonic.util.arrays import FloatArray, check_sequence
 
 # Maximum number of meeting sides to find; the first is reported.
-_MOST_MEETINGS = 100
+_MAX_MEETINGS = 100
 
 
-class Arranged(NamedTuple):
-    """A contour and its nesting among the others.
+class NestedContour(NamedTuple):
+    """A contour and its nesting among the others."""
 
-    Attributes
-    ----------
-    points : (k, 2) float64
-        As given, without consecutive duplicates.
-    depth : int
-        Number of other contours around it; odd for a hole.
-    clockwise : bool
-        Its orientation.
-    """
-
-    points: FloatArray
-    depth: int
-    clockwise: bool
+    points: FloatArray  # (k, 2): as given, without consecutive duplicates
+    depth: int  # Number of other contours around it; odd for a hole
+    clockwise: bool  # Its orientation
 
     @property
     def reversed(self) -> bool:
@@ -40,7 +30,7 @@ class Arranged(NamedTuple):
         return self.clockwise == (self.depth % 2 == 0)
 
     @property
-    def wound(self) -> FloatArray:
+    def oriented(self) -> FloatArray:
         """Its points in the correct orientation, with the same first point."""
         return np.roll(self.points[::-1], 1, axis=0) if self.reversed else self.points
 
@@ -66,7 +56,7 @@ def nested(contours: Sequence[ArrayLike]) -> list[FloatArray]:
         When a contour is not an array of at least three finite points, or encloses no area; when a contour crosses,
         touches or doubles back on itself or another one.
     """
-    return [one.wound for one in arranged(contours)]
+    return [one.oriented for one in arrange(contours)]
 
 
 def filled(contours: Sequence[ArrayLike]) -> list[FloatArray]:
@@ -86,12 +76,13 @@ def filled(contours: Sequence[ArrayLike]) -> list[FloatArray]:
     ValueError
         As `nested`.
     """
-    return [one.points for one in arranged(contours) if one.depth == 0]
+    return [one.points for one in arrange(contours) if one.depth == 0]
 
 
-def arranged(contours: Sequence[ArrayLike]) -> list[Arranged]:
+def arrange(contours: Sequence[ArrayLike]) -> list[NestedContour]:
     """Return contours by decreasing area with their nesting; raises as `nested`."""
-    found = [distinct(checked(c, f"contour {i}"), 0.0) for i, c in enumerate(contours)]
+    check_sequence("contours", contours, "contours (k, 2)")
+    found = [distinct(check_contour(c, f"contour {i}"), 0.0) for i, c in enumerate(contours)]
     if not found:
         return []
     for i, contour in enumerate(found):
@@ -108,7 +99,7 @@ def arranged(contours: Sequence[ArrayLike]) -> list[Arranged]:
     np.fill_diagonal(around, val=False)
     depth = around.sum(axis=0)
     order = sorted(range(len(found)), key=lambda i: -areas[i])
-    return [Arranged(found[i], int(depth[i]), _clockwise(found[i])) for i in order]
+    return [NestedContour(found[i], int(depth[i]), _clockwise(found[i])) for i in order]
 
 
 def collinear(contour: FloatArray) -> bool:
@@ -132,7 +123,7 @@ def _check_simple(contours: list[FloatArray]) -> None:
     following = np.arange(1, start[-1] + 1)
     following[start[1:] - 1] = start[:-1]
     points = np.concatenate(contours)
-    met = contacts(points, np.stack([np.arange(start[-1]), following], axis=1), _MOST_MEETINGS)
+    met = contacts(points, np.stack([np.arange(start[-1]), following], axis=1), _MAX_MEETINGS)
     if not len(met.pairs):
         return
     # A side that doubles back also touches neighbouring sides, so report spikes first.
@@ -147,7 +138,7 @@ def _check_simple(contours: list[FloatArray]) -> None:
 
     how = {SegmentRelation.CROSSING: "crosses", SegmentRelation.TOUCHING: "touches"}.get(relation, "runs along")
     one, other = int(owner[i]), int(owner[j])
-    count = f"{len(met.pairs)} such pairs" if met.complete else f"more than {_MOST_MEETINGS} such pairs"
+    count = f"{len(met.pairs)} such pairs" if met.complete else f"more than {_MAX_MEETINGS} such pairs"
     more = "" if len(met.pairs) == 1 else f" ({count} in all)" if met.complete else f" ({count})"
     if spike[first]:
         at = j if following[i] == j else i

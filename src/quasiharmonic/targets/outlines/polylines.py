@@ -6,11 +6,11 @@ import os
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.loops import listed
+from quasiharmonic.geometry.exact.loops import join_items
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.textual import is_number, number, read_text
-from quasiharmonic.targets.outlines.contours import MOST_POINTS, distinct
-from quasiharmonic.targets.outlines.nesting import arranged, collinear
+from quasiharmonic.io.lowlevel.textual import is_number, number, read_text
+from quasiharmonic.targets.outlines.contours import MAX_POINTS, distinct
+from quasiharmonic.targets.outlines.nesting import arrange, collinear
 from quasiharmonic.util.arrays import FloatArray
 
 
@@ -59,8 +59,8 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
             starts[-1] = line
         loops[-1].append((x, y))
         count += 1
-        if count > MOST_POINTS:
-            raise MeshFileError(path, f"more than {MOST_POINTS:,} points", line, "use fewer points")
+        if count > MAX_POINTS:
+            raise MeshFileError(path, f"more than {MAX_POINTS:,} points", line, "use fewer points")
     contours, begins = [], []
     for loop, start in zip(loops, starts, strict=True):
         if not loop:
@@ -74,7 +74,7 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     if not contours:
         raise MeshFileError(path, "has no points")
     try:
-        return [one.points for one in arranged(contours)]
+        return [one.points for one in arrange(contours)]
     except ValueError as error:
         plural = "contour begins at line" if len(begins) == 1 else "contours begin at lines"
-        raise MeshFileError(path, f"{error} (the {plural} {listed(begins)})") from None
+        raise MeshFileError(path, f"{error} (the {plural} {join_items(begins)})") from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.util.arrays import FloatArray, whole_number
+from quasiharmonic.util.arrays import FloatArray, check_integer, check_numbers, check_positive
 
 
 def disk(radius: float = 1.0, points: int = 256) -> FloatArray:
@@ -26,7 +26,7 @@ def disk(radius: float = 1.0, points: int = 256) -> FloatArray:
     ValueError
         When the radius is not positive, or ``points`` is less than three.
     """
-    _positive(radius=radius)
+    check_positive(radius=radius)
     return ellipse(radius, radius, points)
 
 
@@ -50,7 +50,7 @@ def ellipse(a: float, b: float, points: int = 256) -> FloatArray:
     ValueError
         When a half axis is not positive, or ``points`` is less than three.
     """
-    _positive(a=a, b=b)
+    check_positive(a=a, b=b)
     return _polar(points) * (a, b)
 
 
@@ -71,7 +71,7 @@ def rectangle(width: float, height: float) -> FloatArray:
     ValueError
         When a side is not positive.
     """
-    _positive(width=width, height=height)
+    check_positive(width=width, height=height)
     return np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64)
 
 
@@ -94,7 +94,7 @@ def regular_polygon(corners: int, radius: float = 1.0) -> FloatArray:
     ValueError
         When there are fewer than three corners or the radius is not positive.
     """
-    _positive(radius=radius)
+    check_positive(radius=radius)
     return _polar(corners, start=np.pi / 2) * radius
 
 
@@ -117,9 +117,8 @@ def star(tips: int, inner: float = 0.5) -> FloatArray:
     ValueError
         When there are fewer than three tips or ``inner`` is not between 0 and 1.
     """
-    if not 0 < inner < 1:
-        raise ValueError(f"the inner radius of a star must be between 0 and 1, not {inner}")
-    whole_number("tips", tips, least=3)
+    _check_inner(inner)
+    check_integer("tips", tips, minimum=3)
     outline = _polar(2 * tips, start=np.pi / 2)
     outline[1::2] *= inner
     return outline
@@ -145,20 +144,19 @@ def ring(inner: float = 0.5, points: int = 256) -> list[FloatArray]:
     ValueError
         When ``inner`` is not between 0 and 1, or ``points`` is less than three.
     """
-    if not 0 < inner < 1:
-        raise ValueError(f"the inner radius of a ring must be between 0 and 1, not {inner}")
+    _check_inner(inner)
     circle = _polar(points)
     return [circle, inner * circle[::-1]]
 
 
+def _check_inner(inner: float) -> None:
+    check_numbers(inner=inner)
+    if not 0 < inner < 1:
+        raise ValueError(f"inner must be between 0 and 1, not {inner}")
+
+
 def _polar(points: int, start: float = 0.0) -> FloatArray:
     """Points evenly spaced on the unit circle, counterclockwise from the angle ``start`` in radians."""
-    whole_number("points", points, least=3)
+    check_integer("points", points, minimum=3)
     angle = start + np.arange(points) * (2 * np.pi / points)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def _positive(**lengths: float) -> None:
-    for name, length in lengths.items():
-        if not (0 < length < np.inf):
-            raise ValueError(f"{name} must be positive and finite, not {length}")

@@ -16,18 +16,18 @@ from xml.parsers import expat
 import numpy as np
 
 from quasiharmonic.geometry.curves.arcs import Arc
-from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.textual import read_text
-from quasiharmonic.targets.outlines.contours import MOST_POINTS, Pieces, as_complex, flatten
-from quasiharmonic.targets.outlines.nesting import arranged
+from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.lowlevel.textual import read_text
+from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces, as_complex, flatten
+from quasiharmonic.targets.outlines.nesting import arrange
 from quasiharmonic.targets.outlines.svgpath import commands, parse_path
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, check_numbers
 
 _SVG = "http://www.w3.org/2000/svg"
-MOST_BYTES = 64 << 20
+MAX_BYTES = 64 << 20
 _DEEPEST = 200
-_MOST_TRANSFORMS = 1000
-_TOO_MANY = f"more than {MOST_POINTS:,} pieces in all"
+_MAX_TRANSFORMS = 1000
+_TOO_MANY = f"more than {MAX_POINTS:,} pieces in all"
 # Bound that keeps squares of coordinates and their sums from overflow and underflow.
 _LARGEST = 1e150
 _CONTAINERS = "svg", "g", "a", "switch"
@@ -76,6 +76,7 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     ValueError
         When the tolerance is out of range.
     """
+    check_numbers(tolerance=tolerance)
     if not 1e-7 <= tolerance < 1:
         raise ValueError(
             f"tolerance must be a fraction of the drawing's size, at least 1e-7 and less than 1, not {tolerance}"
@@ -99,15 +100,16 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     if not contours:
         raise MeshFileError(path, "has no path or shape that encloses an area")
     try:
-        return [one.points for one in arranged(contours)]
+        return [one.points for one in arrange(contours)]
     except ValueError as error:
         raise MeshFileError(path, f"{error} (in units of the drawing, the y-axis upwards)") from None
 
 
 def svg_paths(path: str | os.PathLike[str], *, arcs: bool = False) -> list[Pieces]:
     """Paths that an SVG file draws, as read by `read_svg`; ``arcs`` as in `parse_path`."""
-    if os.path.isfile(path) and os.path.getsize(path) > MOST_BYTES:
-        raise MeshFileError(path, f"is larger than {MOST_BYTES >> 20} MiB", remedy="simplify the drawing")
+    check_path("path", path)
+    if os.path.isfile(path) and os.path.getsize(path) > MAX_BYTES:
+        raise MeshFileError(path, f"is larger than {MAX_BYTES >> 20} MiB", remedy="simplify the drawing")
     with np.errstate(over="ignore", invalid="ignore"):
         return _Drawing(path, arcs).read(read_text(path))
 
@@ -151,12 +153,12 @@ class _Drawing:
             try:
                 for pieces in parse_path(d, arcs=self.arcs):
                     count += len(pieces)
-                    if count > MOST_POINTS:
+                    if count > MAX_POINTS:
                         raise ValueError(_TOO_MANY)
                     drawn.append((pieces, transform))
             except ValueError as error:
                 raise MeshFileError(self.path, f"<{tag}>: {error}", line) from None
-        return [_transformed(pieces, transform) for pieces, transform in drawn]
+        return [_apply_transform(pieces, transform) for pieces, transform in drawn]
 
     def _error(self, what: str, remedy: str = "") -> MeshFileError:
         return MeshFileError(self.path, what, self.parser.CurrentLineNumber, remedy)
@@ -176,8 +178,8 @@ class _Drawing:
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self.depth += 1
         self.elements += 1
-        if self.elements > MOST_POINTS:
-            raise self._error(f"more than {MOST_POINTS:,} elements")
+        if self.elements > MAX_POINTS:
+            raise self._error(f"more than {MAX_POINTS:,} elements")
         if self.depth > _DEEPEST:
             raise self._error(f"elements nested more than {_DEEPEST} deep")
         namespace, _, tag = name.rpartition(" ")
@@ -225,15 +227,15 @@ class _Drawing:
         self.depth -= 1
 
     def _note(self, tag: str, d: str, transform: FloatArray) -> None:
-        self.commands += commands(d, MOST_POINTS - self.commands)
-        if self.commands > MOST_POINTS:
+        self.commands += commands(d, MAX_POINTS - self.commands)
+        if self.commands > MAX_POINTS:
             raise ValueError(_TOO_MANY)
         self.shapes.append((tag, self.parser.CurrentLineNumber, d, transform))
 
 
-def _transformed(pieces: list[Any], transform: FloatArray) -> list[Any]:
+def _apply_transform(pieces: list[Any], transform: FloatArray) -> list[Any]:
     matrix, shift = transform[:2, :2], transform[:2, 2]
-    return [p.transformed(matrix, shift) if isinstance(p, Arc) else p @ matrix.T + shift for p in pieces]
+    return [p.transform(matrix, shift) if isinstance(p, Arc) else p @ matrix.T + shift for p in pieces]
 
 
 def _affine(a: float, b: float, c: float, d: float, e: float, f: float) -> FloatArray:
@@ -248,8 +250,8 @@ def _transform(text: str) -> FloatArray:
     while at < len(text):
         found = _TRANSFORM.match(text, at)
         count += 1
-        if count > _MOST_TRANSFORMS:
-            raise ValueError(f"more than {_MOST_TRANSFORMS:,} transforms of one element")
+        if count > _MAX_TRANSFORMS:
+            raise ValueError(f"more than {_MAX_TRANSFORMS:,} transforms of one element")
         if found is None:
             raise ValueError(f"the transform {text[at : at + 40]!a} is not supported")
         name, at = found.group(1), found.end()

@@ -8,13 +8,12 @@ from __future__ import annotations
 import cmath
 import math
 import re
-from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from quasiharmonic.geometry.curves.arcs import Arc
-from quasiharmonic.targets.outlines.contours import MOST_POINTS, Pieces
+from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces
 
 _BLANKS = re.compile(r"[ \t\r\n\f]*")
 _COMMA = re.compile(r"[ \t\r\n\f]*,?[ \t\r\n\f]*")
@@ -22,6 +21,8 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 # Arguments of each command: x is a number, F a flag, a single 0 or 1.
 _ARGUMENTS = {"M": "xx", "L": "xx", "H": "x", "V": "x", "C": "x" * 6, "S": "x" * 4, "Q": "x" * 4, "T": "xx"}
 _ARGUMENTS |= {"A": "xxxFFxx", "Z": ""}
+# Numbers that a command takes, at least 1, by its letter.
+_WIDTHS = {letter: len(kinds) or 1 for upper, kinds in _ARGUMENTS.items() for letter in (upper, upper.lower())}
 # Number of cubic curves per half turn of an arc. Each deviates from a circle by 6.6e-8 of the radius.
 _HALF_TURN = 8
 # A letter other than e and E, and the text up to the next such letter.
@@ -29,25 +30,10 @@ _COMMAND = re.compile(r"([A-DF-Za-df-z])([^A-DF-Za-df-z]*)")
 
 
 def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
-    """Parse path data.
+    """Parse path data of SVG 2 into the pieces of each subpath; empty subpaths are left out.
 
-    Parameters
-    ----------
-    d : str
-        Commands M, L, H, V, C, S, Q, T, A and Z, absolute or relative, as in SVG 2.
-    arcs : bool
-        Whether to return arcs as `quasiharmonic.geometry.curves.Arc` instead of Bézier curves.
-
-    Returns
-    -------
-    list of list of (degree + 1, 2) float64
-        The pieces of every subpath, each a Bézier curve given by its control points. Arcs become cubic curves with an
-        error below 1e-7 of their larger radius. Empty subpaths are left out.
-
-    Raises
-    ------
-    ValueError
-        When the path data are invalid; the message gives the position.
+    A piece is a Bézier curve given by its control points. With ``arcs``, arcs are `Arc` objects; otherwise they become
+    cubic curves with an error below 1e-7 of their larger radius. ValueError gives the position of invalid data.
     """
     pen = _Pen(arcs)
     scan = _Scanner(d)
@@ -60,33 +46,27 @@ def parse_path(d: str, *, arcs: bool = False) -> list[Pieces]:
         if not all(map(math.isfinite, values)):
             raise scan.error("a number is too large")
         pen.draw(command, values)
-        if pen.count > MOST_POINTS:
-            raise scan.error(f"more than {MOST_POINTS:,} pieces")
+        if pen.count > MAX_POINTS:
+            raise scan.error(f"more than {MAX_POINTS:,} pieces")
     return [subpath for subpath in pen.subpaths if subpath]
 
 
-def commands(d: str, most: int) -> int:
-    """Count the commands in path data, much faster than parsing them.
+def commands(d: str, max_count: int) -> int:
+    """Count the commands in path data up to ``max_count``, much faster than parsing them.
 
-    An arc counts as the number of curves of half a turn.
-
-    Parameters
-    ----------
-    d : str
-    most : int
-        Counting stops above this number.
-
-    Returns
-    -------
-    int
-        Too low only if the flags of arcs are written without a separator after them.
+    An arc counts as the number of curves of half a turn. The count is too low only if the flags of arcs are written
+    without a separator after them.
     """
+    if len(d) > max_count and (letters := sum(map(d.count, _WIDTHS))) > max_count:
+        return letters
     total = 0
-    for letter, numbers in map(re.Match.groups, _COMMAND.finditer(d)):
-        width = len(_ARGUMENTS.get(letter.upper(), "")) or 1
-        count = sum(1 for _ in islice(_NUMBER.finditer(numbers), width * (most + 1 - total)))
-        total += max(1, count // width) * (_HALF_TURN if letter in "Aa" else 1)
-        if total > most:
+    for letter, numbers in _COMMAND.findall(d):
+        width = _WIDTHS.get(letter, 1)
+        # Several numbers need at least one character between any two. The number of substitutions needs no memory.
+        several = len(numbers) + 1 >= 4 * width
+        count = max(1, _NUMBER.subn("", numbers)[1] // width) if several else 1
+        total += count * (_HALF_TURN if letter in "Aa" else 1)
+        if total > max_count:
             break
     return total
 

@@ -10,16 +10,19 @@ from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.targets.outlines.contours import distinct, signed_area
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter
 from quasiharmonic.targets.outlines.nesting import filled, nested
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive
 
 # Points of a united outline closer than this, in units of the font size, are merged.
-_ONE = 1e-12
-# Maximum number of Newton steps to the intersection of two curves, and its tolerance as a share of the curve's size.
-_STEPS, _MEET = 30, 1e-14
-# A curve and its chords may differ in length by at most this share. Where chords cross at a small angle, the
-# intersection of the curves may be far away: at most this many tolerances.
-_ALIKE, _STRAYS = 0.01, 100.0
-_FLATLY = (
+_SAME_POINT = 1e-12
+# Maximum number of Newton steps to the intersection of two curves.
+_MAX_STEPS = 30
+# Tolerance of the intersection, as a share of the curve's size.
+_MEETING_TOLERANCE = 1e-14
+# Maximum relative difference between the lengths of a curve and its chords.
+_LENGTH_DIFFERENCE = 0.01
+# Where chords cross at a small angle, the curves may intersect at this distance from there, in tolerances.
+_MAX_DISTANCE = 100.0
+_TANGENT_LETTERS = (
     "letters of the word are almost tangent where they touch, so their curves cannot be joined: choose other letters, "
     "or slide the boundary along a polygon"
 )
@@ -56,7 +59,7 @@ def word(text: str, font: Font | None = None, *, overlap: float = 0.03, toleranc
     ModuleNotFoundError
         When Shapely, which unites the letters, is not installed.
     """
-    contours = [distinct(contour, tolerance) for contour in _united(_set(text, font, overlap, tolerance)[0])]
+    contours = [distinct(contour, tolerance) for contour in _unite(_set(text, font, overlap, tolerance)[0])]
     loose = len(filled(contours)) - 1
     if loose:
         raise ValueError(
@@ -69,22 +72,8 @@ def word(text: str, font: Font | None = None, *, overlap: float = 0.03, toleranc
 def word_curves(text: str, font: Font | None = None, *, overlap: float = 0.03, tolerance: float = 5e-4) -> list[Curve]:
     """Return the exact curves of the contours of `word`: pieces of the letters' curves, joined at their intersections.
 
-    Parameters
-    ----------
-    text, font, overlap, tolerance
-        As for `word`, with the same positions of the letters.
-
-    Returns
-    -------
-    list of Curve
-        Closed, one for each contour.
-
-    Raises
-    ------
-    ValueError
-        As for `word`; when letters touch at so small an angle that the intersection of their curves cannot be found.
-    FileNotFoundError, ModuleNotFoundError
-        As for `word`.
+    There is one closed curve for each contour. Errors as `word`; ValueError also when letters touch at so small an
+    angle that the intersection of their curves cannot be found.
     """
     letters, shifts = _set(text, font, overlap, tolerance)
     drawn = [
@@ -93,13 +82,13 @@ def word_curves(text: str, font: Font | None = None, *, overlap: float = 0.03, t
         for path in glyph_paths(character, font)
         if any(np.ptp(piece, axis=0).any() for piece in path)
     ]
-    return [_traced(distinct(contour, _ONE), drawn, tolerance) for contour in _united(letters)]
+    return [_trace(distinct(contour, _SAME_POINT), drawn, tolerance) for contour in _unite(letters)]
 
 
 def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tuple[list[list[FloatArray]], list[float]]:
     """Return the contours of each letter in its position, and each letter's shift to the left."""
-    if not 0 < overlap < np.inf:
-        raise ValueError(f"overlap must be positive and finite, not {overlap}")
+    check_instance("text", text, str)
+    check_positive(overlap=overlap)
     if not text:
         raise ValueError("a word needs at least one letter")
     letters = [letter(character, font, tolerance=tolerance) for character in text]
@@ -111,7 +100,7 @@ def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tupl
     return letters, shifts
 
 
-def _traced(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
+def _trace(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
     """Return the curve of which a united contour is a polyline, made of pieces of the letters' curves."""
     middles = (contour + np.roll(contour, -1, axis=0)) / 2
     by_point, by_middle = (np.stack([one.nearest(points)[1] for one in drawn]) for points in (contour, middles))
@@ -137,8 +126,8 @@ def _traced(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
     found = Curve(pieces)
     around = float(np.hypot(*(np.roll(contour, -1, axis=0) - contour).T).sum())
     away = float(found.nearest(contour)[1].max())
-    if not found.closed or abs(found.length - around) > _ALIKE * around or away > _STRAYS * tolerance:
-        raise ValueError(_FLATLY)
+    if not found.closed or abs(found.length - around) > _LENGTH_DIFFERENCE * around or away > _MAX_DISTANCE * tolerance:
+        raise ValueError(_TANGENT_LETTERS)
     return found
 
 
@@ -146,9 +135,9 @@ def _meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
     """Intersection of two curves near a point, as arc lengths along each, by Newton's method."""
     s, t = (curve.nearest(near[None])[0] for curve in (one, other))
     ahead = np.ones(1, dtype=bool)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         apart = ((other.position(t) - one.position(s)) @ (1, 1j))[0]
-        if abs(apart) <= _MEET * one.size:
+        if abs(apart) <= _MEETING_TOLERANCE * one.size:
             return float(s[0]), float(t[0])
         along, across = one.frame(s, ahead)[0][0], other.frame(t, ahead)[0][0]
         sine = (along.conjugate() * across).imag
@@ -156,7 +145,7 @@ def _meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
             break
         s = one.advance(s, np.array([(apart * across.conjugate()).imag / -sine]))
         t = other.advance(t, np.array([(apart * along.conjugate()).imag / -sine]))
-    raise ValueError(_FLATLY)
+    raise ValueError(_TANGENT_LETTERS)
 
 
 def _gap(before: list[FloatArray], after: list[FloatArray]) -> float:
@@ -165,8 +154,8 @@ def _gap(before: list[FloatArray], after: list[FloatArray]) -> float:
         [extreme([extreme(c[:, 1]) for c in shape]) for shape in (before, after)] for extreme in (np.min, np.max)
     )
     levels = np.linspace(max(low), min(high), 513)[1:-1:2]
-    room = -_leftmost([c * (-1, 1) for c in before], levels)
-    return float((_leftmost(after, levels) - room).min())
+    right_side = -_leftmost([c * (-1, 1) for c in before], levels)
+    return float((_leftmost(after, levels) - right_side).min())
 
 
 def _leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
@@ -179,7 +168,7 @@ def _leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
     return np.asarray(np.where(meets, a[:, 0] + (y - a[:, 1]) / rise * (b[:, 0] - a[:, 0]), np.inf).min(axis=1))
 
 
-def _united(shapes: list[list[FloatArray]]) -> list[FloatArray]:
+def _unite(shapes: list[list[FloatArray]]) -> list[FloatArray]:
     """Outline of the union of shapes, each of them an outline oriented as in `nested`."""
     try:
         import shapely

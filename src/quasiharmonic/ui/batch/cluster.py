@@ -10,15 +10,17 @@ from typing import Any
 
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
-from quasiharmonic.ui.batch.supervisor import Finished, Supervisor, lost
+from quasiharmonic.ui.batch.supervisor import Finished, Supervisor, record_crash
 
 # Problems submitted per thread of the cluster: enough to keep threads busy, few to lose if the driver dies.
-_AHEAD = 3
-_TICK = 0.2
+_PER_THREAD = 3
+_POLL_INTERVAL = 0.2
 # Seconds between two queries of the cluster's size, which may change.
-_LOOK = 2.0
+_SIZE_INTERVAL = 2.0
 
-_GONE = "the Dask scheduler ended or dropped a problem; finished results are kept: run the same call again to continue"
+_CONNECTION_LOST = (
+    "the Dask scheduler ended or dropped a problem; finished results are kept: run the same call again to continue"
+)
 
 _mine = threading.local()
 
@@ -26,27 +28,11 @@ _mine = threading.local()
 def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> Generator[Finished | None]:
     """Solve problems on a cluster; yield None regularly while no problem is finished.
 
-    If a worker is lost, its problem goes to another worker. The scheduler gives a problem up after several lost workers
-    (``distributed.scheduler.allowed-failures``). Such problems are tried once more, one at a time, after all others. If
-    workers die again, the problem is recorded as a crash.
-
-    Parameters
-    ----------
-    todo : iterator of ProblemFiles
-    orders : Orders
-    scheduler : str, distributed.Client or cluster
-        Address of the scheduler, or a client or a cluster of it.
-
-    Raises
-    ------
-    ImportError
-        If ``distributed`` is not installed.
-    ValueError
-        If the address is malformed.
-    ConnectionError
-        If the scheduler cannot be reached or the connection is lost.
-    OutputError, WorkerError
-        As raised by a `Supervisor` on a worker.
+    The scheduler is an address, or a client or a cluster. If a worker is lost, its problem goes to another worker. The
+    scheduler gives a problem up after several lost workers (``distributed.scheduler.allowed-failures``). Such problems
+    are tried once more, one at a time, after all others. If workers die again, the problem is recorded as a crash.
+    ImportError if ``distributed`` is not installed, ValueError if the address is malformed, ConnectionError if the
+    connection fails, and errors of a `Supervisor` on a worker.
     """
     try:
         from distributed import Client
@@ -83,12 +69,12 @@ def _through(client: Any, todo: Iterator[ProblemFiles], orders: Orders) -> Gener
         pending[future.key] = (files, future)
         future.add_done_callback(lambda done: ended.put(done.key))
 
-    room, looked = 0, -_LOOK
+    free_slots, asked_at = 0, -_SIZE_INTERVAL
     try:
         while True:
-            if time.monotonic() - looked > _LOOK:
-                room, looked = _AHEAD * max(sum(client.nthreads().values()), 1), time.monotonic()
-            while len(pending) < room and (files := next(todo, None)) is not None:
+            if time.monotonic() - asked_at > _SIZE_INTERVAL:
+                free_slots, asked_at = _PER_THREAD * max(sum(client.nthreads().values()), 1), time.monotonic()
+            while len(pending) < free_slots and (files := next(todo, None)) is not None:
                 submit(files)
             if not pending:
                 if not suspects:
@@ -96,10 +82,10 @@ def _through(client: Any, todo: Iterator[ProblemFiles], orders: Orders) -> Gener
                 alone = suspects.pop()
                 submit(alone)
             try:
-                key = ended.get(timeout=_TICK)
+                key = ended.get(timeout=_POLL_INTERVAL)
             except Empty:
                 if client.status != "running":
-                    raise ConnectionError(_GONE) from None
+                    raise ConnectionError(_CONNECTION_LOST) from None
                 yield None
                 continue
             files, future = pending.pop(key)
@@ -109,11 +95,11 @@ def _through(client: Any, todo: Iterator[ProblemFiles], orders: Orders) -> Gener
                     raise result
                 yield result
             elif future.status != "error":
-                raise ConnectionError(_GONE)
+                raise ConnectionError(_CONNECTION_LOST)
             elif not isinstance(error := future.exception(), KilledWorker):
                 raise error
             elif files is alone:
-                yield lost(files, orders, f"the cluster's workers that it was given to died: {error}")
+                yield record_crash(files, orders, f"the cluster's workers that it was given to died: {error}")
             else:
                 # Several workers died with this problem, but they had others too. Try it alone later.
                 suspects.append(files)
@@ -125,7 +111,7 @@ def _through(client: Any, todo: Iterator[ProblemFiles], orders: Orders) -> Gener
 def attend(files: ProblemFiles, orders: Orders) -> Finished | Exception:
     """Solve a problem on a worker of the cluster; errors that must end the run are returned, not raised.
 
-    A raised exception travels with its traceback, and is lost if the traceback cannot be pickled.
+    A raised exception is pickled with its traceback. If the traceback cannot be pickled, the exception is lost.
     """
     if not (orders.output / MARKER).exists():
         return OSError(

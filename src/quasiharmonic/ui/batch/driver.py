@@ -11,21 +11,21 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, get_args
+from typing import Any
 
 from quasiharmonic import __version__
-from quasiharmonic.io.atomic import new_folder, write_whole
-from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.errors import OutputError, check_path
+from quasiharmonic.io.lowlevel.atomic import new_folder, write_whole
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.lock import FILE as LOCK
-from quasiharmonic.ui.batch.lock import alone
-from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, find_problems, small_together
+from quasiharmonic.ui.batch.lock import lock_folder
+from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, find_problems, group_small
 from quasiharmonic.ui.batch.settings import Orders, Settings
 from quasiharmonic.ui.batch.supervisor import ClosedError, Finished, Supervisor, resident
-from quasiharmonic.util.arrays import check_callback
+from quasiharmonic.util.arrays import check_bool, check_callback, check_instance, check_integer, check_positive
 
 # Seconds between two calls of a callback while nothing is finished.
-_TICK = 0.2
+_POLL_INTERVAL = 0.2
 
 
 @dataclass
@@ -142,7 +142,12 @@ def run(
         If processes cannot be started.
     """
     check_callback(callback)
-    settings = _checked(settings or Settings())
+    check_path("source", source)
+    check_path("output", output)
+    check_bool("retry", retry)
+    settings = Settings() if settings is None else settings
+    check_instance("settings", settings, Settings)
+    settings = _check_files(settings)
     _check(jobs, threads, time_limit, memory_limit, scheduler)
     folder = Path(os.path.abspath(output))
     table_path = folder / f"records.{table}"
@@ -151,7 +156,7 @@ def run(
     # The problems are enumerated twice, for counting and for solving, so that memory does not grow with their number.
     progress = Progress(_count(source, settings, folder))
     _check_folder(folder)
-    with new_folder(folder, leftovers=frozenset({LOCK})), alone(folder):
+    with new_folder(folder, leftovers=frozenset({LOCK})), lock_folder(folder):
         _prepare(folder, source, settings)
         orders = Orders(folder, settings, threads, time_limit, memory_limit, retry)
         todo = find_problems(source, plain=settings.plain)
@@ -173,40 +178,23 @@ def run(
     return progress
 
 
-def _checked(settings: Settings) -> Settings:
-    """Validate settings; return them with absolute paths of files."""
-    from quasiharmonic.energies.polishing import ENERGIES
-    from quasiharmonic.geometry.mesh.reference import Reference
-    from quasiharmonic.linsolve import available
-    from quasiharmonic.solver.search.strategy import STRATEGIES
-
-    for name, words in (
-        ("strategy", list(STRATEGIES)),
-        ("energy", [None, *ENERGIES, "distances"]),
-        ("polish", [None, *ENERGIES]),
-        ("reference", [None, *get_args(Reference)]),
-        ("linear_solver", ["auto", *available()]),
-    ):
-        given = getattr(settings, name)
-        if given not in words:
-            raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {given!r}")
-    _check_flatten(settings)
-    if settings.slide and settings.polish is None:
-        raise ValueError("the boundary slides only while distortion is lowered: give an energy as well, by polish")
-    if settings.max_iterations < 1:
-        raise ValueError(f"max_iterations must be at least 1, not {settings.max_iterations}")
+def _check_files(settings: Settings) -> Settings:
+    """Read the outline and the corners as a check; return the settings with absolute paths of files."""
     if settings.to is None:
-        for name in ("cut", "corners"):
-            if getattr(settings, name) and not (name == "cut" and settings.flatten):
-                raise ValueError(f"{name} applies only to plain meshes with an outline: give the outline by to")
         return settings
     from quasiharmonic.targets import outline
     from quasiharmonic.targets.boundary.corner_spec import read_corners
 
-    outline(settings.to)
+    outline(settings.to, font=settings.font)
     if settings.corners is not None:
         read_corners(settings.corners)
-    return replace(settings, to=_anywhere(settings.to), corners=_anywhere(settings.corners))
+    return replace(
+        settings,
+        to=_anywhere(settings.to),
+        font=_anywhere(settings.font),
+        corners=_anywhere(settings.corners),
+        pieces=_anywhere(settings.pieces),
+    )
 
 
 def _anywhere(name: str | None) -> str | None:
@@ -214,27 +202,16 @@ def _anywhere(name: str | None) -> str | None:
     return os.path.abspath(name) if name is not None and os.path.isfile(name) else name
 
 
-def _check_flatten(settings: Settings) -> None:
-    """Raise ValueError if fixed-boundary settings are combined with ``flatten``, or ``energy`` is given without it."""
-    if not settings.flatten:
-        if settings.energy is not None:
-            raise ValueError("energy applies only to flatten: set flatten, or give an energy by polish")
-        return
-    plain = Settings()
-    for name in ("to", "corners", "refine", "strategy", "polish", "slide", "reference"):
-        if getattr(settings, name) != getattr(plain, name):
-            raise ValueError(f"{name} needs a given boundary, but flatten leaves the boundary free: omit one of them")
-
-
 def _check(jobs: int | None, threads: int, time_limit: float | None, memory_limit: int | None, scheduler: Any) -> None:
     if scheduler is not None and jobs is not None:
         raise ValueError("jobs applies only to processes on this machine, not to a Dask cluster: omit one of them")
-    for name, value in (("jobs", jobs), ("threads", threads)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, not {value}")
-    for name, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
-        if limit is not None and not limit > 0:
-            raise ValueError(f"{name} must be positive, not {limit}")
+    if jobs is not None:
+        check_integer("jobs", jobs, minimum=1)
+    check_integer("threads", threads, minimum=1)
+    if time_limit is not None:
+        check_positive(time_limit=time_limit)
+    if memory_limit is not None:
+        check_positive(memory_limit=memory_limit)
     if memory_limit is not None and scheduler is None and resident(os.getpid()) is None:
         raise ValueError("a limit of memory needs psutil on this system: pip install 'quasiharmonic[batch]'")
 
@@ -296,7 +273,7 @@ def _cores() -> int:
 def _local(todo: Iterator[ProblemFiles], orders: Orders, jobs: int) -> Generator[Finished | None]:
     """Solve problems in processes of this machine; yield None regularly while no problem is finished."""
     supervisors = [Supervisor(orders) for _ in range(jobs)]
-    groups = small_together(todo) if orders.settings.together else ([files] for files in todo)
+    groups = group_small(todo) if orders.settings.together else ([files] for files in todo)
     lock, finished = threading.Lock(), SimpleQueue[Finished | BaseException | None]()
 
     def attend(supervisor: Supervisor) -> None:
@@ -321,7 +298,7 @@ def _local(todo: Iterator[ProblemFiles], orders: Orders, jobs: int) -> Generator
     try:
         while working:
             try:
-                item = finished.get(timeout=_TICK)
+                item = finished.get(timeout=_POLL_INTERVAL)
             except Empty:
                 yield None
                 continue

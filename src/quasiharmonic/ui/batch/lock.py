@@ -13,15 +13,11 @@ FILE = "qhm-batch.lock"
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Lock a folder against other runs; the system releases the lock when this process ends for any reason.
 
-    If the system (Windows) or the file system has no such locks, the folder is not locked.
-
-    Raises
-    ------
-    OutputError
-        If another run has locked the folder, or the folder cannot be written to.
+    If the system (Windows) or the file system has no such locks, the folder is not locked. OutputError if another run
+    has locked the folder, or the folder cannot be written to.
     """
     try:
         import fcntl

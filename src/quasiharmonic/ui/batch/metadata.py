@@ -33,28 +33,28 @@ def sizes(problems: list[Problem]) -> Record:
     }
 
 
-def told(results: Sequence[MapResult], status: Status) -> Record:
+def describe_search(results: Sequence[MapResult], status: Status) -> Record:
     """Return status, stages and linear solver of the maps of a mesh's islands."""
     stages = [stage for result in results for stage in result.stages]
     return {
         "status": status.name.lower(),
-        "iterations": sum(stage.iterations for stage in stages),
+        "iterations": sum(stage.n_iterations for stage in stages),
         "stages": json.dumps([stage.to_dict() for stage in stages]),
         "linear_solver": results[0].linear_solver,
     }
 
 
-def measured(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
+def measure(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
     """Return the distortion of a map; empty if no triangle has an area in the rest mesh."""
     found = distortion(V, F, uv)
     if len(found.flat) == len(F):
         return {}
-    values = {"mips": found.summary("mips").mean, "isometric": found.summary("isometric").maximum}
+    values = {"mips": found.statistics("mips").mean, "isometric": found.statistics("isometric").maximum}
     return {name: value if isfinite(value) else None for name, value in values.items()}
 
 
 @contextmanager
-def timed(record: Record, phase: str) -> Iterator[None]:
+def time_phase(record: Record, phase: str) -> Iterator[None]:
     """Add the wall time of a block to the given phase of a record."""
     began = time.perf_counter()
     try:
@@ -85,5 +85,5 @@ def peak() -> int | None:
         import resource
     except ImportError:
         return None
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else 1024 * most
+    max_rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return max_rss if sys.platform == "darwin" else 1024 * max_rss

@@ -9,15 +9,18 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from quasiharmonic.io import READERS, problem_files
+from quasiharmonic.io import problem_files, suffixes
+from quasiharmonic.io.errors import check_path
+from quasiharmonic.util.arrays import check_bool
 
 #: A file that marks a folder as the output of a run; problems are not searched there.
 MARKER = "qhm-batch.json"
-#: Bytes of a small mesh file (about 1,500 triangles), and of the files of one group (about 28,000 triangles). For
-#: larger meshes most searches start differently.
-SMALL_FILE, GROUP_OF_FILES = 100_000, 1_500_000
+#: Bytes of a small mesh file, of about 1,500 triangles; for larger meshes most searches start differently.
+SMALL_FILE = 100_000
+#: Bytes of the files of one group, of about 28,000 triangles.
+GROUP_OF_FILES = 1_500_000
 # Largest number of problems in a group. If one of them fails, the rest of the group is solved one by one.
-_MOST = 64
+_MAX_GROUP = 64
 
 # Start of a comment in a list; file names may contain "#" too.
 _COMMENT = re.compile(r"(?:^|\s)#")
@@ -67,18 +70,20 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
     OSError
         If a folder or the list cannot be read.
     """
+    check_path("source", source)
+    check_bool("plain", plain)
     path = Path(os.path.abspath(source))
     if path.is_dir():
         yield from _below(path, "", plain, frozenset())
     elif not path.exists():
         raise ValueError(f"there is no folder, list or mesh {source}")
-    elif path.suffix.lower() in READERS:
+    elif path.suffix.lower() in suffixes("read"):
         yield ProblemFiles(path.name, path, None)
     else:
-        yield from _listed(path, plain)
+        yield from _read_list(path, plain)
 
 
-def small_together(problems: Iterable[ProblemFiles]) -> Iterator[list[ProblemFiles]]:
+def group_small(problems: Iterable[ProblemFiles]) -> Iterator[list[ProblemFiles]]:
     """Group small problems, by the sizes of their mesh files, in order.
 
     Yields
@@ -93,7 +98,7 @@ def small_together(problems: Iterable[ProblemFiles]) -> Iterator[list[ProblemFil
             bytes_ = os.stat(problem.mesh).st_size
         except OSError:
             bytes_ = SMALL_FILE + 1
-        if group and (size + bytes_ > GROUP_OF_FILES or len(group) == _MOST):
+        if group and (size + bytes_ > GROUP_OF_FILES or len(group) == _MAX_GROUP):
             yield group
             group, size = [], 0
         if bytes_ > SMALL_FILE:
@@ -127,7 +132,7 @@ def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int
         inner = f"{name}/{entry}" if name else entry
         if is_folder:
             yield from _below(folder / entry, inner, plain, above | {here})
-        elif plain and os.path.splitext(entry)[1].lower() in READERS:
+        elif plain and os.path.splitext(entry)[1].lower() in suffixes("read"):
             yield ProblemFiles(inner, folder / entry, None)
 
 
@@ -141,7 +146,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
         return False
 
 
-def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
+def _read_list(path: Path, plain: bool) -> Iterator[ProblemFiles]:
     seen = set()
     with open(path, encoding="utf-8-sig", errors="surrogateescape") as lines:
         for number, line in enumerate(lines, 1):
@@ -149,7 +154,7 @@ def _listed(path: Path, plain: bool) -> Iterator[ProblemFiles]:
             if not text:
                 continue
             place = Path(os.path.abspath(path.parent / text))
-            if not (place.is_dir() or (place.suffix.lower() in READERS and place.is_file())):
+            if not (place.is_dir() or (place.suffix.lower() in suffixes("read") and place.is_file())):
                 raise ValueError(
                     f"{path}: line {number}: there is no folder and no mesh file {text[:100]!r}; "
                     "give one on each line of the list"

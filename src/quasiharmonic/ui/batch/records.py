@@ -14,8 +14,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.io.atomic import write_whole
-from quasiharmonic.io.errors import MeshFileError, OutputError
+from quasiharmonic.io.errors import MeshFileError, OutputError, check_path
+from quasiharmonic.io.lowlevel.atomic import write_whole
 
 Record = dict[str, Any]
 
@@ -63,7 +63,7 @@ COLUMNS: dict[str, type] = {
     "flips_before": int,
     "flips_after": int,
     "iterations": int,
-    # The stages that ran, as JSON: see `quasiharmonic.Stage`.
+    # The stages that ran, as JSON: see `quasiharmonic.results.Stage`.
     "stages": str,
     # Wall time from reading the file to writing the record, and of its phases.
     "seconds": float,
@@ -106,13 +106,7 @@ def map_path(folder: Path) -> Path:
 
 
 def write_record(folder: Path, record: Record) -> None:
-    """Write the record of a problem into the folder of its results.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Write the record of a problem into the folder of its results; OutputError if it cannot be written."""
     write_whole(folder / FILE, json.dumps(record, allow_nan=False).encode() + b"\n", durable=False)
 
 
@@ -138,10 +132,7 @@ def _is_whole(record: Record) -> bool:
 def clear(folder: Path) -> None:
     """Create the folder of a problem's results, and delete results of an earlier attempt, the record first.
 
-    Raises
-    ------
-    OutputError
-        If the folder cannot be created or emptied.
+    OutputError if the folder cannot be created or emptied.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -219,10 +210,11 @@ def read_table(path: str | os.PathLike[str]) -> Iterator[Record]:
     for number, row in enumerate(rows, 1):
         if row.get("problem") in (None, ""):
             raise MeshFileError(path, f"record {number} has no problem", remedy="a column `problem` is needed")
-        yield {column: _typed(path, number, column, value) for column, value in row.items()}
+        yield {column: _convert(path, number, column, value) for column, value in row.items()}
 
 
 def _suffix(path: str | os.PathLike[str]) -> str:
+    check_path("path", path)
     suffix = Path(path).suffix.lower()
     if suffix not in (".csv", ".parquet"):
         raise ValueError(f"{os.fspath(path)!r}: a table of records must be .csv or .parquet")
@@ -283,7 +275,7 @@ def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
         raise MeshFileError(path, f"cannot be read as a table: {error}") from error
 
 
-def _typed(path: str | os.PathLike[str], number: int, column: str, value: Any) -> Any:
+def _convert(path: str | os.PathLike[str], number: int, column: str, value: Any) -> Any:
     """Convert a table value to its column's type; CSV has only text, and other programs may use numbers as names."""
     if value is None or value == "":
         return None

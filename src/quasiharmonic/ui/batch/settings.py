@@ -5,15 +5,28 @@ from __future__ import annotations
 import json
 import os
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from quasiharmonic import __version__
+from quasiharmonic.energies.polishing import ENERGIES
+from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
+from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.linsolve import available
+from quasiharmonic.solver.search.options import MAX_ITERATIONS
+from quasiharmonic.solver.search.strategy import STRATEGIES
 from quasiharmonic.ui.batch.problems import ProblemFiles
+from quasiharmonic.util.arrays import check_bool, check_choice, check_integer, describe
+
+_CHOICES: dict[str, tuple[str | None, ...]] = {
+    "strategy": tuple(STRATEGIES),
+    "energy": (None, *ENERGIES, "distances"),
+    "polish": (None, *ENERGIES),
+    "reference": (None, *get_args(Reference)),
+}
 
 
 @dataclass(frozen=True)
@@ -26,6 +39,10 @@ class Settings:
         If given, problems are plain meshes, and their boundaries are mapped to this outline, as
         `quasiharmonic.targets.outline` reads it. The outline's holes are filled for a surface without holes. If None,
         the problems contain the target positions of their fixed vertices.
+    font : str or None
+        Font of letters and words in ``to``: a file or a name.
+    corner_angle : float
+        Turning angle in degrees from which a point of ``to`` is a corner.
     flatten : bool
         If True, problems are plain meshes with free boundaries. `quasiharmonic.flatten` maps them, and the result must
         be bijective. Of the following settings only ``energy``, ``cut``, ``max_iterations`` and ``linear_solver``
@@ -46,13 +63,22 @@ class Settings:
     slide : bool
         Whether boundary vertices slide during the polish, with fixed corners. They slide along the curves of ``to``, or
         along the polygon of their target positions if ``to`` is None.
+    pieces : str or None
+        File that assigns sliding boundary vertices to sides of ``to``, as for ``qhm map --pieces``.
     reference : {"equilateral", "rest", "corrected"} or None
     max_iterations : int
     linear_solver : str
         As for `quasiharmonic.injective_map`, like ``strategy``, ``reference`` and ``max_iterations``.
+
+    Raises
+    ------
+    ValueError
+        If a setting has an invalid value, or two settings contradict each other.
     """
 
     to: str | None = None
+    font: str | None = None
+    corner_angle: float = 20.0
     flatten: bool = False
     energy: str | None = None
     cut: bool = False
@@ -61,9 +87,46 @@ class Settings:
     strategy: str = "speed"
     polish: str | None = None
     slide: bool = False
+    pieces: str | None = None
     reference: str | None = None
-    max_iterations: int = 2000
+    max_iterations: int = MAX_ITERATIONS
     linear_solver: str = "auto"
+
+    def __post_init__(self) -> None:
+        """Check the values, without reading files."""
+        for name, words in _CHOICES.items():
+            given = getattr(self, name)
+            if not isinstance(given, str | None) or given not in words:
+                raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {given!r}")
+        for name in ("flatten", "cut", "refine", "slide"):
+            check_bool(name, getattr(self, name))
+        for name in ("to", "font", "corners", "pieces"):
+            if not isinstance(getattr(self, name), str | None):
+                raise ValueError(f"{name} must be a text or None, not {describe(getattr(self, name))}")
+        check_corner_angle(self.corner_angle)
+        check_integer("max_iterations", self.max_iterations, minimum=1)
+        check_choice("linear_solver", self.linear_solver, ("auto", *available()))
+        self._check_combination()
+
+    def _check_combination(self) -> None:
+        """Raise ValueError if a setting has no effect with the others."""
+        changed = {one.name for one in fields(self) if getattr(self, one.name) != one.default}
+        if self.flatten:
+            for name in ("to", "corners", "refine", "strategy", "polish", "slide", "reference"):
+                if name in changed:
+                    raise ValueError(
+                        f"{name} needs a given boundary, but flatten leaves the boundary free: omit one of them"
+                    )
+        elif self.energy is not None:
+            raise ValueError("energy applies only to flatten: set flatten, or give an energy by polish")
+        if self.slide and self.polish is None:
+            raise ValueError("the boundary slides only while distortion is lowered: give an energy as well, by polish")
+        if self.to is None:
+            for name in ("cut", "corners", "corner_angle", "font", "pieces"):
+                if name in changed and not (name == "cut" and self.flatten):
+                    raise ValueError(f"{name} applies only to plain meshes with an outline: give the outline by to")
+        elif self.pieces is not None and not self.slide:
+            raise ValueError("pieces assigns vertices to sides of the outline: set slide as well")
 
     @property
     def plain(self) -> bool:
@@ -72,13 +135,17 @@ class Settings:
 
     @property
     def together(self) -> bool:
-        """Whether small problems may be solved in groups by `quasiharmonic.ui.batch.batched`.
+        """Whether small problems may be solved in groups by `quasiharmonic.ui.batch.groups`.
 
         This requires QDLDL, whose result for a mesh does not depend on the other meshes of the group.
         """
         alone = self.flatten or self.cut or self.refine or self.slide or self.polish is not None
         by_qdldl = self.linear_solver in ("auto", "qdldl") and "qdldl" in available()
         return by_qdldl and not alone and self.reference in (None, "equilateral")
+
+    def _names(self) -> tuple[str | None, ...]:
+        """Return the settings that may name files."""
+        return self.to, self.font, self.corners, self.pieces
 
     def key(self, files: ProblemFiles) -> str:
         """Return a digest of a problem's contents, these settings, the version, and the package's sources.
@@ -101,7 +168,7 @@ class Settings:
             If a file cannot be read; the message names it.
         """
         digest = blake2b(digest_size=16)
-        named = [Path(name) if name is not None and os.path.isfile(name) else None for name in (self.to, self.corners)]
+        named = [Path(name) if name is not None and os.path.isfile(name) else None for name in self._names()]
         for path in (files.mesh, files.fixed, *named):
             contents = b"" if path is None else _contents(path)
             digest.update(len(contents).to_bytes(8, "little"))
@@ -148,29 +215,14 @@ def sources_digest() -> str:
 
 @dataclass(frozen=True)
 class Orders:
-    """Parameters of a run that all its workers need.
+    """Parameters of a run that all its workers need."""
 
-    Attributes
-    ----------
-    output : Path
-        Absolute path of the run's folder, the same on all machines.
-    settings : Settings
-    threads : int
-        Threads of the linear solver.
-    time_limit : float or None
-        Seconds of wall time per problem.
-    memory_limit : int or None
-        Bytes of resident memory of the process that solves a problem.
-    retry : bool
-        Whether to try again problems that failed for other reasons than their input.
-    """
-
-    output: Path
+    output: Path  # Absolute path of the run's folder, the same on all machines
     settings: Settings
-    threads: int = 1
-    time_limit: float | None = None
-    memory_limit: int | None = None
-    retry: bool = False
+    threads: int = 1  # Threads of the linear solver
+    time_limit: float | None = None  # Seconds of wall time per problem
+    memory_limit: int | None = None  # Bytes of resident memory of the process that solves a problem
+    retry: bool = False  # Whether to try again problems that failed for other reasons than their input
 
     def folder(self, name: str) -> Path:
         """Return the folder of a problem's map and record."""

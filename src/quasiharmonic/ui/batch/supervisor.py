@@ -28,30 +28,19 @@ COMMAND = [sys.executable, "-P", "-c", "from quasiharmonic.ui.batch.worker impor
 # Thread counts of OpenMP, MKL, OpenBLAS, BLIS and Apple's Accelerate.
 _THREADS = "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"
 # Seconds between two checks of time and memory, and seconds that a process may take to import its libraries.
-_LOOK = 0.05
+_CHECK_INTERVAL = 0.05
 _START = 120.0
 #: Time limit in seconds for a group of small problems; each usually takes some hundredths.
 TOGETHER = 5.0
 
 
 class Finished(NamedTuple):
-    """Report of a finished problem.
-
-    Attributes
-    ----------
-    name : str
-    outcome : str
-        As in the record.
-    seconds : float
-        As in the record.
-    resumed : bool
-        Whether an earlier run had finished it.
-    """
+    """Report of a finished problem."""
 
     name: str
-    outcome: str
-    seconds: float
-    resumed: bool = False
+    outcome: str  # As in the record
+    seconds: float  # As in the record
+    resumed: bool = False  # Whether an earlier run had finished it
 
 
 class ClosedError(Exception):
@@ -63,13 +52,7 @@ class WorkerError(OSError):
 
 
 class Supervisor:
-    """Solve one problem at a time in a separate process.
-
-    Parameters
-    ----------
-    orders : Orders
-        The run's limits, threads, settings and folder.
-    """
+    """Solve one problem at a time in a separate process."""
 
     def __init__(self, orders: Orders) -> None:
         self.orders = orders
@@ -80,17 +63,11 @@ class Supervisor:
     def attend(self, files: ProblemFiles) -> Finished:
         """Ensure that a problem has a record of this input and these settings; solve it if necessary.
 
-        Raises
-        ------
-        OutputError
-            If results cannot be written, for instance on a full disk.
-        WorkerError
-            If no process can be started.
-        ClosedError
-            If `close` was called in the meantime.
+        OutputError if results cannot be written, WorkerError if no process can be started, ClosedError if `close` was
+        called in the meantime.
         """
         job = self._job(files)
-        return job if isinstance(job, Finished) else self._solved(job)
+        return job if isinstance(job, Finished) else self._solve_one(job)
 
     def attend_all(self, some: Sequence[ProblemFiles]) -> Iterator[Finished]:
         """Like `attend` for small problems: solve them together where possible, and the rest one by one.
@@ -117,18 +94,18 @@ class Supervisor:
                 yield finished
             jobs = list(left.values())
         for job in jobs:
-            yield self._solved(job)
+            yield self._solve_one(job)
 
     def _job(self, files: ProblemFiles) -> dict[str, Any] | Finished:
         """Return the job for the process, or the outcome if there is nothing to do."""
         folder, orders = self.orders.folder(files.name), self.orders
-        known = _known(files, orders)
+        known = _start_record(files, orders)
         try:
             known["key"] = orders.settings.key(files)
         except OSError as error:
             return _conclude(folder, known | {"outcome": "invalid", "error": str(error)}, 0.0)
         before = records.read_record(folder)
-        if before is not None and before.get("key") == known["key"] and _settled(folder, before, orders):
+        if before is not None and before.get("key") == known["key"] and _is_valid(folder, before, orders):
             return Finished(files.name, before["outcome"], before.get("seconds") or 0.0, resumed=True)
         return {
             "mesh": str(files.mesh),
@@ -146,7 +123,7 @@ class Supervisor:
             if self._process is not None:
                 self._process.end()
 
-    def _begun(self, job: dict[str, Any]) -> _Process:
+    def _begin(self, job: dict[str, Any]) -> _Process:
         """Send a job to the process, and start the process if necessary."""
         with self._lock:
             if self._closed:
@@ -168,7 +145,7 @@ class Supervisor:
         """Solve small problems together; yield the index and the outcome of each finished one."""
         limit = min(self.orders.time_limit or TOGETHER, TOGETHER)
         orders = replace(self.orders, time_limit=limit)
-        process = self._begun({"together": jobs, "time_limit": limit})
+        process = self._begin({"together": jobs, "time_limit": limit})
         while True:
             answer, _ = process.answer(orders)
             if answer is None:
@@ -183,8 +160,8 @@ class Supervisor:
             k = answer["done"]
             yield k, Finished(jobs[k]["record"]["problem"], answer["outcome"], answer["seconds"])
 
-    def _solved(self, job: dict[str, Any]) -> Finished:
-        process = self._begun(job)
+    def _solve_one(self, job: dict[str, Any]) -> Finished:
+        process = self._begin(job)
         began = time.perf_counter()
         record: Record = job["record"]
         while True:
@@ -212,21 +189,15 @@ class Supervisor:
             self._process = None
 
 
-def lost(files: ProblemFiles, orders: Orders, why: str) -> Finished:
-    """Record a crash for a problem whose supervisor died too.
-
-    Raises
-    ------
-    OutputError
-        If the record cannot be written.
-    """
-    record = _known(files, orders) | {"outcome": "crash", "error": why}
+def record_crash(files: ProblemFiles, orders: Orders, why: str) -> Finished:
+    """Record a crash for a problem whose supervisor died too; OutputError if it cannot be written."""
+    record = _start_record(files, orders) | {"outcome": "crash", "error": why}
     with suppress(OSError):
         record["key"] = orders.settings.key(files)
     return _conclude(orders.folder(files.name), record, 0.0)
 
 
-def _known(files: ProblemFiles, orders: Orders) -> Record:
+def _start_record(files: ProblemFiles, orders: Orders) -> Record:
     """Return the part of a record that is known before the problem is read."""
     return {
         "problem": files.name,
@@ -245,7 +216,7 @@ def _conclude(folder: Path, record: Record, seconds: float) -> Finished:
     return Finished(record["problem"], record["outcome"], seconds)
 
 
-def _settled(folder: Path, record: Record, orders: Orders) -> bool:
+def _is_valid(folder: Path, record: Record, orders: Orders) -> bool:
     """Whether an existing record of the same input and settings is valid for these orders."""
     outcome = record["outcome"]
     if outcome in records.JUDGED:
@@ -311,17 +282,17 @@ class _Process:
         """Wait for the next answer; return None and the cause if the process was ended instead."""
         while True:
             try:
-                line = self._answers.get(timeout=_LOOK)
+                line = self._answers.get(timeout=_CHECK_INTERVAL)
             except Empty:
-                why = self._exceeded(orders)
+                why = self._check_limits(orders)
                 if why is None:
                     continue
                 self.end()
-                return None, why | self._seen()
+                return None, why | self._memory()
             if line is not None:
                 return json.loads(line), {}
             self._process.wait()
-            return None, {"outcome": "crash", "error": self._cause()} | self._seen()
+            return None, {"outcome": "crash", "error": self._cause()} | self._memory()
 
     def end(self) -> None:
         """Kill the process; only the current problem is lost."""
@@ -332,7 +303,7 @@ class _Process:
             self._process.stdin.close()
         self._errors.close()
 
-    def _exceeded(self, orders: Orders) -> Record | None:
+    def _check_limits(self, orders: Orders) -> Record | None:
         if orders.time_limit is not None and time.monotonic() - self._began > orders.time_limit:
             return {"outcome": "timeout", "error": f"not finished within {orders.time_limit:g} s"}
         self._peak = max(self._peak, resident(self._process.pid) or 0)
@@ -340,7 +311,7 @@ class _Process:
             return {"outcome": "memory", "error": f"used more than {orders.memory_limit / 2**20:.0f} MiB of memory"}
         return None
 
-    def _seen(self) -> Record:
+    def _memory(self) -> Record:
         return {"peak_memory": self._peak or None}
 
     def _cause(self) -> str:

@@ -24,22 +24,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic import io
-from quasiharmonic.apps import atlas
-from quasiharmonic.apps.atlas.mapped import MappedAtlas, each_island, faced
-from quasiharmonic.apps.atlas.refined import written_over
-from quasiharmonic.apps.flattening.flattened import flattenable
-from quasiharmonic.apps.repair.fitting import Fitted
-from quasiharmonic.energies.polishing import polished
+from quasiharmonic.apps.atlas import island_functions as atlas
+from quasiharmonic.apps.atlas.atlas_verdict import certify
+from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, each_island, merge_refined, orient_islands
+from quasiharmonic.apps.flattening.free_boundary import check_flattenable
+from quasiharmonic.apps.repair.fitting import FittedProblem
+from quasiharmonic.energies.polishing import PolishOptions, polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.refinement import Refined
-from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.solver.refine.attempts import on_refinement, solve_refining
-from quasiharmonic.solver.search.solving import solve
-from quasiharmonic.ui.batch import batched as together
-from quasiharmonic.ui.batch import metadata as account
-from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch import setup as posing
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.solver.refine.attempts import on_refinement
+from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 
 #: Key of the message that a process sends after its imports.
@@ -73,7 +70,7 @@ def serve() -> None:
         _alarm(job["time_limit"])
         try:
             if "together" in job:
-                together.solve_some(job["together"], tell)
+                groups.solve_some(job["together"], tell)
                 answer: dict[str, Any] = {"over": True}
             else:
                 record = solve_files(job, tell)
@@ -100,31 +97,17 @@ def _alarm(limit: float | None) -> None:
 
 
 def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Record:
-    """Solve one problem and write its map and its record.
+    """Solve one problem, write its map and its record, and return the record.
 
-    Parameters
-    ----------
-    job : dict
-        ``mesh`` and ``fixed``, paths; ``folder``, the folder for results; ``settings``, as returned by
-        `Settings.to_dict`; ``record``, the initial record.
-    tell : callable
-        Called with ``{"facts": …}`` when the size of the problem is known.
-
-    Returns
-    -------
-    dict
-        The record as written.
-
-    Raises
-    ------
-    OutputError
-        If the map or the record cannot be written.
+    The job has the paths ``mesh`` and ``fixed``, the ``folder`` for results, the ``settings`` as from
+    `Settings.to_dict`, and the initial ``record``. ``tell`` is called with ``{"facts": …}`` when the size of the
+    problem is known. OutputError if the map or the record cannot be written.
     """
     folder = Path(job["folder"])
     records.clear(folder)
-    account.forget_peak()
+    metadata.forget_peak()
     began = time.perf_counter()
-    record: Record = {**job["record"], "versions": account.versions()}
+    record: Record = {**job["record"], "versions": metadata.versions()}
     try:
         fill_record(job, folder, record, tell)
     except io.OutputError:
@@ -134,8 +117,8 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     except Exception as error:
         # Errors of the input are raised before the sizes are recorded.
         wrong_input = isinstance(error, ValueError) and "vertices" not in record
-        record |= {"outcome": "invalid", "error": str(error)} if wrong_input else _unexpected(error)
-    record["peak_memory"] = account.peak()
+        record |= {"outcome": "invalid", "error": str(error)} if wrong_input else _describe_error(error)
+    record["peak_memory"] = metadata.peak()
     record["seconds"] = time.perf_counter() - began
     records.write_record(folder, record)
     return record
@@ -144,31 +127,31 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
 def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[dict[str, Any]], None]) -> None:
     """Read, solve, write, certify and measure a problem; each result is recorded as soon as it is known."""
     settings = job["settings"]
-    with account.timed(record, "read"):
+    with metadata.time_phase(record, "read"):
         mesh = io.read_mesh(job["mesh"])
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
-    with account.timed(record, "setup"):
+    with metadata.time_phase(record, "setup"):
         if not settings["flatten"] and settings["to"] is None and mesh.FT is None:
             # Raises an error that names the missing data.
             io.problem_arrays(mesh, fixed)
-        surface = posing.surface_of(mesh, settings)
+        surface = island_problems.make_surface(mesh, settings)
     if settings["cut"]:
         record["cut_edges"] = len(surface.seams) - len(io.seamed(mesh).seams)
     if settings["flatten"]:
-        found = _flattened(surface, settings, record, tell)
+        found = _flatten_islands(surface, settings, record, tell)
         mapped = mesh.with_places(found.mesh)
     else:
-        found, refined = _mapped(surface, fixed, settings, record, tell)
+        found, refined = _map_islands(surface, fixed, settings, record, tell)
         mapped = mesh.with_places(found.mesh)
         if any(refined):
-            mapped = written_over(mesh, surface.islands, refined, found.places())
-    with account.timed(record, "write"):
-        record |= _written(records.map_path(folder), mapped, "bijective" if settings["flatten"] else "injective")
-    with account.timed(record, "measure"):
-        record |= account.measured(*io.without_idle(*io.cut_at_seams(mapped)))
+            mapped = merge_refined(mesh, surface.islands, refined, found.places())
+    with metadata.time_phase(record, "write"):
+        record |= _write_map(records.map_path(folder), mapped, "bijective" if settings["flatten"] else "injective")
+    with metadata.time_phase(record, "measure"):
+        record |= metadata.measure(*io.without_idle(*io.cut_at_seams(mapped)))
 
 
-def _mapped(
+def _map_islands(
     surface: SeamedMesh,
     fixed: NDArray[np.signedinteger] | None,
     settings: dict[str, Any],
@@ -176,16 +159,18 @@ def _mapped(
     tell: Callable[[dict[str, Any]], None],
 ) -> tuple[MappedAtlas, list[Refined | None]]:
     """Map a surface onto a given boundary, island by island; return the maps and the refined meshes."""
-    with account.timed(record, "setup"):
-        posed = posing.posed(surface, fixed, settings)
+    with metadata.time_phase(record, "setup"):
+        posed = island_problems.make_problems(surface, fixed, settings)
     problems = [one.fitted.problem for one in posed]
-    record |= account.sizes(problems)
+    record |= metadata.sizes(problems)
     tell({"facts": record})
     todo = iter(posed)
     # The problems are in the order in which islands are solved.
-    found = each_island(surface, lambda island: _solved(*next(todo), settings, record), reflect=settings["to"] is None)
+    found = each_island(
+        surface, lambda island: _solve_island(*next(todo), settings, record), reflect=settings["to"] is None
+    )
     results = [island.result for island in found.islands]
-    record |= account.told(results, found.status)
+    record |= metadata.describe_search(results, found.status)
     if settings["refine"]:
         record["added_vertices"] = added = sum(result.added for result in results)
         record["vertices"] += added
@@ -200,40 +185,46 @@ def _mapped(
     return found, [result.refined for result in results]
 
 
-def _solved(fitted: Fitted, slide: bool | BoundaryCurves, settings: dict[str, Any], record: Record) -> MapResult:
+def _solve_island(
+    fitted: FittedProblem, slide: bool | BoundaryCurves, settings: dict[str, Any], record: Record
+) -> MapResult:
     """Map one island, and lower its distortion if requested."""
-    with account.timed(record, "map"):
-        way = solve_refining if settings["refine"] else solve
-        result = way(
+    with metadata.time_phase(record, "map"):
+        result = solve(
             fitted.problem,
             strategy=settings["strategy"],
             max_iterations=settings["max_iterations"],
-            linear_solver=together.solver_for(fitted.problem, settings["linear_solver"]),
+            linear_solver=groups.solver_for(fitted.problem, settings["linear_solver"]),
+            refine=settings["refine"],
         )
     if settings["polish"] is None or result.status is not Status.INJECTIVE:
         return result
-    with account.timed(record, "polish"):
+    with metadata.time_phase(record, "polish"):
         fine = on_refinement(fitted.problem, result.refined)
-        return polished(fine, result, energy=settings["polish"], slide=slide)
+        return polish_result(fine, result, PolishOptions(energy=settings["polish"], slide=slide))
 
 
-def _flattened(
+def _flatten_islands(
     surface: SeamedMesh, settings: dict[str, Any], record: Record, tell: Callable[[dict[str, Any]], None]
 ) -> MappedAtlas:
     """Flatten a surface with free boundary, island by island."""
-    with account.timed(record, "setup"):
-        pieces = [piece for island, _ in faced(surface, reflect=False) for piece in flattenable(island.V, island.F)]
+    with metadata.time_phase(record, "setup"):
+        pieces = [
+            piece
+            for island, _ in orient_islands(surface, reflect=False)
+            for piece in check_flattenable(island.V, island.F)
+        ]
     record |= {"vertices": len(surface.V), "triangles": len(surface.F), "fixed": 0, "pins": 0}
     record |= {"loops": sum(len(piece.loops) for piece in pieces), "islands": len(surface.islands)}
     tell({"facts": record})
-    with account.timed(record, "map"):
+    with metadata.time_phase(record, "map"):
         found = atlas.flatten(
             surface,
             energy=settings["energy"] or "symmetric-dirichlet",
             max_iterations=settings["max_iterations"],
             linear_solver=settings["linear_solver"],
         )
-    record |= account.told([island.result for island in found.islands], found.status)
+    record |= metadata.describe_search([island.result for island in found.islands], found.status)
     energy = found.islands[0].result.history[-1].energy
     if len(pieces) == 1 and isfinite(energy):
         record["energy"] = energy
@@ -243,16 +234,16 @@ def _flattened(
     return found
 
 
-def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
-    """Write a map, read it back, and certify that it is injective or bijective, as wanted."""
+def _write_map(path: Path, mesh: io.MeshData, required: str) -> Record:
+    """Write a map, read it back, and certify that it is injective or bijective, as required."""
     # Waiting for the disk would take longer than most problems. `is_complete` detects truncated files.
     io.write_obj(path, mesh, durable=False)
     V, F, uv = io.cut_at_seams(io.read_mesh(path))
-    verdict = atlas.certify(SeamedMesh(V, F, F, uv))
+    verdict = certify(SeamedMesh(V, F, F, uv))
     bijective = verdict.bijective and not len(verdict.overlapping)
-    certified = bijective if wanted == "bijective" else verdict.injective
+    certified = bijective if required == "bijective" else verdict.injective
     return {
-        "outcome": wanted if certified else f"not {wanted}",
+        "outcome": required if certified else f"not {required}",
         "certified": certified,
         "bijective": bijective,
         "flips_after": len(verdict.inverted),
@@ -260,7 +251,7 @@ def _written(path: Path, mesh: io.MeshData, wanted: str) -> Record:
     }
 
 
-def _unexpected(error: Exception) -> Record:
+def _describe_error(error: Exception) -> Record:
     """Return the record of an unexpected exception, with its source location."""
     at = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{Path(at.filename).name}, line {at.lineno}, in {at.name}"

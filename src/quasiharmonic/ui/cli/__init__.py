@@ -16,50 +16,47 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from io import TextIOWrapper
 from typing import Any
 
 from quasiharmonic.ui.cli.interrupts import Interrupts
-from quasiharmonic.ui.cli.report import ReportError, in_words
+from quasiharmonic.ui.cli.report import ReportError, describe_error
 from quasiharmonic.ui.cli.streams import NO_READER, output_failed, tell
 from quasiharmonic.ui.cli.version import Version
 
-# The subcommands in the order of the help; each is a module of `commands`.
-COMMANDS = (
-    "map",
-    "flatten",
-    "morph",
-    "animate",
-    "repair",
-    "field",
-    "polish",
-    "harmonise",
-    "check",
-    "measure",
-    "plot",
-    "view",
-    "studio",
-    "diagnose",
-    "refine",
-    "batch",
-    "report",
-    "demo",
-)
-
+# The subcommands by group, in the order of the help. Each is a module of `commands`.
+GROUPS = {
+    "commands that make or change a map or a mesh": {
+        "map": "map a mesh into the plane without inverted triangles",
+        "flatten": "flatten a surface with a free boundary, without overlap",
+        "unwrap": "compute texture coordinates for any model, packed into a texture",
+        "polish": "lower the distortion of an injective map, and keep it injective",
+        "harmonise": "lower an energy without a barrier, and keep the map injective",
+        "repair": "untangle the inverted triangles of a UV map, with a fixed boundary",
+        "refine": "split the edges that prevent a map",
+        "animate": "map a surface to a sequence of targets, each frame certified, without jumps",
+        "morph": "move the boundary of a planar mesh (Gmsh, VTK) and keep its interior valid",
+        "field": "make a displacement field of an image invertible",
+    },
+    "commands that verify, measure and show, and others": {
+        "check": "report what a mesh is, verify its map, and find obstructions to a map",
+        "measure": "measure a map's distortion, and export it for each triangle",
+        "plot": "draw a map: inverted triangles, distortion, or a texture on the surface",
+        "view": "show a surface and its map in a window",
+        "studio": "edit a map in the browser",
+        "batch": "map all problems of a data set, on all cores or a cluster",
+        "demo": "map a built-in surface onto a letter, and draw the map",
+    },
+}
+COMMANDS = tuple(name for group in GROUPS.values() for name in group)
 
 _INTERRUPTED = "interrupted, nothing was written"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``qhm`` and return its exit status.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments after the command's name; by default those of the process.
-    """
+    """Run ``qhm`` with the given arguments, by default those of the process, and return its exit status."""
     for stream in (sys.stdout, sys.stderr):
         # Escape characters that the terminal cannot encode, so that a report does not fail.
         if isinstance(stream, TextIOWrapper):
@@ -95,12 +92,33 @@ def _fail(command: str, why: str | Exception, status: int) -> int:
     """Print why a command failed, unless standard output has no reader; return the exit status."""
     if isinstance(why, BrokenPipeError):
         return NO_READER
-    tell(f"qhm {command}: {why if isinstance(why, str) else in_words(why)}")
+    tell(f"qhm {command}: {why if isinstance(why, str) else describe_error(why)}")
     return status
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser that raises an OSError when the help cannot be printed, which argparse ignores."""
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose help also lists groups of commands, and examples.
+
+    It raises an OSError when the help cannot be printed, which argparse ignores.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        examples: Sequence[str] = (),
+        groups: Mapping[str, Mapping[str, str]] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(*args, **options)
+        self._examples, self._groups = tuple(examples), groups or {}
+
+    def format_help(self) -> str:
+        parts = [super().format_help()]
+        for title, commands in self._groups.items():
+            parts.append(f"{title}:\n" + "".join(f"  {name:<10} {text}\n" for name, text in commands.items()))
+        if self._examples:
+            parts.append("examples:\n" + "".join(f"  {line}\n" for line in self._examples))
+        return "\n".join(parts)
 
     def print_help(self, file: Any = None) -> None:
         file = file or sys.stdout
@@ -113,14 +131,19 @@ class _Parser(argparse.ArgumentParser):
 
 def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
     """Return the parser of the command, with the given subcommands."""
-    parser = _Parser(
+    parser = CommandParser(
         prog="qhm",
         description="Map triangle meshes into the plane with no inverted triangle, certified exactly.",
         epilog="Exit status: 0 certified injective, 1 not injective, 2 wrong input or call (nothing written), 3 "
-        "written, but the report failed.",
+        "written, but the report failed. `qhm COMMAND --help` explains a command.",
+        usage="qhm [-h] [--version] COMMAND ...",
+        groups=GROUPS,
+        examples=("qhm demo", "qhm map model.obj --to letter:R -o map.obj", "qhm check map.obj"),
     )
     parser.add_argument("--version", action=Version)
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, help=argparse.SUPPRESS, prog="qhm"
+    )
     for name in names:
         import_module(f"{__name__}.commands.{name}").add_parser(commands)
     return parser

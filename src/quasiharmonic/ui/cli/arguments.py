@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import re
 from typing import TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-# Copies of the names in quasiharmonic.energies.polishing, .harmonising, .measures, .strategy and .linsolve, so that the
-# parser need not import these modules.
+# Copies of names in energies.polishing, solver.search.harmonising, energies.measures, solver.search.strategy and
+# linsolve, so that the parser does not import these modules.
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
 FLATTENED = *ENERGIES, "distances"
-HARMONISED = "arap", "arap-unsigned", "area", "springs", "mips", "symmetric-dirichlet"
+HARMONISED = "arap", "arap-unsigned", "area", "springs", *ENERGIES
 MEASURES = (
     "sigma1",
     "sigma2",
@@ -24,7 +25,7 @@ MEASURES = (
     "shear",
 )
 STRATEGIES = "speed", "paper"
-LINEAR_SOLVERS = "auto", "pardiso", "cholmod", "rslab", "qdldl", "superlu"
+LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:
@@ -58,26 +59,11 @@ def add_rings(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def settle(options: argparse.Namespace, name: str, default: object, *, asked: bool, belongs: str) -> None:
-    """Set the default of an option that was not given; raise ValueError if it was given without effect.
+def set_default(options: argparse.Namespace, name: str, default: object, *, asked: bool, belongs: str) -> None:
+    """Set the default of an option that is None; ValueError if the option was given without effect.
 
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Contains None for options that were not given. Modified in place.
-    name : str
-        Name of the attribute.
-    default : object
-        Value to set if the option was not given.
-    asked : bool
-        Whether the option has an effect in this call.
-    belongs : str
-        The option that it requires, as users write it.
-
-    Raises
-    ------
-    ValueError
-        If the option was given without effect.
+    ``asked`` tells whether it has an effect in this call, and ``belongs`` is the option that it requires, as users
+    write it.
     """
     if getattr(options, name) is None:
         setattr(options, name, default)
@@ -100,3 +86,14 @@ def count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
+
+
+def byte_count(text: str) -> int:
+    """Convert a size such as 800M or 4G to bytes; for argparse."""
+    found = re.fullmatch(r"([0-9.]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
+    value = 0.0
+    if found is not None and found[1].count(".") < 2 and found[1] != ".":
+        value = float(found[1]) * 1024 ** " KMGT".index(found[2].upper() or " ")
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a size such as 800M or 4G")
+    return int(value)

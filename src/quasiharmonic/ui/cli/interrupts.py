@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 # Seconds after which a lost interrupt is repeated.
-_AGAIN = 0.01
+_RETRY_SECONDS = 0.01
 
 
 class Interrupts:
@@ -33,12 +33,12 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.happened = False
-        self._minded = False
+        self._installed = False
 
     def __enter__(self) -> Self:
         mine = threading.current_thread() is threading.main_thread()
         if mine and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self._minded = True
+            self._installed = True
             self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
             signal.signal(signal.SIGINT, self._interrupt)
         return self
@@ -46,7 +46,7 @@ class Interrupts:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._minded:
+        if self._installed:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             sys.unraisablehook = self._hook
 
@@ -56,7 +56,7 @@ class Interrupts:
 
     def _unraisable(self, lost: UnraisableHookArgs) -> None:
         if isinstance(lost.exc_value, KeyboardInterrupt):
-            again = threading.Timer(_AGAIN, _interrupt_main)
+            again = threading.Timer(_RETRY_SECONDS, _interrupt_main)
             again.daemon = True
             again.start()
         else:

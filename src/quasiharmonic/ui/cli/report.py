@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from quasiharmonic.ui.cli.streams import require_output, tell
 
 if TYPE_CHECKING:
-    from quasiharmonic.apps.atlas.mapped import MappedAtlas
+    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.problem import Domain
-    from quasiharmonic.ui.cli.verdict import Judged
+    from quasiharmonic.ui.cli.written_map import WrittenMap
 
 
 def sizes(domain: Domain) -> dict[str, Any]:
@@ -23,21 +23,21 @@ def sizes(domain: Domain) -> dict[str, Any]:
     return {"vertices": domain.n, "triangles": len(domain.F), "fixed": len(domain.fixed)}
 
 
-def of_maps(mapped: MappedAtlas, judged: Judged, output: Path) -> str:
+def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str:
     """Return the text report of a map that was computed and written."""
     from quasiharmonic.problem.result import Status
-    from quasiharmonic.util.arrays import counted
+    from quasiharmonic.util.arrays import count_of
 
-    lines = [f"wrote {output}: {judged.summary()}"]
+    lines = [f"wrote {output}: {written.summary()}"]
     results = [island.result for island in mapped.islands]
-    if not judged.injective:
+    if not written.injective:
         lines.append(mapped.status.value)
     # Each surface may be injective although pins make an overlap between surfaces unavoidable.
-    if not judged.injective or mapped.status is Status.IMPOSSIBLE:
+    if not written.injective or mapped.status is Status.IMPOSSIBLE:
         lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
-    iterations = sum(result.iterations for result in results)
+    iterations = sum(result.n_iterations for result in results)
     seconds = sum(result.seconds for result in results)
-    lines.append(f"{counted('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
+    lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
     return "\n".join(lines)
 
 
@@ -59,10 +59,7 @@ def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
 def emit_verdict(facts: dict[str, Any], destination: str | None, text: str) -> None:
     """`emit` for a command that writes no file.
 
-    Raises
-    ------
-    BrokenPipeError
-        When standard output is closed and ``--json`` names no file, so that nobody can read the report.
+    BrokenPipeError when standard output is closed and ``--json`` names no file, so that nobody can read the report.
     """
     if destination is None:
         require_output()
@@ -79,11 +76,8 @@ def check_outputs(
 ) -> None:
     """Check before any work that outputs can be written and do not replace other files.
 
-    Raises
-    ------
-    ValueError, OSError
-        If a path cannot be written, two outputs are the same file, or a picture or a report would replace
-        an input. The map may replace an input, because it is written after reading.
+    ValueError or OSError if a path cannot be written, two outputs are the same file, or a picture or a report would
+    replace an input. The map may replace an input, because it is written after reading.
     """
     from quasiharmonic import io
 
@@ -91,8 +85,8 @@ def check_outputs(
     if plot is not None:
         check_picture("--plot", plot, inputs)
     taken = {map_path.resolve(): "the map (-o)"}
-    told = None if json_path in (None, "-") else Path(str(json_path))
-    for option, path in (("--plot", plot), ("--pattern", pattern), ("--json", told)):
+    json_file = None if json_path in (None, "-") else Path(str(json_path))
+    for option, path in (("--plot", plot), ("--pattern", pattern), ("--json", json_file)):
         if path is None:
             continue
         _check_replaces_nothing(option, path, inputs)
@@ -136,8 +130,7 @@ def check_export(path: Path, inputs: Sequence[Path | None]) -> None:
     """Like `check_outputs`, for values per triangle."""
     from quasiharmonic import io
 
-    if path.suffix.lower() not in io.PER_TRIANGLE_FORMATS:
-        raise ValueError(f"--export {path}: values per triangle are written as {', '.join(io.PER_TRIANGLE_FORMATS)}")
+    io.find_format(path, "encode_values")
     _check_replaces_nothing("--export", path, inputs)
 
 
@@ -184,7 +177,7 @@ def about(source: Path | str) -> Iterator[None]:
         raise ValueError(f"{source}: {error}{counting}") from error
 
 
-def in_words(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """Return the message of an error; system errors without their number."""
     from quasiharmonic.io.errors import printable
 
@@ -204,6 +197,6 @@ def after_writing(output: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, ArithmeticError, ImportError) as error:
-        raise ReportError(f"{output} is written, but the report failed: {in_words(error)}") from error
+        raise ReportError(f"{output} is written, but the report failed: {describe_error(error)}") from error
     except KeyboardInterrupt:
         raise ReportError(f"{output} is written; interrupted before the report") from None

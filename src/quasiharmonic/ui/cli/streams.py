@@ -20,16 +20,8 @@ def tell(text: str) -> None:
 def finish(status: int) -> int:
     """Flush standard output and standard error, so that Python's own flush at exit cannot fail.
 
-    Parameters
-    ----------
-    status : int
-        The exit status so far.
-
-    Returns
-    -------
-    int
-        The same status if it is not 0. Otherwise `NO_READER` if standard output has no reader, 2 if it cannot be
-        written, and 0 without an error.
+    Return the exit status: the given one if it is not 0, `NO_READER` if standard output has no reader, 2 if it cannot
+    be written, otherwise 0.
     """
     error = _flush(1)
     _flush(2)

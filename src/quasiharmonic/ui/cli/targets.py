@@ -8,43 +8,32 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import seams
+from quasiharmonic.ui.cli import seam_options
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apps.repair.fitting import Fitted
+    from quasiharmonic.apps.repair.fitting import FittedProblem
     from quasiharmonic.geometry.curves import BoundaryCurves
-    from quasiharmonic.geometry.mesh.seams import Island
     from quasiharmonic.io import MeshData
+    from quasiharmonic.io.seamed_mesh import Island
     from quasiharmonic.problem import Problem
-    from quasiharmonic.targets.boundary.corner_spec import AskedCorners
+    from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 
 # A copy of the text in quasiharmonic.targets.specification, so that the parser need not import that module.
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
 
 
 @dataclass
-class Posed:
-    """Problem of an island as defined by the options.
+class IslandProblem:
+    """Problem of an island as defined by the options."""
 
-    Attributes
-    ----------
-    fitted : Fitted
-        If the boundary slides, its target positions lie on the curves.
-    facts : dict of str to int
-        Entries for the JSON report; those of several islands are added.
-    notes : list of str
-        Sentences for the text report.
-    slide : bool or BoundaryCurves
-        Whether the boundary slides, and along which curves.
-    """
-
-    fitted: Fitted
+    fitted: FittedProblem  # If the boundary slides, its target positions lie on the curves
+    # Entries for the JSON report; those of several islands are added
     facts: dict[str, int] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    slide: bool | BoundaryCurves = False
+    notes: list[str] = field(default_factory=list)  # Sentences for the text report
+    slide: bool | BoundaryCurves = False  # Whether the boundary slides, and along which curves
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -70,12 +59,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--corner-angle",
-        type=_degrees,
+        type=degrees,
+        default=20.0,
         metavar="DEG",
         help="how far an outline turns at a corner; with 0 all its points are corners, and its sides are matched edge "
-        "by edge (default: 20)",
+        "by edge (default: %(default)g)",
     )
-    seams.add_options(group)
+    seam_options.add_options(group)
     group.add_argument(
         "--refine",
         action="store_true",
@@ -91,12 +81,11 @@ def files(options: argparse.Namespace) -> tuple[Path | None, ...]:
 
 def check_options(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np.int64] | None) -> None:
     """Raise ValueError if options contradict each other, or the mesh defines no target for its boundary."""
-    seams.check_options(options)
+    seam_options.check_options(options)
     if options.to is not None:
         return
-    for name in ("font", "corners", "corner_angle", "cut"):
-        value = getattr(options, name)
-        if value is not None and value is not False:
+    for name, default in (("font", None), ("corners", None), ("corner_angle", 20.0), ("cut", False)):
+        if getattr(options, name) != default:
             option = name.replace("_", "-")
             raise ValueError(f"--{option} applies only to an outline: give one by --to")
     if options.seams != "file":
@@ -113,28 +102,20 @@ def check_options(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np
         )
 
 
-def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] | None, beside: int) -> Posed:
+def make_problem(
+    options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] | None, beside: int
+) -> IslandProblem:
     """Return the problem of an island as defined by the options.
 
-    Parameters
-    ----------
-    options : Namespace
-    island : Island
-    fixed : (k,) int64 or None
-        The mesh's vertices that are fixed at their texture coordinates; the boundaries if None.
-    beside : int
-        Index of the island's own copy of the outline, from the left.
-
-    Raises
-    ------
-    ValueError, OSError, ModuleNotFoundError
-        If options contradict each other, the mesh or the outline is wrong, or they do not fit together.
+    ``fixed`` (k,) are the mesh's vertices that are fixed at their texture coordinates; the boundaries if None.
+    ``beside`` is the index of the island's own copy of the outline, from the left. ValueError, OSError or
+    ModuleNotFoundError if options contradict each other, the mesh or the outline is wrong, or they do not fit together.
     """
-    from quasiharmonic.apps.repair.fitting import held_in_place
+    from quasiharmonic.apps.repair.fitting import fix_in_place
     from quasiharmonic.ui.cli import report
 
     if options.to is None:
-        posed = Posed(held_in_place(island, fixed, reference=options.reference))
+        posed = IslandProblem(fix_in_place(island, fixed, reference=options.reference))
     else:
         posed = _onto_outline(options, island, beside)
     if options.to is not None and not options.refine:
@@ -145,9 +126,9 @@ def pose(options: argparse.Namespace, island: Island, fixed: NDArray[np.int64] |
     return posed
 
 
-def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> Posed:
+def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> IslandProblem:
     """Map the boundary to an outline."""
-    from quasiharmonic.apps.repair.fitting import laid_along
+    from quasiharmonic.apps.repair.fitting import fit_boundary
     from quasiharmonic.targets import outline
     from quasiharmonic.ui.cli import report
 
@@ -157,23 +138,22 @@ def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> P
         text = str(error)
         raise ValueError(text if options.to in text else f"--to {options.to}: {text}") from error
     corners = None if options.corners is None else read_corners(options.corners).within(island.vertices)
-    angle = 20.0 if options.corner_angle is None else options.corner_angle
     with report.about(f"{options.input} --to {options.to}"):
-        fitted = laid_along(
+        fitted = fit_boundary(
             island.V,
             island.F,
             contours,
             corners=corners,
-            corner_angle=angle,
+            corner_angle=options.corner_angle,
             reference=options.reference,
             beside=beside,
         )
-    posed = Posed(fitted)
-    if options.corners == "auto" and fitted.held:
-        found = ",".join(map(str, island.vertices[fitted.held].tolist()))
+    posed = IslandProblem(fitted)
+    if options.corners == "auto" and fitted.corner_vertices:
+        found = ",".join(map(str, island.vertices[fitted.corner_vertices].tolist()))
         posed.notes.append(f"corners by angle, in the outline's order: --corners {found}")
-    if fitted.filled:
-        posed.facts["filled_holes"] = holes = fitted.filled
+    if fitted.filled_holes:
+        posed.facts["filled_holes"] = holes = fitted.filled_holes
         which = "the hole" if holes == 1 else f"the {holes} holes"
         posed.notes.append(
             f"the surface has no hole, so {which} of {options.to} {'is' if holes == 1 else 'are'} filled"
@@ -181,48 +161,42 @@ def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> P
     return posed
 
 
-def _slide(options: argparse.Namespace, posed: Posed) -> None:
+def _slide(options: argparse.Namespace, posed: IslandProblem) -> None:
     """Move the boundary onto the outline's curves; vertices from ``--corners`` stay fixed."""
     from dataclasses import replace
 
-    from quasiharmonic.energies.newton.sliding import moved_onto
-    from quasiharmonic.ui.cli import sliding
+    from quasiharmonic.energies.newton.sliding_boundary import move_onto
+    from quasiharmonic.targets.boundary.sliding_curves import find_sliding_curves
 
     posed.slide = True
     if options.to is not None:
-        posed.slide = sliding.along(
+        posed.slide = find_sliding_curves(
             options.to,
             font=options.font,
-            held=posed.fitted.held,
-            corner_angle=20.0 if options.corner_angle is None else options.corner_angle,
+            fixed=posed.fitted.corner_vertices,
+            corner_angle=options.corner_angle,
             pieces=options.pieces,
         )
-    posed.fitted = replace(posed.fitted, problem=moved_onto(posed.slide, posed.fitted.problem))
+    posed.fitted = replace(posed.fitted, problem=move_onto(posed.slide, posed.fitted.problem))
     posed.facts["slide"] = True
 
 
 def _check_room(problem: Problem, to: str) -> None:
     """Raise ValueError for edges that the target flattens, before a search that may take long."""
     from quasiharmonic.targets import flattened_edges
-    from quasiharmonic.util.arrays import named_edges
+    from quasiharmonic.util.arrays import edge_names
 
     flat = flattened_edges(problem.F, problem.fixed, problem.target)
     if len(flat):
         raise ValueError(
-            f"the inner {named_edges(flat)} {'joins' if len(flat) == 1 else 'join'} boundary vertices between which "
+            f"the inner {edge_names(flat)} {'joins' if len(flat) == 1 else 'join'} boundary vertices between which "
             f"{to} does not bend outwards, so the triangles it cuts off degenerate: use --refine, or assign a vertex "
             "in between to a corner with --corners"
         )
 
 
-def read_corners(text: str) -> AskedCorners:
-    """Read the value of ``--corners``, or the file that it names.
-
-    Raises
-    ------
-    ValueError
-        If the value or the file is malformed.
-    """
+def read_corners(text: str) -> CornerSpec:
+    """Read the value of ``--corners``, or the file that it names; ValueError if it is malformed."""
     from quasiharmonic.targets.boundary import corner_spec as asked_corners
 
     try:
@@ -231,7 +205,7 @@ def read_corners(text: str) -> AskedCorners:
         raise ValueError(f"--corners {text}: {error}") from None
 
 
-def _degrees(text: str) -> float:
+def degrees(text: str) -> float:
     """Convert text to an angle in degrees, 0 to 180; for argparse."""
     angle = float(text)
     if not 0 <= angle <= 180:

@@ -10,7 +10,7 @@ from quasiharmonic.ui.cli.streams import require_output
 
 
 class Version(argparse.Action):
-    """Print the text of `told` and exit."""
+    """Print the text of `describe_environment` and exit."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **_: Any) -> None:
         super().__init__(
@@ -19,11 +19,11 @@ class Version(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         require_output()
-        print(told())
+        print(describe_environment())
         parser.exit()
 
 
-def told() -> str:
+def describe_environment() -> str:
     """Return version, Python, system, packages, whether loops are compiled, and linear solvers; one line each."""
     import os
     import platform
@@ -36,9 +36,9 @@ def told() -> str:
     if kernels.extension is not None:
         loops = "compiled"
     elif os.environ.get("QUASIHARMONIC_PURE"):
-        loops = "in NumPy, as QUASIHARMONIC_PURE has it"
+        loops = "in NumPy, because QUASIHARMONIC_PURE is set"
     else:
-        loops = "in NumPy: the extension is not built, or does not load"
+        loops = "in NumPy, because the extension is not built or does not load"
     return "\n".join(
         [
             f"qhm {__version__}",

@@ -4,7 +4,7 @@
 with `util.display`, which imports it when a result is displayed. Start reading in `pictures`.
 """
 
-from quasiharmonic.ui.display.page import html
+from quasiharmonic.ui.display.markup import html
 from quasiharmonic.ui.display.pictures import draw
 
 __all__ = ["draw", "html"]

@@ -25,18 +25,8 @@ KINDS = ("map", "distortion", "texture", "convergence")
 def draw(shown: Displayable, kind: str, *, measure: str = "isometric") -> Figure:
     """Draw a result, a problem, a certificate, a diagnosis or a distortion measurement.
 
-    Parameters
-    ----------
-    shown : Displayable
-    kind : str
-        One of `KINDS` for a `MapResult`; ignored for other types.
-    measure : str
-        Measure of distortion.
-
-    Raises
-    ------
-    ValueError
-        If the kind is unknown, or the object lacks the data to draw.
+    ``kind`` is one of `KINDS`, for a `MapResult` only; ``measure`` is that of a distortion. ValueError if the kind is
+    unknown, or the object lacks the data to draw.
     """
     match shown:
         case MapResult():

@@ -17,9 +17,9 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.studio.assets import bundle
 from quasiharmonic.ui.studio.protocol import Array, Frame, ProtocolError, decode, encode
-from quasiharmonic.ui.studio.session import Session
-from quasiharmonic.ui.studio.surface import Sheet, read_sheet, sheet_of
-from quasiharmonic.util.arrays import IntArray, kind_of
+from quasiharmonic.ui.studio.session.session import Session
+from quasiharmonic.ui.studio.session.surface import Sheet, make_sheet, read_sheet
+from quasiharmonic.util.arrays import IntArray, describe
 
 try:
     import anywidget
@@ -28,7 +28,7 @@ except ImportError as error:
     raise ImportError(f"the widget needs anywidget ({error}): pip install 'quasiharmonic[notebook]'") from error
 
 # Messages to repeat to a new view, in this order.
-_KEPT = "surface", "map", "obstructions"
+_REPEATED = "surface", "map", "obstructions"
 
 
 class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
@@ -68,22 +68,22 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         self, surface: Problem | MapResult | ArrayLike | MeshLike, F: ArrayLike | None = None, *, height: int = 480
     ) -> None:
         super().__init__(height=height)
-        self._told: dict[str, bytes] = {}
+        self._sent: dict[str, bytes] = {}
         self._note = ""
         sheet = _sheet(surface, F)
         self.vertices: IntArray = sheet.island.vertices
         self._session = Session(self._tell)
         self._session.open(sheet)
-        self.on_msg(self._heard)
+        self.on_msg(self._receive)
 
     @property
     def result(self) -> MapResult:
-        moment = self._session.moment
-        return replace(moment.result, V=moment.problem.V)
+        state = self._session.state
+        return replace(state.result, V=state.problem.V)
 
     @property
     def problem(self) -> Problem:
-        return self._session.moment.problem
+        return self._session.state.problem
 
     def outline(self, to: str) -> None:
         """Map the boundary to a named outline, such as ``"letter:R"``; raise ValueError if that is not possible."""
@@ -108,7 +108,7 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         if self._note:
             raise ValueError(self._note)
 
-    def _heard(self, _: object, content: object, buffers: list[Any]) -> None:
+    def _receive(self, _: object, content: object, buffers: list[Any]) -> None:
         """Handle a message from a view in the notebook."""
         try:
             frame = decode(bytes(buffers[0]) if buffers else b"")
@@ -118,9 +118,9 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         if frame.header.get("do") != "show":
             self._session.handle(frame)
             return
-        for kind in _KEPT:
-            if kind in self._told:
-                self.send({"kind": kind, "first": True}, [self._told[kind]])
+        for kind in _REPEATED:
+            if kind in self._sent:
+                self.send({"kind": kind, "first": True}, [self._sent[kind]])
 
     def _tell(self, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
         """Send to all views, and store the messages that later views need."""
@@ -131,26 +131,26 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         if kind == "note":
             self._note = header["text"]
         # A map message without positions contains only the target of the boundary and must not replace a full one.
-        if kind in _KEPT and (kind != "map" or "places" in arrays):
-            self._told[kind] = data
+        if kind in _REPEATED and (kind != "map" or "places" in arrays):
+            self._sent[kind] = data
         self.send({"kind": kind}, [data])
 
 
 def _sheet(surface: Any, F: ArrayLike | None) -> Sheet:
     """Return the sheet that a session opens."""
     if F is not None:
-        return sheet_of(MeshData(np.asarray(surface), np.asarray(F)), "mesh")
+        return make_sheet(MeshData(np.asarray(surface), np.asarray(F)), "mesh")
     if isinstance(surface, Problem):
         # Only the positions of fixed vertices are used.
         uv = np.zeros((surface.n, 2))
         uv[surface.fixed] = surface.target
-        return sheet_of(MeshData(surface.V, surface.F).with_map(uv), "problem", surface.fixed)
+        return make_sheet(MeshData(surface.V, surface.F).with_map(uv), "problem", surface.fixed)
     if isinstance(surface, MapResult):
         if surface.V is None:
             raise ValueError("the result has no surface: pass its Problem, or V and F")
-        return sheet_of(MeshData(surface.V, surface.F).with_map(surface.uv), "result")
+        return make_sheet(MeshData(surface.V, surface.F).with_map(surface.uv), "result")
     if isinstance(surface, str | PathLike):
         return read_sheet(Path(fspath(surface)))
     if stands_for_mesh(surface):
-        return sheet_of(MeshData(*mesh_arrays(surface)), "mesh")
-    raise ValueError(f"{kind_of(surface)} is not a surface: pass V and F, a mesh, a path, a Problem or a MapResult")
+        return make_sheet(MeshData(*mesh_arrays(surface)), "mesh")
+    raise ValueError(f"{describe(surface)} is not a surface: pass V and F, a mesh, a path, a Problem or a MapResult")

@@ -8,7 +8,7 @@ from quasiharmonic.ui.plot.boundary import save_boundary_figure
 from quasiharmonic.ui.plot.convergence import plot_convergence
 from quasiharmonic.ui.plot.distortion import plot_distortion, save_distortion_figure
 from quasiharmonic.ui.plot.maps import plot_before_after, plot_map, plot_surface, save_map_figure
-from quasiharmonic.ui.plot.problems import plot_problem
+from quasiharmonic.ui.plot.problem_figure import plot_problem
 from quasiharmonic.ui.plot.texture import plot_texture, save_texture_figure
 
 __all__ = [

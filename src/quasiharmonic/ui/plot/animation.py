@@ -16,19 +16,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
+from quasiharmonic.io.errors import check_path
 from quasiharmonic.ui.plot.canvas import as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.ui.plot.shading import view
-from quasiharmonic.util.arrays import FloatArray, map_array, whole_number
+from quasiharmonic.util.arrays import FloatArray, check_integer, check_sequence, map_array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from PIL import Image
 
 
-# A GIF stores frame durations in hundredths of a second. Viewers do not respect a duration of 1/100 s.
-_HUNDREDTHS, _SHORTEST = 100, 2
-# The palette of a GIF: number of colours, and bits per channel used to count colours.
-_COLOURS, _BITS = 255, 5
+# A GIF stores frame durations in hundredths of a second.
+_HUNDREDTHS = 100
+# Shortest duration in hundredths; viewers do not respect 1/100 s.
+_SHORTEST = 2
+# Number of colours of a GIF's palette.
+_COLOURS = 255
 _NONE = "there are no frames"
 
 
@@ -63,6 +66,7 @@ def save_animation(
     ImportError, quasiharmonic.io.errors.OutputError
         As for `save_figures`.
     """
+    check_sequence("frames", frames, "pairs of a name and a map")
     save_figures(path, _figures(V, F, list(frames), fixed), frames_per_second=frames_per_second)
 
 
@@ -88,7 +92,7 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
     quasiharmonic.io.errors.OutputError
         If the file cannot be written.
     """
-    from quasiharmonic.io.atomic import write_whole
+    from quasiharmonic.io.lowlevel.atomic import write_whole
 
     suffix = check_animation(path, frames_per_second)
     encode = _gif if suffix == ".gif" else _mp4
@@ -96,22 +100,19 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
 
 
 def check_animation(path: str | PathLike[str], frames_per_second: int) -> str:
-    """Check the path and the frame rate before `save_figures`; return the suffix in lower case.
+    """Check path and frame rate before `save_figures`, with its errors; return the suffix in lower case."""
+    from quasiharmonic.io.lowlevel.atomic import check_writable
 
-    Raises
-    ------
-    ValueError, ImportError, quasiharmonic.io.errors.OutputError
-        As for `save_figures`.
-    """
-    from quasiharmonic.io.atomic import check_writable
-
+    check_path("path", path)
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
         raise ValueError(f"{path}: an animation must be .gif or .mp4")
-    whole_number("frames_per_second", frames_per_second, least=1)
-    most = _HUNDREDTHS // _SHORTEST
-    if suffix == ".gif" and frames_per_second > most:
-        raise ValueError(f"frames_per_second of a GIF must be at most {most}, not {frames_per_second}: write an .mp4")
+    check_integer("frames_per_second", frames_per_second, minimum=1)
+    max_rate = _HUNDREDTHS // _SHORTEST
+    if suffix == ".gif" and frames_per_second > max_rate:
+        raise ValueError(
+            f"frames_per_second of a GIF must be at most {max_rate}, not {frames_per_second}: write an .mp4"
+        )
     if suffix == ".mp4":
         _ffmpeg()
     check_writable(path)
@@ -152,57 +153,32 @@ def _picture(figure: Figure) -> NDArray[np.uint8]:
 def _gif(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     from PIL import Image
 
-    palette = _Palette()
-    # The palette needs the colours of all frames, so the frames are kept compressed until the first is written.
-    packed = []
+    # All frames share one palette, so that colours do not flicker. It is made of the palettes of the frames, which keep
+    # colours that only few frames use. The frames are stored compressed until it is known.
+    palettes, packed = bytearray(), []
     shape: tuple[int, ...] = ()
     for picture in pictures:
-        palette.look_at(picture)
+        half = np.ascontiguousarray(picture[::2, ::2])
+        palettes += bytes(Image.fromarray(half).quantize(_COLOURS).getpalette() or ())
         packed.append(zlib.compress(picture.tobytes(), 1))
         shape = picture.shape
     if not packed:
         raise ValueError(_NONE)
-    colours = palette.picture()
+    every = Image.frombytes("RGB", (len(palettes) // 3, 1), bytes(palettes))
+    palette = every.quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
 
-    def drawn(data: bytes) -> Image.Image:
+    def quantize(data: bytes) -> Image.Image:
         picture = np.frombuffer(zlib.decompress(data), dtype=np.uint8).reshape(shape)
-        return Image.fromarray(picture).quantize(palette=colours, dither=Image.Dither.NONE)
+        return Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
 
     # Round the end times, not the durations, so that rounding errors do not add up.
     ends = [round(_HUNDREDTHS * (k + 1) / rate) for k in range(len(packed))]
     times = [1000 // _HUNDREDTHS * (end - begin) for begin, end in zip([0, *ends], ends, strict=False)]
     times[-1] += 1000
     file = BytesIO()
-    others = map(drawn, packed[1:])
-    drawn(packed[0]).save(file, "GIF", save_all=True, append_images=others, duration=times, loop=0, optimize=False)
+    others = map(quantize, packed[1:])
+    quantize(packed[0]).save(file, "GIF", save_all=True, append_images=others, duration=times, loop=0, optimize=False)
     return file.getvalue()
-
-
-class _Palette:
-    """One palette for all frames, so that colours do not flicker; it includes colours that only few frames use."""
-
-    def __init__(self) -> None:
-        self._count = np.zeros(1 << 3 * _BITS)
-        self._sum = np.zeros((1 << 3 * _BITS, 3))
-
-    def look_at(self, picture: NDArray[np.uint8]) -> None:
-        """Count the colours of every second pixel of every second row."""
-        pixels = picture[::2, ::2].reshape(-1, 3)
-        red, green, blue = (pixels >> (8 - _BITS)).astype(np.intp).T
-        cell = (red << 2 * _BITS) | (green << _BITS) | blue
-        self._count += np.bincount(cell, minlength=self._count.size)
-        for channel in range(3):
-            self._sum[:, channel] += np.bincount(cell, weights=pixels[:, channel], minlength=self._count.size)
-
-    def picture(self) -> Image.Image:
-        """Return an image that carries the palette."""
-        from PIL import Image
-
-        there = np.flatnonzero(self._count)
-        colours = np.rint(self._sum[there] / self._count[there, None]).astype(np.uint8)
-        # Weighting a colour by the square root of its area keeps rare colours.
-        often = np.ceil(np.sqrt(self._count[there] / self._count.max()) * _COLOURS).astype(np.intp)
-        return Image.fromarray(np.repeat(colours, often, axis=0)[None]).quantize(_COLOURS, dither=Image.Dither.NONE)
 
 
 def _ffmpeg() -> str:

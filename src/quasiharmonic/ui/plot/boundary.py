@@ -21,12 +21,18 @@ from quasiharmonic.ui.plot.canvas import (
     save_picture,
 )
 from quasiharmonic.ui.plot.shading import view
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, loop_arrays
 
-# Side of the figure in inches, and size of the numbers in points.
-_INCHES, _SIZE = 10.0, 7.5
-# In units of the font size: width of a digit, height of a number, and distance of a number from its vertex.
-_DIGIT, _HEIGHT, _OFF = 0.68, 1.25, 0.3
+# Side of the figure in inches.
+_INCHES = 10.0
+# Size of the numbers in points.
+_FONT_SIZE = 7.5
+# Width of a digit, in units of the font size.
+_DIGIT_WIDTH = 0.68
+# Height of a number, in the same units.
+_NUMBER_HEIGHT = 1.25
+# Distance of a number from its vertex, in the same units.
+_NUMBER_DISTANCE = 0.3
 
 
 @writer_accepts_mesh
@@ -57,7 +63,9 @@ def save_boundary_figure(
         If the file cannot be written.
     """
     rest, F = as_mesh(V, F)
-    seen, marked = view(rest, F), np.asarray(corners, dtype=np.int64)
+    seen, marked = view(rest, F), index_array("corners", corners)
+    loops = loop_arrays(loops, len(rest))
+    check_range("corners", marked, len(rest))
     figure = new_figure((_INCHES, _INCHES))
     ax = figure.add_axes((0.04, 0.02, 0.92, 0.9))
     # Pale colours keep the numbers readable.
@@ -69,12 +77,12 @@ def save_boundary_figure(
     ax.plot(*seen.points[marked].T, "o", color=RED, markersize=5, zorder=6)
     border = np.concatenate([marked, *(loop[~np.isin(loop, marked)] for loop in loops)])
     digits = np.array([len(str(vertex)) for vertex in border.tolist()])
-    half = _SIZE / 2 * np.stack([_DIGIT * (digits + 1), np.full(len(digits), _HEIGHT)], axis=1)
-    places = scale * seen.points[border] + (half + _OFF * _SIZE) * _outward(seen.points, F, border)
-    for k in _readable(places, half):
+    half = _FONT_SIZE / 2 * np.stack([_DIGIT_WIDTH * (digits + 1), np.full(len(digits), _NUMBER_HEIGHT)], axis=1)
+    centres = scale * seen.points[border] + (half + _NUMBER_DISTANCE * _FONT_SIZE) * _outward(seen.points, F, border)
+    for k in _readable(centres, half):
         color = RED if k < len(marked) else INK
-        x, y = places[k] / scale
-        ax.text(x, y, str(border[k]), size=_SIZE, color=color, ha="center", va="center", zorder=7)
+        x, y = centres[k] / scale
+        ax.text(x, y, str(border[k]), size=_FONT_SIZE, color=color, ha="center", va="center", zorder=7)
     count, many = sum(len(loop) for loop in loops), "" if len(loops) == 1 else "s"
     caption(ax, f"{count:,} boundary vertices in {len(loops)} loop{many}; corners in red")
     save_picture(path, figure)
@@ -90,14 +98,14 @@ def _outward(points: FloatArray, F: IntArray, border: IntArray) -> FloatArray:
     return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1), np.finfo(float).tiny)[:, None])
 
 
-def _readable(places: FloatArray, half: FloatArray) -> list[int]:
+def _readable(centres: FloatArray, half: FloatArray) -> list[int]:
     """Return the indices of a greedy choice of boxes that do not overlap.
 
-    The boxes have centres ``places`` (k, 2) and half sizes ``half`` (k, 2). Earlier boxes take precedence.
+    The boxes have ``centres`` (k, 2) and half sizes ``half`` (k, 2). Earlier boxes take precedence.
     """
     chosen: list[int] = []
-    for k in range(len(places)):
-        apart = np.abs(places[chosen] - places[k]) >= half[chosen] + half[k]
+    for k in range(len(centres)):
+        apart = np.abs(centres[chosen] - centres[k]) >= half[chosen] + half[k]
         if apart.any(axis=1).all():
             chosen.append(k)
     return chosen

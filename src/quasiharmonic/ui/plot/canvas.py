@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.ui.plot.shading import View, drawable, edge_style, least_heights
+from quasiharmonic.io.errors import check_path
+from quasiharmonic.ui.plot.shading import View, drawable, edge_style, min_heights
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, triangle_rows, vertex_array
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 #: Suffixes of pictures: one raster format and two vector formats.
 PICTURES = (".png", ".svg", ".pdf")
 # Above this number of triangles vector formats get pixels too, because shapes would take megabytes.
-_MOST_SHAPES = 10_000
+_MAX_SHAPES = 10_000
 
 RED = (0.89, 0.07, 0.17)
 INK = (0.06, 0.12, 0.29)
@@ -36,11 +37,11 @@ def new_figure(inches: tuple[float, float]) -> Figure:
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        from quasiharmonic.ui.plot.figures import ShownFigure
+        from quasiharmonic.ui.plot.notebook_figures import NotebookFigure
     except ImportError as error:
         raise ImportError(f"pictures need matplotlib ({error}): pip install 'matplotlib>=3.8'") from error
 
-    figure = ShownFigure(figsize=inches, dpi=100, facecolor="white")
+    figure = NotebookFigure(figsize=inches, dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
@@ -48,16 +49,11 @@ def new_figure(inches: tuple[float, float]) -> Figure:
 def save_picture(path: str | PathLike[str], figure: Figure) -> None:
     """Write a figure in the format of the path's suffix; the file is replaced only when it is complete.
 
-    Raises
-    ------
-    ValueError
-        If the suffix is not one of `PICTURES`.
-    quasiharmonic.io.errors.OutputError
-        If the file cannot be written.
+    ValueError if the suffix is not one of `PICTURES`; OutputError if the file cannot be written.
     """
     from matplotlib import rc_context
 
-    from quasiharmonic.io.atomic import write_whole
+    from quasiharmonic.io.lowlevel.atomic import write_whole
 
     suffix = check_ending(path)
     # Equal figures give equal files: no date and no random identifiers.
@@ -68,6 +64,7 @@ def save_picture(path: str | PathLike[str], figure: Figure) -> None:
 
 def check_ending(path: str | PathLike[str]) -> str:
     """Return the suffix of a picture's path in lower case; raise ValueError if it is not one of `PICTURES`."""
+    check_path("path", path)
     suffix = Path(path).suffix.lower()
     if suffix not in PICTURES:
         raise ValueError(f"{path}: pictures are written as {', '.join(PICTURES)}")
@@ -109,7 +106,7 @@ def paint_surface(ax: Axes, seen: View, F: IntArray, color: FloatArray) -> None:
     """Paint a projected surface, its outer side in the given colours (f, 3), its inner side greyed."""
     color = np.where(seen.inside[:, None], _INSIDE * (0.5 + 0.5 * color), color)
     scale = fit(ax, seen.points)
-    edges, width = edge_style(color, scale * least_heights(seen.points[F]))
+    edges, width = edge_style(color, scale * min_heights(seen.points[F]))
     # Nearer triangles are painted later. Each boundary edge is painted just after its triangle.
     border = boundary_edges(F, len(seen.points))[:, [0, 1, 1]]
     ink = np.broadcast_to(INK, (len(border), 3))
@@ -143,7 +140,7 @@ def paint_map(
     scale = fit(ax, drawable(window))
     color = color.copy()
     color[inverted] = RED
-    height = scale * least_heights(uv[F])
+    height = scale * min_heights(uv[F])
     edges, width = edge_style(color, height)
     # Inverted triangles are painted last, on top of the triangles they overlap.
     order = np.concatenate([np.delete(np.arange(len(F)), inverted), inverted])
@@ -191,7 +188,7 @@ def _fill(ax: Axes, corners: FloatArray, color: FloatArray, edges: FloatArray, w
     triangles = PolyCollection(
         _polygons(corners), facecolors=color, edgecolors=edges, linewidths=width, joinstyle="round", zorder=1
     )
-    triangles.set_rasterized(len(corners) > _MOST_SHAPES)
+    triangles.set_rasterized(len(corners) > _MAX_SHAPES)
     ax.add_collection(triangles, autolim=False)
 
 

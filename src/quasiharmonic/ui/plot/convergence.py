@@ -10,6 +10,7 @@ import numpy as np
 
 from quasiharmonic.problem.result import MapResult, Step
 from quasiharmonic.ui.plot.canvas import INK, RED, new_figure
+from quasiharmonic.util.arrays import check_instance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,6 +39,7 @@ def plot_convergence(result: MapResult) -> Figure:
     """
     from matplotlib.ticker import MaxNLocator
 
+    check_instance("result", result, MapResult)
     if not result.history:
         raise ValueError("the result has no history to draw")
     figure = new_figure((8, 4.5))
@@ -76,7 +78,7 @@ def _runs(result: MapResult) -> list[tuple[str, Sequence[Step]]]:
         names: list[str] = []
         left = last - first - 1
         while stages and (left > 0 or not names):
-            left -= stages[0].iterations
+            left -= stages[0].n_iterations
             names.append(stages.pop(0).name)
         name = names[0] if len(names) == 1 else f"{len(names)} stages, the last {names[-1]}" if names else "run"
         runs.append((name, result.history[first:last]))

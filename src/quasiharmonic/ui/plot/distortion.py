@@ -39,23 +39,13 @@ LABELS = {
 
 @dataclass(frozen=True, eq=False)
 class _Scale:
-    """Colour scale of one measure.
-
-    Attributes
-    ----------
-    label : str
-    norm : matplotlib Normalize
-        Limits from the 1st and 99th percentiles by area, or from the value of a perfect map.
-    colormap : str
-        Diverging if a perfect map lies in the middle. No colormap contains red, which marks inverted triangles.
-    beyond : {"max", "both"}
-        The ends beyond which there may be values.
-    """
+    """Colour scale of one measure."""
 
     label: str
-    norm: Normalize
+    norm: Normalize  # Limits from the 1st and 99th percentiles by area, or from the value of a perfect map
+    # Diverging if a perfect map lies in the middle. No colormap contains red, which marks inverted triangles.
     colormap: str
-    beyond: str = "max"
+    beyond: str = "max"  # {"max", "both"}: the ends beyond which there may be values
 
     def place(self, values: FloatArray) -> FloatArray:
         """Return the positions of values (k,) between the limits, 0 to 1."""
@@ -207,5 +197,5 @@ def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, sc
     ax.set_xlabel(scale.label, color=INK)
     ax.set_ylabel("% of the surface's area", color=INK)
     ax.spines[["top", "right"]].set_visible(False)
-    summed = found.summary(measure)
+    summed = found.statistics(measure)
     caption(ax, f"median {summed.median:.3g}, 95 % < {summed.p95:.3g}, max {summed.maximum:.3g}")

@@ -25,26 +25,9 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
     """Open a window on a surface and its map, and return when it is closed.
 
     The surface is textured with a checkerboard through the map; the map lies beside it. Inverted triangles are red in
-    both. Measures of distortion can be switched on as colours of the other triangles.
-
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
-        The rest surface.
-    F : (f, 3) int
-    uv : (n, 2) float
-        The map.
-    screenshot : path, optional
-        Write the view as a PNG instead of opening a window; no display is needed.
-
-    Raises
-    ------
-    ImportError
-        If polyscope is not installed.
-    ValueError
-        As for `quasiharmonic.distortion`.
-    RuntimeError
-        If no window can be opened.
+    both. Measures of distortion can be switched on as colours of the other triangles. With ``screenshot``, the view is
+    written as a PNG, which needs no display. ImportError if polyscope is not installed, RuntimeError if no window can
+    be opened, and ValueError as `quasiharmonic.distortion`.
     """
     polyscope = _polyscope()
     polyscope.set_verbosity(0)
@@ -65,7 +48,7 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
 
 def _photograph(polyscope: Any, path: str | PathLike[str]) -> None:
     """Write the view as a PNG; the file is replaced only when it is complete."""
-    from quasiharmonic.io.atomic import write_whole
+    from quasiharmonic.io.lowlevel.atomic import write_whole
 
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder) / "view.png"
@@ -76,11 +59,8 @@ def _photograph(polyscope: Any, path: str | PathLike[str]) -> None:
 def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
     """Add a surface and its map to an initialised polyscope, for custom views.
 
-    Parameters
-    ----------
-    V, F, uv
-        As for `show`. The structures are named "surface" and "map". Inverted triangles, if there are any, are separate
-        structures named "surface: inverted" and "map: inverted".
+    The structures are named "surface" and "map". Inverted triangles, if there are any, are separate structures named
+    "surface: inverted" and "map: inverted".
     """
     polyscope = _polyscope()
     rest, F = as_mesh(V, F)
@@ -133,19 +113,9 @@ def _colour_by(drawn: Any, measure: str, values: FloatArray) -> None:
 
 
 def view_of(points: FloatArray, aspect: float, angle: float) -> tuple[FloatArray, FloatArray]:
-    """Return the camera and the target of a front view that contains all points.
+    """Return the camera and the target of a front view that contains all points (n, 3).
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    aspect : float
-        Width of the picture divided by its height.
-    angle : float
-        Vertical field of view, in radians.
-
-    Returns
-    -------
-    camera, target : (3,) float64
+    ``aspect`` is the picture's width divided by its height, ``angle`` the vertical field of view in radians.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     half = 1.05 * (high - low) / 2

@@ -21,7 +21,7 @@ from quasiharmonic.ui.plot.canvas import (
     verdict,
 )
 from quasiharmonic.ui.plot.shading import View, view
-from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, map_array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,9 +87,9 @@ def plot_map(
     """
     rest, F = as_mesh(V, F)
     if ax is None:
-        from quasiharmonic.ui.plot.figures import ShownAxes
+        from quasiharmonic.ui.plot.notebook_figures import NotebookAxes
 
-        ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9), axes_class=ShownAxes)
+        ax = new_figure((6, 6)).add_axes((0.02, 0.02, 0.96, 0.9), axes_class=NotebookAxes)
     _draw_map(ax, view(rest, F), F, map_array("uv", uv, len(rest)), inverted, fixed)
     return ax
 
@@ -197,7 +197,16 @@ def _draw_map(
     fixed: ArrayLike | None,
 ) -> int:
     """Draw a map into axes and return the number of its inverted triangles."""
-    inverted = not_positive(F, uv) if inverted is None else np.asarray(inverted)
-    inverted = np.flatnonzero(inverted) if inverted.dtype == bool else inverted.astype(np.int64)
-    paint_map(ax, F, uv, seen.color, inverted, fixed)
-    return int(inverted.size)
+    marked = _check_inverted(inverted, len(F)) if inverted is not None else not_positive(F, uv)
+    paint_map(ax, F, uv, seen.color, marked, fixed)
+    return int(marked.size)
+
+
+def _check_inverted(inverted: ArrayLike, count: int) -> IntArray:
+    """Return the indices of triangles given as indices or as a mask."""
+    mask = np.asarray(inverted)
+    if mask.dtype == bool and mask.shape == (count,):
+        return np.flatnonzero(mask)
+    indices = index_array("inverted", inverted)
+    check_range("inverted", indices, count, "triangle", "triangles")
+    return indices

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.targets.boundary.correspondence import upright
+from quasiharmonic.targets.boundary.correspondence import viewer_axes
 from quasiharmonic.util.arrays import FloatArray
 
 # Colours at the four corners of the view; all differ clearly from the red of inverted triangles.
@@ -21,46 +21,17 @@ _LIGHT = np.array([-0.45, 0.60, 0.66])
 
 @dataclass(frozen=True)
 class View:
-    """Projection of a surface onto the picture plane.
+    """Projection of a surface onto the picture plane."""
 
-    Attributes
-    ----------
-    points : (n, 2) float64
-        Vertices in the plane of the picture.
-    depth : (n,) float64
-        Depth of the vertices, increasing towards the viewer.
-    inside : (f,) bool
-        Triangles that show their inner side.
-    light : (f,) float64
-        Cosine between normal and light direction per triangle: -1 from behind, 1 head-on.
-    color : (f, 3) float64
-        Red, green and blue of every triangle's outer side, 0 to 1.
-    """
-
-    points: FloatArray
-    depth: FloatArray
-    inside: NDArray[np.bool_]
-    light: FloatArray
-    color: FloatArray
+    points: FloatArray  # (n, 2): vertices in the plane of the picture
+    depth: FloatArray  # (n,): depth of the vertices, increasing towards the viewer
+    inside: NDArray[np.bool_]  # (f,): triangles that show their inner side
+    light: FloatArray  # (f,): cosine between normal and light direction per triangle: -1 from behind, 1 head-on
+    color: FloatArray  # (f, 3): red, green and blue of every triangle's outer side, 0 to 1
 
 
 def view(V: FloatArray, F: NDArray[np.int64]) -> View:
-    """Project a surface: a planar one from above, an open one from the direction that shows most of it.
-
-    Parameters
-    ----------
-    V : (n, 2) or (n, 3) float64
-    F : (f, 3) int64
-
-    Returns
-    -------
-    View
-
-    Raises
-    ------
-    ValueError
-        If there are no triangles.
-    """
+    """Project a surface: a planar one from above, an open one from the direction that shows most of it."""
     if not len(F):
         raise ValueError("the mesh has no triangles to draw")
     V = drawable(V)
@@ -108,7 +79,7 @@ def edge_style(color: FloatArray, height: FloatArray) -> tuple[FloatArray, Float
     return color + (1 - color) * lightness, np.clip(0.09 * height, 0.25, 0.8)
 
 
-def least_heights(corners: FloatArray) -> FloatArray:
+def min_heights(corners: FloatArray) -> FloatArray:
     """Return the least height of each triangle, (f,) float64 for corners (f, 3, 2)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -124,9 +95,9 @@ def _frame(area: FloatArray, total: float) -> FloatArray:
     """
     openness = np.linalg.norm(area) / total if total > 0 else 0.0
     if openness > 0.999:
-        return upright(area)
+        return viewer_axes(area)
     if openness > 0.2:
-        frame = upright(area)
+        frame = viewer_axes(area)
     else:
         axis, up, towards = int(np.argmax(np.abs(area))), np.zeros(3), np.zeros(3)
         if openness < 0.01 or abs(area[axis]) < 0.85 * np.linalg.norm(area):

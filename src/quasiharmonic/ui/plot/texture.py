@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
+from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.models.textures import Texture, read_texture
 from quasiharmonic.ui.plot.canvas import (
     RED,
     as_mesh,
@@ -23,14 +25,16 @@ from quasiharmonic.ui.plot.canvas import (
     verdict,
 )
 from quasiharmonic.ui.plot.shading import drawable, lit, view
-from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, map_array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-_LIGHT, _DARK = np.array((0.93, 0.93, 0.90)), np.array((0.16, 0.38, 0.75))
+# Colours of the checkerboard.
+_LIGHT = np.array((0.93, 0.93, 0.90))
+_DARK = np.array((0.16, 0.38, 0.75))
 _SIDE = 600  # pixels of a panel
 _SAMPLES = 2  # per pixel and direction
 _CHUNK = 1 << 17  # samples processed together, so that they fit into the cache
@@ -38,7 +42,12 @@ _CHUNK = 1 << 17  # samples processed together, so that they fit into the cache
 
 @accepts_mesh
 def plot_texture(
-    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, squares: int = 24, picture: str | PathLike[str] | None = None
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    squares: int = 24,
+    texture: str | PathLike[str] | Texture | None = None,
 ) -> Figure:
     """Draw a surface with a checkerboard that a map puts on it, beside the same board in the plane.
 
@@ -54,7 +63,7 @@ def plot_texture(
         The map.
     squares : int
         Number of squares along the longer side of the map's bounding box.
-    picture : path, optional
+    texture : path or Texture, optional
         A PNG or JPEG image to use instead of the board. It covers the unit square and repeats beyond it.
 
     Returns
@@ -64,27 +73,26 @@ def plot_texture(
     Raises
     ------
     ValueError
-        If there are no triangles, a vertex is not finite, ``squares`` is less than 1, or ``picture`` is not an image.
+        If there are no triangles, a vertex is not finite, ``squares`` is less than 1, or ``texture`` is not an image.
     """
     rest, F = as_mesh(V, F)
     uv = drawable(map_array("uv", uv, len(rest)))
     if not F.size:
         raise ValueError("the mesh has no triangles")
-    if squares < 1:
-        raise ValueError(f"squares must be at least 1, not {squares}")
+    check_integer("squares", squares, minimum=1)
     color: Callable[[FloatArray], FloatArray]
-    if picture is None:
+    if texture is None:
         low, size = uv.min(axis=0), float(np.ptp(uv, axis=0).max()) or 1.0
-        board, color = (uv - low) / size * squares, _checkered
+        board, color = (uv - low) / size * squares, _checkerboard_color
     else:
-        board, color = uv, _pictured(picture)
+        board, color = uv, _make_image_color(texture)
     inverted = not_positive(F, uv)
     seen = view(rest, F)
     figure = new_figure((9.6, 4.8))
     surface, plane = panels(figure, 2)
-    _show(surface, seen.points, _painted(seen.points, seen.depth, F, board, color, inverted, seen.light))
+    _show(surface, seen.points, _render(seen.points, seen.depth, F, board, color, inverted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
-    _show(plane, board, _painted(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
+    _show(plane, board, _render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
     outline(plane, F, board)
     verdict(plane, "map", len(inverted))
     return figure
@@ -98,7 +106,7 @@ def save_texture_figure(
     uv: ArrayLike,
     *,
     squares: int = 24,
-    picture: str | PathLike[str] | None = None,
+    texture: str | PathLike[str] | Texture | None = None,
 ) -> None:
     """Write the figure of `plot_texture`, 960 × 480 pixels.
 
@@ -106,7 +114,7 @@ def save_texture_figure(
     ----------
     path : path
         Ends in .png, .svg or .pdf. The file is replaced only when the picture is complete.
-    V, F, uv, squares, picture
+    V, F, uv, squares, texture
         As for `plot_texture`.
 
     Raises
@@ -116,7 +124,7 @@ def save_texture_figure(
     quasiharmonic.io.errors.OutputError
         If the file cannot be written.
     """
-    save_picture(path, plot_texture(V, F, uv, squares=squares, picture=picture))
+    save_picture(path, plot_texture(V, F, uv, squares=squares, texture=texture))
 
 
 def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:
@@ -133,7 +141,7 @@ def _window(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return (low + high) / 2 - reach, (low + high) / 2 + reach
 
 
-def _painted(
+def _render(
     points: FloatArray,
     depth: FloatArray,
     F: IntArray,
@@ -172,35 +180,34 @@ def _painted(
     return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
 
 
-def _checkered(places: FloatArray) -> FloatArray:
+def _checkerboard_color(coordinates: FloatArray) -> FloatArray:
     """Return the colours (k, 3) of a checkerboard whose squares have side 1."""
-    return np.where(np.floor(places).sum(axis=1)[:, None] % 2 == 0, _LIGHT, _DARK)
+    return np.where(np.floor(coordinates).sum(axis=1)[:, None] % 2 == 0, _LIGHT, _DARK)
 
 
-def _pictured(path: str | PathLike[str]) -> Callable[[FloatArray], FloatArray]:
+def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[FloatArray], FloatArray]:
     """Return a function from texture coordinates (k, 2) to colours (k, 3) of an image that repeats with period 1."""
     try:
         from PIL import Image
     except ImportError as error:
         raise ImportError(f"pictures need Pillow ({error}): pip install pillow") from error
-    from quasiharmonic.io import read_texture
-    from quasiharmonic.io.errors import MeshFileError
-
-    data = read_texture(path).data
+    if not isinstance(texture, Texture):
+        check_path("texture", texture)
+    path, image_file = ("", texture) if isinstance(texture, Texture) else (texture, read_texture(texture))
     try:
-        with Image.open(BytesIO(data)) as image:
+        with Image.open(BytesIO(image_file.data)) as image:
             # Details finer than the panel's samples would alias.
             image.thumbnail((_SIDE * _SAMPLES, _SIDE * _SAMPLES))
             glass = image.convert("RGBA")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise MeshFileError(path, f"is a damaged picture: {error}") from error
+        raise MeshFileError(path, f"is a damaged image: {error}") from error
     white = Image.new("RGBA", glass.size, "white")
     # Rows from bottom to top, as v increases.
     pixels = np.asarray(Image.alpha_composite(white, glass).convert("RGB"), dtype=np.float64)[::-1] / 255
     size = np.array(pixels.shape[1::-1])
 
-    def color(places: FloatArray) -> FloatArray:
-        within = (places - np.floor(places)) * size - 0.5
+    def color(coordinates: FloatArray) -> FloatArray:
+        within = (coordinates - np.floor(coordinates)) * size - 0.5
         left = np.floor(within).astype(np.int64)
         (x, y), (s, t) = left.T, (within - left).T[:, :, None]
         x, right, y, up = x % size[0], (x + 1) % size[0], y % size[1], (y + 1) % size[1]
@@ -225,10 +232,10 @@ def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArra
         row = first[triangle, 1] + within // np.maximum(extent[triangle, 0], 1)
         at = np.stack([column, row], axis=1) + 0.5
         a, b, c = corners[triangle].transpose(1, 0, 2)
-        whole = _cross(b - a, c - a)
-        whole = np.where(whole == 0, np.nan, whole)
+        doubled_area = _cross(b - a, c - a)
+        doubled_area = np.where(doubled_area == 0, np.nan, doubled_area)
         weights = np.stack([_cross(b - at, c - at), _cross(c - at, a - at), _cross(a - at, b - at)], axis=1)
-        weights /= whole[:, None]
+        weights /= doubled_area[:, None]
         inside = (weights >= 0).all(axis=1)
         yield triangle[inside], (row * side + column)[inside], weights[inside]
 

@@ -10,15 +10,20 @@ from math import isfinite, isnan
 
 import numpy as np
 
-from quasiharmonic.io.atomic import check_writable, write_whole
+from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.ui.batch.records import OUTCOMES, SOLVED, Record
-from quasiharmonic.ui.report import figures, numbers
-from quasiharmonic.ui.report.numbers import PHASES, Run
+from quasiharmonic.ui.batch.settings import Settings
+from quasiharmonic.ui.report import charts, statistics
+from quasiharmonic.ui.report.statistics import PHASES, Run
 from quasiharmonic.ui.report.style import STYLE
 from quasiharmonic.ui.report.thumbnails import thumbnail
 
-# Number of problems with a picture per list, of failures with a picture, and of failures listed in total.
-_PICTURES, _FAILURES, _NAMED = 12, 24, 500
+# Maximum number of problems per list of certified maps.
+_PICTURES = 12
+# Maximum number of failures with a picture.
+_FAILURES = 24
+# Maximum number of failures that are listed.
+_MAX_LISTED = 500
 
 
 def write_report(
@@ -28,26 +33,13 @@ def write_report(
 ) -> None:
     """Write an HTML page about a run: success, distortion, times, and notable problems.
 
-    Parameters
-    ----------
-    path : path
-        The HTML file to write. It contains all pictures and styles.
-    source : path
-        The folder of a run, or a table of records.
-    against : path, optional
-        Another run or a table about another program, for comparison. Columns: ``problem``, with the same names;
-        ``seconds``; optionally ``mips`` and ``certified``.
-
-    Raises
-    ------
-    ValueError
-        If there are no records, or they cannot be read.
-    OutputError
-        If the page cannot be written.
+    ``source`` is the folder of a run or a table of records. ``against`` is another run, or a table about another
+    program with the columns ``problem``, ``seconds`` and optionally ``mips`` and ``certified``. ValueError if there are
+    no records, or they cannot be read; OutputError if the page cannot be written.
     """
     check_writable(path)
-    run = numbers.load(source)
-    other = None if against is None else numbers.load(against)
+    run = statistics.load(source)
+    other = None if against is None else statistics.load(against)
     write_whole(path, _page(run, other).encode())
 
 
@@ -62,13 +54,13 @@ def _page(run: Run, other: Run | None) -> str:
         _groups(run),
         '<div class="pair">',
         _distortion(run, other),
-        _times(run) if other is None else _compared(run, other),
+        _times(run) if other is None else _comparison(run, other),
         *([] if other is None else [_times(run)]),
         _phases(run),
         "</div>",
-        _gallery("Most stretched of the certified, max(σ₁, 1/σ₂)", pictures, _worst(run, "isometric")),
-        _gallery("Most distorted of the certified (MIPS)", pictures, _worst(run, "mips")),
-        _gallery("Slowest of the certified", pictures, _worst(run, "seconds")),
+        _gallery("Highest stretch, max(σ₁, 1/σ₂), of certified maps", pictures, _worst(run, "isometric")),
+        _gallery("Highest MIPS distortion of certified maps", pictures, _worst(run, "mips")),
+        _gallery("Slowest certified maps", pictures, _worst(run, "seconds")),
         _failures(run, pictures),
     ]
     return (
@@ -96,23 +88,24 @@ def number(value: float, unit: str = "") -> str:
     text = f"{value:,.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}" if isfinite(value) else "∞"
     if "e" in text:
         mantissa, exponent = text.split("e")
-        text = f"{mantissa}·{figures.power(int(exponent))}"
+        text = f"{mantissa}·{charts.power(int(exponent))}"
     return text + (f" {unit}" if unit else "")
 
 
-def percent(part: int, whole: int) -> str:
+def percent(part: int, total: int) -> str:
     """Format a share; "100 %" only if it is exact."""
-    share = 100 * part / whole
-    return "100 %" if part == whole else f"{min(share, 99.99):.2f} %" if share >= 99 else f"{share:.1f} %"
+    share = 100 * part / total
+    return "100 %" if part == total else f"{min(share, 99.99):.2f} %" if share >= 99 else f"{share:.1f} %"
 
 
 def _origin(run: Run) -> str:
     words = []
     if run.about.get("source"):
         words.append(f"Problems of <code>{shown(run.about['source'])}</code>.")
-    settings = run.about.get("settings", {})
+    usual = Settings().to_dict()
+    settings = {k: v for k, v in run.about.get("settings", {}).items() if v and v != usual.get(k)}
     if settings:
-        words.append("Settings: " + ", ".join(f"{shown(k)} {shown(v)}" for k, v in settings.items() if v) + ".")
+        words.append("Settings: " + ", ".join(f"{shown(k)} {shown(v)}" for k, v in settings.items()) + ".")
     for versions in sorted({str(row["versions"]) for row in run.rows if row.get("versions")}):
         try:
             words.append(", ".join(f"{shown(k)} {shown(v)}" for k, v in json.loads(versions).items()) + ".")
@@ -122,31 +115,31 @@ def _origin(run: Run) -> str:
 
 
 def _tiles(run: Run) -> str:
-    whole = numbers.groups(run)[-1]
+    whole = statistics.groups(run)[-1]
     tiles = [
         (percent(whole.certified, whole.problems), f"{whole.certified:,} of {whole.problems:,} certified {run.wanted}"),
         (number(whole.stretch[0]), f"worst stretch, max(σ₁, 1/σ₂), of a triangle; median {number(whole.stretch[1])}"),
         (number(whole.mips[0]), f"worst MIPS distortion of a map; median {number(whole.mips[1])}"),
-        (number(whole.seconds[0], "s"), f"median time of these; 95 % within {number(whole.seconds[1], 's')}"),
-        (number(whole.triangles), "triangles in all"),
-        (number(numbers.quantile(run.column("peak_memory"), 1.0) / 2**20, "MiB"), "memory of one problem at most"),
+        (number(whole.seconds[0], "s"), f"median time of the certified; 95 % within {number(whole.seconds[1], 's')}"),
+        (number(whole.triangles), "triangles in total"),
+        (number(statistics.quantile(run.column("peak_memory"), 1.0) / 2**20, "MiB"), "maximum memory of a problem"),
     ]
     cells = "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in tiles)
     return f'<div class="tiles">{cells}</div>'
 
 
 def _outcomes(run: Run) -> str:
-    counted = numbers.outcomes(run)
+    counted = statistics.outcomes(run)
     css = {**dict.fromkeys(SOLVED, "good"), "not injective": "bad", "not bijective": "bad"}
     bar = "".join(f'<i class="{css.get(name, "broken")}" style="flex:{count}"></i>' for name, count in counted)
     words = ", ".join(f"{count:,} {shown(OUTCOMES.get(name, name))}" for name, count in counted)
     impossible = sum(row.get("status") == "impossible" for row in run.rows)
-    words += f"; it is proven of {impossible:,} that they have no such map" if impossible else ""
+    words += f"; {impossible:,} proven to have no such map" if impossible else ""
     return f'<div class="bar">{bar}</div><p class="quiet">{words}</p>'
 
 
 def _groups(run: Run) -> str:
-    groups = numbers.groups(run)
+    groups = statistics.groups(run)
     if len(groups) == 1:
         return ""
     head = "problems", "certified", "success", "worst stretch", "worst MIPS", "median MIPS", "median", "95 %", "longest"
@@ -172,11 +165,11 @@ def _distortion(run: Run, other: Run | None) -> str:
         if np.isfinite(mips).any():
             series.append(("theirs", mips))
             legend.append(("theirs", other.name))
-    medians = [number(numbers.quantile(values, 0.5)) for _, values in series]
+    medians = [number(statistics.quantile(values, 0.5)) for _, values in series]
     caption = f"Over the certified maps. Median {' against '.join(medians)}."
     return _figure(
         "Distribution of distortion",
-        figures.histogram(series, "MIPS: mean of σ₁/σ₂ + σ₂/σ₁ − 2 over the surface"),
+        charts.histogram(series, "MIPS: mean of σ₁/σ₂ + σ₂/σ₁ − 2 over the surface"),
         legend if len(legend) > 1 else [],
         caption,
     )
@@ -186,25 +179,25 @@ def _times(run: Run) -> str:
     good = run.certified
     size, seconds = run.column("triangles"), run.column("seconds")
     series = [("ours", size[good], seconds[good]), ("failed", size[~good], seconds[~good])]
-    legend = [("ours", f"certified {run.wanted}"), ("failed", "not")] if not good.all() else []
+    legend = [("ours", f"certified {run.wanted}"), ("failed", "failed")] if not good.all() else []
     caption = "Each dot is a problem; wall time from the file to the record."
-    return _figure("Time and size", figures.scatter(series, "triangles", "seconds"), legend, caption)
+    return _figure("Time and size", charts.scatter(series, "triangles", "seconds"), legend, caption)
 
 
-def _compared(run: Run, other: Run) -> str:
-    ours, theirs = numbers.matched(run, other, "seconds")
+def _comparison(run: Run, other: Run) -> str:
+    ours, theirs = statistics.match_column(run, other, "seconds")
     name = shown(other.name)
     if not ours.size:
-        words = f"No problem of {name} has the name of one here and a time."
+        words = f"No problem of {name} has a time and the name of a problem of this run."
         return f'<section class="card"><h2>Time against {name}</h2><p>{words}</p></section>'
     with np.errstate(divide="ignore"):
-        ratio = numbers.quantile(theirs / ours, 0.5)
+        ratio = statistics.quantile(theirs / ours, 0.5)
     sentence = f"median {number(ratio)} times faster" if ratio >= 1 else f"median {number(1 / ratio)} times slower"
     return _figure(
         f"Time against {name}",
-        figures.scatter([("ours", theirs, ours)], f"seconds, {name}", f"seconds, {shown(run.name)}", same=True),
+        charts.scatter([("ours", theirs, ours)], "seconds of the other run", "seconds of this run", same=True),
         [],
-        f"Each dot is one of the {ours.size:,} problems that both have; {sentence}.",
+        f"Each dot is one of the {ours.size:,} problems in both runs; {sentence}.",
     )
 
 
@@ -216,7 +209,7 @@ def _phases(run: Run) -> str:
     rows = [(phase, number(total, "s"), f"{100 * total / whole:.1f} %") for phase, total in totals if total]
     rows.append(("all", number(whole, "s"), "100 %"))
     table = _table(("phase", "time", "share"), rows, last_is_sum=True)
-    return f'<section class="card"><h2>Where the time went</h2>{table}</section>'
+    return f'<section class="card"><h2>Time by phase</h2>{table}</section>'
 
 
 def _worst(run: Run, column: str) -> list[Record]:
@@ -260,7 +253,7 @@ def _card(row: Record, address: str) -> str:
         if isinstance(value, int | float):
             facts.append(form.format(number(value)))
     if row.get("flips_after"):
-        facts.append(f"{row['flips_after']} inverted, {row.get('flips_before')} at the start")
+        facts.append(f"{row['flips_after']} inverted, {row.get('flips_before')} initially")
     words = f'<p class="why">{shown(_reason(row))}</p>' if row.get("certified") is not True else ""
     title, line = shown(row["problem"]), shown(" · ".join(facts))
     return f'<div class="card item">{picture}<h3>{title}</h3><p>{line}</p>{words}</div>'
@@ -279,11 +272,11 @@ def _failures(run: Run, pictures: _Pictures) -> str:
     if not rows:
         return "<h2>Failed</h2><p>None.</p>"
     parts = [_gallery(f"Failed ({len(rows):,})", pictures, rows[:_FAILURES])]
-    rest = rows[_FAILURES:_NAMED]
+    rest = rows[_FAILURES:_MAX_LISTED]
     if rest:
-        parts.append(_table(("problem", "triangles", "time", "why"), [_line(row) for row in rest]))
-    if len(rows) > _NAMED:
-        parts.append(f"<p>And {len(rows) - _NAMED:,} more, which the table of records has.</p>")
+        parts.append(_table(("problem", "triangles", "time", "reason"), [_line(row) for row in rest]))
+    if len(rows) > _MAX_LISTED:
+        parts.append(f"<p>And {len(rows) - _MAX_LISTED:,} more; the table of records lists them.</p>")
     return "".join(parts)
 
 

@@ -51,12 +51,6 @@ tr.sum td { font-weight: 650; }
 .legend .ours { background: var(--ours); } .legend .theirs { background: var(--theirs); }
 .legend .failed { background: var(--failed); }
 svg { display: block; width: 100%; height: auto; margin: 4px 0; }
-svg text { fill: var(--quiet); font-size: 13px; }
-svg path { fill: none; }
-.axis { stroke: var(--quiet); } .grid { stroke: var(--line); } .guide { stroke: var(--quiet); stroke-dasharray: 4 4; }
-svg .ours { color: var(--ours); } svg .theirs { color: var(--theirs); } svg .failed { color: var(--failed); }
-svg .fill { fill: currentColor; opacity: 0.8; }
-svg .line { stroke: currentColor; stroke-width: 2; }
-svg .dots { stroke: currentColor; stroke-linecap: round; opacity: 0.65; }
+svg text { font-family: inherit !important; }
 @media print { body { background: #ffffff; } .card, .tile { break-inside: avoid; } }
 """

@@ -18,27 +18,17 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
 
 # Maximum number of triangles; drawing that many takes about one second.
-_MOST = 100_000
+_MAX_TRIANGLES = 100_000
 
 
 def thumbnail(record: Record, results: Path | None) -> str:
-    """Draw the surface of a record and, if it exists, its map.
-
-    Parameters
-    ----------
-    record : dict
-    results : Path or None
-        Folder of the run's maps.
-
-    Returns
-    -------
-    str
-        A ``data:`` address of a PNG; empty if nothing can be drawn.
+    """Draw the surface of a record and, if it exists, its map: a ``data:`` address of a PNG, empty if nothing can be
+    drawn.
     """
-    if (record.get("triangles") or 0) > _MOST:
+    if (record.get("triangles") or 0) > _MAX_TRIANGLES:
         return ""
     mesh, mapped = _read(record, results)
-    if mesh is None or not len(mesh.F) or len(mesh.F) > _MOST:
+    if mesh is None or not len(mesh.F) or len(mesh.F) > _MAX_TRIANGLES:
         return ""
     from quasiharmonic.ui.plot import plot_map, plot_surface
     from quasiharmonic.ui.plot.canvas import new_figure, panels
@@ -47,11 +37,11 @@ def thumbnail(record: Record, results: Path | None) -> str:
     axes = panels(figure, 2 if mapped else 1)
     for ax in axes:
         ax.set_position((ax.get_position().x0, 0.03, ax.get_position().width, 0.94))
-    V = _framed(mesh.V)
+    V = _center(mesh.V)
     plot_surface(V, mesh.F, axes[0])
     if mapped:
         opened, F, uv = io.without_idle(*io.cut_at_seams(mesh))
-        plot_map(_framed(opened), F, _framed(uv), ax=axes[1])
+        plot_map(_center(opened), F, _center(uv), ax=axes[1])
     file = BytesIO()
     figure.savefig(file, format="png")
     return "data:image/png;base64," + b64encode(file.getvalue()).decode()
@@ -59,10 +49,10 @@ def thumbnail(record: Record, results: Path | None) -> str:
 
 def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:
     """Return the mesh to draw, and whether it has a map."""
-    places = [] if results is None else [(records.map_path(results / record["problem"]), True)]
+    candidates = [] if results is None else [(records.map_path(results / record["problem"]), True)]
     if record.get("source"):
-        places.append((Path(record["source"]), False))
-    for path, mapped in places:
+        candidates.append((Path(record["source"]), False))
+    for path, mapped in candidates:
         try:
             if path.is_file():
                 return io.read_mesh(path), mapped
@@ -71,7 +61,7 @@ def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:
     return None, False
 
 
-def _framed(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _center(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points translated and scaled by powers of two into a box around the origin, which prevents overflow."""
     points = np.ldexp(points, -int(np.frexp(np.abs(points).max())[1]))
     points = points - points.mean(axis=0)

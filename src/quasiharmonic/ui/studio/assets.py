@@ -36,22 +36,9 @@ def assets() -> dict[str, Asset]:
 
 
 def bundle(name: str) -> str:
-    """Return a module of the page together with all modules that it imports, as one JavaScript module; for widgets.
+    """Return a module of the page, such as ``view``, with all modules that it imports, as one JavaScript module.
 
-    Parameters
-    ----------
-    name : str
-        Name without suffix, such as ``"view"``.
-
-    Returns
-    -------
-    str
-        JavaScript with the exports of the module.
-
-    Raises
-    ------
-    KeyError
-        If there is no such module.
+    KeyError if there is no such module.
     """
     wrapped: dict[str, str] = {}
 

@@ -32,51 +32,32 @@ class ProtocolError(ValueError):
 
 
 class Frame(NamedTuple):
-    """Message.
+    """Message."""
 
-    Attributes
-    ----------
-    header : dict
-        Plain JSON; ``kind`` is the type of a message to the page, ``do`` the command of a message from the page.
-    arrays : dict of str to array
-        Arrays by name; read-only in a decoded message.
-    """
-
+    # Plain JSON; ``kind`` is the type of a message to the page, ``do`` the command of a message from the page
     header: dict[str, Any]
-    arrays: dict[str, Array]
+    arrays: dict[str, Array]  # Arrays by name; read-only in a decoded message
 
 
 def encode(header: Mapping[str, Any], arrays: Mapping[str, Array] | None = None) -> bytes:
-    """Return the buffer of a header and arrays of the types in `TYPES`.
-
-    Raises
-    ------
-    KeyError
-        If an array has another type.
-    """
+    """Return the buffer of a header and arrays of the types in `TYPES`; KeyError for another type."""
     described, parts, offset = {}, [], 0
     for name, array in (arrays or {}).items():
-        whole = np.ascontiguousarray(array)
-        described[name] = [_NAMES[whole.dtype], list(whole.shape), offset]
-        parts.append(whole.tobytes())
-        parts.append(bytes(-whole.nbytes % 8))
-        offset += whole.nbytes + -whole.nbytes % 8
+        contiguous = np.ascontiguousarray(array)
+        described[name] = [_NAMES[contiguous.dtype], list(contiguous.shape), offset]
+        parts.append(contiguous.tobytes())
+        parts.append(bytes(-contiguous.nbytes % 8))
+        offset += contiguous.nbytes + -contiguous.nbytes % 8
     text = json.dumps({**header, "arrays": described}, allow_nan=False).encode()
     text += b" " * (-(4 + len(text)) % 8)
     return b"".join([len(text).to_bytes(4, "little"), text, *parts])
 
 
 def decode(data: bytes) -> Frame:
-    """Decode a buffer from an untrusted source.
-
-    Raises
-    ------
-    ProtocolError
-        If the buffer is malformed.
-    """
+    """Decode a buffer from an untrusted source; ProtocolError if it is malformed."""
     length = int.from_bytes(data[:4], "little")
     if len(data) < 4 or length > min(_LONGEST, len(data) - 4):
-        raise ProtocolError("a message is shorter than it says")
+        raise ProtocolError("a message is shorter than its header says")
     try:
         header = json.loads(data[4 : 4 + length])
         if not isinstance(header, dict):
@@ -89,9 +70,9 @@ def decode(data: bytes) -> Frame:
 
 def _array(data: bytes, start: int, kind: str, shape: list[int], offset: int) -> Array:
     if kind not in TYPES or not all(isinstance(extent, int) and extent >= 0 for extent in [*shape, offset]):
-        raise ProtocolError("an array is described as none can be")
+        raise ProtocolError("the description of an array is invalid")
     dtype = np.dtype(TYPES[kind])
     count = math.prod(shape)
     if start + offset + count * dtype.itemsize > len(data):
-        raise ProtocolError("an array is shorter than it says")
+        raise ProtocolError("an array is shorter than its description")
     return np.frombuffer(data, dtype, count, start + offset).reshape(shape)

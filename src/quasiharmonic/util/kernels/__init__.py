@@ -20,6 +20,8 @@ copied.
 Set ``QUASIHARMONIC_PURE=1`` in the environment to run the NumPy versions. Both versions give the same results up to
 rounding, and identical results in the package `exact`.
 
+Constants that both versions use are assigned in Python; `constants` writes them into a C header during the build.
+
 The C files are in `c`; `_compiled.pyi` lists their functions. Start reading in `c/module.c`.
 """
 
@@ -45,10 +47,7 @@ TWINS: dict[str, Callable[..., Any]] = {}
 def compiled(twin: Kernel) -> Kernel:
     """Return the function of this name in the extension, or the NumPy function if there is no extension.
 
-    Raises
-    ------
-    ImportError
-        If the extension has no such function, because it was built from older C files.
+    Raises an ImportError if the extension has no such function, because it was built from older C files.
     """
     TWINS[twin.__name__] = twin
     if extension is None:

@@ -4,11 +4,10 @@ Each boundary loop is filled by a fan around a new vertex, its *hub*. Boundary v
 and `quasiharmonic.geometry.coarsening.levels` can remove them like others. Hubs are kept, and get no new edges. Without
 the hubs, a coarse mesh with coarse loops remains.
 
-Prolongation positions each removed vertex according to the surface's shape. The vertex's ring is laid out flat around
-it by its rest angles and lengths. The affine map that fits the flat ring best to the ring's current positions also maps
-the vertex. This is exact if the map is affine. If it inverts a triangle, the vertex gets the position that gives its
-triangles the best shape, as in `quasiharmonic.geometry.coarsening.prolongation`. This position is inside its ring and
-the coarse image.
+Prolongation lays the ring of each removed vertex out flat around it by its rest angles and lengths. The affine map that
+fits the flat ring best to the ring's current positions also maps the vertex. If this inverts a triangle, the vertex
+gets the position that gives its triangles the best shape, as in `quasiharmonic.geometry.coarsening.prolongation`. This
+position is inside its ring and the coarse image.
 """
 
 from __future__ import annotations
@@ -17,16 +16,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.start import fans
+from quasiharmonic.apps.flattening.disk_start import make_fans
 from quasiharmonic.geometry.coarsening.levels import coarsen
-from quasiharmonic.geometry.coarsening.prolongation import places
+from quasiharmonic.geometry.coarsening.prolongation import reinsertion_positions
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 # Weight that keeps the affine map close to a similarity.
 _RIGID = 1e-2
 # The affine position is used if every triangle has at least this fraction of its area in the flat layout.
-_LEAST = 0.05
+_MIN_AREA_SHARE = 0.05
 #: Minimum height of a coarse mesh's triangles, relative to their longest side.
 LOWEST = 0.05
 # Maximum sum of the angles around a boundary vertex when its ring is laid out.
@@ -37,14 +36,8 @@ _WIDEST = 1.9 * np.pi
 class Level:
     """One mesh of a hierarchy, with its own vertex numbering.
 
-    Attributes
-    ----------
-    stop : int
-        The hierarchy's stop that the mesh belongs to.
-    vertices : (m,) int64
-        The finest mesh's indices of its vertices, ascending.
-    F : (f, 3) int64
-    loops : list of (l,) int64
+    ``stop`` is the hierarchy's stop that the mesh belongs to. ``vertices`` (m,) are the finest mesh's indices of its
+    vertices, ascending.
     """
 
     stop: int
@@ -56,29 +49,15 @@ class Level:
 class Hierarchy:
     """A sequence of increasingly coarse meshes of a surface.
 
-    Parameters
-    ----------
-    V : (n, 3) float64
-        Rest positions, of about unit size.
-    F : (f, 3) int64
-        Triangles of a connected surface.
-    loops : list of (l,) int64
-        Boundary loops of the surface.
-    goal : int
-        Number of vertices of the coarsest mesh; it has more if no others can be removed.
-
-    Attributes
-    ----------
-    V : (n, 3) float64
-        As given.
-    stops : list of int
-        Rounds after which there is a mesh, finest first; 0 is the surface itself.
+    The surface is connected, and ``V`` (n, 3) of about unit size. The coarsest mesh has ``goal`` vertices, or more if
+    no others can be removed. ``stops`` are the rounds after which there is a mesh, finest first; 0 is the surface
+    itself.
     """
 
     def __init__(self, V: FloatArray, F: IntArray, loops: list[IntArray], goal: int) -> None:
         self.V = V
         self._n = n = len(V)
-        filled = fans(loops, n)
+        filled = make_fans(loops, n)
         held = np.zeros(n + len(loops), dtype=bool)
         held[n:] = True
         self._coarsening = coarsen(np.concatenate([F, filled]), held.size, held, goal + len(loops))
@@ -86,7 +65,7 @@ class Hierarchy:
         # There are meshes before some of the rounds, and after the last.
         self.stops = [*sorted(self._coarsening.levels), self._rounds]
 
-    def stations(self, ratio: float) -> list[int]:
+    def select_stops(self, ratio: float) -> list[int]:
         """Some of the `stops`, coarsest first; each mesh has at least ``ratio`` times the vertices of the last."""
         left = self._left()
         chosen = [0]
@@ -97,10 +76,10 @@ class Hierarchy:
             chosen.append(self.stops[-1])
         return chosen[::-1]
 
-    def coarsest(self, least: float) -> int:
-        """Return the last of the `stops` whose mesh has at least ``least`` vertices; 0 if none has."""
+    def coarsest(self, min_vertices: float) -> int:
+        """Return the last of the `stops` whose mesh has at least ``min_vertices`` vertices; 0 if none has."""
         left = self._left()
-        return max((stop for stop in self.stops if left[stop] >= least), default=0)
+        return max((stop for stop in self.stops if left[stop] >= min_vertices), default=0)
 
     def finer(self, stop: int) -> int:
         """Return the next finer stop."""
@@ -124,25 +103,13 @@ class Hierarchy:
         F = number[T]
         return Level(stop, vertices, F, boundary_loops(F, vertices.size))
 
-    def prolong(self, w: ComplexArray, start: int, stop: int, wary: BoolArray, height: float) -> ComplexArray:
-        """Carry a map from the mesh at one stop to a finer one.
+    def prolong(self, w: ComplexArray, start: int, stop: int, kept_inside: BoolArray, height: float) -> ComplexArray:
+        """Prolong a map ``w`` (n,) from the mesh at one stop to a finer one, ``stop < start``.
 
-        Parameters
-        ----------
-        w : (n,) complex128
-            The map in the finest mesh's numbering; only vertices of the mesh at ``start`` are read.
-        start, stop : int
-            Stops, ``stop < start``.
-        wary : (n,) bool
-            Boundary vertices that are placed inside the coarse image, so that their edges do not intersect others. The
-            other vertices are placed by the surface's shape.
-        height : float
-            Height of wary ears, which cannot be placed inside, above their edges, relative to the edges' lengths. If
-            all boundary vertices are wary and the height is small enough, a bijective map stays bijective.
-
-        Returns
-        -------
-        (n,) complex128
+        ``w`` has the finest mesh's numbering. ``kept_inside`` (n,) marks boundary vertices that are placed inside the
+        coarse image, so that their edges do not intersect others. The surface's shape places the other vertices. Such
+        vertices that cannot be placed inside rise above their edges by ``height`` times the edge's length. If all
+        boundary vertices are marked and the height is small enough, a bijective map stays bijective.
         """
         w = w.copy()
         for number in reversed(range(stop, start)):
@@ -150,39 +117,41 @@ class Hierarchy:
                 at_rim = (rings >= self._n).any(axis=1)
                 for some, rim in ((~at_rim, False), (at_rim, True)):
                     if some.any():
-                        ring = self._opened(rings[some]) if rim else rings[some]
-                        w[vertices[some]] = self._placed(w, vertices[some], ring, rim, wary, height)
+                        ring = self._open_rings(rings[some]) if rim else rings[some]
+                        w[vertices[some]] = self._place(w, vertices[some], ring, rim, kept_inside, height)
         return w
 
-    def _opened(self, rings: IntArray) -> IntArray:
+    def _open_rings(self, rings: IntArray) -> IntArray:
         """Return the rings of boundary vertices without their hubs, from one end to the other."""
         hub = (rings >= self._n).argmax(axis=1)
         turn = (hub[:, None] + 1 + np.arange(rings.shape[1] - 1)) % rings.shape[1]
         return np.take_along_axis(rings, turn, axis=1)
 
-    def _placed(
-        self, w: ComplexArray, vertices: IntArray, ring: IntArray, rim: bool, wary: BoolArray, height: float
+    def _place(
+        self, w: ComplexArray, vertices: IntArray, ring: IntArray, rim: bool, kept_inside: BoolArray, height: float
     ) -> ComplexArray:
         """Positions of vertices with rings (r, d), which are closed, or open if ``rim``."""
-        flat = self._laid_out(vertices, ring, rim)
+        flat = self._lay_out(vertices, ring, rim)
         around = w[ring]
-        place = _carried(flat, around)
+        place = _fit_affine(flat, around)
         if rim and ring.shape[1] == 2:
             # An ear lies to the left of x₁ → x₂, and the rest of the surface to the right.
-            return np.where(wary[vertices], around[:, 0] + (0.5 + 1j * height) * (around[:, 1] - around[:, 0]), place)
+            return np.where(
+                kept_inside[vertices], around[:, 0] + (0.5 + 1j * height) * (around[:, 1] - around[:, 0]), place
+            )
         good = _keeps_shape(flat, place, around, rim)
         if rim:
-            good &= ~wary[vertices]
+            good &= ~kept_inside[vertices]
         poor = np.flatnonzero(~good)
         if poor.size:
             ring_now = around[poor]
             if rim:
                 # Either end of an open ring can be the apex of the fan that fills it.
                 ring_now = np.where(_fan_positive(ring_now)[:, None], ring_now, np.roll(ring_now, 1, axis=1))
-            place[poor] = places(ring_now)
+            place[poor] = reinsertion_positions(ring_now)
         return place
 
-    def _laid_out(self, vertices: IntArray, ring: IntArray, rim: bool) -> ComplexArray:
+    def _lay_out(self, vertices: IntArray, ring: IntArray, rim: bool) -> ComplexArray:
         """Lay rest rings out flat around their vertices; (r, d) complex128, of about unit size."""
         arm = self.V[ring] - self.V[vertices][:, None]
         length = np.linalg.norm(arm, axis=2)
@@ -200,7 +169,7 @@ class Hierarchy:
         return length / np.where(size > 0, size, 1)[:, None] * np.exp(1j * turned)
 
 
-def _carried(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
+def _fit_affine(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
     """Images of the rings' centres under the affine maps that fit flat rings best to given ones; (r,) complex128."""
     weight = 1 / (flat.real**2 + flat.imag**2 + 1e-12)
     columns = np.stack([np.ones(flat.shape, dtype=np.complex128), flat, flat.conj()], axis=2)
@@ -225,7 +194,7 @@ def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, 
     longest = np.maximum(np.maximum(np.abs(then), np.abs(following)), np.abs(following - then))[:, :last]
     rest = np.maximum(rest, LOWEST * longest**2)
     scale = area.sum(axis=1) / rest.sum(axis=1)
-    least = np.maximum(_LEAST * scale[:, None] * rest, 0)
+    least = np.maximum(_MIN_AREA_SHARE * scale[:, None] * rest, 0)
     good: BoolArray = (area > least).all(axis=1)
     return good
 

@@ -21,28 +21,16 @@ _BITS = 31
 
 @dataclass(frozen=True)
 class Quadtree:
-    """A rectangle of squares, split into quarters where requested; neighbours differ by at most one level.
+    """A rectangle of squares, split into quarters where requested; neighbours differ by at most one level."""
 
-    Attributes
-    ----------
-    corner : (2,) float64
-        Lower left corner.
-    side : float
-        Side of the largest squares.
-    shape : (int, int)
-        Numbers of largest squares along x and y.
-    split : list of (k,) int64
-        Split squares of each level, as ascending integers ``y · 2³¹ + x``.
-    """
-
-    corner: FloatArray
-    side: float
-    shape: tuple[int, int]
-    split: list[IntArray]
+    corner: FloatArray  # (2,): lower left corner
+    side: float  # Side of the largest squares
+    shape: tuple[int, int]  # Numbers of largest squares along x and y
+    split: list[IntArray]  # each (k,): split squares of each level, as ascending integers ``y · 2³¹ + x``
 
     @classmethod
     def around(
-        cls, places: FloatArray, sizes: FloatArray, corner: FloatArray, side: float, shape: tuple[int, int]
+        cls, positions: FloatArray, sizes: FloatArray, corner: FloatArray, side: float, shape: tuple[int, int]
     ) -> Quadtree:
         """Split until squares at given positions (k, 2) have at most given sizes (k,)."""
         # The depth is limited by the integers; smaller sizes get squares that are too large.
@@ -52,7 +40,7 @@ class Quadtree:
         split: list[IntArray] = []
         below = np.empty(0, dtype=np.int64)
         for depth in range(int(level.max(initial=0)) - 1, -1, -1):
-            here = places[level == depth + 1]
+            here = positions[level == depth + 1]
             asked = np.floor((here - corner) / (side * 0.5**depth)).astype(np.int64)
             # Neighbours of a split square must exist, so their parent squares are split.
             x, y = below & (1 << _BITS) - 1, below >> _BITS
@@ -84,11 +72,11 @@ class Quadtree:
         points: FloatArray = self.corner + size[:, None] * np.stack([shifted, y + 0.5], axis=1)
         return points, size
 
-    def sizes_at(self, places: FloatArray) -> FloatArray:
+    def sizes_at(self, positions: FloatArray) -> FloatArray:
         """Return the sides of the leaves at given positions (k, 2) in the rectangle; (k,) float64."""
-        size = np.full(len(places), self.side)
+        size = np.full(len(positions), self.side)
         for depth, split in enumerate(self.split):
-            x, y = np.floor((places - self.corner) / (self.side * 0.5**depth)).astype(np.int64).T
+            x, y = np.floor((positions - self.corner) / (self.side * 0.5**depth)).astype(np.int64).T
             key = (y << _BITS) + x
             found = split[np.minimum(np.searchsorted(split, key), split.size - 1)] == key
             size[found] = self.side * 0.5 ** (depth + 1)

@@ -17,22 +17,25 @@ if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
 
 PICTURES = ".gif", ".mp4"
-_MESHES = ".obj", ".ply", ".off", ".glb", ".gltf"
 
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.io.registry import format_names
     from quasiharmonic.ui.cli import arguments
 
     parser = commands.add_parser(
         "animate",
-        help="map a surface to a sequence of targets, each frame certified, without jumps",
         description="Map a surface to a sequence of targets, each frame from the one before it. With --polish every "
         "frame has little distortion, and vertices do not jump between frames.",
         epilog="Exit status: 0 every frame is written and certified injective as written; 1 one is not; 2 wrong input "
         "or call, nothing written; 3 written, but the report failed. Ctrl-C writes the frames so far.",
+        examples=(
+            "qhm animate face.obj frames/*.obj -o film.gif",
+            "qhm animate face.obj frames/*.obj --polish symmetric-dirichlet -o frames_out/",
+        ),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, OFF, PLY, GLB, glTF or STL file: the surface")
+    parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('read')} file: the surface")
     parser.add_argument(
         "targets",
         type=Path,
@@ -79,15 +82,15 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.apps.animation.animated import animate
+    from quasiharmonic.apps.animation.frame_sequence import animate
     from quasiharmonic.geometry.mesh.topology import boundary_edges
     from quasiharmonic.problem import Problem
-    from quasiharmonic.ui.cli import arguments, progress, report
+    from quasiharmonic.ui.cli import arguments, progress_line, report
     from quasiharmonic.ui.plot.animation import check_animation
 
-    arguments.settle(options, "max_motion_ratio", None, asked=options.polish is not None, belongs="--polish")
+    arguments.set_default(options, "max_motion_ratio", None, asked=options.polish is not None, belongs="--polish")
     drawn = [path for path in options.output if path.suffix.lower() in PICTURES]
-    arguments.settle(options, "frames_per_second", 24, asked=bool(drawn), belongs="a moving picture (-o x.gif)")
+    arguments.set_default(options, "frames_per_second", 24, asked=bool(drawn), belongs="a moving picture (-o x.gif)")
     targets = _files(options.targets)
     inputs = (options.input, options.fixed, *targets)
     for path in drawn:
@@ -99,14 +102,15 @@ def run(options: argparse.Namespace) -> int:
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input):
-        held = np.unique(boundary_edges(mesh.F, len(mesh.V))) if fixed is None else fixed
-    places = _targets(targets, mesh, held)
+        if fixed is None:
+            fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))
+    positions = _targets(targets, mesh, fixed)
     with report.about(options.input):
-        problem = Problem(mesh.V, mesh.F, held, places[0])
-    with report.about(options.input), progress.line(_words) as show:
+        problem = Problem(mesh.V, mesh.F, fixed, positions[0])
+    with report.about(options.input), progress_line.line(_words) as show:
         animation = animate(
             problem,
-            places,
+            positions,
             polish=options.polish,
             max_motion_ratio=options.max_motion_ratio,
             fill_gaps=options.fill_gaps,
@@ -126,10 +130,10 @@ def run(options: argparse.Namespace) -> int:
         with report.after_writing(before[0]) if before else nullcontext():
             _draw(path, problem, animation, options.frames_per_second)
     with report.after_writing(options.output[0]):
-        missing = len(places) - len(animation.frames)
+        missing = len(positions) - len(animation.frames)
         facts: dict[str, Any] = {
             **animation.to_dict(),
-            "asked": len(places),
+            "asked": len(positions),
             "input": str(options.input),
             "outputs": [str(path) for path in options.output],
         }
@@ -147,10 +151,14 @@ def run(options: argparse.Namespace) -> int:
 
 def _files(given: list[Path]) -> list[Path]:
     """Return the given files, or the meshes of the given folder."""
+    from quasiharmonic.io.registry import suffixes
+
     if len(given) == 1 and given[0].is_dir():
-        found = sorted(path for path in given[0].iterdir() if path.suffix.lower() in _MESHES)
+        # Formats that are written with a map are read with one.
+        accepted = suffixes("write_map")
+        found = sorted(path for path in given[0].iterdir() if path.suffix.lower() in accepted)
         if not found:
-            raise ValueError(f"{given[0]}: no mesh in this folder ({', '.join(_MESHES)})")
+            raise ValueError(f"{given[0]}: no mesh in this folder ({', '.join(accepted)})")
         return found
     if len(given) > 1 and any(path.suffix.lower() == ".npy" for path in given):
         raise ValueError("an .npy array has all frames: give no other file with it")
@@ -168,7 +176,7 @@ def _checked_folder(path: Path, inputs: tuple[Path | None, ...]) -> Path:
     return path
 
 
-def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDArray[np.float64]:
+def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the target positions of the fixed vertices in every frame; (t, k, 2)."""
     import numpy as np
 
@@ -176,8 +184,8 @@ def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDAr
     from quasiharmonic.ui.cli import report
 
     if files[0].suffix.lower() == ".npy":
-        return _array(files[0], len(mesh.V), held)
-    places = []
+        return _array(files[0], len(mesh.V), fixed)
+    positions = []
     for path in files:
         frame = io.read_mesh(path)
         if len(frame.V) != len(mesh.V):
@@ -187,11 +195,11 @@ def _targets(files: list[Path], mesh: MeshData, held: NDArray[np.int64]) -> NDAr
         opened = mapped.opened()
         if opened.uv is None or not mapped.seamless:
             raise ValueError(f"{path}: its map has seams, which frames do not support")
-        places.append(opened.uv[held])
-    return np.stack(places)
+        positions.append(opened.uv[fixed])
+    return np.stack(positions)
 
 
-def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
+def _array(path: Path, n: int, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
     import numpy as np
 
     from quasiharmonic import io
@@ -203,30 +211,24 @@ def _array(path: Path, n: int, held: NDArray[np.int64]) -> NDArray[np.float64]:
         raise io.MeshFileError(path, "there is no such file") from error
     except (ValueError, EOFError, MemoryError) as error:
         # The first line names the error; further lines address programmers.
-        said = str(error).partition("\n")[0]
-        raise ValueError(f"{path}: not an array of numbers in NumPy's format: {said}") from error
-    shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, held.size) and array.shape[2] == 2
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{path}: not an array of numbers in NumPy's format: {reason}") from error
+    shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, fixed.size) and array.shape[2] == 2
     if not shaped or array.dtype.kind not in "iuf":
         raise ValueError(
-            f"{path}: must be real numbers of shape (frames, {n}, 2), or (frames, {held.size}, 2) for fixed vertices "
+            f"{path}: must be real numbers of shape (frames, {n}, 2), or (frames, {fixed.size}, 2) for fixed vertices "
             f"only, not {array.dtype} {array.shape}"
         )
-    return real_array(f"{path}: its array", array if array.shape[1] == held.size else array[:, held])
+    return real_array(f"{path}: its array", array if array.shape[1] == fixed.size else array[:, fixed])
 
 
 def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[bool, list[str]]:
     """Write every frame that has a map.
 
-    Returns
-    -------
-    certified : bool
-        Whether all written files are certified injective.
-    others : list of str
-        Frames in the folder that belong to another run.
+    Return whether all written files are certified injective, and the frames in the folder that belong to another run.
     """
     from quasiharmonic import io
-    from quasiharmonic.ui.cli import report
-    from quasiharmonic.ui.cli import verdict as judging
+    from quasiharmonic.ui.cli import report, written_map
 
     certified = True
     digits = max(4, len(str(len(animation.frames) - 1)))
@@ -239,7 +241,7 @@ def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[b
             with report.after_writing(folder / min(written)) if written else nullcontext():
                 io.write_mapped(path, mesh.with_map(frame.uv))
                 written.add(path.name)
-                certified &= judging.judge(io.read_mesh(path)).injective
+                certified &= written_map.certify_map(io.read_mesh(path)).injective
     others = {path.name for path in folder.glob("*.obj") if path.stem.isdecimal()} - written
     return certified, sorted(others)
 

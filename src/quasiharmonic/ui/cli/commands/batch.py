@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 import shutil
 import sys
 import time
@@ -16,8 +15,10 @@ if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
     from quasiharmonic.ui.cli.arguments import Commands
 
-# Seconds between two updates of the line on a terminal, and between two lines elsewhere.
-LIVE, LOG = 0.1, 30.0
+#: Seconds between two updates of the line on a terminal.
+LIVE = 0.1
+#: Seconds between two lines elsewhere.
+LOG = 30.0
 
 
 def add_parser(commands: Commands) -> None:
@@ -26,24 +27,41 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "batch",
-        help="map all problems of a data set, on all cores or a cluster",
         description="Map every problem of a data set, each in a separate process: a failure does not affect "
         "other problems. "
         "Maps and records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has "
-        "all records. To continue an interrupted run, give the same command again. `qhm report OUT` "
-        "makes a page of it.",
+        "all records. To continue an interrupted run, give the same command again.",
         epilog="Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not "
         "(the records give the reason); 2 wrong call, or stopped: finished results are kept; 3 "
         "finished, but the report failed.",
+        examples=(
+            "qhm batch problems/ -o results/ --report",
+            "qhm batch meshes/ -o flat/ --flatten --cut -j 4",
+            "qhm batch -o results/ --report --against other.csv",
+        ),
     )
     parser.add_argument(
         "source",
         metavar="DIR_OR_LIST",
         type=Path,
+        nargs="?",
         help="folder with problems (input.obj and handles.txt) at any depth, or a text file that lists folders and "
-        "meshes, one per line",
+        "meshes, one per line; may be omitted with --report",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    parser.add_argument(
+        "--report",
+        action="store_true",
+        help="write OUT/report.html about the run: success, distortion, times, the slowest, worst and failed problems "
+        "with images; without DIR_OR_LIST, about the run or the table of records (.csv, .parquet) that -o names",
+    )
+    parser.add_argument(
+        "--against",
+        type=Path,
+        metavar="OTHER",
+        help="for --report: compare with another run, or with a table about another program, with the columns problem "
+        "and seconds",
+    )
     parser.add_argument(
         "--table", choices=("csv", "parquet"), default="csv", help="format of the table of records (default: csv)"
     )
@@ -71,7 +89,10 @@ def add_parser(commands: Commands) -> None:
         help="time limit per problem in seconds; 0 for no limit (default: 600)",
     )
     work.add_argument(
-        "--memory-limit", type=_bytes, metavar="SIZE", help="limit of resident memory per problem, such as 800M or 4G"
+        "--memory-limit",
+        type=arguments.byte_count,
+        metavar="SIZE",
+        help="limit of resident memory per problem, such as 800M or 4G",
     )
 
     solver = parser.add_argument_group("solution of each problem")
@@ -79,6 +100,14 @@ def add_parser(commands: Commands) -> None:
         "--to",
         metavar="OUTLINE",
         help=f"map every mesh file onto an outline: {targets.FORMS}",
+    )
+    solver.add_argument("--font", metavar="FONT", help="for letters and words: a font file or the name of a font")
+    solver.add_argument(
+        "--corner-angle",
+        type=targets.degrees,
+        default=20.0,
+        metavar="DEG",
+        help="for --to: turning angle from which a point of the outline is a corner (default: %(default)g)",
     )
     solver.add_argument(
         "--flatten",
@@ -90,8 +119,8 @@ def add_parser(commands: Commands) -> None:
     )
     solver.add_argument(
         "--corners",
-        metavar="auto",
-        help="with --to: corners of the boundary by angle (auto), near:x,y,z,…, or as qhm map takes them",
+        metavar="V,V,…",
+        help="for --to: corners of the boundary, in every form of qhm map: auto, near:x,y,z, vertices, or a file",
     )
     solver.add_argument(
         "--refine",
@@ -112,6 +141,9 @@ def add_parser(commands: Commands) -> None:
         action="store_true",
         help="let boundary vertices slide along the outline while --polish lowers distortion; corners stay fixed",
     )
+    solver.add_argument(
+        "--pieces", type=Path, metavar="FILE", help="for --to and --slide: sides of boundary vertices, as for qhm map"
+    )
     solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
     solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
     arguments.add_linear_solver(solver)
@@ -119,14 +151,22 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the data set with progress, then print a summary."""
+    """Run the data set with progress, then print a summary and write the report page."""
     from quasiharmonic.ui import batch
     from quasiharmonic.ui.cli import report
 
+    if options.against is not None and not options.report:
+        raise ValueError("--against needs --report: add --report, or omit --against")
+    if options.source is None:
+        if not options.report:
+            raise ValueError("name a folder or a list of problems, or add --report to describe a run")
+        return _write_report(options)
     if options.flatten and options.strategy is not None:
         raise ValueError("--strategy needs a given boundary, but --flatten leaves the boundary free: omit one of them")
     settings = batch.Settings(
         to=options.to,
+        font=options.font,
+        corner_angle=options.corner_angle,
         flatten=options.flatten,
         energy=options.energy,
         cut=options.cut,
@@ -135,6 +175,7 @@ def run(options: argparse.Namespace) -> int:
         strategy=options.strategy or "speed",
         polish=options.polish,
         slide=options.slide,
+        pieces=None if options.pieces is None else str(options.pieces),
         reference=options.reference,
         max_iterations=options.max_iterations,
         linear_solver=options.linear_solver,
@@ -166,7 +207,23 @@ def run(options: argparse.Namespace) -> int:
     records = options.output / f"records.{options.table}"
     with report.after_writing(records):
         print(_account(progress, wanted, records), flush=True)
+    if options.report:
+        with report.after_writing(records):
+            _write_report(options)
     return 0 if progress.solved == progress.total else 1
+
+
+def _write_report(options: argparse.Namespace) -> int:
+    """Write the page about a run or a table of records; return the exit status."""
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.ui.report import write_report
+
+    folder: Path = options.output if options.output.is_dir() else options.output.parent
+    page = folder / "report.html"
+    write_report(page, options.output, options.against)
+    with report.after_writing(page):
+        print(f"wrote {page}", flush=True)
+    return 0
 
 
 def _account(progress: Progress, wanted: str, table: Path) -> str:
@@ -213,12 +270,12 @@ class _Display:
 
 
 def _duration(seconds: float) -> str:
-    whole = round(seconds)
-    if whole < 60:
-        return f"{seconds:.2g} s" if seconds < 9.5 else f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+    rounded = round(seconds)
+    if rounded < 60:
+        return f"{seconds:.2g} s" if seconds < 9.5 else f"{rounded} s"
+    if rounded < 3600:
+        return f"{rounded // 60} min {rounded % 60} s"
+    return f"{rounded // 3600} h {rounded % 3600 // 60} min"
 
 
 def _seconds(text: str) -> float:
@@ -226,13 +283,3 @@ def _seconds(text: str) -> float:
     if not 0 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a time in seconds")
     return value
-
-
-def _bytes(text: str) -> int:
-    found = re.fullmatch(r"([0-9.]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
-    value = 0.0
-    if found is not None and found[1].count(".") < 2 and found[1] != ".":
-        value = float(found[1]) * 1024 ** " KMGT".index(found[2].upper() or " ")
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a size such as 800M or 4G")
-    return int(value)

@@ -1,28 +1,52 @@
-"""``qhm check``: certify the map of a file exactly."""
+"""``qhm check``: say what a mesh is, certify its map exactly, and find what prevents a map."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.io import MeshData
+    from quasiharmonic.problem.diagnosis import Diagnosis
     from quasiharmonic.ui.cli.arguments import Commands
+    from quasiharmonic.ui.cli.written_map import WrittenMap
 
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.io.registry import format_names
     from quasiharmonic.ui.cli import arguments
 
     parser = commands.add_parser(
         "check",
-        help="verify a map: inverted triangles and overlaps",
-        description="Verify a planar map exactly: the texture coordinates (vt) of an OBJ file whose faces refer to "
-        "them, else the first two coordinates of its vertices. A map with seams is verified in the plane.",
-        epilog="Exit status: 0 injective (every triangle strictly positive), or the boundary is listed; 1 not; 2 the "
-        "file cannot be verified.",
+        description="Report the components, boundaries, genus and defects of a mesh. If the file has a map (vt of an "
+        "OBJ; a planar mesh without vt is its own map), verify it exactly. A map with seams is verified in the plane. "
+        "If the map is not injective, look for obstructions: conditions that no map with these fixed vertices meets.",
+        epilog="Exit status: 0 the map is injective (every triangle strictly positive), or there is no map and the "
+        "mesh has no defect, or the boundary is listed; 1 otherwise; 2 the file cannot be read.",
+        examples=(
+            "qhm check model.obj",
+            "qhm check problem/ --json report.json",
+            "qhm check model.obj --boundary --plot boundary.png",
+        ),
     )
-    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB, glTF or OFF file")
+    parser.add_argument(
+        "input",
+        type=Path,
+        metavar="FILE",
+        help=f"{format_names('read')} file, a finite-element mesh ({format_names('read_elements')}), or a folder with "
+        "input.obj and handles.txt",
+    )
+    parser.add_argument(
+        "--fixed",
+        type=Path,
+        metavar="FILE",
+        help="file of fixed vertices for the obstructions, 0-based, one per line (default: the boundary)",
+    )
     parser.add_argument(
         "--as",
         dest="precision",
@@ -39,55 +63,117 @@ def add_parser(commands: Commands) -> None:
         action="store_true",
         help="only list the boundary of the surface: its loops, and corners for qhm map --corners",
     )
-    parser.add_argument("--plot", type=Path, metavar="PICTURE", help="draw the boundary that --boundary lists")
+    parser.add_argument("--plot", type=Path, metavar="IMAGE", help="draw the boundary that --boundary lists")
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, certify, report; or report the boundary."""
+    """Read, inspect, certify, diagnose, report; or report the boundary."""
     from quasiharmonic import io
-    from quasiharmonic.geometry.exact.convexity import not_convex
-    from quasiharmonic.ui.cli import boundary, report
-    from quasiharmonic.ui.cli import verdict as judging
-    from quasiharmonic.util.arrays import counted, named
+    from quasiharmonic.problem.inspection import inspect_mesh
+    from quasiharmonic.ui.cli import boundary_report, finite_elements, report
 
-    report.check_json(options.json, inputs=(options.input,))
+    options.input, options.fixed = io.problem_files(options.input, options.fixed)
+    report.check_json(options.json, inputs=(options.input, options.fixed))
     if options.boundary:
         if options.precision is not None or options.any_triangulation:
             raise ValueError("--boundary verifies no map: omit --as and --any-triangulation")
-        return boundary.run(options)
-    precision = options.precision or "float64"
+        return boundary_report.run(options)
     if options.plot is not None:
         raise ValueError("--plot needs --boundary: add it, or use qhm plot")
+    if finite_elements.has_elements(options.input):
+        return finite_elements.check(options)
     mesh = io.read_mesh(options.input)
-    judged = judging.judge(mesh, precision=precision)
-    further = len(judged.V) - len(mesh.V)
+    with report.about(options.input):
+        found = inspect_mesh(mesh.V, mesh.F)
+    facts: dict[str, Any] = {"input": str(options.input), "mesh": found.to_dict()}
+    lines = [f"{options.input}: {found.summary()}"]
+    if not io.has_map(mesh):
+        if options.precision is not None or options.any_triangulation:
+            raise ValueError(f"{options.input} has no map: omit --as and --any-triangulation")
+        if not found.clean:
+            facts["changes"], table = _clean(mesh)
+            lines.append(table)
+        lines.append("The file has no map: no texture coordinates, and the mesh is not planar.")
+        report.emit_verdict({**facts, "injective": None}, options.json, "\n".join(lines))
+        return 0 if found.clean else 1
+    good, more, text = _verify(mesh, options)
+    report.emit_verdict({**facts, **more}, options.json, "\n".join([*lines, *text]))
+    return 0 if good else 1
+
+
+def _clean(mesh: MeshData) -> tuple[dict[str, Any], str]:
+    """Return the changes that ``qhm unwrap`` makes to a mesh with defects, and a table of them."""
+    from quasiharmonic.apps.unwrapping.cleaning import clean
+
+    try:
+        cleaned = clean(mesh.V, mesh.F)
+    except ValueError as error:  # All triangles are degenerate.
+        return {}, f"qhm unwrap rejects the mesh: {error}"
+    changes = {name: elements.tolist() for name, elements in cleaned.changes.items()}
+    return changes, f"qhm unwrap uses this mesh with these changes:\n{cleaned.tabulate_changes()}"
+
+
+def _verify(mesh: MeshData, options: argparse.Namespace) -> tuple[bool, dict[str, Any], list[str]]:
+    """Certify the map of a mesh; return whether it passes, the entries of the report, and its text."""
+    from quasiharmonic.ui.cli import written_map
+
+    precision = options.precision or "float64"
+    certified = written_map.certify_map(mesh, precision=precision)
+    further = len(certified.V) - len(mesh.V)
+    good = certified.certificate.injective
     facts = {
-        **judged.to_dict(),
+        **certified.to_dict(),
         # Mirrored triangles count as inverted here.
-        "injective": judged.certificate.injective,
-        "input": str(options.input),
+        "injective": good,
         "precision": precision,
         "triangles": len(mesh.F),
         "further_places": further,
     }
-    lines = [f"{options.input}: {judged.certificate.summary()}"]
-    if judged.summary() != judged.certificate.summary():
-        lines.append(judged.summary().removeprefix(judged.certificate.summary()).strip())
+    lines = [certified.certificate.summary()]
+    if certified.summary() != certified.certificate.summary():
+        lines.append(certified.summary().removeprefix(certified.certificate.summary()).strip())
     if further:
         lines.append(f"The map has seams: vertices from {len(mesh.V)} on are copies of vertices on the seams.")
-    good = judged.certificate.injective
     if options.any_triangulation:
-        bent = not_convex(mesh.polygons, judged.F, judged.uv)
+        bent, text = _convexity(mesh, certified)
         facts["not_convex"] = bent.tolist()
         good = good and not bent.size
-        lines.append(
-            f"Not injective for every triangulation: {named('face', 'faces', bent)} not convex in the plane."
-            if bent.size
-            else f"Every one of {counted('face', 'faces', mesh.faces)} is convex in the plane: the "
-            f"result holds for any "
-            "triangulation."
+        lines.append(text)
+    diagnosis = None if certified.certificate.injective else _diagnose(mesh, options.fixed)
+    facts["diagnosis"] = None if diagnosis is None else diagnosis.to_dict()
+    return good, facts, lines if diagnosis is None else [*lines, diagnosis.summary()]
+
+
+def _convexity(mesh: MeshData, certified: WrittenMap) -> tuple[NDArray[np.int64], str]:
+    """Return the faces that are not convex in the plane, and a sentence about them."""
+    from quasiharmonic.geometry.exact.convexity import find_concave
+    from quasiharmonic.util.arrays import count_of, names_of
+
+    bent = find_concave(mesh.polygons, certified.F, certified.uv)
+    if bent.size:
+        return (
+            bent,
+            f"Not injective for every triangulation: {names_of('face', 'faces', bent)} not convex in the plane.",
         )
-    report.emit_verdict(facts, options.json, "\n".join(lines))
-    return 0 if good else 1
+    faces = count_of("face", "faces", mesh.faces)
+    return bent, f"Every one of {faces} is convex in the plane: the result holds for any triangulation."
+
+
+def _diagnose(mesh: MeshData, fixed_path: Path | None) -> Diagnosis | None:
+    """Return the obstructions to a map with these fixed vertices; None if the file is not such a problem.
+
+    A file of fixed vertices must be valid. Without one, meshes that are not a surface with one map are skipped.
+    """
+    from quasiharmonic import io
+    from quasiharmonic.problem import Problem
+    from quasiharmonic.problem.diagnosis import diagnose
+
+    fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
+    try:
+        return diagnose(Problem(*io.problem_arrays(mesh, fixed), reference="equilateral"))
+    except ValueError:
+        if fixed_path is not None:
+            raise
+        return None

@@ -16,10 +16,13 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     parser = commands.add_parser(
         "demo",
-        help="make a surface and a letter, map the one onto the other, draw it",
         description="Make the head of a cat, map it onto the letter R, and write demo.obj, demo.png and demo.json.",
         epilog="Exit status: 0 the written map is certified injective; 1 it is not; 2 nothing was written; 3 the map "
         "was written, but the report failed.",
+        examples=(
+            "qhm demo",
+            "qhm demo -o folder/",
+        ),
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("qhm-demo"), metavar="DIR", help="folder to write to (qhm-demo)"
@@ -30,13 +33,12 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Make the surface, map it, write, certify, draw, report."""
     from quasiharmonic import io, targets
-    from quasiharmonic.apps.atlas.mapped import each_island
+    from quasiharmonic.apps.atlas.mapped_atlas import each_island
     from quasiharmonic.geometry import surfaces
-    from quasiharmonic.geometry.mesh.seams import SeamedMesh
     from quasiharmonic.geometry.mesh.topology import boundary_loops
+    from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem import Problem
-    from quasiharmonic.ui.cli import report
-    from quasiharmonic.ui.cli import verdict as judging
+    from quasiharmonic.ui.cli import report, written_map
     from quasiharmonic.ui.cli.commands import map
 
     folder: Path = options.output
@@ -45,10 +47,10 @@ def run(options: argparse.Namespace) -> int:
         (loop,) = boundary_loops(F, len(V))
         problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
         mapped = each_island(SeamedMesh(V, F), lambda _: map.search(problem, "speed", None, 2000, "auto"))
-        judged = judging.write(folder / "demo.obj", io.MeshData(V, F).with_places(mapped.mesh))
+        written = written_map.write(folder / "demo.obj", io.MeshData(V, F).with_places(mapped.mesh))
     with report.after_writing(folder / "demo.obj"):
-        map.draw(folder / "demo.png", judged, [problem], mapped)
-        facts = {**mapped.to_dict(), **judged.to_dict(), **report.sizes(problem.domain)}
-        report.emit(facts, str(folder / "demo.json"), report.of_maps(mapped, judged, folder / "demo.obj"))
+        map.draw(folder / "demo.png", written, [problem], mapped)
+        facts = {**mapped.to_dict(), **written.to_dict(), **report.sizes(problem.domain)}
+        report.emit(facts, str(folder / "demo.json"), report.describe_maps(mapped, written, folder / "demo.obj"))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
-    return 0 if judged.injective else 1
+    return 0 if written.injective else 1

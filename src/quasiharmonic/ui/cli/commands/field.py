@@ -19,13 +19,16 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "field",
-        help="make a displacement field of an image invertible",
-        description="Make a displacement field invertible, with the least change: away from folds "
-        "every bit is unchanged. The field is an array .npy of shape (height, width, 2), displacements "
+        description="Make a displacement field invertible with the least change. Away from folds "
+        "the field is unchanged, bit for bit. It is an array .npy of shape (height, width, 2), displacements "
         "along x, to the right, and y, down, in the unit of --spacing.",
-        epilog="Exit status: 0 written, and certified to fold nowhere, as written; 1 written, but an inverse was asked "
-        "for and there is none, since the border overlaps itself; 2 wrong input or call, or no such field was found, "
-        "nothing written; 3 written, but the report failed.",
+        epilog="Exit status: 0 the written field is certified without folds; 1 written, but the inverse that "
+        "--inverse requests does not exist, because the border overlaps itself; 2 wrong input or call, or no such "
+        "field was found, nothing written; 3 written, but the report failed.",
+        examples=(
+            "qhm field field.npy -o field_without_folds.npy",
+            "qhm field field.npy --inverse inverse.npy -o field_without_folds.npy",
+        ),
     )
     parser.add_argument("input", type=Path, metavar="INPUT", help=".npy file")
     parser.add_argument("-o", "--output", type=Path, required=True, help=".npy file to write")
@@ -33,7 +36,7 @@ def add_parser(commands: Commands) -> None:
         "--inverse",
         type=Path,
         metavar="FILE",
-        help="write the inverse of the new field too, on the same grid, as .npy; NaN where the field does not reach",
+        help="also write the inverse of the new field, on the same grid, as .npy; NaN outside the field's image",
     )
     parser.add_argument(
         "--spacing",
@@ -41,7 +44,7 @@ def add_parser(commands: Commands) -> None:
         nargs="+",
         default=[1.0],
         metavar="LENGTH",
-        help="from a pixel to the next; or two, along x and along y (default: 1)",
+        help="distance between pixels; or two, along x and along y (default: 1)",
     )
     parser.add_argument(
         "--min-jacobian",
@@ -50,7 +53,7 @@ def add_parser(commands: Commands) -> None:
         metavar="DET",
         help="lower bound of all Jacobian determinants (default: 0.01)",
     )
-    parser.add_argument("--hold-border", action="store_true", help="keep the displacements of the border's pixels")
+    parser.add_argument("--fix-border", action="store_true", help="keep the displacements of the border's pixels")
     arguments.add_report(parser)
     parser.set_defaults(run=run)
 
@@ -68,28 +71,28 @@ def run(options: argparse.Namespace) -> int:
     spacing = options.spacing if len(options.spacing) > 1 else options.spacing[0]
     field = _read(options.input)
     with report.about(options.input):
-        held = _border(field) if options.hold_border else None
+        held = _border(field) if options.fix_border else None
         try:
-            mended = nearest_invertible(field, spacing=spacing, min_jacobian=options.min_jacobian, fixed=held)
+            repaired = nearest_invertible(field, spacing=spacing, min_jacobian=options.min_jacobian, fixed=held)
         except RuntimeError as error:
             raise ValueError(str(error)) from error
-    _write(options.output, mended.field)
-    invertible = bool(mended.certificate.bijective)
+    _write(options.output, repaired.field)
+    invertible = bool(repaired.certificate.bijective)
     with report.after_writing(options.output):
         facts: dict[str, Any] = {
-            "injective": mended.certificate.injective,
+            "injective": repaired.certificate.injective,
             "bijective": invertible,
-            "folds": mended.folds,
-            "moved": int(mended.moved_mask.sum()),
-            "patches": mended.patches,
-            "distance": mended.distance,
-            "seconds": mended.seconds,
+            "folds": repaired.folds,
+            "moved": int(repaired.moved_mask.sum()),
+            "patches": repaired.patches,
+            "distance": repaired.distance,
+            "seconds": repaired.seconds,
             "input": str(options.input),
             "output": str(options.output),
         }
-        lines = [f"wrote {options.output}: {mended.summary()}"]
+        lines = [f"wrote {options.output}: {repaired.summary()}"]
         if options.inverse is not None and invertible:
-            lines.append(_invert(options.inverse, mended.field, spacing))
+            lines.append(_invert(options.inverse, repaired.field, spacing))
             facts["inverse"] = str(options.inverse)
         elif options.inverse is not None:
             lines.append(f"{options.inverse} is not written: the field has no inverse")
@@ -118,7 +121,7 @@ def _write(path: Path, field: NDArray[np.float64]) -> None:
 
 def _invert(path: Path, field: NDArray[np.float64], spacing: float | list[float]) -> str:
     """Write the inverse field, and return its summary."""
-    from quasiharmonic.apps.displacement_fields.inverse import inverse_field
+    from quasiharmonic.apps.displacement_fields.field_inversion import inverse_field
 
     back = inverse_field(field, spacing=spacing)
     _write(path, back.field)

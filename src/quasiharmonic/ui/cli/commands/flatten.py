@@ -9,29 +9,34 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quasiharmonic.apps.atlas import MappedAtlas
+    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.ui.cli.arguments import Commands
 
 
 # Distance between pieces, in allowances; with 2 or less the allowances would touch.
-_ROOM = 2.1
+_PIECE_GAP = 2.1
 
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.ui.cli import arguments, material, seams
+    from quasiharmonic.io.registry import format_names
+    from quasiharmonic.ui.cli import arguments, material, seam_options
 
     parser = commands.add_parser(
         "flatten",
-        help="flatten a surface with a free boundary, without overlap",
         description="Map a surface with a boundary into the plane. The boundary is free and moves to lower "
         "distortion. No "
         "triangle is inverted, and nothing overlaps.",
         epilog="Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing "
         "written; 3 written, but the report failed. Ctrl-C writes the best map so far.",
+        examples=(
+            "qhm flatten scan.obj -o flat.obj",
+            "qhm flatten model.glb --cut --pack --texture checkerboard -o model_uv.glb",
+            "qhm flatten shirt.obj --energy arap-barrier --pattern shirt.svg -o shirt_flat.obj",
+        ),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, OFF, PLY, GLB, glTF or STL file")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
+    parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('read')} file")
+    parser.add_argument("-o", "--output", type=Path, required=True, help=f"{format_names('write_map')} file to write")
     parser.add_argument(
         "--energy",
         choices=arguments.FLATTENED,
@@ -53,8 +58,8 @@ def add_parser(commands: Commands) -> None:
         help="file of vertices, 0-based, one per line, to fix at the input's vt",
     )
     parser.add_argument("--unit-square", action="store_true", help="scale the map evenly into the unit square")
-    seams.add_options(parser)
-    seams.add_packing(parser)
+    seam_options.add_options(parser)
+    seam_options.add_packing(parser)
     parser.add_argument(
         "--pattern", type=Path, metavar="FILE", help="also draw the outline true to scale, as .svg or .dxf"
     )
@@ -84,17 +89,16 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, flatten, write, read back, certify, report."""
     from quasiharmonic import io
-    from quasiharmonic.apps import atlas
+    from quasiharmonic.apps.atlas import island_functions as atlas
     from quasiharmonic.apps.flattening.patterns import write_pattern
     from quasiharmonic.energies.measures import distortion
-    from quasiharmonic.ui.cli import arguments, material, progress, report, seams
-    from quasiharmonic.ui.cli import verdict as judging
+    from quasiharmonic.ui.cli import arguments, material, progress_line, report, seam_options, written_map
 
     began = time.perf_counter()
-    seams.check_options(options)
-    seams.check_packing(options)
-    arguments.settle(options, "rings", 20, asked=options.energy == "distances", belongs="--energy distances")
-    arguments.settle(options, "unit", "mm", asked=options.pattern is not None, belongs="--pattern")
+    seam_options.check_options(options)
+    seam_options.check_packing(options)
+    arguments.set_default(options, "rings", 20, asked=options.energy == "distances", belongs="--energy distances")
+    arguments.set_default(options, "unit", "mm", asked=options.pattern is not None, belongs="--pattern")
     inputs = (
         options.input,
         options.weights,
@@ -116,27 +120,27 @@ def run(options: argparse.Namespace) -> int:
         given["fixed"] = io.read_handles(options.fixed, len(mesh.V))
     if options.weights is not None:
         given["weights"] = _weights(options.weights)
-    found = seams.surface(options, mesh, disks_too=True)
-    with report.about(options.input), progress.line() as show:
+    found = seam_options.surface(options, mesh, disks_too=True)
+    with report.about(options.input), progress_line.line() as show:
         mapped = atlas.flatten(
             found.mesh,
             start=options.start,
             energy=options.energy,
             unit_square=options.unit_square,
             rings=options.rings,
-            gap=_ROOM * options.allowance,
+            gap=_PIECE_GAP * options.allowance,
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,
             **given,
         )
-    judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, mapped.mesh)))
+    certified = written_map.write(options.output, mesh.with_places(seam_options.pack_islands(options, mapped.mesh)))
     with report.after_writing(options.output):
-        flat = io.without_idle(judged.V, judged.F, judged.uv)
+        flat = io.without_idle(certified.V, certified.F, certified.uv)
         measured = distortion(*flat, rings=options.rings if options.energy == "distances" else None)
         facts = {
             **mapped.to_dict(),
-            **judged.to_dict(),
+            **certified.to_dict(),
             "vertices": len(mesh.V),
             "triangles": len(mesh.F),
             **found.facts,
@@ -148,8 +152,8 @@ def run(options: argparse.Namespace) -> int:
             "output": str(options.output),
             "seconds_in_all": time.perf_counter() - began,
         }
-        worst = measured.summary("isometric").maximum
-        lines = [report.of_maps(mapped, judged, options.output), *found.notes, f"maximum stretch {worst:.3g}"]
+        worst = measured.statistics("isometric").maximum
+        lines = [report.describe_maps(mapped, certified, options.output), *found.notes, f"maximum stretch {worst:.3g}"]
         if measured.distances is not None:
             lines.append(measured.distances.summary())
         if options.pattern is not None:
@@ -158,7 +162,7 @@ def run(options: argparse.Namespace) -> int:
             lines.append(f"wrote {options.pattern}, true to scale")
         lines.append(mapped.status.value)
         report.emit(facts, options.json, "\n".join(lines))
-    return 0 if judged.apart else 1
+    return 0 if certified.apart else 1
 
 
 def _check_pattern(options: argparse.Namespace) -> None:
@@ -186,7 +190,7 @@ def _mean_energy(mapped: MappedAtlas) -> float | None:
 def _weights(path: Path) -> list[float]:
     """Read one positive number per line."""
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.numbers import read_rows
+    from quasiharmonic.io.lowlevel.textual import read_rows
 
     values = []
     for line, (value,) in read_rows(path, 1):

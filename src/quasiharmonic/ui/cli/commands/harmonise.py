@@ -12,26 +12,31 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apps.atlas import MappedAtlas, SeamedMesh
+    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
+    from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem.result import Step
     from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.ui.cli import arguments, material, seams
+    from quasiharmonic.io.registry import format_names
+    from quasiharmonic.ui.cli import arguments, material, seam_options
 
     parser = commands.add_parser(
         "harmonise",
-        help="lower an energy without a barrier, and keep the map injective",
         description="Lower the distortion of the map in the input's texture coordinates (vt), by an energy that "
         "needs no barrier, and keep or make the map injective. If qhm polish has the energy, it is faster.",
         epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (for mips "
         "and symmetric-dirichlet, a map that is not injective included), nothing written; 3 written, but the "
         "report failed.",
+        examples=(
+            "qhm harmonise map.obj -o better.obj",
+            "qhm harmonise map.obj --energy area -o better.obj",
+        ),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with a map")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
+    parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('write_map')} file with a map")
+    parser.add_argument("-o", "--output", type=Path, required=True, help=f"{format_names('write_map')} file to write")
     parser.add_argument(
         "--fixed",
         type=Path,
@@ -55,7 +60,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--max-iterations", type=arguments.count, default=40, metavar="N", help="linear solves per round (default: 40)"
     )
-    seams.add_packing(parser)
+    seam_options.add_packing(parser)
     arguments.add_linear_solver(parser)
     material.add_options(parser)
     arguments.add_report(parser)
@@ -64,10 +69,12 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, harmonise, write, certify, report."""
+    if options.unscaled and options.energy == "mips":
+        raise ValueError("--unscaled has no effect on mips, which measures angles only: omit --unscaled")
     from quasiharmonic.ui.cli.commands import polish
 
     def lower(mesh: SeamedMesh, fixed: NDArray[np.int64] | None, show: Callable[[Step], None] | None) -> MappedAtlas:
-        from quasiharmonic.apps import atlas
+        from quasiharmonic.apps.atlas import island_functions as atlas
 
         return atlas.harmonise(
             mesh,
@@ -80,4 +87,4 @@ def run(options: argparse.Namespace) -> int:
             callback=show,
         )
 
-    return polish.improve(options, lower)
+    return polish.lower_distortion(options, lower)

@@ -13,27 +13,33 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.io.registry import format_names
     from quasiharmonic.ui.cli import arguments
 
     parser = commands.add_parser(
         "measure",
-        help="measure a map's distortion, and export it for each triangle",
-        description="Measure what the map that the input's texture coordinates (vt) give does to every triangle. "
-        "Means and quantiles are weighted by the surface's area; measures of size are taken after the map has been "
-        "scaled to it.",
+        description="Measure the distortion of every triangle by the map in the input's texture coordinates (vt). "
+        "Means and quantiles are weighted by the surface's area. For measures of size the map is scaled to the "
+        "surface's area first. Of a finite-element mesh, measure the quality of its elements.",
         epilog="Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but the report failed.",
+        examples=(
+            "qhm measure map.obj",
+            "qhm measure map.obj --export distortion.ply --json report.json",
+        ),
     )
     parser.add_argument(
-        "input", type=Path, metavar="FILE", help="OBJ, PLY, GLB, glTF or OFF file with a map, injective or not"
+        "input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map, injective or not"
     )
     parser.add_argument(
-        "--export", type=Path, metavar="FILE", help="write every measure of every triangle as .csv, .npz or .ply"
+        "--export",
+        type=Path,
+        metavar="FILE",
+        help=f"write every measure of every triangle as {format_names('encode_values')}",
     )
     parser.add_argument(
         "--distances",
         action="store_true",
-        help="measure too how far distances between vertices some edges apart are off, along the surface against in "
-        "the plane",
+        help="also compare distances between vertices some edges apart, along the surface and in the plane",
     )
     arguments.add_rings(parser)
     arguments.add_report(parser)
@@ -45,22 +51,24 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.apps.atlas.verdict import mirrored_islands, unmirrored
+    from quasiharmonic.apps.atlas.atlas_verdict import mirrored_islands, reflect_mirrored
     from quasiharmonic.energies.measures import distortion
-    from quasiharmonic.geometry.mesh.seams import SeamedMesh
-    from quasiharmonic.ui.cli import arguments, report
-    from quasiharmonic.util.arrays import named
+    from quasiharmonic.io.seamed_mesh import SeamedMesh
+    from quasiharmonic.ui.cli import arguments, finite_elements, report
+    from quasiharmonic.util.arrays import names_of
 
-    arguments.settle(options, "rings", 20, asked=options.distances, belongs="--distances")
+    arguments.set_default(options, "rings", 20, asked=options.distances, belongs="--distances")
     report.check_json(options.json, inputs=(options.input, options.export))
     if options.export is not None:
         report.check_export(options.export, inputs=(options.input,))
+    if finite_elements.has_elements(options.input):
+        return finite_elements.measure(options)
     mesh = io.read_mesh(options.input)
     V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
     opened = SeamedMesh(V, F, F, uv)
     mirrored = np.flatnonzero(mirrored_islands(opened))
     if mirrored.size:
-        reflected = unmirrored(opened).uv
+        reflected = reflect_mirrored(opened).uv
         uv = uv if reflected is None else reflected
     with report.about(options.input):
         found = distortion(V, F, uv, rings=options.rings if options.distances else None)
@@ -71,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
     facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
     lines = [_table(found, len(mesh.F))]
     if mirrored.size:
-        lines.append(f"mirrored {named('island', 'islands', mirrored)} measured with reversed orientation")
+        lines.append(f"mirrored {names_of('island', 'islands', mirrored)} measured with reversed orientation")
     if found.distances is not None:
         lines.append(found.distances.summary())
     text = "\n".join(lines)
@@ -90,7 +98,7 @@ def _table(found: Distortion, count: int) -> str:
         if (values != values).all():
             lines.append(f"{name:20}  undefined: no triangle has area")
             continue
-        s = found.summary(name)
+        s = found.statistics(name)
         numbers = "".join(f"{value:12.4g}" for value in (s.mean, s.median, s.p95, s.minimum, s.maximum))
         lines.append(f"{name:20}{numbers}  {s.highest}")
     lines.append(f"{len(found.inverted)} of {count} triangles inverted, {len(found.flat)} degenerate in the rest mesh")

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apps.mesh_motion.morphed import MorphResult
+    from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
     from quasiharmonic.io.fem.files import FemMesh
     from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.util.arrays import FloatArray
@@ -26,20 +26,24 @@ _QUALITY = {
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.io.registry import format_names
     from quasiharmonic.ui.cli import arguments
 
     parser = commands.add_parser(
         "morph",
-        help="move the boundary of a planar mesh (Gmsh, VTK) and keep its interior valid",
         description="Move some nodes of a planar mesh and place the others such that no element is inverted: triangles "
-        "of three or six nodes, quadrilaterals of four. Boundary nodes that are not moved stay; mid-side nodes go "
-        "along with their sides. Positions are changed within the file; every other byte of it stays, data, times and "
-        "physical groups included.",
+        "of three or six nodes, quadrilaterals of four. Boundary nodes without a displacement stay fixed; mid-side "
+        "nodes move with their sides. Only positions change in the file; data, times and physical groups stay "
+        "byte for byte.",
         epilog="Exit status: 0 no element of the written mesh is inverted, verified exactly; 1 some are; 2 wrong "
         "input or call, nothing written; 3 written, but the report failed.",
+        examples=(
+            "qhm morph mesh.msh --positions boundary.csv -o moved.msh",
+            "qhm morph mesh.vtu --field displacement --slide -o moved.vtu",
+        ),
     )
     parser.add_argument(
-        "input", type=Path, metavar="MESH", help="Gmsh .msh (2 or 4), legacy .vtk or .vtu; text or binary"
+        "input", type=Path, metavar="MESH", help=f"{format_names('read_elements')} file, text or binary"
     )
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="MESH", help="mesh to write, in the same format"
@@ -51,27 +55,26 @@ def add_parser(commands: Commands) -> None:
     given.add_argument(
         "--field",
         metavar="NAME",
-        help="point data of the mesh with the displacements of boundary vertices; of several times, the last",
+        help="point data of the mesh with the displacements of boundary vertices; the last time step counts",
     )
     parser.add_argument(
         "--energy",
-        choices=(*arguments.ENERGIES, "none"),
-        default="symmetric-dirichlet",
-        help="energy to lower; none: the first valid mesh (default: symmetric-dirichlet)",
+        choices=arguments.ENERGIES,
+        help="energy to lower (default: symmetric-dirichlet)",
     )
+    parser.add_argument("--no-polish", action="store_true", help="keep the first valid mesh")
     parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
     parser.add_argument(
         "--slide",
         action="store_true",
-        help="let boundary vertices that are not moved, or by nothing, glide along the boundary as it is, its corners "
-        "held",
+        help="let boundary vertices without a displacement slide along the boundary; its corners stay fixed",
     )
     parser.add_argument(
         "--rest",
         type=Path,
         metavar="MESH",
-        help="the mesh against which distortion is measured: of a chain of steps the first one. How far the written "
-        "mesh is from where one step from there would end is told (default: the input)",
+        help="reference mesh of distortion, such as the first of several steps. The report gives the distance of "
+        "the written mesh from the result of a single step from there (default: the input)",
     )
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
@@ -84,8 +87,10 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.geometry.mesh.elements import rim
     from quasiharmonic.io.fem.files import check_fem_output, read_fem, write_fem
-    from quasiharmonic.ui.cli import progress, report
+    from quasiharmonic.ui.cli import progress_line, report
 
+    if options.no_polish and options.energy is not None:
+        raise ValueError("--energy needs polishing: omit --no-polish")
     report.check_moved(options.output, options.json, inputs=(options.input, options.positions, options.rest))
     check_fem_output(options.output, options.input)
     mesh = read_fem(options.input)
@@ -98,13 +103,13 @@ def run(options: argparse.Namespace) -> int:
             moved, positions = moved[goes], positions[goes]
     else:
         moved, positions = _positions(options.positions, len(mesh.points))
-    with report.about(options.input), progress.line() as show:
+    with report.about(options.input), progress_line.line() as show:
         morphed = morph(
             mesh.points,
             mesh.F,
             moved,
             positions,
-            energy=None if options.energy == "none" else options.energy,
+            energy=None if options.no_polish else options.energy or "symmetric-dirichlet",
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,
@@ -168,15 +173,15 @@ def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float6
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.numbers import read_rows
+    from quasiharmonic.io.lowlevel.textual import read_rows
 
-    places: dict[int, list[float]] = {}
+    positions: dict[int, list[float]] = {}
     for line, (vertex, *place) in read_rows(path, 3):
         if not (0 <= vertex < n and vertex.is_integer()):
             raise MeshFileError(path, f"{vertex:g} is not a vertex from 0 to {n - 1}", line, "write lines 'vertex,x,y'")
-        if int(vertex) in places:
+        if int(vertex) in positions:
             raise MeshFileError(path, f"lists vertex {int(vertex)} a second time", line)
-        places[int(vertex)] = place
-    if not places:
+        positions[int(vertex)] = place
+    if not positions:
         raise MeshFileError(path, "moves no vertex")
-    return np.array(list(places), dtype=np.int64), np.array(list(places.values()))
+    return np.array(list(positions), dtype=np.int64), np.array(list(positions.values()))

@@ -12,35 +12,40 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.io.registry import format_names
     from quasiharmonic.ui.cli import arguments
 
     parser = commands.add_parser(
         "plot",
-        help="draw a map: inverted triangles, distortion, or a checkerboard on the surface",
         description="Draw the map that the input's texture coordinates (vt) give, injective or not.",
-        epilog="Exit status: 0 the picture is written; 2 wrong input or call, nothing written.",
+        epilog="Exit status: 0 the image is written; 2 wrong input or call, nothing written.",
+        examples=(
+            "qhm plot map.obj -o map.png",
+            "qhm plot map.obj --kind distortion --measure area_ratio -o distortion.svg",
+            "qhm plot model.glb --kind texture -o model.png",
+        ),
     )
-    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB or glTF file with a map")
+    parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="PICTURE", help="picture to write: .png, .svg or .pdf"
+        "-o", "--output", type=Path, required=True, metavar="IMAGE", help="image to write: .png, .svg or .pdf"
     )
     parser.add_argument(
         "--kind",
         choices=("map", "distortion", "texture"),
         help="map: the surface and the map, inverted triangles in red (default); distortion: both coloured by a "
-        "measure, and its histogram; texture: a checkerboard of the plane, or --picture, on the surface",
+        "measure, and its histogram; texture: the surface with the model's own texture, --texture, or a checkerboard",
     )
     parser.add_argument(
         "--measure",
         choices=arguments.MEASURES,
         metavar="NAME",
-        help="what --kind distortion shows: %(choices)s (default: isometric)",
+        help="measure for --kind distortion: %(choices)s (default: isometric)",
     )
     parser.add_argument(
-        "--picture",
-        type=Path,
-        metavar="FILE",
-        help="a picture, PNG or JPEG, in place of the checkerboard of --kind texture: the unit square, repeated beyond",
+        "--texture",
+        metavar="IMAGE",
+        help="texture of --kind texture: a PNG or JPEG file, which repeats beyond the unit square, or checkerboard "
+        "(default: the model's own texture if it has one)",
     )
     parser.set_defaults(run=run)
 
@@ -49,20 +54,26 @@ def run(options: argparse.Namespace) -> int:
     """Read and draw."""
     from quasiharmonic import io
     from quasiharmonic.geometry.exact.certificate import inverted_triangles
-    from quasiharmonic.ui.cli import arguments, report
+    from quasiharmonic.ui.cli import arguments, finite_elements, report
+    from quasiharmonic.ui.cli.material import CHECKERBOARD
     from quasiharmonic.ui.plot import save_distortion_figure, save_map_figure, save_texture_figure
 
-    report.check_picture("-o", options.output, inputs=(options.input, options.picture))
+    image = None if options.texture in (None, CHECKERBOARD) else Path(options.texture)
+    report.check_picture("-o", options.output, inputs=(options.input, image))
+    if finite_elements.has_elements(options.input):
+        return finite_elements.plot(options)
     shows_measure = options.kind == "distortion"
-    arguments.settle(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
-    if options.picture is not None and options.kind not in (None, "texture"):
-        raise ValueError(f"--picture is not supported by --kind {options.kind}: use --kind texture, or omit it")
-    V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))
+    arguments.set_default(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
+    if options.texture is not None and options.kind not in (None, "texture"):
+        raise ValueError(f"--texture is not supported by --kind {options.kind}: use --kind texture, or omit it")
+    mesh = io.read_mesh(options.input)
+    V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
     with report.about(options.input):
         if options.kind == "distortion":
             save_distortion_figure(options.output, V, F, uv, options.measure)
-        elif options.kind == "texture" or options.picture is not None:
-            save_texture_figure(options.output, V, F, uv, picture=options.picture)
+        elif options.kind == "texture" or options.texture is not None:
+            texture = io.own_texture(mesh) if options.texture is None else image
+            save_texture_figure(options.output, V, F, uv, texture=texture)
         else:
             save_map_figure(options.output, V, F, uv, inverted=inverted_triangles(F, uv))
     with report.after_writing(options.output):

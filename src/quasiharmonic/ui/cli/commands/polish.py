@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apps.atlas import MappedAtlas, SeamedMesh
+    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.energies.measures import Distortion
+    from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem.result import Step
     from quasiharmonic.ui.cli.arguments import Commands
 
@@ -23,17 +24,23 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.ui.cli import arguments, material, seams, sliding
+    from quasiharmonic.io.registry import format_names
+    from quasiharmonic.ui.cli import arguments, material, seam_options, slide_options
 
     parser = commands.add_parser(
         "polish",
-        help="lower the distortion of an injective map, and keep it injective",
         description="Lower the distortion of the injective map that the input's texture coordinates (vt) give.",
         epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (a map "
         "that is not injective included), nothing written; 3 written, but the report failed.",
+        examples=(
+            "qhm polish map.obj -o polished.obj",
+            "qhm polish map.obj --energy mips --free -o polished.obj",
+        ),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with an injective map")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB, glTF or OFF file to write")
+    parser.add_argument(
+        "input", type=Path, metavar="INPUT", help=f"{format_names('write_map')} file with an injective map"
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, help=f"{format_names('write_map')} file to write")
     parser.add_argument(
         "--fixed",
         type=Path,
@@ -47,15 +54,15 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--free",
         action="store_true",
-        help="free the boundary; each island stays about where it is",
+        help="free the boundary; each island stays near its position",
     )
-    sliding.add_options(parser)
+    slide_options.add_options(parser)
     parser.add_argument(
         "--to",
         metavar="OUTLINE",
         help="the outline of the boundary, as for qhm map (default: the polygon of the boundary)",
     )
-    seams.add_packing(parser)
+    seam_options.add_packing(parser)
     arguments.add_linear_solver(parser)
     material.add_options(parser)
     arguments.add_report(parser)
@@ -64,18 +71,19 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, polish, write, certify, report."""
-    from quasiharmonic.ui.cli import sliding
+    from quasiharmonic.targets.boundary.sliding_curves import find_sliding_curves
+    from quasiharmonic.ui.cli import slide_options
 
     if options.to is not None and not options.slide:
         raise ValueError("--to gives the outline to slide along: add --slide")
     if options.free and (options.slide or options.fixed is not None):
         raise ValueError("--free frees the boundary: omit --slide and --fixed")
-    sliding.check_options(options)
+    slide_options.check_options(options)
 
     notes: list[str] = []
 
     def lower(mesh: SeamedMesh, fixed: NDArray[np.int64] | None, show: Callable[[Step], None] | None) -> MappedAtlas:
-        from quasiharmonic.apps import atlas
+        from quasiharmonic.apps.atlas import island_functions as atlas
 
         given: dict[str, Any] = {
             "energy": options.energy,
@@ -89,14 +97,14 @@ def run(options: argparse.Namespace) -> int:
             raise ValueError(f"--slide --to supports one island, but the mesh has {len(mesh.islands)}")
         if options.to is None:
             return atlas.polish(mesh, fixed=fixed, slide=options.slide, **given)
-        rails = sliding.along(options.to, pieces=options.pieces)
-        notes.extend(sliding.told_off(rails, mesh.islands[0]))
-        return atlas.polish(mesh, fixed=fixed, slide=rails, **given)
+        curves = find_sliding_curves(options.to, pieces=options.pieces)
+        notes.extend(slide_options.describe_off_outline(curves, mesh.islands[0]))
+        return atlas.polish(mesh, fixed=fixed, slide=curves, **given)
 
-    return improve(options, lower, inputs=(options.pieces,), notes=notes)
+    return lower_distortion(options, lower, inputs=(options.pieces,), notes=notes)
 
 
-def improve(
+def lower_distortion(
     options: argparse.Namespace, lower: Lower, inputs: Sequence[Path | None] = (), notes: Sequence[str] = ()
 ) -> int:
     """Read a map, lower its distortion, write, certify, report; used by every command that does so.
@@ -105,26 +113,25 @@ def improve(
     them.
     """
     from quasiharmonic import io
-    from quasiharmonic.apps.atlas.verdict import unmirrored
+    from quasiharmonic.apps.atlas.atlas_verdict import reflect_mirrored
     from quasiharmonic.energies.measures import distortion
-    from quasiharmonic.ui.cli import material, progress, report, seams
-    from quasiharmonic.ui.cli import verdict as judging
+    from quasiharmonic.ui.cli import material, progress_line, report, seam_options, written_map
 
-    seams.check_packing(options)
+    seam_options.check_packing(options)
     report.check_outputs(options.output, None, options.json, inputs=(options.input, options.fixed, *inputs))
     mesh = material.read_mesh(options, options.input)
     before = io.mapped(mesh)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
-    with report.about(options.input), progress.line() as show:
+    with report.about(options.input), progress_line.line() as show:
         after = lower(before, fixed, show)
-    judged = judging.write(options.output, mesh.with_places(seams.laid_out(options, after.mesh)))
+    written = written_map.write(options.output, mesh.with_places(seam_options.pack_islands(options, after.mesh)))
     with report.after_writing(options.output):
         # Each map is cut at its own seams, which may differ.
-        opened = unmirrored(before).opened(), unmirrored(after.mesh).opened()
+        opened = reflect_mirrored(before).opened(), reflect_mirrored(after.mesh).opened()
         measured = [distortion(*io.without_idle(m.V, m.F, m.uv)) for m in opened if m.uv is not None]
         facts = {
             **after.to_dict(),
-            **judged.to_dict(),
+            **written.to_dict(),
             "vertices": len(mesh.V),
             "triangles": len(mesh.F),
             "input": str(options.input),
@@ -132,17 +139,17 @@ def improve(
             "distortion_before": measured[0].to_dict(),
             "distortion": measured[1].to_dict(),
         }
-        lines = [report.of_maps(after, judged, options.output)]
-        if judged.injective:
-            lines += [*notes, _change(*measured), *([] if judged.mirrored else [after.status.value])]
+        lines = [report.describe_maps(after, written, options.output)]
+        if written.injective:
+            lines += [*notes, _change(*measured), *([] if written.mirrored else [after.status.value])]
         report.emit(facts, options.json, "\n".join(lines))
-    return 0 if judged.injective else 1
+    return 0 if written.injective else 1
 
 
 def _change(before: Distortion, after: Distortion) -> str:
     """Return a sentence about the change of angle and length distortion."""
-    angles = [found.summary("mips").mean for found in (before, after)]
-    lengths = [found.summary("isometric").maximum for found in (before, after)]
+    angles = [found.statistics("mips").mean for found in (before, after)]
+    lengths = [found.statistics("isometric").maximum for found in (before, after)]
     return (
         f"MIPS from {angles[0]:.3g} to {angles[1]:.3g} on average, "
         f"isometric distortion from {lengths[0]:.3g} to {lengths[1]:.3g} at worst"

@@ -22,13 +22,13 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "refine",
-        help="split the edges that prevent a map",
-        description="Split the edges that qhm diagnose names, and no others, until it names none. Beside the mesh "
-        "with its first guess (vt), which qhm map then takes, the fixed vertices are written to OUTPUT.handles, and "
-        "how the new mesh came from the old one to OUTPUT.origin.json (OUTPUT without its suffix).",
-        epilog="Exit status: 0 written, and nothing known forbids an injective map any more; 1 written, but something "
-        "does that no refinement cures; 2 wrong input or call, nothing written; 3 written, but not what should be told "
-        "about it.",
+        description="Split only the edges that qhm check lists, until it lists none. Three files are written: the "
+        "mesh with an initial map (vt), the input of qhm map; its fixed vertices, OUTPUT.handles; and the origin of "
+        "its vertices and triangles, OUTPUT.origin.json (OUTPUT without its suffix).",
+        epilog="Exit status: 0 written, and no known obstruction to an injective map remains; 1 written, but an "
+        "obstruction remains that no refinement removes; 2 wrong input or call, nothing written; 3 written, but the "
+        "report failed.",
+        examples=("qhm refine problem/ -o finer.obj",),
     )
     parser.add_argument(
         "input", type=Path, metavar="INPUT", help="OBJ file, or a folder with input.obj and handles.txt"

@@ -12,22 +12,29 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.io.registry import format_names
     from quasiharmonic.ui.cli import arguments, material
 
     parser = commands.add_parser(
         "repair",
-        help="untangle the inverted triangles of a UV map, with a fixed boundary",
         description="Untangle the inverted triangles of the map in the input's texture coordinates (vt). The map "
-        "may have seams; each of its islands is repaired on its own. Boundaries stay, and so does every vertex that "
-        "need not move.",
+        "may have seams; each of its islands is repaired separately. Boundaries and all vertices that need not "
+        "move stay fixed.",
         epilog="Exit status: 0 every triangle in the written file is certified positive; 1 some are not; 2 wrong input "
         "or call, nothing written; 3 written, but the report failed.",
+        examples=(
+            "qhm repair model.obj -o repaired.obj",
+            "qhm repair model.glb --whole -o repaired.glb",
+        ),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="OBJ, PLY, GLB or glTF file with texture coordinates")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ, PLY, GLB or glTF file to write")
     parser.add_argument(
-        "--all",
-        dest="whole",
+        "input", type=Path, metavar="INPUT", help=f"{format_names('read', 'seams')} file with texture coordinates"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help=f"{format_names('write_map', 'seams')} file to write"
+    )
+    parser.add_argument(
+        "--whole",
         action="store_true",
         help="recompute whole islands that have inverted triangles (default: only patches around them)",
     )
@@ -41,7 +48,7 @@ def add_parser(commands: Commands) -> None:
         type=arguments.count,
         default=2000,
         metavar="N",
-        help="on an island as a whole (default: 2000)",
+        help="maximum iterations on a whole island (default: 2000)",
     )
     arguments.add_linear_solver(parser)
     material.add_options(parser)
@@ -54,21 +61,19 @@ def run(options: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from quasiharmonic import io
-    from quasiharmonic.apps.atlas.verdict import certify
-    from quasiharmonic.apps.repair.repairing import repair
-    from quasiharmonic.geometry.mesh.seams import SeamedMesh
-    from quasiharmonic.ui.cli import material, progress, report
-    from quasiharmonic.ui.cli import verdict as judging
+    from quasiharmonic.apps.atlas.atlas_verdict import certify
+    from quasiharmonic.apps.repair.uv_repair import repair
+    from quasiharmonic.io.seamed_mesh import SeamedMesh
+    from quasiharmonic.ui.cli import material, progress_line, report, written_map
 
-    if options.output.suffix.lower() == ".off":
-        raise ValueError(f"{options.output}: OFF does not support seams: write .obj, .ply or .glb")
+    io.find_format(options.output, "write_map", "seams")
     report.check_outputs(options.output, None, options.json, inputs=(options.input,))
     mesh = material.read_mesh(options, options.input)
     if mesh.vt is None or mesh.FT is None or (mesh.FT < 0).any(axis=1).all():
         raise ValueError(
             f"{options.input}: there is no map to repair: no face has texture coordinates (vt) at all three corners"
         )
-    with report.about(options.input), progress.line() as show:
+    with report.about(options.input), progress_line.line() as show:
         result = repair(
             mesh.V,
             mesh.F,
@@ -81,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
             callback=show,
         )
     repaired = replace(mesh, vt=result.uv, FT=result.FT)
-    judging.tell_losses(options.output, repaired)
+    written_map.tell_losses(options.output, repaired)
     io.write_mapped(options.output, repaired)
     written = io.read_mesh(options.output)
     with report.after_writing(options.output):

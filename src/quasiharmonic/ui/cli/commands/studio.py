@@ -12,21 +12,25 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.io.registry import format_names
+
     parser = commands.add_parser(
         "studio",
-        help="edit a map in the browser",
         description="Open a page with a surface beside its map: drag corners, pins and the boundary, and the map "
-        "follows, each picture of it certified. Needs the extra 'studio'. Only this machine can open the page, by the "
-        "address that is printed. Ctrl-C ends it.",
+        "follows. Every map shown is certified. Needs the extra 'studio'. Only this machine can open the page, at the "
+        "address that is printed. Ctrl-C stops the server.",
         epilog="Exit status: 0 ended by Ctrl-C; 2 wrong input or call.",
+        examples=(
+            "qhm studio",
+            "qhm studio model.obj",
+        ),
     )
     parser.add_argument(
         "input",
         type=Path,
         nargs="?",
         metavar="INPUT",
-        help="OBJ, OFF, PLY, GLB, glTF or STL file, or a folder with input.obj and handles.txt (default: a surface of "
-        "ours)",
+        help=f"{format_names('read')} file, or a folder with input.obj and handles.txt (default: a cat's head)",
     )
     parser.add_argument("--port", type=int, default=0, metavar="N", help="port to listen on (default: any free port)")
     parser.add_argument("--no-browser", action="store_true", help="print the address and do not open the browser")
@@ -41,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
     from contextlib import suppress
 
     try:
-        from quasiharmonic.ui.studio.server import Studio
+        from quasiharmonic.ui.studio.server.server import Studio
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] != "websockets":
             raise
@@ -49,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
 
     source = ""
     if options.input is not None:
-        from quasiharmonic.ui.studio.surface import read_sheet
+        from quasiharmonic.ui.studio.session.surface import read_sheet
 
         # Errors of the input are reported here rather than on the page.
         read_sheet(options.input)

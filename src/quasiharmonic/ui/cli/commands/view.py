@@ -12,14 +12,19 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.io.registry import format_names
+
     parser = commands.add_parser(
         "view",
-        help="show a surface and its map in a window",
-        description="Open a window on a surface and the map that its texture coordinates (vt) give, with a "
+        description="Show a surface and the map in its texture coordinates (vt) in a window, with a "
         "checkerboard, distortion and inverted triangles. Needs the extra 'view'.",
         epilog="Exit status: 0 shown; 2 wrong input or call, or no window can be opened.",
+        examples=(
+            "qhm view map.obj",
+            "qhm view map.obj --screenshot view.png",
+        ),
     )
-    parser.add_argument("input", type=Path, metavar="FILE", help="OBJ, PLY, GLB or glTF file with a map")
+    parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     parser.add_argument(
         "--screenshot",
         type=Path,

@@ -1,7 +1,7 @@
 // History of the certified maps that were shown, for playback and for saving as a film.
 
-const MOST_BYTES = 96 * 2 ** 20;
-const MOST_MAPS = 1500;
+const MAX_BYTES = 96 * 2 ** 20;
+const MAX_MAPS = 1500;
 const PER_SECOND = 30;
 
 const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
@@ -22,7 +22,7 @@ export class Film {
     if (this.playing) return;
     this.maps.push(places);
     this.bytes += places.byteLength;
-    if (this.bytes > MOST_BYTES || this.maps.length > MOST_MAPS) {
+    if (this.bytes > MAX_BYTES || this.maps.length > MAX_MAPS) {
       this.maps = this.maps.filter((_, i) => i % 2 === 1);
       this.bytes = this.maps.reduce((sum, map) => sum + map.byteLength, 0);
     }

@@ -15,11 +15,11 @@ export class Hands {
     this.held = -1;
     this.aimed = -1;
     this.panes = [
-      this.#pane(element, "surface", "The surface. Arrow keys turn it, plus and minus enlarge it."),
+      this.#pane(element, "surface", "The surface. Arrow keys rotate it, plus and minus zoom."),
       this.#pane(
         element,
         "map",
-        "The map. N and P choose a handle, arrow keys move it, with shift finely; without one they shift the map.",
+        "The map. N and P select a handle, arrow keys move it, with Shift in small steps. Without a handle, arrow keys move the map.",
       ),
     ];
   }

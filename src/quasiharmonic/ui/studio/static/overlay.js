@@ -6,7 +6,7 @@ const HANDLE = "#b35900";
 const PIN = "#7a1fa2";
 const PAPER = "#ffffff";
 // Maximum number of rings around triangles that are too small to see; more would hide the picture.
-const MOST_RINGS = 200;
+const MAX_RINGS = 200;
 
 /** Draw on a 2D canvas whose unit is the CSS pixel. `scene` is the scene of `createView`. */
 export function drawOverlay(context, scene, space, plane) {
@@ -65,7 +65,7 @@ function outline(context, scene, plane) {
 function badTriangles(context, scene, plane) {
   context.strokeStyle = RED;
   context.lineWidth = 2;
-  for (const t of scene.bad.subarray(0, MOST_RINGS)) {
+  for (const t of scene.bad.subarray(0, MAX_RINGS)) {
     const corners = [0, 1, 2].map((k) => scene.placeOf(scene.triangles[3 * t + k]));
     const middle = plane.pointOf(...[0, 1].map((k) => (corners[0][k] + corners[1][k] + corners[2][k]) / 3));
     context.beginPath();

@@ -75,7 +75,7 @@ class Page {
   async take(file) {
     if (file.size > this.mostBytes) {
       const mega = (bytes) => `${Math.ceil(bytes / 2 ** 20).toLocaleString("en")} MB`;
-      this.panel.note(`${file.name} has ${mega(file.size)}, and ${mega(this.mostBytes)} are taken: map it by the command, qhm map.`);
+      this.panel.note(`${file.name} has ${mega(file.size)}, more than ${mega(this.mostBytes)}: map it with the command qhm map.`);
       return;
     }
     const content = new Uint8Array(await file.arrayBuffer());

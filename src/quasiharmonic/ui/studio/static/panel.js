@@ -4,9 +4,9 @@ const $ = (id) => document.getElementById(id);
 
 const HINTS = {
   move: "",
-  pin: "Click on the surface to hold a vertex, then drag it in the map with Move. Click it again to let it go.",
-  corner: "Click on the surface near its boundary: that vertex goes to the outline's next corner.",
-  draw: "Click the polygon's corners in the map; click the first again, or press Enter, to close it.",
+  pin: "Click a vertex on the surface to pin it, then drag it in the map with Move. Click it again to remove the pin.",
+  corner: "Click on the surface: the nearest boundary vertex is assigned to the outline's next corner.",
+  draw: "Click the corners of a polygon in the map. To close it, click the first corner again or press Enter.",
 };
 const NUMBER = new Intl.NumberFormat("en", { maximumSignificantDigits: 4 });
 const shown = (value) => {
@@ -94,12 +94,12 @@ export class Panel {
       $("hint").hidden = true;
     }
     if (!moved) {
-      this.#verdict("open", "…", "No map follows from here", "Let go to search for one, or undo.");
+      this.#verdict("open", "…", "No injective map yet", "Release the pointer to search for one, or undo.");
       return;
     }
-    if (!header.injective) this.#verdict("bad", "✗", "Not a valid map", header.verdict);
+    if (!header.injective) this.#verdict("bad", "✗", "Not injective", header.verdict);
     else if (!header.reached) {
-      this.#verdict("open", "…", "Not there yet", "The map shown is certified; its boundary is not where the dashed line wants it.");
+      this.#verdict("open", "…", "Target not reached", "The map is certified, but its boundary has not reached the dashed target.");
     } else if (header.bijective) this.#verdict("good", "✓", "Certified: no inverted triangle, no overlap", header.verdict);
     else this.#verdict("open", "✓", "Certified: no inverted triangle, but it overlaps itself", header.verdict);
     $("flips").textContent = header.flips;
@@ -128,8 +128,8 @@ export class Panel {
   }
 
   #needs(header) {
-    const files = header.needs.length ? `They read ${header.needs.join(" and ")}, which Save OBJ hands over. ` : "";
-    return header.anew ? files : `${files}This map went on from the one before it, and is not found from nothing.`;
+    const files = header.needs.length ? `They read ${header.needs.join(" and ")}; Save OBJ writes what they read. ` : "";
+    return header.anew ? files : `${files}This map was computed from the previous one; a search from scratch did not find it.`;
   }
 
   #verdict(kind, sign, title, words) {
@@ -146,7 +146,7 @@ export class Panel {
         const item = document.createElement("li");
         const button = document.createElement("button");
         button.textContent = `${one.message} ${one.advice}`;
-        button.title = `Show where. It means that ${one.forbids}.`;
+        button.title = `Show the place. Consequence: ${one.forbids}.`;
         button.addEventListener("click", () => this.page.view.point(one));
         item.append(button);
         return item;
@@ -173,12 +173,12 @@ export class Panel {
   }
 
   disconnected() {
-    this.#gone("Cut off", "The server has ended. Reload the page once it runs again.");
+    this.#gone("Disconnected", "The server has stopped. Restart it, then reload the page.");
   }
 
   /** Report that the server has too many open pages. */
   refused(why) {
-    this.#gone("Not opened", `${why}, and no more are taken. Close one, then reload this one.`);
+    this.#gone("Not opened", `${why}. Close another page, then reload this one.`);
   }
 
   #gone(title, words) {

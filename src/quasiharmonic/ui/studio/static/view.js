@@ -2,7 +2,7 @@
 // and pass frames to `receive`.
 //
 // It handles the frames "surface", "map" and "obstructions", and sends {do: "grab" | "drag" | "drop" | "pin" | "unpin" |
-// "corner" | "polygon"}; docs/studio.md describes their fields. Without `send` the view is read-only.
+// "corner" | "polygon"}; docs/development/page_protocol.md describes them. Without `send` the view is read-only.
 
 import { decodeFrame } from "./frames.js";
 import { Hands } from "./hands.js";

@@ -2,6 +2,8 @@
 #ifndef QUASIHARMONIC_ARGUMENTS_H
 #define QUASIHARMONIC_ARGUMENTS_H
 
+#include "constants.h"
+
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 #include <stdint.h>

@@ -1,4 +1,4 @@
-/* What `energy/deformation.py` has compiled: Jacobians of a map, forces on its vertices, where triangles collapse. */
+/* Kernels of `energies/deformation.py`: Jacobians of a map, forces on its vertices, the step at which triangles collapse. */
 #include "arguments.h"
 
 #include <math.h>

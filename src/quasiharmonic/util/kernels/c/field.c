@@ -1,15 +1,11 @@
-/* What `field/passes.py` has compiled: a field's tensors to stiffness, and V3 with its gradient in xi. */
+/* Kernels of `solver/field/passes.py`: stiffness of a tensor field, and V3 with its gradient in xi. */
 #include "arguments.h"
 
 #include <float.h>
 #include <math.h>
 
-/* Stands in for a divisor of zero, where the dividend vanishes too. */
-#define TINY 1e-300
 /* Sums are taken over so many triangles at a time before they are added up, which keeps rounding small. */
 #define TOGETHER 1024
-/* Of `TANH` in `field/tensor.py`. */
-#define TANH_BOUND 8.8
 
 /* r/rho, 1/(1 - r^2) and r' of the sigmoid of this number in `field/tensor.py`. */
 typedef struct {

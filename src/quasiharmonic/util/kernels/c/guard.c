@@ -1,4 +1,4 @@
-/* What `linsolve/guard.py` has compiled: what the residual test knows of a matrix, and of a solution. */
+/* Kernels of `linsolve/guard.py`: norms of a matrix and residuals of a solution. */
 #include "arguments.h"
 
 #include <math.h>

@@ -1,4 +1,4 @@
-/* What `linsolve/laplacian.py` has compiled: the way from stiffness to a matrix and a right-hand side, and back. */
+/* Kernels of `linsolve/laplacian.py`: the matrix and the right-hand side of a stiffness, and the map of a solution. */
 #include "arguments.h"
 
 /* (stiffness, indptr, row, column, halves, offsets, border, border_row, values): values of the upper triangle. */

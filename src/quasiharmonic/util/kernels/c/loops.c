@@ -1,4 +1,4 @@
-/* What `exact/loops.py` has compiled. */
+/* Kernels of `geometry/exact/loops.py`. */
 #include "arguments.h"
 #include "predicates.h"
 

@@ -1,4 +1,4 @@
-/* The extension: the kernels of all files, a file for each idea, as the Python files that they are for. */
+/* The extension module: it lists the kernels of all files. Each file has the kernels of one Python module. */
 #include "arguments.h"
 
 #define FILES(with) \
@@ -26,13 +26,22 @@
 
 FILES(DECLARED)
 
+/* Constants for the test that compares them with the Python source. */
+#define FORMAT(name) "sd"
+#define VALUE(name) , #name, (double)(name)
+
 static int fill(PyObject *module)
 {
     PyMethodDef *const tables[] = {FILES(LISTED)};
     for (Py_ssize_t i = 0; i < LENGTH(tables); i++)
         if (PyModule_AddFunctions(module, tables[i]) < 0)
             return -1;
-    return 0;
+    PyObject *constants = Py_BuildValue("{" SHARED_CONSTANTS(FORMAT) "}" SHARED_CONSTANTS(VALUE));
+    if (constants == NULL)
+        return -1;
+    const int failed = PyModule_AddObjectRef(module, "constants", constants);
+    Py_DECREF(constants);
+    return failed;
 }
 
 static PyModuleDef_Slot slots[] = {{Py_mod_exec, (void *)fill}, {0, NULL}};

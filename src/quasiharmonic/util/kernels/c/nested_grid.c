@@ -1,13 +1,10 @@
-/* What `exact/nested_grid.py` has compiled: which cells triangles meet. */
+/* Kernels of `geometry/exact/nested_grid.py`: the cells that triangles intersect. */
 #include "arguments.h"
 
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* As there. */
-#define BITS 40
-static const double MARGIN = 0x1p-48, UNDERFLOWN = 0x1p-1000;
 
 /* Pairs of a cell and the number of an entry that meets it. */
 typedef struct {
@@ -73,7 +70,7 @@ static PyObject *divide_cells(PyObject *module, PyObject *const *given, Py_ssize
             double reach[3];
             for (int i = 0; i < 3; i++)
                 reach[i] = offset[3 * t + i] - (0.5 * size + MARGIN) * (fabs(nx[3 * t + i]) + fabs(ny[3 * t + i])) -
-                           UNDERFLOWN;
+                           UNDERFLOW_MARGIN;
             for (int64_t y = first[1]; y <= last[1] && enough; y++)
                 for (int64_t x = first[0]; x <= last[0] && enough; x++) {
                     const double middle_x = ((double)x + 0.5) * size, middle_y = ((double)y + 0.5) * size;

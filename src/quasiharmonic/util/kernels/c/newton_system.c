@@ -1,4 +1,4 @@
-/* What `energy/newton_system.py` has compiled: triangles' quadratic forms added up into a sparse matrix. */
+/* Kernels of `energies/newton/newton_system.py`: assembly of the triangles' quadratic forms into a sparse matrix. */
 #include "arguments.h"
 
 #include <string.h>

@@ -1,4 +1,4 @@
-/* What `linsolve/pattern.py` has compiled, and the check of patterns in `linsolve/base.py`. */
+/* Kernels of `linsolve/pattern.py`, and the check of patterns of `linsolve/base.py`. */
 #include "arguments.h"
 #include "sorting.h"
 
@@ -115,24 +115,22 @@ static PyObject *find_pattern(PyObject *module, PyObject *const *given, Py_ssize
     return done(a, LENGTH(a));
 }
 
-enum { RIGHT, EMPTY_ROW, NO_DIAGONAL, NOT_ASCENDING };
-
 static int wrong(const int32_t *indptr, const int32_t *indices, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i++)
         if (indptr[i + 1] <= indptr[i])
-            return EMPTY_ROW;
+            return PATTERN_EMPTY_ROW;
     for (Py_ssize_t i = 0; i < n; i++)
         if (indices[indptr[i]] != i)
-            return NO_DIAGONAL;
+            return PATTERN_NO_DIAGONAL;
     for (Py_ssize_t i = 0; i < n; i++) {
         for (int32_t k = indptr[i] + 1; k < indptr[i + 1]; k++)
             if (indices[k] <= indices[k - 1])
-                return NOT_ASCENDING;
+                return PATTERN_NOT_ASCENDING;
         if (indices[indptr[i + 1] - 1] >= n)
-            return NOT_ASCENDING;
+            return PATTERN_NOT_ASCENDING;
     }
-    return RIGHT;
+    return PATTERN_RIGHT;
 }
 
 /* (indptr, indices): what is wrong with an upper triangle's rows, which are known to begin with 0 and to end with the

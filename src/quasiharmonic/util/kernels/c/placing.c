@@ -1,15 +1,9 @@
-/* What `descent/placing.py` has compiled: placing the vertices of inverted triangles, mesh after mesh. */
+/* Kernels of `solver/methods/relocation.py`: relocation of the vertices of inverted triangles, mesh after mesh. */
 #include "arguments.h"
 
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-
-/* As there. */
-#define SWEEPS 8
-#define IN_VAIN 3
-#define SHARING 2
-#define MOST_AROUND 16
 
 /* Some vertices, ascending, and the edges opposite to each, those of vertex i from first[i] on; groups from 1 on of
    vertices that share no triangle, and 0 for those with too many triangles around them. */

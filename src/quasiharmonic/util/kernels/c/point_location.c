@@ -1,9 +1,7 @@
-/* What `exact/point_location.py` has compiled. */
+/* Kernels of `geometry/exact/point_location.py`. */
 #include "arguments.h"
 
-/* As there. */
-static const double UNSURE = 0x1p-50;
-enum { NOWHERE = -1, UNDECIDED = -2 };
+enum { NOWHERE = -1 };
 
 /* The least of the determinants of a point with the edges of a triangle. */
 static double least_determinant(const double *point, const double *row)

@@ -5,9 +5,7 @@
 #include <float.h>
 #include <math.h>
 
-/* Accounted for in `exact/predicates.py`. */
-#define RELATIVE_BOUND 0x1p-51
-#define UNDERFLOW_BOUND 0x1p-1060
+#include "constants.h"
 
 /* Sign of the orientation of three points where floating point is sure of it, else 0: so for NaN and infinity too. */
 static inline int sure_orientation(const double *a, const double *b, const double *c)

@@ -1,22 +1,20 @@
-/* What `mesh/prolongation.py` has compiled.
+/* Kernels of `geometry/coarsening/prolongation.py`.
  *
- * Which place is best is decided by comparison: all is computed in the order of the NumPy text, so that the last bit is
- * the same and no vertex goes elsewhere.
+ * The best position is chosen by comparison. All operations have the order of the NumPy version, so that both versions
+ * choose the same position.
  */
 #include "arguments.h"
 
 #include <math.h>
 #include <stdlib.h>
 
-/* As in `mesh/prolongation.py`. */
-#define GOOD 8.0
 typedef struct {
     double x, y;
 } Point;
 
 /* Places to try, and where none of these will do: so far from the apex towards the middle, and so far straight in. */
-static const double TOWARDS_MIDDLE[2][2] = {{0.75, 0.5}, {0.25, 0.1}};
-static const double INWARDS[2][3] = {{2.0, 1.0, 0.5}, {8.0, 4.0, 0.25}};
+static const double middle_fractions[2][2] = TOWARDS_MIDDLE;
+static const double inward_distances[2][3] = INWARDS;
 
 static Point middle(const Point *ring, Py_ssize_t d)
 {
@@ -98,7 +96,7 @@ static Point best_place(const Point *ring, Py_ssize_t d)
     const Point arms[] = {difference(centre, apex), inwards(ring, d)};
     for (int likely = 0; likely < 2 && (!likely || isinf(lowest)); likely++)
         for (int k = 0; k < 5; k++) {
-            const double reach = k < 2 ? TOWARDS_MIDDLE[likely][k] : INWARDS[likely][k - 2];
+            const double reach = k < 2 ? middle_fractions[likely][k] : inward_distances[likely][k - 2];
             const Point *arm = &arms[k >= 2], place = {apex.x + reach * arm->x, apex.y + reach * arm->y};
             const double here = shape(place, ring, d);
             if (here < lowest) {

@@ -1,4 +1,4 @@
-/* What `mesh/reference.py` has compiled. */
+/* Kernels of `geometry/mesh/reference.py`. */
 #include "arguments.h"
 
 #include <math.h>

@@ -1,4 +1,4 @@
-/* What `mesh/removal.py` has compiled: one round of coarsening.
+/* Kernels of `geometry/coarsening/removal.py`: one round of coarsening.
  *
  * Each vertex has a star: for each triangle around it the two other corners, counterclockwise. Half-edges are never
  * sorted: whether two vertices are neighbours is looked up in a star, of six triangles as a rule.
@@ -8,11 +8,6 @@
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-
-/* As in `mesh/removal.py`. */
-#define MOST_NEIGHBOURS 8
-#define PASSES 3
-#define PER_NEIGHBOUR 0.35
 
 typedef struct {
     int32_t tail, head;

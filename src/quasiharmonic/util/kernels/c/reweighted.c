@@ -1,4 +1,4 @@
-/* What `reweighted.py` has compiled. */
+/* Kernels of `energies/newton/reweighted.py`. */
 #include "arguments.h"
 
 #include <math.h>

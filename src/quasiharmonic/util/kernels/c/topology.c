@@ -1,4 +1,4 @@
-/* What `mesh/topology.py` has compiled. */
+/* Kernels of `geometry/mesh/topology.py`. */
 #include "arguments.h"
 #include "sorting.h"
 

@@ -1,4 +1,4 @@
-/* What `exact/triangles.py` has compiled. */
+/* Kernels of `geometry/exact/triangles.py`. */
 #include "arguments.h"
 #include "predicates.h"
 

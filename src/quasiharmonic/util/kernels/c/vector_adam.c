@@ -1,4 +1,4 @@
-/* What `descent/vector_adam.py` has compiled. */
+/* Kernels of `solver/methods/vector_adam.py`. */
 #include "arguments.h"
 
 #include <math.h>

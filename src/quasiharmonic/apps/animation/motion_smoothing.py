@@ -1,0 +1,137 @@
+"""Frames of low distortion whose vertices move continuously.
+
+The least distorted map for a boundary is one of many local minima. If every frame is polished separately, successive
+frames may end in different minima, and vertices jump by up to thirty times the motion of the boundary. The frames are
+therefore polished in order, each with a proximal term to the previous frame
+(`quasiharmonic.energies.newton.proximal`). This follows a branch of minima and leaves it slowly at its end. If a move
+is still too long, sweeps spread it over neighbouring frames. They polish the frames at both ends again with proximal
+terms to the previous and the next frame. The weight grows until no move is too long.
+
+    forward   t = 0, 1, 2, …       E(wₜ) + near(wₜ₋₁), soft
+    sweeps    ↓↑ at long moves     E(wₜ) + near(wₜ₋₁) + near(wₜ₊₁), hard
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from quasiharmonic.apps.animation.frames import find_longest
+from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, in_units
+from quasiharmonic.energies.newton.newton_descent import NewtonDescent
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.energies.newton.proximal import Neighbour, ProximalPenalty, ProximalTerm
+from quasiharmonic.energies.polishing import scale_energy
+from quasiharmonic.problem import Domain
+from quasiharmonic.util.arrays import FloatArray
+
+# Weight of the proximal term in the forward pass, as a fraction of the mean energy.
+_PROXIMAL_WEIGHT = 0.5
+# Lower bound of that mean energy.
+_MIN_ENERGY = 1.0
+# The forward pass does not penalise displacements up to this multiple of the boundary's displacement.
+_FREE_MOTION = 1.5
+# Factor of the weight in the first sweep.
+_SWEEP_WEIGHT = 300.0
+# Factor of the weight from one sweep to the next.
+_SWEEP_GROWTH = 1.5
+# Moves within this fraction of the limit cost nothing in a sweep.
+_FREE_SHARE = 0.9
+_SWEEPS = 40
+# Newton steps per frame in the forward pass.
+_FORWARD_STEPS = 60
+# Newton steps per frame in a sweep.
+_SWEEP_STEPS = 20
+_TOLERANCE = 1e-4
+
+
+class MotionSmoothing:
+    """Polishing of frames with a limit on the motion of vertices.
+
+    ``maps`` are the frames so far, (n, 2) and injective, and ``energies`` their mean energies. ``max_motion_ratio`` is
+    the maximum vertex displacement between frames, relative to the maximum boundary displacement.
+    """
+
+    def __init__(self, domain: Domain, energy: Energy, max_motion_ratio: float, linear_solver: str) -> None:
+        self.domain = domain
+        self._energy, self._limit, self._linear_solver = energy, max_motion_ratio, linear_solver
+        self._system: NewtonSystem | None = None
+        # Per pair of successive frames: the boundary displacement, and the vertex displacement relative to it.
+        self._lengths: list[float] = []
+        self._moves: list[float] = []
+        self.maps: list[FloatArray] = []
+        self.energies: list[float] = []
+
+    def append(self, uv: FloatArray) -> None:
+        """Polish a further frame, given as an injective map, close to the last one.
+
+        Its target positions must differ from those of the last frame.
+        """
+        before = []
+        if self.maps:
+            fixed = self.domain.fixed
+            self._lengths.append(find_longest(uv[fixed] - self.maps[-1][fixed]))
+            before = [Neighbour(self.maps[-1], self._lengths[-1])]
+        weight = _PROXIMAL_WEIGHT * max(_MIN_ENERGY, self.energies[-1] if self.energies else 0.0)
+        lowered, energy = self._lower(uv, before, ProximalPenalty(weight, _FREE_MOTION), _FORWARD_STEPS)
+        self.maps.append(lowered)
+        self.energies.append(energy)
+        if before:
+            self._moves.append(0.0)
+            self._measure(len(self._moves) - 1)
+
+    def largest_move(self) -> float:
+        """Return the maximum vertex displacement between frames, relative to that of the boundary."""
+        return max(self._moves, default=0.0)
+
+    def _measure(self, t: int) -> None:
+        """Store the maximum vertex displacement between frames t and t + 1, relative to that of the boundary."""
+        self._moves[t] = find_longest(self.maps[t + 1] - self.maps[t]) / self._lengths[t]
+
+    def sweep(self, report: Callable[[int, int], object]) -> None:
+        """Spread moves that are too long over the neighbouring frames.
+
+        ``report`` is called with the number of the sweep, from 1, and the frame.
+        """
+        weight = _PROXIMAL_WEIGHT * _SWEEP_WEIGHT * max(_MIN_ENERGY, sum(self.energies) / max(len(self.energies), 1))
+        for sweep in range(1, _SWEEPS + 1):
+            if self.largest_move() <= self._limit:
+                return
+            # Alternate the direction, so that the next frame takes up the change of the previous one.
+            order = range(len(self.maps))
+            for t in order if sweep % 2 else reversed(order):
+                beside = range(max(t - 1, 0), min(t + 1, len(self._moves)))
+                if any(self._moves[one] > self._limit for one in beside):
+                    report(sweep, t)
+                    penalty = ProximalPenalty(weight, _FREE_SHARE * self._limit)
+                    self.maps[t], self.energies[t] = self._lower(
+                        self.maps[t], self._neighbours(t), penalty, _SWEEP_STEPS
+                    )
+                    for one in beside:
+                        self._measure(one)
+            weight *= _SWEEP_GROWTH
+
+    def _neighbours(self, t: int) -> list[Neighbour]:
+        before = [Neighbour(self.maps[t - 1], self._lengths[t - 1])] if t > 0 else []
+        after = [Neighbour(self.maps[t + 1], self._lengths[t])] if t < len(self._lengths) else []
+        return before + after
+
+    def _lower(
+        self, uv: FloatArray, around: Sequence[Neighbour], penalty: ProximalPenalty, steps: int
+    ) -> tuple[FloatArray, float]:
+        """Return a frame after Newton steps, and its mean energy."""
+        domain = self.domain
+        # As in a polish: overflow gives inf or NaN, and a step with either is never accepted.
+        with np.errstate(all="ignore"):
+            energy, exponent = scale_energy(domain, uv, self._energy)
+            if self._system is None:
+                self._system = NewtonSystem(energy.F, energy.g, domain.n, domain.fixed, self._linear_solver)
+            self._system.take_gradients(energy.g)
+            terms = [ProximalTerm(neighbour, penalty, exponent) for neighbour in around]
+            model = MapModel(energy, Coordinates.of(uv, domain.fixed, exponent), self._system, terms)
+            descent = NewtonDescent(model, model.evaluate(in_units(uv, exponent)))
+            for _ in descent.descend(steps, _TOLERANCE):
+                pass
+            return model.positions(descent.w), energy.value_of(descent.state.derivatives)

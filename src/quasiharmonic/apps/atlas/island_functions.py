@@ -1,0 +1,346 @@
+"""Map, flatten, improve and pack the islands of a map with seams, like the functions of the same names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.atlas.atlas_verdict import is_mirrored
+from quasiharmonic.apps.atlas.mapped_atlas import (
+    MappedAtlas,
+    MappedIsland,
+    each_island,
+    fit_in_place,
+    name_island,
+    orient_islands,
+)
+from quasiharmonic.apps.atlas.packing.pack import pack_charts
+from quasiharmonic.apps.flattening import free_boundary
+from quasiharmonic.apps.flattening.layout import fit_unit_square, place_in_row
+from quasiharmonic.energies.deformation import positive_weights
+from quasiharmonic.energies.polishing import PolishOptions, polish_map
+from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.io.adapters.objects import MeshLike, seamed_mesh
+from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.problem.result import MapResult
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.solver.search.harmonising import HarmoniseOptions, harmonise_map
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_bool,
+    check_non_negative,
+    index_array,
+    map_array,
+    names_of,
+)
+
+
+def polish(
+    mesh: SeamedMesh | MeshLike,
+    *,
+    free: bool = False,
+    fixed: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
+    **rest: Any,
+) -> MappedAtlas:
+    """Lower the distortion of every island of an injective map.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh, or a mesh or path that stands for one
+        A map whose islands are injective; mirrored islands are allowed.
+    free : bool
+        Let the boundaries move. The centre, direction and area of each island are kept. Islands may then overlap.
+    fixed : (k,) array of int, optional
+        Fixed vertices of the mesh, on all islands that contain them; the boundaries by default. Not with ``free``.
+    weights : (f,) array, optional
+        Weight of each triangle's distortion.
+    **rest
+        Options of `quasiharmonic.polish`, or with ``free`` of `quasiharmonic.flatten`: ``energy``,
+        ``max_iterations``, ``tol``, ``linear_solver``, ``callback``; without ``free`` also ``slide``.
+
+    Returns
+    -------
+    MappedAtlas
+
+    Raises
+    ------
+    ValueError
+        If an island is not injective or not a surface; the message names its first triangle.
+    """
+    mesh = seamed_mesh(mesh)
+    check_bool("free", free)
+    weights = None if weights is None else positive_weights(weights, len(mesh.F))
+    if free and fixed is not None:
+        raise ValueError("fixed and free exclude each other: omit one of them")
+    checked = _check_fixed(mesh, fixed)
+
+    def lower(island: Island) -> MapResult:
+        own: dict[str, Any] = {} if weights is None else {"weights": weights[island.triangles]}
+        if free:
+            result = free_boundary.flatten(island.V, island.F, start=island.uv, **own, **rest)
+            return replace(result, uv=fit_in_place(island, result.uv))
+        return polish_map(_domain(island, checked), island.uv, PolishOptions(**own, **rest))
+
+    return each_island(mesh, lower)
+
+
+def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **rest: Any) -> MappedAtlas:
+    """Lower an energy of every island within the injective maps, with a fixed boundary; see `quasiharmonic.harmonise`.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh, or a mesh or path that stands for one
+    fixed : (k,) array of int, optional
+        As for `polish`.
+    **rest
+        Options of `quasiharmonic.harmonise`.
+
+    Returns
+    -------
+    MappedAtlas
+    """
+    mesh = seamed_mesh(mesh)
+    checked = _check_fixed(mesh, fixed)
+    return each_island(
+        mesh, lambda island: harmonise_map(_domain(island, checked), island.uv, HarmoniseOptions(**rest))
+    )
+
+
+def injective_map(
+    mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, reference: Any = None, **rest: Any
+) -> MappedAtlas:
+    """Map every island again with a fixed boundary; see `quasiharmonic.injective_map`.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh, or a mesh or path that stands for one
+    fixed : (k,) array of int, optional
+        As for `polish`.
+    reference, **rest
+        Options of `quasiharmonic.injective_map`.
+
+    Returns
+    -------
+    MappedAtlas
+        If an island has no injective map, its result reports it.
+    """
+    mesh = seamed_mesh(mesh)
+    checked = _check_fixed(mesh, fixed)
+
+    def find(island: Island) -> MapResult:
+        own = _select_fixed(island, checked)
+        return solve(Problem(island.V, island.F, own, island.uv[own], reference=reference), **rest)
+
+    return each_island(mesh, find)
+
+
+def flatten(
+    mesh: SeamedMesh | MeshLike,
+    *,
+    start: bool = False,
+    fixed: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
+    unit_square: bool = False,
+    gap: float = 0.0,
+    **rest: Any,
+) -> MappedAtlas:
+    """Flatten every island with a free boundary. Islands stand side by side and are not mirrored.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh, or a mesh or path that stands for one
+        Its islands may be without positions.
+    start : bool
+        Start from the islands' current positions.
+    fixed : (k,) array of int, optional
+        Fixed vertices of the mesh, at their current positions. Islands with fixed vertices are mapped there, and the
+        others are placed beside them without overlap.
+    weights : (f,) array, optional
+        Weight of each triangle's distortion.
+    unit_square, gap, **rest
+        Options of `quasiharmonic.flatten`.
+
+    Returns
+    -------
+    MappedAtlas
+        In the surface's unit of length, or in the unit square.
+    """
+    mesh = seamed_mesh(mesh)
+    check_bool("start", start)
+    check_bool("unit_square", unit_square)
+    check_non_negative("gap", gap)
+    weights = None if weights is None else positive_weights(weights, len(mesh.F))
+    checked = _check_fixed(mesh, fixed)
+    if checked is not None and unit_square:
+        raise ValueError("fixed vertices determine the size of the map: omit unit_square")
+    if checked is not None and mesh.uv is None:
+        raise ValueError("the fixed vertices have no target positions: the mesh has no texture coordinates")
+
+    def lay(island: Island) -> MapResult:
+        own: dict[str, Any] = {} if weights is None else {"weights": weights[island.triangles]}
+        if start:
+            own["start"] = island.uv
+        pins = _select_fixed(island, checked) if checked is not None else np.empty(0, dtype=np.int64)
+        if pins.size:
+            own |= {"fixed": pins, "target": island.uv[pins]}
+        return free_boundary.flatten(island.V, island.F, **own, **rest)
+
+    faces = orient_islands(mesh, reflect=start)
+    if checked is not None and checked.size and len(faces) > 1 and not any(mirrored for _, mirrored in faces):
+        return _flatten_together(mesh, checked, weights, start, {"gap": gap, **rest})
+    mapped = each_island(mesh, lay, reflect=start)
+    uv = [island.result.uv for island in mapped.islands]
+    if checked is None and len(uv) > 1:
+        uv = place_in_row(uv, gap)
+    if unit_square:
+        sizes = np.cumsum([len(places) for places in uv])[:-1]
+        uv = np.split(fit_unit_square(np.concatenate(uv)), sizes)
+    return replace(mapped, mesh=mesh.with_places(uv))
+
+
+def _flatten_together(
+    mesh: SeamedMesh, fixed: IntArray, weights: FloatArray | None, start: bool, rest: dict[str, Any]
+) -> MappedAtlas:
+    """Flatten several islands of which some have fixed vertices as one mesh, so that they do not overlap."""
+    islands = mesh.islands
+    for island in islands:
+        with name_island(island, len(islands)):
+            free_boundary.check_flattenable(island.V, island.F)
+    # Without seams, use the mesh's numbering, so that messages name the mesh's elements.
+    order, by_mesh = (np.argsort(_concatenate(islands, name), kind="stable") for name in ("vertices", "triangles"))
+    number = np.argsort(order)
+    ends = np.cumsum([len(island.V) for island in islands])
+    numbers = np.split(number, ends[:-1])
+    pins = [_select_fixed(island, fixed) for island in islands]
+    own: dict[str, Any] = {} if weights is None else {"weights": weights[np.sort(_concatenate(islands, "triangles"))]}
+    if start:
+        own["start"] = _concatenate(islands, "uv")[order]
+    result = free_boundary.flatten(
+        _concatenate(islands, "V")[order],
+        np.concatenate([of[island.F] for island, of in zip(islands, numbers, strict=True)])[by_mesh],
+        fixed=np.concatenate([of[own_pins] for own_pins, of in zip(pins, numbers, strict=True)]),
+        target=np.concatenate([island.uv[own_pins] for island, own_pins in zip(islands, pins, strict=True)]),
+        **own,
+        **rest,
+    )
+    # There is one result for all islands, so its stages, history and time are reported once.
+    reports = [result, *[replace(result, stages=[], history=[], diagnosis=None, seconds=0.0) for _ in islands[1:]]]
+    places = [result.uv[of] for of in numbers]
+    done = [
+        MappedIsland(island.triangles, False, replace(one, uv=uv, certificate=certify(island.F, uv)))
+        for island, one, uv in zip(islands, reports, places, strict=True)
+    ]
+    return MappedAtlas(mesh.with_places(places), tuple(done))
+
+
+def _concatenate(islands: Sequence[Island], name: str) -> Any:
+    """Concatenate an attribute of all islands."""
+    return np.concatenate([getattr(island, name) for island in islands])
+
+
+def pack(
+    mesh: SeamedMesh | MeshLike,
+    *,
+    resolution: int | tuple[int, int] = 1024,
+    padding: float = 4,
+    rotate: bool = True,
+    stack: bool = False,
+) -> SeamedMesh:
+    """Pack islands into the unit square by their shapes, as large as possible and at one texel density.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh, or a mesh or path that stands for one
+        Its islands are injective or mirrored. Mirrored islands stay mirrored.
+    resolution, padding, rotate, stack
+        As for `quasiharmonic.apps.atlas.packing.pack.pack_charts`: texels along a side of the texture, the minimum
+        distance between islands in texels, and whether islands may be rotated and congruent ones share their position.
+
+    Returns
+    -------
+    SeamedMesh
+        Islands without area on the surface or in the plane have the average scale.
+
+    Raises
+    ------
+    ValueError
+        If an island has no positions or the islands do not fit; if an island has triangles so thin that rounding to
+        positions in the square would invert them.
+    """
+    mesh = seamed_mesh(mesh)
+    islands = mesh.islands
+    charts = _scale_to_surface(islands, _surface_areas(mesh))
+    packing = pack_charts(charts, resolution=resolution, padding=padding, rotate=rotate, stack=stack)
+    for i, (uv, F) in enumerate(charts):
+        mirrored = packing.placements[i].mirrored
+        lost = inverted_triangles(F[:, ::-1] if mirrored else F, packing.uv[i])
+        lost = np.setdiff1d(lost, inverted_triangles(F, uv))
+        if lost.size:
+            raise ValueError(
+                f"island {i}: its {names_of('triangle', 'triangles', lost)} would be inverted by rounding in the unit "
+                "square, too thin for that: polish the map first, or do not pack it"
+            )
+    return mesh.with_places(packing.uv)
+
+
+def _scale_to_surface(islands: Sequence[Island], surface: FloatArray) -> list[tuple[FloatArray, IntArray]]:
+    """Islands with areas proportional to those on the surface, with all mirrored triangles turned over."""
+    positions = [map_array(f"uv of island {i}", island.uv) for i, island in enumerate(islands)]
+    # Scale by a power of two to about unit size, so that squares do not overflow.
+    largest = max((float(np.abs(uv).max()) for uv in positions), default=0.0)
+    positions = [np.ldexp(uv, -int(np.frexp(largest)[1])) for uv in positions]
+    F = [
+        island.F[:, ::-1] if is_mirrored(island.F, uv) else island.F
+        for island, uv in zip(islands, positions, strict=True)
+    ]
+    plane = np.array([np.abs(_doubled_areas(uv, rows)).sum() / 2 for uv, rows in zip(positions, F, strict=True)])
+    known = (plane > 0) & (surface > 0)
+    mean = surface[known].sum() / plane[known].sum() if known.any() else 1.0
+    scales = np.sqrt(np.divide(surface, plane, out=np.full(len(plane), mean), where=known))
+    return [(uv * scale, rows) for uv, scale, rows in zip(positions, scales.tolist(), F, strict=True)]
+
+
+def _doubled_areas(uv: FloatArray, F: IntArray) -> FloatArray:
+    a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _surface_areas(mesh: SeamedMesh) -> FloatArray:
+    """Areas of the islands on the surface, in a unit near the surface's size."""
+    V = np.ldexp(mesh.V, -int(np.frexp(np.abs(mesh.V).max(initial=0.0))[1]))
+    a, b, c = V[mesh.F].swapaxes(0, 1)
+    along, across = b - a, c - a
+    squared = (along**2).sum(axis=1) * (across**2).sum(axis=1) - (along * across).sum(axis=1) ** 2
+    area = 0.5 * np.sqrt(np.maximum(squared, 0.0))
+    return np.array([area[island.triangles].sum() for island in mesh.islands])
+
+
+def _check_fixed(mesh: SeamedMesh, fixed: ArrayLike | None) -> IntArray | None:
+    if fixed is None:
+        return None
+    array = index_array("fixed", fixed).ravel()
+    absent = array[(array < 0) | (array >= len(mesh.V))]
+    if absent.size:
+        raise ValueError(f"fixed refers to {names_of('vertex', 'vertices', absent)}, which the mesh does not have")
+    return array
+
+
+def _select_fixed(island: Island, fixed: IntArray | None) -> IntArray:
+    """Fixed vertices of an island; its boundary by default."""
+    if fixed is None:
+        return np.unique(boundary_edges(island.F, len(island.vertices)))
+    return np.flatnonzero(np.isin(island.vertices, fixed))
+
+
+def _domain(island: Island, fixed: IntArray | None) -> Domain:
+    domain = Domain(island.V, island.F, _select_fixed(island, fixed))
+    domain.check_boundary_fixed()
+    return domain

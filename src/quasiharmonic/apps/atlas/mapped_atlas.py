@@ -1,0 +1,230 @@
+"""Apply an operation to each island of a mesh, and combine the results into one mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, AtlasVerdict, certify, mirrored_islands
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.geometry.mesh.surface_checks import manifold_edges
+from quasiharmonic.io import MeshData, refined_mesh
+from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.outcome import Outcome
+
+# The status of an atlas is the first of these that one of its islands has; without any, that of the first island.
+_FURTHEST_LAST = (
+    Status.INTERRUPTED,
+    Status.IMPOSSIBLE,
+    Status.TOO_MANY_SPLITS,
+    Status.PRECISION_LIMIT,
+    Status.OUT_OF_ITERATIONS,
+    Status.COLLAPSED,
+    Status.STILL_FALLING,
+    Status.EXHAUSTED,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedIsland:
+    """The result for one island.
+
+    Attributes
+    ----------
+    triangles : (k,) int64
+        Triangles of the island, as indices of the mesh, ascending.
+    mirrored : bool
+        Whether the island is mirrored. If so, ``result`` belongs to its reflection about the v axis.
+    result : MapResult
+        The result, in the island's own numbering.
+    """
+
+    triangles: IntArray
+    mirrored: bool
+    result: MapResult
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result for JSON."""
+        return {
+            "first_triangle": int(self.triangles[0]),
+            "triangles": len(self.triangles),
+            "mirrored": self.mirrored,
+            **self.result.to_dict(),
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MappedAtlas(Outcome):
+    """A map with seams and the results of its islands.
+
+    Attributes
+    ----------
+    mesh : SeamedMesh
+        The surface with its new positions.
+    islands : tuple of MappedIsland
+        Results in the order of each island's first triangle. After Ctrl-C the remaining islands are not listed and
+        keep their positions.
+    """
+
+    mesh: SeamedMesh
+    islands: tuple[MappedIsland, ...]
+
+    @property
+    def injective(self) -> bool:
+        """Whether every island is injective, or mirrored and injective (certified)."""
+        return all(island.result.injective for island in self.islands)
+
+    @property
+    def success(self) -> bool:
+        """Whether the results of all islands are successes; False if the call was interrupted."""
+        return len(self.islands) == len(self.mesh.islands) and all(island.result.success for island in self.islands)
+
+    @property
+    def message(self) -> str:
+        """The message of `status`."""
+        return self.status.value
+
+    @property
+    def status(self) -> Status:
+        """The status of the island that made the least progress."""
+        found = [island.result.status for island in self.islands]
+        return next((status for status in _FURTHEST_LAST if status in found), found[0])
+
+    def places(self) -> list[FloatArray]:
+        """Return the vertex positions of every island, in the order of its result."""
+        done = [one.result.uv * MIRROR if one.mirrored else one.result.uv for one in self.islands]
+        return [*done, *(island.uv for island in self.mesh.islands[len(done) :])]
+
+    def verdict(self) -> AtlasVerdict:
+        """Return the exact verdict on the stored positions."""
+        return certify(self.mesh)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The results for JSON: with one island its result, otherwise totals and the list of islands."""
+        results = [island.result for island in self.islands]
+        if len(results) == 1:
+            return results[0].to_dict()
+        return {
+            "success": self.success,
+            "injective": self.injective,
+            "status": self.status.name.lower(),
+            "message": self.message,
+            "n_iterations": sum(result.n_iterations for result in results),
+            "seconds": sum(result.seconds for result in results),
+            "linear_solver": results[0].linear_solver,
+            "islands": [island.to_dict() for island in self.islands],
+        }
+
+
+def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, reflect: bool = True) -> MappedAtlas:
+    """Apply an operation to each island of a mesh; without seams it must be a manifold surface.
+
+    ``lower`` maps an island to a result with a position for every vertex of it, and perhaps further vertices at the
+    end. With ``reflect``, mirrored ones of several islands are passed as their reflection and stay mirrored. A single
+    mirrored island is treated as inverted. After Ctrl-C the remaining islands keep their positions; KeyboardInterrupt
+    is raised if they have none. ValueError as `orient_islands`, or if ``lower`` rejects an island; the message names
+    it.
+    """
+    islands = orient_islands(mesh, reflect=reflect)
+    done: list[MappedIsland] = []
+    places = [island.uv for island in mesh.islands]
+    for k, (island, mirrored) in enumerate(islands):
+        if done and done[-1].result.status is Status.INTERRUPTED:
+            if np.isnan(island.uv).any():
+                raise KeyboardInterrupt
+            continue
+        with name_island(island, len(islands)):
+            result = lower(island)
+        # A refined island has further vertices at the end.
+        places[k] = (result.uv * MIRROR if mirrored else result.uv)[: len(island.vertices)]
+        done.append(MappedIsland(island.triangles, mirrored, result))
+    return MappedAtlas(mesh.with_places(places), tuple(done))
+
+
+def orient_islands(mesh: SeamedMesh, *, reflect: bool = True) -> list[tuple[Island, bool]]:
+    """Return the islands of a mesh, mirrored ones as their reflection, and whether each was reflected.
+
+    Raises ValueError if the mesh is not a surface or has no island.
+    """
+    if mesh.seamless:
+        # A mesh without seams must be a surface: without this check it would silently split at non-manifold edges.
+        manifold_edges(mesh.F, len(mesh.V))
+    islands = mesh.islands
+    if not islands:
+        raise ValueError("the mesh has no triangles" if not len(mesh.F) else "no triangle has texture coordinates")
+    mirrored = mirrored_islands(mesh) if reflect else [False] * len(islands)
+    return [
+        (replace(island, uv=island.uv * MIRROR) if turned else island, turned)
+        for island, turned in zip(islands, mirrored, strict=True)
+    ]
+
+
+@contextmanager
+def name_island(island: Island, count: int) -> Iterator[None]:
+    """Name the island in a ValueError if there are several islands."""
+    try:
+        yield
+    except ValueError as error:
+        if count == 1:
+            raise
+        raise ValueError(f"the {which_island(island.triangles)}, with its own numbering: {error}") from None
+
+
+def fit_in_place(island: Island, uv: FloatArray) -> FloatArray:
+    """Rotate, scale and shift an island's map (m, 2) to the island's old direction, area and position.
+
+    If rounding would invert a triangle, the map is returned unchanged.
+    """
+    before, after = (np.ascontiguousarray(w).view(np.complex128).ravel() for w in (island.uv, uv))
+    centre, middle = before.mean(), after.mean()
+    turn = np.vdot(after - middle, before - centre)
+    area = [abs(float(signed_areas(island.F, w).sum())) for w in (before, after)]
+    scale = np.sqrt(area[0] / area[1]) * (turn / abs(turn) if turn else 1.0)
+    placed = ((after - middle) * scale + centre).view(np.float64).reshape(-1, 2)
+    return placed if is_injective(island.F, placed) else uv
+
+
+def merge_refined(
+    mesh: MeshData, islands: Sequence[Island], refined: Sequence[Refined | None], places: Sequence[FloatArray]
+) -> MeshData:
+    """Transfer refinements of islands and their positions to the mesh data that contains them.
+
+    Each refinement splits only interior edges, or is None for an unchanged island. ``places`` has the positions of each
+    island's vertices, including new ones. Old vertices keep their indices, and new ones follow. The parts of a triangle
+    take its place in the order.
+    """
+    n, dimension = mesh.V.shape
+    V, F, FT, parent = [mesh.V], [], [], []
+    parents, weights = [np.empty((0, 3), dtype=np.int64)], [np.empty((0, 3))]
+    rows = 0
+    for island, fine, uv in zip(islands, refined, places, strict=True):
+        origin, own, of = island.vertices, island.F, island.triangles
+        if fine is not None:
+            added, k = fine.parents.shape
+            origin = np.concatenate([origin, n + np.arange(added)])
+            own, of = fine.F, of[fine.parent]
+            V.append(fine.V[len(island.vertices) :, :dimension])
+            # Vertices have two or three parents; padded parents have weight zero.
+            pad = (0, 0), (0, 3 - k)
+            parents.append(np.pad(island.vertices[fine.parents], pad, mode="edge"))
+            weights.append(np.pad(fine.weights, pad))
+            n += added
+        F.append(origin[own])
+        FT.append(own + rows)
+        parent.append(of)
+        rows += len(uv)
+    together = Refined(
+        np.concatenate(V), np.concatenate(F), np.concatenate(parent), np.concatenate(parents), np.concatenate(weights)
+    )
+    # The zeros are placeholders for positions, replaced below.
+    new, _ = refined_mesh(mesh, together, np.zeros((len(mesh.V), 2)))
+    order = np.argsort(together.parent, kind="stable")
+    return new.with_places(SeamedMesh(new.V, new.F, np.concatenate(FT)[order], np.concatenate(places)))

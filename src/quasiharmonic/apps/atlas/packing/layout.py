@@ -1,0 +1,310 @@
+"""Search for the largest common scale at which the bitmaps of all charts fit into the tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil, pi, sqrt
+
+import numpy as np
+
+from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw
+from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board, frame_of
+from quasiharmonic.apps.atlas.packing.shapes import Shape, find_smallest_box
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat
+
+# Cells along a tile for at most so many charts, and on the finer board for the final layout. More charts get
+# proportionally smaller cells, up to a limit.
+_CELLS, _FINE_CELLS, _CELLS_OF_MANY, _FEW, _MOST_CELLS = 96, 256, 128, 20, 2048
+# Directions of each chart: sixteen for at most so many charts, then eight. More than the second number get four, and
+# their boards are searched window by window.
+_MOST_DIRECTIONS, _MANY = 10, 50
+# Range of the scale on the finer board, relative to that on the coarser one.
+_FINE_GAIN, _FINE_LOSS = 1.06, 1.01
+# Charts beyond this number are placed as boxes, the smallest ones.
+_BITMAPS = 500
+# Share of the tiles that charts with half the padding around them are expected to cover.
+_EXPECTED = 0.8
+# The number of cells along a tile varies between these multiples of the expected number.
+_FEWEST_CELLS, _MORE_CELLS = 0.8, 1.25
+# Placements tried with other orders of the charts, in all.
+_TRIALS = 60
+# Directions compared for the expected scale.
+_TURNS = 16
+# Angles compared for the direction of a single chart, and the precision of the best one.
+_ANGLES, _ANGLE_PRECISION = 256, 1e-6
+# Relative precision of the scale of many charts.
+_COARSE = 0.04
+# Relative precision of the sufficient size.
+_SIZE_PRECISION = 0.01
+# Spread of the logarithm of the areas by which charts are ordered in these trials.
+_SPREAD = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where shapes are placed.
+
+    Attributes
+    ----------
+    scale : float
+        Texels per unit of length.
+    directions : (n,) complex128
+        Unit vector of each shape that becomes the x-axis.
+    centres : (n,) complex128
+        Centre of each rotated shape's box in its tile, in texels.
+    tiles : (n,) int64
+    """
+
+    scale: float
+    directions: ComplexArray
+    centres: ComplexArray
+    tiles: IntArray
+
+
+def find_layout(
+    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool, scale: float | None
+) -> Layout | None:
+    """Place shapes at the largest common scale that is found, or at a given scale.
+
+    Parameters
+    ----------
+    shapes : sequence of Shape
+        At least one.
+    size : two int
+        Width and height of each tile in texels.
+    padding : float
+        Distance between shapes, and twice the distance to the sides of the tile, in texels.
+    tiles : int
+    rotate : bool
+        Allow rotations.
+    scale : float or None
+        Texels per unit of length.
+
+    Returns
+    -------
+    Layout
+        None if the shapes do not fit, not even with a largest box of one texel.
+    """
+    if len(shapes) == 1 and rotate and scale is None:
+        return _place_one(shapes[0], size, padding)
+    if scale is not None:
+        search = _Search(shapes, size, padding, tiles, scale, rotate=rotate)
+        return search.place_in(search.cells)
+    expected, least = _expected_scale(shapes, size, padding, tiles), _least_scale(shapes)
+    while expected > least:
+        search = _Search(shapes, size, padding, tiles, expected, rotate=rotate)
+        if len(shapes) > _MANY:
+            layout = search.enlarge_coarsely()
+            if layout is not None:
+                return layout
+        elif (found := search.enlarge()) is not None:
+            layout, order = found
+            fine = _Search(shapes, size, padding, tiles, layout.scale, rotate=rotate, given=layout.directions)
+            return fine.enlarge_finely(order) or layout
+        expected /= _MORE_CELLS
+    return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
+
+
+def _place_one(shape: Shape, size: tuple[int, int], padding: float) -> Layout | None:
+    """Place one shape in the middle of a tile, in the direction in which it can be largest."""
+    room = np.array([size[0] - padding, size[1] - padding])
+
+    def scales(angles: FloatArray) -> FloatArray:
+        seen = np.exp(-1j * angles)[:, None] * shape.hull
+        sides = np.stack([np.ptp(seen.real, axis=1), np.ptp(seen.imag, axis=1)], axis=1)
+        return np.asarray((room / np.maximum(sides, np.finfo(float).tiny)).min(axis=1))
+
+    if room.min() <= 0:
+        return None
+    box = np.angle(find_smallest_box(shape))
+    width = pi / _ANGLES
+    angles = np.concatenate([box + pi / 2 * np.arange(2), width * np.arange(_ANGLES)])
+    best = float(angles[np.argmax(scales(angles))])
+    while width > _ANGLE_PRECISION:
+        near = best + width * np.linspace(-1, 1, 9)[[4, 0, 1, 2, 3, 5, 6, 7, 8]]
+        best, width = float(near[np.argmax(scales(near))]), width / 4
+    scale, least = float(scales(np.array([best]))[0]), _least_scale([shape])
+    if scale < least:
+        return None
+    if not max(shape.extent(1)):
+        scale = least
+    return Layout(scale, np.exp(1j * np.array([best])), np.array([complex(*size) / 2]), np.zeros(1, dtype=np.int64))
+
+
+def find_sufficient_size(
+    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool, scale: float | None
+) -> tuple[int, int]:
+    """Width and height of tiles, of the same ratio, into which shapes fit that do not fit into tiles of a size."""
+
+    def enlarge(factor: float) -> tuple[int, int]:
+        return ceil(size[0] * factor), ceil(size[1] * factor)
+
+    def fits(size: tuple[int, int]) -> bool:
+        if scale is None:
+            return _place_boxes(shapes, size, padding, tiles, rotate=rotate) is not None
+        return find_layout(shapes, size, padding, tiles, rotate=rotate, scale=scale) is not None
+
+    low, high = 1.0, 2.0
+    while not fits(enlarge(high)):
+        low, high = high, 2 * high
+    while enlarge(low) != enlarge(high) and high - low > _SIZE_PRECISION * high:
+        middle = (low + high) / 2
+        low, high = (low, middle) if fits(enlarge(middle)) else (middle, high)
+    return enlarge(high)
+
+
+def _place_boxes(
+    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool
+) -> Layout | None:
+    """Place shapes as boxes at the least scale."""
+    search = _Search(shapes, size, padding, tiles, _least_scale(shapes), rotate=rotate, bitmaps=0)
+    return search.place_in(min(4 * max(size), _MOST_CELLS))
+
+
+def _least_scale(shapes: Sequence[Shape]) -> float:
+    """Scale at which the longest side of all boxes is one texel."""
+    return 1 / (max(max(shape.extent(find_smallest_box(shape))) for shape in shapes) or 1.0)
+
+
+def _expected_scale(shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int) -> float:
+    """Scale at which the shapes with half the padding around them cover the expected share of the tiles."""
+    area = sum(shape.area for shape in shapes)
+    length = sum(float(np.abs(shape.heads - shape.tails).sum()) for shape in shapes)
+    free = _EXPECTED * tiles * size[0] * size[1] - len(shapes) * pi * padding**2 / 4
+    b = length * padding / 2
+    # The largest shape must fit in the tile, in its best direction of a few.
+    turns = np.exp(0.5j * pi * np.arange(_TURNS) / _TURNS)
+    sides = [min(max(shape.extent(turn)) for turn in turns) for shape in shapes]
+    fits = (max(size) - padding) / (max(sides) or 1.0)
+    if free <= 0:
+        return 0.0
+    return min(2 * free / (b + sqrt(b**2 + 4 * area * free)), fits) if area > 0 else fits
+
+
+class _Search:
+    """Bitmaps of all shapes with cells of a fixed size in units of length, and boards of variable size."""
+
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        size: tuple[int, int],
+        padding: float,
+        tiles: int,
+        scale: float,
+        *,
+        rotate: bool,
+        bitmaps: int = _BITMAPS,
+        given: ComplexArray | None = None,
+    ) -> None:
+        self._size, self._tiles, self._padding = size, tiles, padding
+        few = len(shapes) <= _MANY
+        cells = (_CELLS if given is None else _FINE_CELLS) if few else _CELLS_OF_MANY
+        self.cells = ceil(min(cells * max(1.0, sqrt(len(shapes) / tiles / _FEW)), _MOST_CELLS))
+        # Length of a cell's side.
+        self._cell = max(size) / self.cells / scale
+        radius = _MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
+        self._frame = frame_of(int(_MORE_CELLS * self.cells)) if few else None
+        self._areas = np.array([shape.area for shape in shapes])
+        self._order = np.argsort(-self._areas, kind="stable")
+        self._few = bitmaps
+        large, small = self._order[:bitmaps], self._order[bitmaps:]
+        turns = np.exp(0.125j * pi * (np.arange(4) if len(shapes) <= _MOST_DIRECTIONS else np.arange(0, 4, 2)))
+        turns = turns if few else turns[:1]
+        self._bitmaps = {}
+        for i in large.tolist():
+            if given is not None or not rotate:
+                directions = np.ones(1, dtype=complex) if given is None else given[i : i + 1]
+                self._bitmaps[i] = Bitmaps(directions, [draw(shapes[i], directions[0], 1 / self._cell, radius)])
+            else:
+                self._bitmaps[i] = self._draw(shapes[i], turns, radius)
+        # Small shapes lie in their smallest boxes.
+        self._lying = np.array([_find_lying(shapes[i]) if rotate else 1 + 0j for i in small.tolist()])
+        sides = [shapes[i].extent(direction)[::-1] for i, direction in zip(small, self._lying, strict=True)]
+        self._boxes = np.array(sides).reshape(-1, 2) / self._cell
+
+    def _draw(self, shape: Shape, turns: ComplexArray, radius: float) -> Bitmaps:
+        """Draw a shape with each of its sides up, after each of several rotations of its smallest box."""
+        directions, cells = [], []
+        for direction in find_smallest_box(shape) * turns:
+            bitmap = draw(shape, direction, 1 / self._cell, radius)
+            for quarters in range(4):
+                directions.append(direction * 1j**quarters)
+                cells.append(np.rot90(bitmap, quarters))
+        return Bitmaps(np.array(directions), cells)
+
+    def enlarge(self) -> tuple[Layout, IntArray] | None:
+        """Find the smallest board on which few bitmaps fit; the layout on it, and the order of the shapes."""
+        low, high = int(_FEWEST_CELLS * self.cells), int(_MORE_CELLS * self.cells)
+        best = self.place_in(high)
+        if best is None:
+            return None
+        while high - low > 1:
+            middle = (low + high) // 2
+            found = self.place_in(middle)
+            low, high, best = (middle, high, best) if found is None else (low, middle, found)
+        generator, best_order = np.random.default_rng(0), self._order
+        for _ in range(_TRIALS // len(self._areas)):
+            order = np.argsort(-self._areas * np.exp(generator.normal(0, _SPREAD, len(self._areas))), kind="stable")
+            while (found := self.place_in(high - 1, order)) is not None:
+                high, best, best_order = high - 1, found, order
+        return best, best_order
+
+    def enlarge_finely(self, order: IntArray) -> Layout | None:
+        """Find a small board for bitmaps in a given order that fit at about the expected scale."""
+        best = None
+        low, high = int(self.cells / _FINE_GAIN), ceil(self.cells * _FINE_LOSS)
+        while high - low > 1:
+            middle = (low + high) // 2
+            found = self.place_in(middle, order)
+            low, high, best = (middle, high, best) if found is None else (low, middle, found)
+        return best
+
+    def enlarge_coarsely(self) -> Layout | None:
+        """Find a small board for many bitmaps."""
+        low, high, best = int(_FEWEST_CELLS * self.cells), int(_MORE_CELLS * self.cells), None
+        while best is None or high - low > _COARSE * high:
+            middle = (low + high) // 2
+            found = self.place_in(middle)
+            low, high, best = (middle, high, best) if found is None else (low, middle, found)
+            if best is None and high - low <= 1:
+                return None
+        return best
+
+    def place_in(self, cells: int, order: IntArray | None = None) -> Layout | None:
+        """Place the bitmaps on boards with a number of cells along the longer side; None if one does not fit."""
+        texels = max(self._size) / cells
+        columns, rows = (int(side / texels * (1 + 1e-12)) for side in self._size)
+        boards = [Board(rows, columns, self._frame) for _ in range(self._tiles)]
+        n = len(self._areas)
+        directions, centres, tiles = np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64)
+        for i in (self._order[: self._few] if order is None else order).tolist():
+            heartbeat()
+            bitmaps = self._bitmaps[i]
+            found = next(((tile, spot) for tile, board in enumerate(boards) if (spot := board.find(bitmaps))), None)
+            if found is None:
+                return None
+            tile, spot = found
+            bitmap = bitmaps.cells[spot.direction]
+            boards[tile].put(bitmap, spot.row, spot.column)
+            directions[i], tiles[i] = bitmaps.directions[spot.direction], tile
+            centres[i] = complex(spot.column + bitmap.shape[1] / 2, spot.row + bitmap.shape[0] / 2) * texels
+        rest = self._order[self._few :]
+        directions[rest] = self._lying
+        boxes = np.ceil(self._boxes + self._padding / texels).astype(np.int64)
+        waiting = np.arange(len(rest))
+        for tile, board in enumerate(boards):
+            spots = board.fill_rows(boxes[waiting])
+            done = waiting[spots[:, 0] >= 0]
+            tiles[rest[done]] = tile
+            centres[rest[done]] = (spots[spots[:, 0] >= 0] + boxes[done] / 2) @ [1j, 1] * texels
+            waiting = waiting[spots[:, 0] < 0]
+        return None if waiting.size else Layout(texels / self._cell, directions, centres, tiles)
+
+
+def _find_lying(shape: Shape) -> complex:
+    """Direction of the longer side of the smallest box."""
+    direction = find_smallest_box(shape)
+    width, height = shape.extent(direction)
+    return direction if width >= height else direction * 1j

@@ -1,0 +1,209 @@
+"""Pack charts into textures by their shapes, as large as possible and at one texel density."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence, Sized
+from dataclasses import dataclass
+from math import atan2
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.atlas.packing.copies import Copy, Motion, find_copies
+from quasiharmonic.apps.atlas.packing.layout import Layout, find_layout, find_sufficient_size
+from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_bool,
+    check_integer,
+    check_non_negative,
+    check_positive,
+    count_of,
+    describe,
+    map_array,
+    triangle_array,
+)
+
+# Additional space between charts, relative to the texture's side, for rounding to single precision.
+_ROUNDING = 2.0**-22
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a chart is placed: mirror, rotate, scale and shift.
+
+    Attributes
+    ----------
+    angle : float
+        Rotation counterclockwise in radians.
+    mirrored : bool
+        Whether x changes its sign before the rotation.
+    offset : tuple of two floats
+        Position of the chart's origin in its tile, in texels from the lower left corner.
+    tile : int
+        Number of the tile. The UDIM number is 1001 + tile.
+    """
+
+    angle: float
+    mirrored: bool
+    offset: tuple[float, float]
+    tile: int
+
+
+@dataclass(frozen=True, eq=False)
+class Packing:
+    """Charts in textures; see `pack_charts`.
+
+    Attributes
+    ----------
+    placements : tuple of Placement
+        One for each chart.
+    uv : tuple of (m, 2) float64
+        Texture coordinates of each chart's vertices. Tile ``k`` is the unit square at ``(k % 10, k // 10)``.
+    texels_per_unit : float
+        Scale of all charts: texels per unit of length of the given maps.
+    utilisation : float
+        Area of the charts in texels, as a fraction of all tiles. Charts in the same place count once.
+    """
+
+    placements: tuple[Placement, ...]
+    uv: tuple[FloatArray, ...]
+    texels_per_unit: float
+    utilisation: float
+
+
+def pack_charts(
+    charts: Sequence[tuple[ArrayLike, ArrayLike]],
+    *,
+    resolution: int | tuple[int, int] = 2048,
+    padding: float = 4,
+    texels_per_unit: float | None = None,
+    tiles: int = 1,
+    rotate: bool = True,
+    stack: bool = False,
+) -> Packing:
+    """Pack charts into one or several textures by their shapes, as large as possible and at one texel density.
+
+    Charts are placed into concave parts and holes of others. They are rotated by any angle and not mirrored.
+
+    Parameters
+    ----------
+    charts : sequence of (uv, F)
+        Positions (m, 2) of each chart's vertices, all charts at the same scale, and its triangles (k, 3).
+    resolution : int or (int, int)
+        Texels along a side of each texture, or width and height.
+    padding : float
+        Minimum distance between two charts in texels. The distance to the texture's sides is at least half of it, so
+        that adjacent copies of the texture keep the padding too.
+    texels_per_unit : float, optional
+        Texel density. By default the largest that is found.
+    tiles : int
+        Number of textures (UDIM tiles).
+    rotate : bool
+        Allow rotations.
+    stack : bool
+        Place congruent charts, and mirrored ones, at the same position.
+
+    Returns
+    -------
+    Packing
+        The result is deterministic.
+
+    Raises
+    ------
+    ValueError
+        If arguments are malformed, or the charts do not fit. The message then names a sufficient resolution.
+    """
+    pairs = _check_charts(charts)
+    size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)
+    if not pairs:
+        return Packing((), (), texels_per_unit or 1.0, 0.0)
+    # Scale by a power of two to about unit size, so that squares do not overflow.
+    exponent = int(np.frexp(max(float(np.abs(uv).max()) for uv, _ in pairs))[1])
+    pairs = [(np.ldexp(uv, -exponent), F) for uv, F in pairs]
+    wanted = None if texels_per_unit is None else float(np.ldexp(texels_per_unit, exponent))
+    copies = find_copies(pairs) if stack else {}
+    originals = [i for i in range(len(pairs)) if i not in copies]
+    shapes = [make_shape(*pairs[i]) for i in originals]
+    spaced = padding + max(size) * (_ROUNDING + _deviation(pairs, copies))
+    layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+    if layout is None:
+        width, height = find_sufficient_size(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+        sufficient = f"{width} × {height} texels" if width != height else f"resolution={width}"
+        raise ValueError(
+            f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels do not fit into "
+            f"{f'{tiles} tiles of ' if tiles > 1 else ''}{size[0]} × {size[1]} texels: {sufficient} suffices"
+        )
+    placed = {i: _place(shape, layout, k) for k, (i, shape) in enumerate(zip(originals, shapes, strict=True))}
+    for i, copy in copies.items():
+        placed[i] = _place_copy(copy.motion, placed[copy.original], layout.scale)
+    placements = tuple(placed[i] for i in range(len(pairs)))
+    uv = tuple(
+        _transform(points, layout.scale, placement, size)
+        for (points, _), placement in zip(pairs, placements, strict=True)
+    )
+    covered = sum(shape.area for shape in shapes) * layout.scale**2
+    density = float(np.ldexp(layout.scale, -exponent))
+    return Packing(placements, uv, density, covered / (tiles * size[0] * size[1]))
+
+
+def _check_charts(charts: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[FloatArray, IntArray]]:
+    """Convert charts to arrays; a ValueError names the malformed ones."""
+    if not isinstance(charts, Sized) or isinstance(charts, str | bytes):
+        raise ValueError(f"charts must be a list of pairs (uv, F), not {describe(charts)}")
+    pairs = []
+    for i, chart in enumerate(charts):
+        if not isinstance(chart, Sized) or len(chart) != 2:
+            raise ValueError(f"charts[{i}] must be a pair (uv, F), not {describe(chart)}")
+        uv = map_array(f"charts[{i}]", chart[0])
+        pairs.append((uv, triangle_array(chart[1], len(uv))))
+    return pairs
+
+
+def check_texture(
+    resolution: Any, padding: Any, texels_per_unit: Any, tiles: Any, rotate: Any, stack: Any
+) -> tuple[int, int]:
+    """Check the options of `pack_charts`; return width and height in texels."""
+    check_non_negative("padding", padding)
+    if texels_per_unit is not None:
+        check_positive(texels_per_unit=texels_per_unit)
+    check_bool("rotate", rotate)
+    check_bool("stack", stack)
+    check_integer("tiles", tiles, minimum=1)
+    sides = tuple(resolution) if isinstance(resolution, Sequence | np.ndarray) else (resolution, resolution)
+    if len(sides) != 2:
+        raise ValueError(f"resolution must be a number of texels, or width and height, not {resolution!r}")
+    for side in sides:
+        check_integer("resolution", side, minimum=1)
+    return int(sides[0]), int(sides[1])
+
+
+def _place(shape: Shape, layout: Layout, i: int) -> Placement:
+    """The placement of a shape in a layout."""
+    direction = complex(layout.directions[i])
+    offset = complex(layout.centres[i]) - layout.scale * shape.box_centre(direction)
+    return Placement(-atan2(direction.imag, direction.real), False, (offset.real, offset.imag), int(layout.tiles[i]))
+
+
+def _deviation(pairs: list[tuple[FloatArray, IntArray]], copies: dict[int, Copy]) -> float:
+    """Bound on the distance between copies and their originals, twice, as a fraction of the texture's side."""
+    return max((4 * copy.deviation / np.ptp(pairs[i][0], axis=0).max() for i, copy in copies.items()), default=0.0)
+
+
+def _place_copy(motion: Motion, original: Placement, scale: float) -> Placement:
+    """The placement of a chart that a motion moves onto another chart."""
+    turn = complex(np.exp(1j * original.angle))
+    offset = complex(*original.offset) + scale * turn * motion.shift
+    angle = original.angle + atan2(motion.turn.imag, motion.turn.real)
+    return Placement(angle, motion.mirrored, (offset.real, offset.imag), original.tile)
+
+
+def _transform(uv: FloatArray, scale: float, placement: Placement, size: tuple[int, int]) -> FloatArray:
+    """Texture coordinates of a chart's vertices."""
+    z = uv.view(np.complex128).ravel()
+    if placement.mirrored:
+        z = -z.conjugate()
+    z = z * (scale * np.exp(1j * placement.angle)) + complex(*placement.offset)
+    return np.stack([z.real / size[0] + placement.tile % 10, z.imag / size[1] + placement.tile // 10], axis=1)

@@ -1,0 +1,105 @@
+"""Shapes of charts: their outlines, and the directions in which their boxes are small."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from quasiharmonic.geometry.exact.triangles import triangle_signs
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+
+# Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
+_AS_SMALL = 1e-9
+# Positions of hull points computed per block.
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """The part of the plane that a chart covers.
+
+    The shape is the closure of the points around which the edges wind, and of the edges themselves. For an injective
+    chart the edges are its boundary. Where triangles are inverted or degenerate, edges inside the shape are added, so
+    that the shape covers every triangle.
+
+    Attributes
+    ----------
+    tails, heads : (e,) complex128
+        Ends of the directed edges. Each point is as often a tail as it is a head.
+    hull : (h,) complex128
+        Corners of the convex hull, or all points if they are on a line.
+    area : float
+        Area of the triangles.
+    """
+
+    tails: ComplexArray
+    heads: ComplexArray
+    hull: ComplexArray
+    area: float
+
+    def extent(self, direction: complex) -> tuple[float, float]:
+        """Width and height of the shape's box with a side along a unit vector."""
+        seen = self.hull * direction.conjugate()
+        return float(np.ptp(seen.real)), float(np.ptp(seen.imag))
+
+    def box_centre(self, direction: complex) -> complex:
+        """Centre of the box with a side along a unit vector, relative to this direction."""
+        seen = self.hull * direction.conjugate()
+        return complex(seen.real.min() + seen.real.max(), seen.imag.min() + seen.imag.max()) / 2
+
+
+def make_shape(uv: FloatArray, F: IntArray) -> Shape:
+    """Return the shape of a chart with vertices (m, 2) and triangles (k, 3), at least one."""
+    z = np.ascontiguousarray(uv).view(np.complex128).ravel()
+    sign, _ = triangle_signs(F, uv)
+    rows = np.where((sign < 0)[:, None], F[:, ::-1], F)
+    tail, head = rows.ravel(), np.roll(rows, -1, axis=1).ravel()
+    # Opposite directed edges cancel.
+    lower, upper = np.minimum(tail, head), np.maximum(tail, head)
+    key, place = np.unique(lower * len(z) + upper, return_inverse=True)
+    count = np.bincount(place, np.where(tail < head, 1, -1), len(key)).astype(np.int64)
+    lower, upper = np.divmod(key, len(z))
+    first, second = np.where(count > 0, lower, upper), np.where(count > 0, upper, lower)
+    first, second = np.repeat(first, np.abs(count)), np.repeat(second, np.abs(count))
+    thin = F[sign == 0]
+    if thin.size:
+        tail, head = thin.ravel(), np.roll(thin, -1, axis=1).ravel()
+        first, second = np.concatenate([first, tail, head]), np.concatenate([second, head, tail])
+    corners = z[F]
+    across = ((corners[:, 1] - corners[:, 0]).conj() * (corners[:, 2] - corners[:, 0])).imag
+    return Shape(z[first], z[second], _hull(z[np.unique(first)]), float(np.abs(across).sum() / 2))
+
+
+def _hull(points: ComplexArray) -> ComplexArray:
+    """Corners of the convex hull; all points if they are on a line."""
+    try:
+        return points[ConvexHull(points.view(np.float64).reshape(-1, 2)).vertices]
+    except (QhullError, ValueError):
+        return points
+
+
+def find_smallest_box(shape: Shape) -> complex:
+    """Unit vector along a side of the box of smallest area, rotated by at most 45° from the x-axis."""
+    along = _side_directions(shape.hull)
+    boxes = [
+        np.ptp(seen.real, axis=1) * np.ptp(seen.imag, axis=1)
+        for some in np.array_split(along, 1 + along.size * shape.hull.size // _BLOCK)
+        for seen in (shape.hull[None, :] * some.conj()[:, None],)
+    ]
+    return _least_rotated(along, np.concatenate(boxes))
+
+
+def _side_directions(hull: ComplexArray) -> ComplexArray:
+    """Directions of the hull's sides as unit vectors, rotated by multiples of 90° to at most 45° from the x-axis."""
+    sides = np.roll(hull, -1) - hull
+    along = np.concatenate([[1 + 0j], sides[sides != 0] / np.abs(sides[sides != 0])])
+    along = along * np.array([1, -1j, -1, 1j])[np.rint(np.angle(along) / (np.pi / 2)).astype(np.int64) % 4]
+    return np.asarray(along)
+
+
+def _least_rotated(along: ComplexArray, size: FloatArray) -> complex:
+    """Of the directions with the smallest size the one with the smallest rotation."""
+    small = np.flatnonzero(size <= (1 + _AS_SMALL) * size.min())
+    return complex(along[small[np.argmin(np.abs(along[small].imag))]])

@@ -1,0 +1,209 @@
+"""Descend from a field without folds to the nearest one, patch by patch, with a step length for each patch.
+
+The free pixels form patches. No cell has free pixels of two patches. Let ``w`` be the positions of the mapped pixels
+and ``a`` those under the given field, both in the grid's unit. Each patch minimises::
+
+    ½ Σ |w − a|²  +  κ Σ B((det − δ) / d)        B(s) = −(s − 1)² log s   for s < 1,   0 for s ≥ 1
+
+over its pixels and its cells' corner triangles. The barrier [1]_ is infinite at determinants of δ. From δ + d on, it
+and its first two derivatives vanish. So only the first term acts on pixels whose cells are not nearly folded, and moves
+them exactly to their positions under the given field. κ decreases in steps, until the barrier's effect is negligible.
+
+Patches share one block-diagonal matrix and Newton's direction. Step length and convergence are determined per patch.
+
+References
+----------
+.. [1] M. Li, Z. Ferguson, T. Schneider, T. Langlois, D. Zorin, D. Panozzo, C. Jiang, D. Kaufman, Incremental potential
+   contact. ACM Transactions on Graphics 39 (2020), equation 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.apps.displacement_fields.grid import Grid
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import Deformation, Isotropic
+from quasiharmonic.energies.newton.line_search import backtrack_each
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat
+
+# The barrier's width d.
+_WIDTH = 0.05
+# The barrier's weights κ in turn.
+_WEIGHTS = 1e-3, 1e-5
+# A patch has converged if Newton's model predicts a decrease below this fraction of its value.
+_TOLERANCE = 1e-6
+# It has also converged below this decrease in squared pixels.
+_ZERO_DECREASE = 1e-14
+# It has also converged if a step lowers its value by less than this fraction.
+_IDLE = 1e-9
+# Maximum number of steps for one weight.
+_MAX_STEPS = 100
+# Maximum number of lengths of one step.
+_MAX_HALVINGS = 30
+# Fraction of the step to the first collapse, as in the other Newton descents.
+_FRACTION = 0.9
+# Diagonal shifts, tried in this order until the matrix is positive definite.
+_SHIFTS = 0.0, 1e-12, 1e-8, 1e-4
+# Approximate number of free pixels in one matrix.
+_AT_ONCE = 20_000
+
+
+@dataclass(frozen=True)
+class ThinBarrier(Isotropic):
+    """A barrier at determinants of ``min_jacobian`` that vanishes from ``min_jacobian + width`` on."""
+
+    min_jacobian: float
+    width: float
+
+    barrier = True
+
+    def density(self, d: Deformation) -> FloatArray:
+        """Return ``B(s)``."""
+        s = self._place(d)
+        return np.where(s > 0, -((s - 1) ** 2) * np.log(np.where(s > 0, s, 1)), np.inf)
+
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """Derivatives by a and by b; they are opposite, as φ is a function of det = a − b."""
+        s = self._inside(d)
+        slope = -(2 * (s - 1) * np.log(s) + (s - 1) ** 2 / s) / self.width
+        return slope, -slope
+
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Second derivatives by a and a, a and b, b and b."""
+        s = self._inside(d)
+        bend = -(2 * np.log(s) + 4 * (s - 1) / s - ((s - 1) / s) ** 2) / self.width**2
+        return bend, -bend, bend
+
+    def _place(self, d: Deformation) -> FloatArray:
+        return np.minimum((d.det - self.min_jacobian) / self.width, 1)
+
+    def _inside(self, d: Deformation) -> FloatArray:
+        s = self._place(d)
+        return np.where(s > 0, s, 1)
+
+
+def descend_patches(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float) -> None:
+    """Move the free pixels as near to their positions under a given field as possible.
+
+    ``w`` (h, w) complex128 is changed in place. It is a map in the grid's unit whose determinants are above
+    ``min_jacobian`` at all corners of cells with free pixels. ``given`` (h, w) is the given map, and ``patch`` (h, w)
+    the patch of each free pixel, from 1 on; 0 for fixed pixels.
+    """
+    size = np.bincount(patch.ravel())
+    size[0] = 0
+    batch = (np.cumsum(size) - size) // _AT_ONCE
+    # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never taken.
+    with np.errstate(all="ignore"):
+        for number in range(int(batch[-1]) + 1):
+            todo = np.flatnonzero((batch == number) & (size > 0))
+            for weight in _WEIGHTS:
+                _descend(grid, w, given, patch, todo, min_jacobian, weight)
+
+
+def _descend(
+    grid: Grid,
+    w: ComplexArray,
+    given: ComplexArray,
+    patch: IntArray,
+    todo: IntArray,
+    min_jacobian: float,
+    weight: float,
+) -> None:
+    """Converge the patches ``todo`` for one weight of the barrier; the matrix only has patches that still move."""
+    steps = _MAX_STEPS
+    while todo.size and steps:
+        batch = _Batch(grid, w, given, np.where(np.isin(patch, todo), patch, 0), min_jacobian, weight)
+        moving = np.ones(todo.size, dtype=bool)
+        while steps and 2 * np.count_nonzero(moving) > todo.size:
+            heartbeat()
+            moving &= batch.step(moving)
+            steps -= 1
+        batch.enter(w)
+        todo = todo[moving]
+
+
+class _Batch:
+    """Patches that share one matrix."""
+
+    def __init__(
+        self, grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float, weight: float
+    ) -> None:
+        touched = find_cells(patch > 0)
+        cells = grid.cells(*np.nonzero(touched))
+        pixels, local = np.unique(cells, return_inverse=True)
+        F = grid.corner_triangles(local.reshape(-1, 4))
+        self.weight, self._pixels = weight, pixels
+        self.here, self.given = w.ravel()[pixels], given.ravel()[pixels]
+        label = patch.ravel()[pixels]
+        self.free = np.flatnonzero(label)
+        _, own = np.unique(label[self.free], return_inverse=True)
+        self.patches = int(own.max()) + 1
+        self.of_pixel = own
+        of = np.full(len(pixels), -1, dtype=np.int64)
+        of[self.free] = own
+        self.of_triangle = np.repeat(of[local.reshape(-1, 4)].max(axis=1), 4)
+        self.energy = DeformationEnergy(
+            grid.points.reshape(-1, 2)[pixels] / grid.unit, F, ThinBarrier(min_jacobian, _WIDTH)
+        )
+        self.system = NewtonSystem(F, self.energy.g, len(pixels), np.flatnonzero(label == 0))
+        self._count = len(F)
+
+    def enter(self, w: ComplexArray) -> None:
+        """Write the free pixels' positions into a map (h, w)."""
+        w.ravel()[self._pixels[self.free]] = self.here[self.free]
+
+    def _values(self, w: ComplexArray) -> tuple[FloatArray, Deformation]:
+        """Return the objective of each patch, and the deformation."""
+        deformation = self.energy.deform(w)
+        density = self.energy.energy.density(deformation)
+        apart = np.abs((w - self.given)[self.free]) ** 2
+        near = np.bincount(self.of_pixel, apart, minlength=self.patches)
+        return 0.5 * near + self.weight * np.bincount(self.of_triangle, density, minlength=self.patches), deformation
+
+    def step(self, moving: BoolArray) -> BoolArray:
+        """Take one step of each moving patch; return which patches have not converged."""
+        value, deformation = self._values(self.here)
+        # The energy is a mean, but the patches' objective is a sum.
+        share = self.weight * self._count
+        pull = share * self.energy.gradient_of(deformation, len(self.here))[self.free]
+        gradient = pull + (self.here - self.given)[self.free]
+        self.system.assemble(self.energy.curvature_of(deformation).scaled(np.full(self._count, share)))
+        one = np.ones(self.free.size)
+        self.system.add_blocks(one, 0 * one, one)
+        found = self.system.descent(gradient, _SHIFTS)
+        direction = found[0] if found is not None else self.system.solve_diagonal(-gradient)
+        fall = -(gradient.real * direction.real + gradient.imag * direction.imag)
+        expected_decrease = np.bincount(self.of_pixel, fall, minlength=self.patches).astype(np.float64, copy=False)
+        fallen = self._search(direction, expected_decrease, value, moving & (expected_decrease > 0))
+        return (fallen > _IDLE * value) & (0.5 * expected_decrease > np.maximum(_TOLERANCE * value, _ZERO_DECREASE))
+
+    def _search(
+        self, direction: ComplexArray, expected_decrease: FloatArray, before: FloatArray, moving: BoolArray
+    ) -> FloatArray:
+        """Search along a direction with a step length for each patch; return each patch's decrease."""
+        full = np.zeros_like(self.here)
+        full[self.free] = direction
+        reach = np.full(self.patches, np.inf)
+        np.minimum.at(reach, self.of_triangle, self.energy.steps_to_collapse(self.here, full))
+        longest = np.where(moving, np.minimum(1, _FRACTION * reach), 0)
+        start, trial = self.here[self.free], self.here.copy()
+
+        def values(t: FloatArray) -> FloatArray:
+            trial[self.free] = start + t[self.of_pixel] * direction
+            return self._values(trial)[0]
+
+        t, value = backtrack_each(values, before, expected_decrease, longest, tries=_MAX_HALVINGS)
+        self.here = trial
+        return np.where(t > 0, before - value, 0)
+
+
+def find_cells(pixels: BoolArray) -> BoolArray:
+    """The cells (h − 1, w − 1) that have at least one of the pixels (h, w)."""
+    rows = pixels[:-1] | pixels[1:]
+    touched: BoolArray = rows[:, :-1] | rows[:, 1:]
+    return touched

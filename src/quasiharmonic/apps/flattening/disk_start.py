@@ -1,0 +1,51 @@
+"""Initial bijective map: the longest boundary loop on a circle, the other loops free.
+
+Each hole is filled by a fan around a new vertex, so the surface becomes a disk. The library's solver maps it onto the
+convex outline and certifies the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quasiharmonic.problem import Problem
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+
+def map_to_disk(
+    V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str = "auto"
+) -> FloatArray | None:
+    """Map a surface into a disk of its area, with its longest loop on the circle by arc length.
+
+    ``V`` (n, 3) is of about unit size, and the surface is connected and has no handles. Return a bijective map (n, 2),
+    or None if none was found in double precision.
+    """
+    lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
+    longest = int(np.argmax([length.sum() for length in lengths]))
+    outer = loops[longest]
+    holes = [loop for k, loop in enumerate(loops) if k != longest]
+    # Edges of length zero get a small length, so that no two vertices share a position.
+    length = lengths[longest] + 1e-6 * lengths[longest].mean()
+    angle = 2 * np.pi * np.cumsum(length) / length.sum()
+    corners = V[F]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    radius = np.sqrt(0.5 * float(np.linalg.norm(cross, axis=1).sum()) / np.pi)
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    problem = Problem(
+        np.concatenate([V, *(V[hole].mean(axis=0)[None] for hole in holes)]),
+        np.concatenate([F, make_fans(holes, len(V))]),
+        outer,
+        circle,
+        reference="equilateral",
+    )
+    result = solve(problem, linear_solver=linear_solver, max_iterations=200)
+    return result.uv[: len(V)] if result.injective else None
+
+
+def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:
+    """Fill loops, with the surface on their left, by triangles (k, 3) around new vertices numbered from ``n``."""
+    triangles = [np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)]
+    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles])

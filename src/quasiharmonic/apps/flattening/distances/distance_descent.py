@@ -1,0 +1,243 @@
+"""Flat maps that keep distances: Newton steps on the distance energy among bijective maps.
+
+A pair of distant vertices couples vertices that share no triangle, so the factors of a matrix with all pairs would have
+much fill. Each vertex has pairs in all directions, so the diagonal blocks of the pairs are a good approximation. Write
+``H = M + (P − D)``: P is the pairs' matrix, D its diagonal blocks, and M the triangles' matrix plus D. Conjugate
+gradients with the factors of M as preconditioner give Newton's direction in about a dozen iterations. Products with M
+need no work, as they are the residuals before preconditioning.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy, PairForm
+from quasiharmonic.apps.flattening.layout import to_given_unit
+from quasiharmonic.apps.flattening.piece import Piece, Settings
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
+from quasiharmonic.energies.distances import Sampling, SurfaceDistances, sample_distances
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_integer, map_array
+from quasiharmonic.util.progress import reports_progress
+
+# Number of pairs. On a cortex of 9,465 vertices, twice as many lower the error by 1 %, and half as many raise it by 1
+# %.
+_PAIRS = 300_000
+# Maximum number of edges that a segment crosses.
+_CROSSINGS = 3
+# Number of sources times the squared rings, because the cost of the distances from a source grows with the square.
+_WORK = 1_000_000
+# Minimum number of sources.
+_MIN_SOURCES = 1000
+# Maximum number of sources.
+_MAX_SOURCES = 4000
+# Conjugate gradients stop at this reduction of the residual.
+_RESIDUAL = 0.1
+# Maximum number of iterations of conjugate gradients.
+_MAX_GRADIENTS = 20
+
+
+@accepts_mesh
+@reports_progress
+def keep_distances(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    rings: int = 20,
+    max_iterations: int = 100,
+    tol: float = 1e-3,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+    record_every: int = 0,
+) -> MapResult:
+    """Lower the error of distances in a bijective map; all maps on the way are bijective.
+
+    The objective is a mean over a sample of vertex pairs at most ``rings`` edges apart. It is the distance error of
+    `quasiharmonic.distortion`, except that errors below 30 % count quadratically. A small multiple of the symmetric
+    Dirichlet energy keeps triangles from collapsing (`quasiharmonic.apps.flattening.distances.energy`). With 20 rings,
+    the sample has 2,500 vertices, or all if there are fewer, with 120 others each. Fewer rings use up to 4,000
+    vertices, and more rings down to 1,000; there are 300,000 pairs in all. The sample is random but deterministic.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Rest positions.
+    F : (f, 3) array of int
+        Triangles of a connected surface with at least one boundary loop and without handles.
+    uv : (n, 2) array
+        A bijective map of any size, for example from `flatten`.
+    rings : int
+        Maximum number of edges between the vertices of a pair.
+    max_iterations : int
+        Maximum number of Newton steps.
+    tol : float
+        The descent has converged when Newton's model predicts a decrease below this fraction of the energy. Not
+        negative.
+    linear_solver, callback, record_every
+        As for `quasiharmonic.flatten`.
+
+    Returns
+    -------
+    MapResult
+        ``uv`` is certified as bijective, and in the surface's unit of length, at the scale that fits distances best.
+        The status is ``POLISHED`` if converged, ``STILL_FALLING`` after ``max_iterations``, ``EXHAUSTED`` if no better
+        bijective map was found, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
+
+    Raises
+    ------
+    ValueError
+        If the input is malformed (see `Problem`), the surface has handles, a rest triangle has no area, or ``uv`` is
+        not bijective; the message names the elements.
+
+    Examples
+    --------
+    A dome seen from above is compressed at its boundary; the descent spreads it out:
+
+    >>> import numpy as np
+    >>> from quasiharmonic import distortion
+    >>> from quasiharmonic.surfaces import disk
+    >>> flat, F = disk(12)
+    >>> V = np.column_stack([flat, np.sqrt(1.1 - (flat**2).sum(axis=1))])
+    >>> result = keep_distances(V, F, flat, rings=8)
+    >>> result.certificate.bijective
+    True
+    >>> errors = [distortion(V, F, uv, rings=8).distances.mean for uv in (flat, result.uv)]
+    >>> errors[1] < 0.5 * errors[0]
+    True
+    """
+    began = time.perf_counter()
+    check_integer("rings", rings, minimum=1)
+    settings = Settings("symmetric-dirichlet", tol, max_iterations, linear_solver, callback, record_every)
+    piece = Piece(V, F)
+    n = len(piece.V)
+    positions = map_array("uv", uv, n)
+    certificate = certify(piece.F, positions, loops=piece.loops)
+    if not certificate.bijective:
+        raise ValueError(f"uv is not bijective: the descent needs a bijective map. {certificate.summary()}")
+    result = lower_distance_error(piece, positions, rings, settings)
+    uv = to_given_unit(result.uv, piece.exponent)
+    certificate = certify(piece.F, uv, loops=piece.loops)
+    rest = np.ldexp(piece.V, piece.exponent)
+    return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began, V=rest)
+
+
+def lower_distance_error(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first: int = 0) -> MapResult:
+    """Lower the error of distances in a bijective map (n, 2), of any size, of a piece; see `keep_distances`.
+
+    The energy of ``settings`` is ignored, and ``first`` is the number of the first step. The result's ``uv`` is in the
+    piece's unit, and its ``path`` in the surface's.
+    """
+    began = time.perf_counter()
+    distances = sample_distances(piece.V, piece.F, choose_sampling(rings))
+    start = fit_scale(uv, distances, piece.F, piece.loops)
+    with np.errstate(all="ignore"):
+        energy = DistanceEnergy(distances, piece.energy(SymmetricDirichlet(), None), len(piece.V))
+        descent = SurfaceDescent(
+            energy, start, settings.linear_solver, rim=Rim(piece.loops), pairs=DistancePairs(energy)
+        )
+    history: list[Step] = []
+    path: list[Snapshot] = []
+
+    def report(value: float) -> None:
+        history.append(Step(first + len(history), 0, value))
+        if settings.record_every and history[-1].iteration % settings.record_every == 0:
+            path.append(Snapshot(history[-1].iteration, to_given_unit(descent.uv, piece.exponent)))
+        if settings.callback is not None:
+            settings.callback(history[-1])
+
+    status = run_descent(descent, settings, report)
+    seconds = time.perf_counter() - began
+    energies = history[0].energy, descent.distortion
+    return MapResult(
+        uv=descent.uv,
+        status=status,
+        certificate=certify(piece.F, descent.uv, loops=piece.loops),
+        stages=[Stage("guarded descent, distances", len(history) - 1, seconds, (0, 0), energies)],
+        history=history,
+        path=path,
+        linear_solver=descent.linear_solver,
+        seconds=seconds,
+    )
+
+
+def choose_sampling(rings: int) -> Sampling:
+    """The sampling for a number of rings: a constant number of pairs, from fewer sources if there are many rings."""
+    sources = int(np.clip(_WORK // rings**2, _MIN_SOURCES, _MAX_SOURCES))
+    return Sampling(rings, sources, _PAIRS // sources, _CROSSINGS)
+
+
+def fit_scale(uv: FloatArray, distances: SurfaceDistances, F: IntArray, loops: list[IntArray]) -> FloatArray:
+    """Scale a bijective map so that its distances fit the surface's best, and centre it at the origin."""
+    # First scale by a power of two, so that squared lengths neither overflow nor underflow.
+    uv = np.ldexp(uv, -int(np.frexp(np.ptp(uv, axis=0).max())[1]))
+    scale = distances.error(uv).scale
+    scaled = scale * (uv - uv.mean(axis=0))
+    if certify(F, scaled, loops=loops).bijective:
+        return scaled
+    # Rounding inverts very thin triangles; scaling by a power of two does not change their signs.
+    return np.ldexp(uv, int(np.rint(np.log2(scale))))
+
+
+def run_descent(descent: SurfaceDescent, settings: Settings, report: Callable[[float], None]) -> Status:
+    """Take steps until converged, stalled or interrupted by Ctrl-C; return the status.
+
+    ``report`` is called with the energy at the start and after every step.
+    """
+    try:
+        report(descent.distortion)
+        for _ in range(settings.max_iterations):
+            with np.errstate(all="ignore"):
+                outcome = descent.step(settings.tol)
+            report(descent.distortion)
+            if outcome is not None and not descent.relax_barrier():
+                return outcome
+    except KeyboardInterrupt:
+        return Status.INTERRUPTED
+    return Status.STILL_FALLING
+
+
+class DistancePairs:
+    """Second derivatives of an energy of distances between distant vertices; see `Pairs`."""
+
+    def __init__(self, energy: DistanceEnergy) -> None:
+        self._energy = energy
+        self._form: PairForm | None = None
+
+    def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
+        """Add the diagonal blocks of the pairs at a map (n,)."""
+        self._form = self._energy.pairs_at(w)
+        system.add_blocks(*(part[system.free] for part in self._form.diagonal))
+
+    def solve(self, system: NewtonSystem, load: ComplexArray) -> ComplexArray:
+        """Return Newton's direction for a load on the free vertices, by conjugate gradients."""
+        assert self._form is not None
+        free, full_step = system.free, np.zeros(self._energy.n, dtype=np.complex128)
+        direction, residual = np.zeros_like(load), load
+        step, by_matrix = system.solve(load), load
+        now = first = _dot(load, step)
+        for _ in range(_MAX_GRADIENTS):
+            if not now > _RESIDUAL**2 * first:
+                break
+            full_step[free] = step
+            product = by_matrix + self._form.apply_off_diagonal(full_step)[free]
+            size = now / _dot(step, product)
+            direction, residual = direction + size * step, residual - size * product
+            preconditioned = system.solve(residual)
+            now, before = _dot(residual, preconditioned), now
+            step, by_matrix = preconditioned + now / before * step, residual + now / before * by_matrix
+        return direction
+
+
+def _dot(a: ComplexArray, b: ComplexArray) -> float:
+    return float(np.sum(a.real * b.real + a.imag * b.imag))

@@ -1,0 +1,301 @@
+"""Flatten a surface without a given boundary: a bijective map into the plane with low distortion.
+
+    V, F ─▶ connected pieces ─▶ start, a disk ─▶ free descent ─▶ does the boundary touch itself? ─ no ─▶ layout,
+                                      │                                       │ yes                  ▲  certified
+                                      └───────────────────────────────────────┴─▶ guarded descent ───┘
+
+Overlaps are rare, and the guarded descent takes longer than the free one. So the boundary first moves freely. If the
+converged map overlaps itself, the descent starts again with the guard.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.flattening.connected_parts import Part, combine_statuses, split_parts
+from quasiharmonic.apps.flattening.distances.distance_descent import lower_distance_error
+from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
+from quasiharmonic.apps.flattening.layout import (
+    align_with_axis,
+    check_in_range,
+    fit_unit_square,
+    place_in_row,
+    to_given_unit,
+)
+from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
+from quasiharmonic.energies.deformation import positive_weights
+from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
+from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.linsolve import check_name
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_bool,
+    check_integer,
+    check_non_negative,
+    map_array,
+    names_of,
+    triangle_rows,
+    vertex_array,
+)
+from quasiharmonic.util.progress import reports_progress
+
+# Distances are sampled, so their descent converges at a tolerance larger by this factor.
+_SAMPLED = 10.0
+# Statuses of descents that were not interrupted.
+_DESCENDED = Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING, Status.COLLAPSED
+
+
+@accepts_mesh
+@reports_progress
+def flatten(
+    V: ArrayLike,
+    F: ArrayLike,
+    *,
+    fixed: ArrayLike | None = None,
+    target: ArrayLike | None = None,
+    energy: str | Energy = "symmetric-dirichlet",
+    weights: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    unit_square: bool = False,
+    rings: int = 20,
+    gap: float = 0.0,
+    max_iterations: int = 500,
+    tol: float = 1e-4,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+    record_every: int = 0,
+) -> MapResult:
+    """Map a surface into the plane bijectively with a free boundary.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Rest positions.
+    F : (f, 3) array of int
+        Triangles of one or several surfaces. Each surface needs at least one boundary loop and must not have handles.
+        Holes are allowed.
+    fixed : (k,) array of int, optional
+        Fixed vertices. They get exactly the positions in ``target``. Surfaces without fixed vertices are placed beside
+        the surfaces that have some.
+    target : (k, 2) array, optional
+        Target positions of the fixed vertices.
+    energy : str or Energy
+        The objective, a mean over the surface's area: ``"symmetric-dirichlet"``, ``"mips"`` (angles only),
+        ``"blend"``, ``"arap-barrier"`` or an `Energy`; see `quasiharmonic.polish`. With ``"distances"`` the symmetric
+        Dirichlet energy is minimised first, then the error of distances between vertices some edges apart; see
+        `quasiharmonic.keep_distances`. ``"distances"`` does not accept ``fixed`` or ``weights``. Without ``start``,
+        pieces of at least 50,000 triangles use a coarse mesh for it, and ``path`` has only their final map.
+    weights : (f,) array, optional
+        Positive weight of each triangle's distortion; 1 by default.
+    start : (n, 2) array, optional
+        Initial injective map, at any scale. If the descent from it collapses or every map overlaps itself, the descent
+        starts again from the default initial map.
+    unit_square : bool
+        Scale the map uniformly into the unit square. By default it is in the surface's unit of length.
+    rings : int
+        For ``"distances"``: the largest number of edges between two vertices whose distance is kept.
+    gap : float
+        Minimum space between the bounding boxes of several pieces, in the surface's unit; not negative. The space is
+        always at least a twentieth of the longest box side.
+    max_iterations : int
+        Maximum number of Newton steps on each connected piece. The count starts again when an overlap restarts the
+        descent, and for distances. With 0 the map is the initial map. With fixed vertices, each of the two attempts
+        of the search takes at most this number of steps, or 2,000 if that is more.
+    tol : float
+        The descent has converged when Newton's model predicts a decrease below this fraction of the energy. For
+        distances, which are sampled, the fraction is ten times larger. Not negative.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+    callback : callable, optional
+        Called with a `Step` at the start and after every step. Between steps it is called again with the last `Step`
+        at least every half second, except during a factorisation. ``Step.energy`` is the current mean energy. The
+        callback may raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
+    record_every : int
+        Keep the map of every ``record_every``-th step in the result's ``path``, before layout. With 0, the default,
+        or with several pieces, no maps are kept.
+
+    Returns
+    -------
+    MapResult
+        ``uv`` is certified as bijective. Without fixed vertices the principal axis lies along x, the bounding box
+        starts at the origin, and several pieces stand side by side. The status is one of:
+
+        - ``POLISHED``: converged.
+        - ``STILL_FALLING``: stopped after ``max_iterations``.
+        - ``EXHAUSTED``: doubles cannot represent a better map.
+        - ``COLLAPSED``: from every initial map, the result is stretched far more than the surface requires.
+        - ``INTERRUPTED``: stopped by Ctrl-C; the map is the best so far.
+        - With fixed vertices also ``IMPOSSIBLE``, with the cause in ``diagnosis``, or the status of the search. The
+          map is then the best found and may not be injective; see its certificate. The same holds after an interrupt
+          of that search.
+
+    Raises
+    ------
+    ValueError
+        If the input is malformed (see `Problem`), a surface is closed or has handles, a rest triangle has no area, or
+        ``start`` is not injective; the message names the elements. Also if the map exceeds the range of doubles.
+    KeyboardInterrupt
+        If Ctrl-C comes before a bijective map exists.
+
+    Examples
+    --------
+    A cone without its tip, cut open, is isometric to a part of a ring:
+
+    >>> import numpy as np
+    >>> from quasiharmonic.surfaces import grid
+    >>> square, F = grid(12, 6)
+    >>> r, angle = 1 + square[:, 1], 5 * square[:, 0]
+    >>> V = np.stack([0.6 * r * np.cos(angle), 0.6 * r * np.sin(angle), 0.8 * r], axis=1)
+    >>> result = flatten(V, F)
+    >>> bool(result.certificate.bijective), result.history[-1].energy < 1e-2
+    (True, True)
+    """
+    began = time.perf_counter()
+    if (fixed is None) != (target is None):
+        raise ValueError("give fixed and target together: fixed vertices and their target positions")
+    if fixed is not None and unit_square:
+        raise ValueError("fixed vertices determine the size of the map: omit unit_square")
+    check_bool("unit_square", unit_square)
+    check_integer("rings", rings, minimum=1)
+    check_non_negative("gap", gap)
+    check_name(linear_solver)
+    of_distances = isinstance(energy, str) and energy == "distances"
+    if of_distances and not (fixed is None and weights is None):
+        raise ValueError(
+            "the energy 'distances' supports neither fixed vertices nor weights: omit fixed and weights, or choose "
+            "another energy"
+        )
+    chosen = "symmetric-dirichlet" if of_distances else energy
+    settings = Settings(chosen, tol, max_iterations, linear_solver, callback, record_every)
+    V, F = vertex_array(V), triangle_rows(F)
+    weights = None if weights is None else positive_weights(weights, len(F))
+    given = None if start is None else _check_start(start, V, F)
+    held, free, results = list[Part](), split_parts(V, F), list[MapResult]()
+    if fixed is not None and target is not None:
+        from quasiharmonic.apps.flattening.pins.part_arrangement import flatten_pinned_parts
+        from quasiharmonic.apps.flattening.pins.pin_search import check_pins, flatten_pinned
+
+        pins = check_pins(fixed, target, len(V))
+        if len(free) == 1:
+            result = flatten_pinned(free[0].piece, *pins, settings, weights, given)
+            return replace(result, seconds=time.perf_counter() - began, V=V)
+        has_pins = [bool(np.isin(pins[0], part.vertices).any()) for part in free]
+        held = [part for part, has in zip(free, has_pins, strict=True) if has]
+        free = [part for part, has in zip(free, has_pins, strict=True) if not has]
+        results.append(flatten_pinned_parts(F, held, *pins, settings, weights, given))
+    for part in free:
+        if results and results[-1].status is Status.INTERRUPTED:
+            # The other pieces still need a position, so they get their initial maps.
+            settings = replace(settings, max_iterations=0, callback=None)
+        results.append(_flatten_part(part, given, weights, settings, rings if of_distances else None))
+    uv = _place(len(V), held, free, results, gap)
+    result = _combine(F, fit_unit_square(uv) if unit_square else uv, held, free, results)
+    return replace(result, seconds=time.perf_counter() - began, V=V)
+
+
+def _flatten_part(
+    part: Part, start: FloatArray | None, weights: FloatArray | None, settings: Settings, rings: int | None
+) -> MapResult:
+    """Flatten one connected surface without fixed vertices; with ``rings``, keep distances."""
+    piece = part.piece
+    uv = None if start is None else np.ldexp(start[part.vertices], -piece.exponent)
+    if rings is not None:
+        return _flatten_with_distances(piece, uv, rings, settings)
+    return Flattening(piece, settings, None if weights is None else weights[part.triangles]).run(uv)
+
+
+def _place(n: int, held: Sequence[Part], free: Sequence[Part], results: Sequence[MapResult], gap: float) -> FloatArray:
+    """Return the positions (n, 2) of all pieces, side by side; pieces with fixed vertices keep their positions."""
+    first = len(results) - len(free)
+    placed = [result.uv for result in results[:first]]
+    low = placed[0].min(axis=0) if placed else 0.0
+    with np.errstate(over="ignore"):
+        boxes = [check_in_range(uv - low) for uv in placed]
+    boxes += [_lay_out(part.piece, result.uv) for part, result in zip(free, results[first:], strict=True)]
+    beside = place_in_row(boxes, gap) if len(boxes) > 1 else boxes
+    with np.errstate(over="ignore"):
+        placed += [check_in_range(place + low) for place in beside[len(placed) :]]
+    uv = np.zeros((n, 2))
+    uv[np.concatenate([part.vertices for part in [*held, *free]])] = np.concatenate(placed)
+    return uv
+
+
+def _combine(
+    F: IntArray, uv: FloatArray, held: Sequence[Part], free: Sequence[Part], results: Sequence[MapResult]
+) -> MapResult:
+    """Certify the map of all pieces, and combine the reports of the descents."""
+    loops = [loop for part in [*held, *free] for loop in part.loops]
+    status, certificate = combine_statuses(result.status for result in results), certify(F, uv, loops=loops)
+    if held and not certificate.bijective and status in _DESCENDED:
+        # If fixed vertices are far away or at a very different scale, doubles cannot resolve the other pieces there.
+        status = Status.ROUNDED
+    return MapResult(
+        uv=uv,
+        status=status,
+        certificate=certificate,
+        stages=[stage for result in results for stage in result.stages],
+        history=[step for result in results for step in result.history],
+        path=results[0].path if len(results) == 1 else [],
+        diagnosis=results[0].diagnosis,
+        linear_solver=results[0].linear_solver,
+    )
+
+
+def check_flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
+    """Return the connected pieces of a mesh, largest first; raise ValueError if `flatten` rejects it."""
+    V, F = vertex_array(V), triangle_rows(F)
+    pieces = [part.piece for part in split_parts(V, F)]
+    for piece in pieces:
+        # Raises ValueError and names rest triangles without area.
+        piece.energy(SymmetricDirichlet(), None)
+    return pieces
+
+
+def _flatten_with_distances(piece: Piece, start: FloatArray | None, rings: int, settings: Settings) -> MapResult:
+    """Map a piece with ``"distances"``; if interrupted before that map exists, return the map without distances."""
+    sampled = replace(settings, tol=_SAMPLED * settings.tol)
+    if start is None and settings.max_iterations and len(piece.F) >= COARSE_FROM:
+        by_coarse = lower_coarse_distance_error(piece, rings, sampled)
+        if by_coarse is not None:
+            return by_coarse
+    found = Flattening(piece, settings, None).run(start)
+    if found.status is Status.INTERRUPTED or piece.thin_planar_map() is not None:
+        return found
+    try:
+        then = lower_distance_error(piece, found.uv, rings, sampled, first=len(found.history))
+    except KeyboardInterrupt:
+        return replace(found, status=Status.INTERRUPTED)
+    return replace(
+        then,
+        status=Status.COLLAPSED if found.status is Status.COLLAPSED else then.status,
+        stages=found.stages + then.stages,
+        history=found.history + then.history,
+        path=found.path + then.path,
+    )
+
+
+def _check_start(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
+    array = map_array("start", start, len(V))
+    inverted = inverted_triangles(F, array)
+    if inverted.size:
+        raise ValueError(
+            f"start is not injective: {names_of('triangle', 'triangles', inverted)} inverted or degenerate; "
+            "omit it, or make it injective first (quasiharmonic.repair)"
+        )
+    return array
+
+
+def _lay_out(piece: Piece, uv: FloatArray) -> FloatArray:
+    """Align a piece's map with its axis in the surface's unit; without the rotation if that would invert a triangle."""
+    placed_uv = to_given_unit(align_with_axis(piece.F, uv), piece.exponent)
+    if certify(piece.F, placed_uv, loops=piece.loops).bijective:
+        return placed_uv
+    return to_given_unit(uv, piece.exponent)

@@ -1,0 +1,343 @@
+"""Bijective maps with fixed vertices and a boundary that is otherwise free.
+
+::
+
+    surface ─▶ flattened freely ─▶ shifted, rotated and scaled onto the pins ─▶ air around it up to a frame
+            ─▶ surface and air solved as one problem with frame and pins fixed
+            ─▶ bijective; the air is removed ─▶ guarded descent with only the pins fixed ─▶ certified
+
+While the frame is fixed and no triangle of surface and air is inverted, the surface does not overlap itself. So the
+solver for fixed boundaries also solves this problem. Air edges between pins can forbid a map that the surface alone
+allows. These edges are split, and so are air edges that a diagnosis names, because new vertices in the air are
+harmless.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.layout import to_given_unit
+from quasiharmonic.apps.flattening.piece import Flattening, Piece, Settings
+from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
+from quasiharmonic.apps.flattening.scaffold.air_triangulation import triangulate_air
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.mesh.refinement import split_edges
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis import Diagnosis, Kind
+from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.solver.methods import RandomRestarts, Untangling, VectorAdam
+from quasiharmonic.solver.search.stages import CoarseToFine, Stages
+from quasiharmonic.solver.search.strategy import speed
+from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, target_positions
+
+# Tolerance for the map that is then moved onto the pins.
+_TOLERANCE = 1e-2
+# Maximum number of steps for that map.
+_MAX_STEPS = 40
+# Distance of the frame, relative to the longer side of the box around surface and pins, for each attempt in turn.
+_MARGINS = 0.5, 1.5
+# Iterations on tensors before vertices are moved. In hard cases this takes a third of the time of waiting until
+# tensors converge, and is as reliable, since the other methods follow.
+_TENSOR_ITERATIONS = 60
+# Iterations on vertices.
+_VERTEX_ITERATIONS = 300
+# Maximum number of consecutive failed restarts of patches, after all other methods have failed.
+_IN_VAIN = 30
+# Minimum of the limit on linear solves per attempt.
+_MIN_ITERATIONS = 2000
+# Maximum number of times that air edges are split.
+_MAX_SPLITS = 4
+
+
+def flatten_pinned(
+    piece: Piece,
+    fixed: IntArray,
+    target: FloatArray,
+    settings: Settings,
+    weights: FloatArray | None = None,
+    start: FloatArray | None = None,
+) -> MapResult:
+    """Map a surface into the plane bijectively, with some fixed vertices and an otherwise free boundary.
+
+    ``target`` (k, 2) are the positions of ``fixed`` (k,), at least one; they may be contradictory. ``start`` (n, 2) is
+    an injective map at any scale and position. ``settings`` are those of the descent that follows once the map is
+    bijective. If the result's certificate is bijective, its status reports the convergence of the distortion, as for
+    `flatten`. Otherwise the status is ``IMPOSSIBLE`` if the diagnosis proves that there is no bijective map,
+    ``INJECTIVE`` if no triangle is inverted but the surface overlaps itself, or else that of the search. Ctrl-C raises
+    KeyboardInterrupt before there is any bijective map, with or without pins. ValueError if a rest triangle has no
+    area.
+    """
+    began = time.perf_counter()
+    run = PinSearch(piece, fixed, target, settings, weights)
+    # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never accepted.
+    with np.errstate(all="ignore"):
+        run.run(start)
+    return replace(run.result(), seconds=time.perf_counter() - began)
+
+
+def move_onto_pins(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
+    """Shift, rotate and scale a map so that vertices are as near to target positions as possible, by least squares.
+
+    Only shift it if there is one vertex, or if the best scale is zero or not finite.
+    """
+    w, there = (np.ascontiguousarray(places).view(np.complex128).ravel() for places in (uv, target))
+    here = w[fixed]
+    a, b = here - here.mean(), there - there.mean()
+    square = float(np.sum(a.real**2 + a.imag**2))
+    factor = np.sum(a.conj() * b) / square if square > 0 else 1.0
+    if not 0 < abs(factor) < np.inf:
+        factor = 1.0
+    return ((w - here.mean()) * factor + there.mean()).view(np.float64).reshape(-1, 2)
+
+
+def _choose_stages(problem: Problem, *, last: bool) -> Stages:
+    """The methods to try, in order; the air is flexible, so vertices are moved early.
+
+    Random restarts are used in the last attempt only, as other air is more promising than many restarts with this one.
+    """
+    stages = [stage for stage in speed(problem) if not isinstance(stage, RandomRestarts)]
+    if isinstance(stages[0], CoarseToFine):
+        return stages
+    first = VectorAdam(parameterisation="si-log", iterations=_TENSOR_ITERATIONS)
+    restarts = [RandomRestarts(max_failures=_IN_VAIN)] if last else []
+    return [first, Untangling(iterations=_VERTEX_ITERATIONS, resume=True), *stages, *restarts]
+
+
+def check_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, FloatArray]:
+    """Check the arguments ``fixed`` and ``target`` of `flatten` for a mesh of n vertices.
+
+    ValueError if no vertex is given, an index is out of range or repeated, or a position is missing or not finite.
+    """
+    vertices = fixed_vertices(fixed, n)
+    if not vertices.size:
+        raise ValueError("fixed has no vertex: omit fixed and target, or give at least one vertex")
+    return vertices, target_positions(target, vertices.size)
+
+
+# Binary exponent: maximum ratio between the extent of the pins and the surface's size, either way, for energies.
+_APART = 100
+# Binary exponent: maximum distance of a map from the origin, in its unit.
+_LARGEST = 1000
+# Statuses that only report that no map was found; the map may still be injective.
+_UNDECIDED = Status.INJECTIVE, Status.STALLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
+
+
+class PinSearch:
+    """The search for a map with fixed vertices: the current map, and its record for the result; see `flatten_pinned`.
+
+    Attributes
+    ----------
+    certificate : Certificate
+        The certificate of the current map.
+    status : Status
+    exponent : int
+        The map is in units of ``2 ** exponent``, normally the piece's unit. It differs if the extent of the pins
+        differs so much from the surface's size that squared stretches exceed the range of doubles, or if the pins are
+        too far from the origin. Energies are then measured for pins at a smaller ratio or distance; the minimum is the
+        same.
+    """
+
+    def __init__(
+        self, piece: Piece, fixed: IntArray, target: FloatArray, settings: Settings, weights: FloatArray | None
+    ) -> None:
+        self._piece, self._settings = piece, settings
+        self._fixed, self._given = fixed, target
+        # Computed from quarters, because the difference of the largest doubles overflows.
+        extent, quarter = np.frexp(np.ptp(np.ldexp(target, -2), axis=0).max())
+        apart = int(quarter) + 2 - piece.exponent if extent > 0 else 0
+        unit = piece.exponent + apart - min(max(apart, -_APART), _APART)
+        # Pins may be even farther from the origin, and the map there must also stay within the range of doubles.
+        self._larger = max(int(np.frexp(np.abs(target).max())[1]) - _LARGEST - unit, 0)
+        self.exponent = unit + self._larger
+        self._target = np.ldexp(target, -self.exponent)
+        self._energy = piece.energy(settings.density, weights)
+        self._solver = ""
+        self.status = Status.STALLED
+        self._diagnosis: Diagnosis | None = None
+        self._stages: list[Stage] = []
+        self._history: list[Step] = []
+        self._path: list[Snapshot] = []
+
+    @property
+    def pins(self) -> tuple[IntArray, FloatArray]:
+        """The fixed vertices (k,) and their target positions (k, 2)."""
+        return self._fixed, self._target
+
+    def run(self, start: FloatArray | None) -> None:
+        """Find a bijective map with the vertices at their target positions, and lower its distortion."""
+        moved = self.flatten_freely(start)
+        if not self.certificate.bijective and self.status is not Status.INTERRUPTED:
+            self.find_bijective(moved)
+        if self.certificate.bijective and self.status is not Status.INTERRUPTED:
+            self.lower_distortion()
+
+    def flatten_freely(self, start: FloatArray | None) -> FloatArray:
+        """Flatten freely, optionally from a start in the surface's unit, and move the map onto the pins; (n, 2)."""
+        piece = self._piece
+        solver = self._settings.linear_solver
+        rough = Settings("symmetric-dirichlet", _TOLERANCE, _MAX_STEPS, solver, callback=None, record_every=0)
+        flat = Flattening(piece, rough, None).run(None if start is None else np.ldexp(start, -piece.exponent))
+        self._stages += flat.stages
+        self._solver = flat.linear_solver
+        if flat.status is Status.INTERRUPTED:
+            self.status = Status.INTERRUPTED
+        moved = move_onto_pins(np.ldexp(flat.uv, -self._larger), self._fixed, self._target)
+        self.keep(moved)
+        return moved
+
+    def find_bijective(self, moved: FloatArray) -> None:
+        """Find a bijective map with the target positions, from a bijective map (n, 2) without them."""
+        piece = self._piece
+        n = len(piece.V)
+        diagnosis = pin_obstructions(piece.F, n, edges(piece.F, n), self._fixed, self._target)
+        if diagnosis.forbids_bijective:
+            self.status, self._diagnosis = Status.IMPOSSIBLE, diagnosis
+            return
+        if not certify(piece.F, moved, loops=piece.loops).bijective:
+            # At this distance or scale, doubles cannot resolve the triangles.
+            self.status = Status.ROUNDED
+            return
+        for margin in _MARGINS:
+            self._search(moved, margin, last=margin == _MARGINS[-1])
+            if self.certificate.bijective or self.status in (Status.INTERRUPTED, Status.IMPOSSIBLE):
+                return
+
+    def _search(self, flat: FloatArray, margin: float, *, last: bool) -> None:
+        """Solve surface and air together, from a bijective map of the surface, with frame and pins fixed."""
+        n, piece = len(flat), self._piece
+        try:
+            air = triangulate_air(piece.F, flat, piece.loops, margin=margin, around=self._target)
+        except ValueError:
+            # There are no doubles between close parts of the boundary.
+            self.status = Status.ROUNDED
+            return
+        F, points = np.concatenate([piece.F, air.F]), np.concatenate([flat, air.points])
+        fixed = np.concatenate([self._fixed, air.frame])
+        target = np.concatenate([self._target, air.points[air.frame - n]])
+        inner = edges(F, len(points)).interior
+        split = self._select_air_edges(inner[np.isin(inner, fixed).all(axis=1)])
+        for _ in range(1 + _MAX_SPLITS):
+            refined = split_edges(points, F, split)
+            F, points = refined.F, refined.V
+            problem = Problem(points, F, fixed, target, reference="equilateral")
+            settings = self._settings
+            found = solve(
+                problem,
+                strategy=_choose_stages(problem, last=last),
+                max_iterations=max(_MIN_ITERATIONS, settings.max_iterations),
+                linear_solver=settings.linear_solver,
+                callback=settings.callback,
+            )
+            self._stages += found.stages
+            self._history += found.history
+            before = self.certificate
+            uv = found.uv[:n]
+            here = certify(piece.F, uv, loops=piece.loops)
+            if (
+                here.bijective
+                or here.inverted.size + here.degenerate.size < before.inverted.size + before.degenerate.size
+            ):
+                self.keep(uv)
+            self.status = found.status
+            if here.bijective or found.status is not Status.IMPOSSIBLE or found.diagnosis is None:
+                return
+            split = self._select_air_edges(found.diagnosis.split)
+            if not len(split):
+                self._diagnosis = self._select_obstructions(found.diagnosis)
+                self.status = Status.STALLED if self._diagnosis is None else Status.IMPOSSIBLE
+                return
+
+    def _select_air_edges(self, pairs: IntArray) -> IntArray:
+        """Return the edges that belong to no triangle of the surface."""
+        F = self._piece.F
+        n = max(int(pairs.max(initial=0)) + 1, len(self._piece.V))
+        own = edge_keys(F.ravel(), np.roll(F, -1, axis=1).ravel(), n)
+        return pairs[~np.isin(edge_keys(pairs[:, 0], pairs[:, 1], n), own)]
+
+    def _select_obstructions(self, diagnosis: Diagnosis) -> Diagnosis | None:
+        """Return the obstructions that do not involve air or frame; None if there are none."""
+        n, F = len(self._piece.V), self._piece.F
+        held = np.zeros(n, dtype=bool)
+        held[self._fixed] = True
+        own = []
+        for obstruction in diagnosis.obstructions:
+            vertices = np.concatenate([obstruction.vertices, obstruction.edges.ravel()])
+            if vertices.max(initial=-1) >= n or obstruction.triangles.max(initial=-1) >= len(F):
+                continue
+            if obstruction.kind in (Kind.HALF_PLANES, Kind.HIDDEN):
+                # If not all neighbours of a vertex are fixed, it may have a valid position outside the frame.
+                around = np.setdiff1d(F[np.isin(F, vertices[:1]).any(axis=1)], vertices[:1])
+                if not held[around].all():
+                    continue
+            elif obstruction.kind not in (Kind.COLLAPSED_EDGE, Kind.INVERTED_TRIANGLE, Kind.INVERTED_PATCH, Kind.CHORD):
+                continue
+            own.append(obstruction)
+        return Diagnosis(tuple(own), diagnosis.unchecked) if own else None
+
+    def lower_distortion(self) -> None:
+        """Lower the distortion of a bijective map with only the pins fixed."""
+        began, settings = time.perf_counter(), self._settings
+        descent = SurfaceDescent(
+            self._energy, self._uv, settings.linear_solver, self._fixed, rim=Rim(self._piece.loops)
+        )
+        self._solver = descent.linear_solver
+        first, steps, status = descent.distortion, 0, Status.STILL_FALLING
+        try:
+            self._report(descent)
+            course = descend(descent, settings.density, settings.tol)
+            for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):  # noqa: B007
+                status = outcome or status
+                self._report(descent)
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+        self.keep(descent.uv)
+        self.status = status
+        seconds, energies = time.perf_counter() - began, (first, descent.distortion)
+        self._stages.append(Stage(f"guarded descent, {settings.name}", steps, seconds, (0, 0), energies))
+
+    def _report(self, descent: SurfaceDescent) -> None:
+        settings, number = self._settings, len(self._history)
+        self._history.append(Step(number, 0, descent.distortion))
+        if settings.record_every and number % settings.record_every == 0:
+            self._path.append(Snapshot(number, self._to_target_unit(descent.uv)))
+        if settings.callback is not None:
+            settings.callback(self._history[-1])
+
+    def keep(self, uv: FloatArray) -> None:
+        """Store a map in units of ``2 ** exponent``, with the fixed vertices set to their target positions."""
+        self._uv = uv.copy()
+        self._uv[self._fixed] = self._target
+        self.certificate = certify(self._piece.F, self._uv, loops=self._piece.loops)
+
+    def _to_target_unit(self, uv: FloatArray) -> FloatArray:
+        """Return a map in the target's unit, with the fixed vertices exactly at their target positions."""
+        placed = to_given_unit(uv, self.exponent)
+        placed[self._fixed] = self._given
+        return placed
+
+    def result(self) -> MapResult:
+        """Return the result for the current map."""
+        uv = self._to_target_unit(self._uv)
+        certificate = certify(self._piece.F, uv, loops=self._piece.loops)
+        status = self.status
+        if certificate.injective and not certificate.bijective and status in _UNDECIDED:
+            status = Status.INJECTIVE
+        return MapResult(
+            uv=uv,
+            status=status,
+            certificate=certificate,
+            stages=self._stages,
+            history=self._history,
+            path=self._path,
+            diagnosis=self._diagnosis,
+            linear_solver=self._solver,
+        )

@@ -1,0 +1,225 @@
+"""Triangulate the plane around a flat surface with well-shaped triangles: outside up to a frame, and inside holes.
+
+As long as no triangle of surface and air is inverted and the frame is fixed, the surface does not overlap itself. The
+air has its own points, which make it flexible; triangles that span a whole gap would lock.
+
+    boundary ──lengths──▶ quadtree ──centres away from edges──▶ inner points ──constrained Delaunay──▶ triangles
+             ──▶ those inside the surface removed ──▶ smoothed ──▶ air
+
+No points are added on the boundary. Where a gap is narrower than the edges around it, triangles span it, as this can
+only be avoided by splitting edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.flattening.scaffold.graded_points import Quadtree
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
+from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, names_of
+
+# Side of a square of the tree, relative to the length of an edge in it.
+_SPACING = 1.4
+# Minimum distance of inner points to the boundary, relative to their square's side.
+_CLEARANCE = 0.55
+# The frame's sides are bent outwards by this fraction of their length, so that corners of the hull are strictly convex.
+_BULGE = 0.05
+# Number of the tree's largest squares along the longer side of the frame.
+_LARGEST_SQUARES = 8
+_SMOOTHINGS = 3
+_MEETS_ITSELF = "the boundary meets itself, so the air around it cannot be meshed: certify(F, uv) lists where"
+# Smoothing may reduce shape qualities above this; 1 is an equilateral triangle.
+_GOOD = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Air:
+    """A triangulation of the surroundings of a flat surface with n vertices."""
+
+    points: FloatArray  # (k, 2): new points, the vertices n … n + k - 1
+    F: IntArray  # (a, 3): triangles between the surface's boundary vertices and the new points, counterclockwise
+    frame: IntArray  # (h,): the new vertices on the frame, counterclockwise
+
+
+def triangulate_air(
+    F: ArrayLike,
+    uv: ArrayLike,
+    loops: Sequence[IntArray],
+    *,
+    margin: float = 0.5,
+    around: ArrayLike | None = None,
+) -> Air:
+    """Triangulate the plane around a flat surface up to a frame, and its holes.
+
+    ``np.concatenate([F, air.F])`` is a triangle mesh whose only boundary is the frame. ``uv`` (n, 2) must be bijective,
+    otherwise ValueError; its interior vertices are not read. The ``loops`` have the surface on their left. The frame
+    encloses the positions ``around`` (p, 2) too. Its distance is ``margin`` times the longer side of the boundary's
+    bounding box. The result is deterministic.
+    """
+    if not 0 < margin < np.inf:
+        raise ValueError(f"margin must be positive, not {margin}")
+    positions = np.asarray(uv, dtype=np.float64)
+    n, boundary = len(positions), np.concatenate(loops)
+    # Scaling by a power of two is exact.
+    exponent = int(np.frexp(np.abs(positions[boundary]).max())[1])
+    others = np.empty((0, 2)) if around is None else np.ldexp(np.asarray(around, dtype=np.float64), -exponent)
+    outline = np.ldexp(positions[boundary], -exponent)
+    start = np.cumsum([0, *(len(loop) for loop in loops)])
+    heads = np.concatenate([np.roll(np.arange(*ends), -1) for ends in pairwise(start.tolist())])
+    segments = np.stack([np.arange(len(boundary)), heads], axis=1)
+
+    corner, side, shape = _squares(np.concatenate([outline, others]), margin)
+    frame = _frame(corner, side, shape)
+    inner = _inner_points(outline, outline[heads], corner, side, shape)
+    points, triangles = _triangulate(outline, segments, frame, inner)
+    triangles = triangles[_find_outside(triangles, segments, len(points))]
+    points = _smooth_points(points, triangles, len(outline) + len(frame))
+    # Inner points that were placed inside the surface by mistake were removed with their triangles.
+    used = np.unique(triangles[triangles >= len(outline)])
+    number = np.concatenate([boundary, np.zeros(len(points) - len(outline), dtype=np.int64)])
+    number[used] = n + np.arange(len(used))
+    air = Air(np.ldexp(points[used], exponent), number[triangles], number[len(outline) + np.arange(len(frame))])
+    bad = inverted_triangles(air.F, np.concatenate([positions, air.points]))
+    if bad.size:
+        raise ValueError(
+            f"the boundary is too close to itself to mesh the air, at {names_of('vertex', 'vertices', air.F[bad, 0])}"
+        )
+    return air
+
+
+def _squares(points: FloatArray, margin: float) -> tuple[FloatArray, float, tuple[int, int]]:
+    """Corner, side and numbers of the squares that cover the points' bounding box and a margin around it."""
+    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    longer = float(extent.max())
+    side = (1 + 2 * margin) * longer / _LARGEST_SQUARES
+    across = np.ceil((extent + 2 * margin * longer) / side - 1e-9)
+    return low + (extent - side * across) / 2, side, (int(across[0]), int(across[1]))
+
+
+def _frame(corner: FloatArray, side: float, shape: tuple[int, int]) -> FloatArray:
+    """A rectangle with bent sides, counterclockwise, with one point per square along it; (h, 2) float64."""
+    width, height = side * shape[0], side * shape[1]
+    frame = []
+    for start, along, outward, count in (
+        ((0.0, 0.0), (width, 0.0), (0, -1), shape[0]),
+        ((width, 0.0), (0.0, height), (1, 0), shape[1]),
+        ((width, height), (-width, 0.0), (0, 1), shape[0]),
+        ((0.0, height), (0.0, -height), (-1, 0), shape[1]),
+    ):
+        t = (np.arange(count) / count)[:, None]
+        bulge = 4 * _BULGE * np.hypot(*along) * t * (1 - t)
+        frame.append(corner + start + t * np.array(along) + bulge * np.array(outward))
+    return np.concatenate(frame)
+
+
+def _inner_points(
+    tails: FloatArray, heads: FloatArray, corner: FloatArray, side: float, shape: tuple[int, int]
+) -> FloatArray:
+    """Points in the air with the density of the boundary's edges, and not too close to them; (k, 2) float64."""
+    from scipy.spatial import KDTree
+
+    lengths = np.hypot(*(heads - tails).T)
+    tree = Quadtree.around(
+        np.concatenate([(tails + heads) / 2, tails]),
+        _SPACING * np.concatenate([lengths, lengths]),
+        corner,
+        side,
+        shape,
+    )
+    points, sizes = tree.points()
+    # Edges are cut into pieces of at most half their squares' sides, so that the nearest centre gives the nearest
+    # piece.
+    pieces = []
+    p, q = tails, heads
+    while len(p):
+        middle = (p + q) / 2
+        done = 2 * np.hypot(*(q - p).T) <= 1.01 * tree.sizes_at(middle)
+        pieces.append(np.stack([p[done], q[done]]))
+        p, q, middle = p[~done], q[~done], middle[~done]
+        p, q = np.concatenate([p, middle]), np.concatenate([middle, q])
+    p, q = np.concatenate(pieces, axis=1)
+    nearest = KDTree((p + q) / 2).query(points)[1]
+    p, q = p[nearest], q[nearest]
+    along, away = (q - p) @ (1, 1j), (points - p) @ (1, 1j)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        local = away / along
+    local = np.where(np.isfinite(local), local, 0)
+    distance = np.abs(local - np.clip(local.real, 0, 1)) * np.abs(along)
+    return points[(local.imag < 0) & (distance > _CLEARANCE * sizes)]
+
+
+def _triangulate(
+    outline: FloatArray, segments: IntArray, frame: FloatArray, inner: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Triangulate all points with the segments as edges; inner points that lie on a segment are dropped."""
+    hull = len(outline) + np.arange(len(frame))
+    while True:
+        points = np.concatenate([outline, frame, inner])
+        try:
+            return points, constrained_delaunay(points, segments, hull)
+        except BlockedError as blocked:
+            at = blocked.point - len(outline) - len(frame)
+            if at < 0:
+                raise ValueError(_MEETS_ITSELF) from blocked
+            inner = np.delete(inner, at, axis=0)
+        except ValueError as error:
+            raise ValueError(_MEETS_ITSELF) from error
+
+
+def _find_outside(triangles: IntArray, segments: IntArray, n: int) -> BoolArray:
+    """Which triangles are on the right of the segments, (t,): those connected to it without crossing a segment."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    tails, heads = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    keys = edge_keys(tails, heads, n)
+    order = np.argsort(keys, kind="stable")
+    walls = edge_keys(segments[:, 0], segments[:, 1], n)
+    paired = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    open_ = paired[~np.isin(keys[order[paired]], walls)]
+    graph = coo_array((np.ones(open_.size), (order[open_] // 3, order[open_ + 1] // 3)), shape=2 * (len(triangles),))
+    label = connected_components(graph, directed=False)[1]
+    directed = np.sort(segments[:, 1] * n + segments[:, 0])
+    at = np.isin(tails * n + heads, directed)
+    return np.isin(label, np.unique(label[np.flatnonzero(at) // 3]))
+
+
+def _smooth_points(points: FloatArray, triangles: IntArray, held: int) -> FloatArray:
+    """Move points after the first ``held`` to the mean of their neighbours, if no triangle's shape gets worse."""
+    n = len(points)
+    tails, heads = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    count = np.maximum(np.bincount(tails, minlength=n), 1)
+    best, shape = points, _shapes(points, triangles)
+    for _ in range(_SMOOTHINGS):
+        middle = np.stack([np.bincount(tails, best[heads, k], minlength=n) / count for k in range(2)], axis=1)
+        moved = best.copy()
+        moved[held:] = middle[held:]
+        idle = np.zeros(n, dtype=bool)
+        while True:
+            after = _shapes(moved, triangles)
+            worse = after < np.minimum(shape, _GOOD)
+            back = triangles[worse].ravel()
+            back = back[~idle[back]]
+            back = back[back >= held]
+            if not back.size:
+                break
+            idle[back] = True
+            moved[back] = best[back]
+        best, shape = moved, after
+    return best
+
+
+def _shapes(points: FloatArray, triangles: IntArray) -> FloatArray:
+    """Shape quality of triangles: 1 if equilateral, near 0 for slivers, negative if inverted; (t,) float64."""
+    w = np.ascontiguousarray(points).view(np.complex128).ravel()
+    corners = w[triangles.T]
+    sides = (np.abs(corners - np.roll(corners, 1, axis=0)) ** 2).sum(axis=0)
+    return 4 * np.sqrt(3) * signed_areas(triangles, w) / sides

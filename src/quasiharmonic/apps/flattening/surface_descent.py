@@ -1,0 +1,395 @@
+"""Newton steps for the energy of a map with a free boundary, optionally without overlaps on the way.
+
+One vertex is fixed to prevent drift. Rotation remains possible; a raised diagonal keeps the Newton system regular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from quasiharmonic.apps.flattening.contacts import HATS, Contacts, Rim
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import Energy, QuadraticForm
+from quasiharmonic.energies.newton.line_search import backtrack, extend
+from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, NewtonObjective, in_units
+from quasiharmonic.energies.newton.newton_descent import NewtonDescent, NewtonState
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
+from quasiharmonic.energies.newton.rotation_path import RotationPath, rates
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.problem.result import Status
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+
+# Stages of a guarded descent: the weight of each contact, relative to the surface's mean energy per triangle, and a
+# factor on the tolerance. Early stages stop sooner, as they only prepare the later ones.
+_STAGES = (1e-2, 30.0), (1e-3, 5.0), (1e-4, 1.0)
+# The system's sparsity pattern is rebuilt when this fraction of the repelling contacts is not in it.
+_MAX_UNCOUPLED = 0.3
+# Lower bound of the energy for the contacts' weight.
+_MIN_ENERGY = 1e-4
+# A step may reduce the smallest gap to this fraction of its old value, or of its reach.
+_NARROWER = 0.3
+# Full Newton steps converge quadratically. A slow step leaves more than the first fraction of the decrement, and more
+# than the second one of the energy.
+_SLOW_DECREMENT = 0.3
+_SLOW_ENERGY = 0.8
+# Number of slow steps in a row after which rotating triangles probably limit straight steps.
+_SLOW_STEPS = 4
+# Minimum ratio of median rotation to median growth of such triangles. Below it a straight step is as good, and needs no
+# solve.
+_TURNED = 12.0
+
+
+class _Evaluation(NamedTuple):
+    """The evaluation of a map by `GuardedEnergy`."""
+
+    surface: Any
+    w: ComplexArray
+
+
+class GuardedEnergy:
+    """The energy of a surface and of the contacts of its boundary with itself, for `NewtonDescent`.
+
+    ``contacts`` couple their vertices in the Newton system. ``uncoupled`` are not in the system's sparsity pattern.
+    ``stiffness`` is a factor on each contact's barrier.
+    """
+
+    def __init__(self, surface: NewtonObjective) -> None:
+        self.surface = surface
+        self.F, self.g = surface.F, surface.g
+        self.contacts, self.uncoupled, self.stiffness = Contacts.none(), Contacts.none(), 0.0
+
+    def deform(self, w: ComplexArray) -> _Evaluation:
+        """Evaluate the quantities of a map that the other methods need."""
+        return _Evaluation(self.surface.deform(w), w)
+
+    def value_of(self, derivatives: _Evaluation) -> float:
+        """The mean energy of the surface plus the barriers."""
+        return self.surface.value_of(derivatives.surface) + self.stiffness * (
+            self.contacts.value(derivatives.w) + self.uncoupled.value(derivatives.w)
+        )
+
+    def gradient_of(self, derivatives: _Evaluation, n: int) -> ComplexArray:
+        """The derivative with respect to ``n`` positions; (n,) complex128."""
+        return self.surface.gradient_of(derivatives.surface, n) + self.stiffness * (
+            self.contacts.gradient(derivatives.w) + self.uncoupled.gradient(derivatives.w)
+        )
+
+    def curvature_of(self, derivatives: _Evaluation, *, negative: float = 0.0) -> QuadraticForm:
+        """Second derivatives on the surface's triangles, then on those of the contacts."""
+        surface = self.surface.curvature_of(derivatives.surface, negative=negative)
+        between = self.contacts.curvature(derivatives.w).scaled(np.full(self.contacts.reach.shape, self.stiffness))
+        fields = zip(vars(surface).values(), vars(between).values(), strict=True)
+        return QuadraticForm(*(np.concatenate(both) for both in fields))
+
+    def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:
+        """The step along a direction at which each of the surface's triangles first becomes degenerate."""
+        return self.surface.steps_to_collapse(w, direction)
+
+
+class _StepRecord(NamedTuple):
+    """How the last step went, and the contacts at a map; the ``extra`` of a `NewtonState`.
+
+    ``decrease`` and ``value`` are the expected decrease and the objective of the last step, and ``slow`` is the number
+    of successive slow steps. ``near`` are contacts of the boundary with itself, none without a guard, and ``gap`` is
+    their `Contacts.smallest_gap`.
+    """
+
+    decrease: float
+    value: float
+    slow: int
+    near: Contacts
+    gap: float
+
+
+class Guard:
+    """Contacts of the boundary with itself, which repel each other so that a map stays bijective.
+
+    ``energy`` is the surface's energy with the contacts. ``slack`` is a factor on the tolerance; early stages stop
+    sooner.
+    """
+
+    def __init__(self, rim: Rim, surface: NewtonObjective) -> None:
+        self.energy = GuardedEnergy(surface)
+        self._rim = rim
+        self._stages = iter(_STAGES)
+        self._weight, self.slack = next(self._stages)
+        self._known = Contacts.none().corners
+
+    def relax(self) -> bool:
+        """Lower the weight of the contacts; return False if it is the last one."""
+        following = next(self._stages, None)
+        if following is not None:
+            self._weight, self.slack = following
+        return following is not None
+
+    def contacts(self, w: ComplexArray) -> Contacts:
+        """Contacts at a map (n,)."""
+        return self._rim.contacts(w)
+
+    def prepare(self, state: NewtonState, known_system: Callable[[IntArray, ComplexArray], None]) -> NewtonState:
+        """Update the contacts and their weight; ``known_system`` rebuilds the system for other triangles."""
+        energy, near, n = self.energy, state.extra.near, state.w.size
+        known, uncoupled = near.split(self._known, n)
+        repelling = near.within(state.w, 1.0).reach.size
+        if uncoupled.within(state.w, 1.0).reach.size > _MAX_UNCOUPLED * repelling:
+            # The new pattern includes possible and earlier contacts, so that it lasts for several steps.
+            self._known = _unite_pairs(self._known, near.corners, n)
+            g = np.concatenate([energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
+            known_system(np.concatenate([energy.F, self._known.T]), g)
+            known, uncoupled = near.split(self._known, n)
+        energy.contacts, energy.uncoupled = known, uncoupled
+        distortion = energy.surface.value_of(state.derivatives.surface)
+        energy.stiffness = self._weight * max(distortion, _MIN_ENERGY) / len(energy.F)
+        return state._replace(value=energy.value_of(state.derivatives))
+
+    def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
+        """Add contacts outside the system's pattern to its diagonal."""
+        uncoupled, stiffness = self.energy.uncoupled, self.energy.stiffness
+        if uncoupled.reach.size:
+            system.add_blocks(*(stiffness * part[system.free] for part in uncoupled.blocks(w)))
+
+    def accept(self, state: NewtonState, w: ComplexArray, uv: FloatArray) -> tuple[Contacts, float] | None:
+        """Return the contacts at a map and their gap; None if the boundary meets itself or gaps shrink too much."""
+        near = self._rim.contacts(w)
+        gap = near.smallest_gap(w)
+        # New pairs are compared with _NARROWER at most, as otherwise no step might be short enough.
+        before = min(state.extra.gap, near.smallest_gap(state.w), _NARROWER)
+        return None if gap < _NARROWER * before or self._rim.meets_itself(uv) else (near, gap)
+
+
+class Pairs(Protocol):
+    """Second derivatives between distant vertices, for which the system has no entries."""
+
+    def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
+        """Add the diagonal blocks at a map (n,) to an assembled system."""
+
+    def solve(self, system: NewtonSystem, load: ComplexArray) -> ComplexArray:
+        """Solve with the factored system and the entries that it lacks."""
+
+
+class SurfaceModel:
+    """The model of a map with a free boundary, with or without a guard; see `NewtonModel` and `SurfaceDescent`."""
+
+    def __init__(
+        self,
+        energy: NewtonObjective,
+        uv: FloatArray,
+        linear_solver: str,
+        fixed: Sequence[int] | IntArray,
+        rim: Rim | None,
+        pairs: Pairs | None,
+    ) -> None:
+        self.surface, self.guard, self._pairs = energy, None if rim is None else Guard(rim, energy), pairs
+        coordinates = Coordinates.of(uv, np.asarray(fixed, dtype=np.int64), 0)
+        system = NewtonSystem(energy.F, energy.g, len(uv), coordinates.fixed, linear_solver)
+        self.map = MapModel(energy if self.guard is None else self.guard.energy, coordinates, system)
+        self._n, self._linear_solver = len(uv), linear_solver
+
+    @property
+    def system(self) -> NewtonSystem:
+        """See `NewtonModel`."""
+        return self.map.system
+
+    @property
+    def slack(self) -> float:
+        """See `NewtonModel`."""
+        return 1.0 if self.guard is None else self.guard.slack
+
+    def start(self, uv: FloatArray) -> NewtonState:
+        """Return the state of a map (n, 2)."""
+        state = self.map.evaluate(in_units(uv, 0))
+        near = Contacts.none() if self.guard is None else self.guard.contacts(state.w)
+        return state._replace(extra=_StepRecord(np.inf, np.inf, 0, near, near.smallest_gap(state.w)))
+
+    def distortion(self, state: NewtonState) -> float:
+        """The value of the surface's energy, without contacts."""
+        return state.value if self.guard is None else self.surface.value_of(state.derivatives.surface)
+
+    def prepare(self, state: NewtonState) -> NewtonState:
+        """See `NewtonModel`."""
+        return state if self.guard is None else self.guard.prepare(state, self._rebuild)
+
+    def _rebuild(self, F: IntArray, g: ComplexArray) -> None:
+        self.map.system = NewtonSystem(F, g, self._n, self.map.coordinates.fixed, self._linear_solver)
+
+    def gradient(self, state: NewtonState) -> ComplexArray:
+        """See `NewtonModel`."""
+        return self.map.gradient(state)
+
+    def assemble(self, state: NewtonState, negative: float) -> None:
+        """See `NewtonModel`."""
+        self.map.assemble(state, negative)
+        if self.guard is not None:
+            self.guard.add_to(self.system, state.w)
+        if self._pairs is not None:
+            self._pairs.add_to(self.system, state.w)
+
+    def solve(self, load: ComplexArray) -> ComplexArray:
+        """See `NewtonModel`."""
+        return self.system.solve(load) if self._pairs is None else self._pairs.solve(self.system, load)
+
+    def restrict(
+        self, state: NewtonState, gradient: ComplexArray, direction: ComplexArray, expected_decrease: float
+    ) -> tuple[ComplexArray, float]:
+        """See `NewtonModel`."""
+        return direction, expected_decrease
+
+    def check_numbers(self, state: NewtonState) -> None:
+        """See `NewtonModel`."""
+        if isinstance(self.surface, DeformationEnergy):
+            self.surface.check_numbers(state.derivatives if self.guard is None else state.derivatives.surface)
+
+    def search(
+        self, state: NewtonState, direction: ComplexArray, expected_decrease: float, shortened: bool
+    ) -> tuple[NewtonState, bool] | None:
+        """See `NewtonModel`; after several slow full steps, first try a path along which triangles rotate."""
+        course: _StepRecord = state.extra
+        less = expected_decrease > _SLOW_DECREMENT * course.decrease and state.value > _SLOW_ENERGY * course.value
+        slow = course.slow + 1 if less and not shortened else 0
+        state = state._replace(extra=course._replace(decrease=expected_decrease, value=state.value, slow=slow))
+        full = self.map.displacement(direction, state.w.size)
+        if slow >= _SLOW_STEPS:
+            rotated = self._search_rotating(state, full, expected_decrease)
+            if rotated is not None:
+                return rotated, False
+
+        def trial(t: float, bound: float) -> tuple[float, NewtonState | None]:
+            return self._evaluate_trial(state, state.w + t * full, bound)
+
+        return self.map.search_straight(state, full, expected_decrease, trial)
+
+    @cached_property
+    def _rotation_path(self) -> RotationPath | None:
+        surface, fixed = self.surface, self.map.coordinates.fixed
+        return RotationPath.of(surface.F, surface.g, self._n, fixed, self._linear_solver)
+
+    def _search_rotating(self, state: NewtonState, full: ComplexArray, expected_decrease: float) -> NewtonState | None:
+        """Take a full or longer step along a rotating path; None if the energy does not decrease enough."""
+        rate = rates(self.surface.F, self.surface.g, state.w, full)
+        rotates = np.median(np.abs(rate.imag)) > _TURNED * np.median(np.abs(rate.real))
+        if not rotates or self._rotation_path is None:
+            return None
+        path = self._rotation_path.path(state.w, full)
+
+        def trial(t: float, bound: float) -> tuple[float, NewtonState | None]:
+            try:
+                there = path(t)
+            except NotPositiveDefinite:
+                # With very thin rest triangles, the path's own system can be numerically singular.
+                return np.inf, None
+            return self._evaluate_trial(state, there, bound)
+
+        taken = backtrack(trial, state.value, expected_decrease, tries=1)
+        return None if taken is None else extend(trial, taken).state
+
+    def _evaluate_trial(self, state: NewtonState, w: ComplexArray, bound: float) -> tuple[float, NewtonState | None]:
+        """Return the objective at a map reached from ``state``, and its state if it is accepted."""
+        value, there = self.map.evaluate_trial(w, bound)
+        if there is None:
+            return value, None
+        if self.guard is None:
+            return value, there._replace(extra=state.extra)
+        found = self.guard.accept(state, w, self.map.positions(w))
+        if found is None:
+            return value, None
+        near, gap = found
+        return value, there._replace(extra=state.extra._replace(near=near, gap=gap))
+
+
+class SurfaceDescent:
+    """Newton steps of a map with a free boundary, from an injective map ``uv`` (n, 2) of about unit size.
+
+    ``fixed`` has at least one vertex, to prevent drift; usually exactly one. With the surface's boundary as ``rim`` the
+    map stays bijective. ``pairs`` are further second derivatives of the energy.
+    """
+
+    def __init__(
+        self,
+        energy: NewtonObjective,
+        uv: FloatArray,
+        linear_solver: str,
+        fixed: Sequence[int] | IntArray = (0,),
+        *,
+        rim: Rim | None = None,
+        pairs: Pairs | None = None,
+    ) -> None:
+        self.model = SurfaceModel(energy, uv, linear_solver, fixed, rim, pairs)
+        self.newton = NewtonDescent(self.model, self.model.start(uv))
+
+    @property
+    def w(self) -> ComplexArray:
+        """The current map; (n,) complex128."""
+        return self.newton.w
+
+    @property
+    def uv(self) -> FloatArray:
+        """The current map; (n, 2) float64."""
+        return self.model.map.positions(self.newton.w)
+
+    @property
+    def distortion(self) -> float:
+        """The value of the surface's energy, without contacts."""
+        return self.model.distortion(self.newton.state)
+
+    @property
+    def linear_solver(self) -> str:
+        """Name of the linear solver."""
+        return self.model.system.solver.name
+
+    def step(self, tol: float) -> Status | None:
+        """Take one step; return a status if no further step is possible."""
+        return self.newton.step(tol)
+
+    def use_density(self, density: Energy) -> None:
+        """Continue with another density on the same triangles; the energy must be a `DeformationEnergy`."""
+        assert isinstance(self.model.surface, DeformationEnergy)
+        self.model.surface.energy = density
+        state = self.newton.state
+        self.newton.state = state._replace(value=self.model.map.energy.value_of(state.derivatives))
+        self.newton.memory = replace(self.newton.memory, shortened=True, idle=0)
+
+    def relax_barrier(self) -> bool:
+        """Lower the weight of the barrier that guards the map; return False if there is none or it is the last."""
+        if self.model.guard is None or not self.model.guard.relax():
+            return False
+        self.newton.memory = replace(self.newton.memory, idle=0)
+        return True
+
+
+def _unite_pairs(older: IntArray, newer: IntArray, n: int) -> IntArray:
+    """Unite pairs (3, c), or return the newer ones if they are less than half; ``n`` exceeds all vertices."""
+    both = np.concatenate([newer, older], axis=1)
+    _, first = np.unique(both[0] * n + both[1], return_index=True)
+    return newer if first.size > 2 * newer.shape[1] else both[:, first]
+
+
+def descend(descent: SurfaceDescent, density: Energy, tol: float) -> Iterator[Status | None]:
+    """Take steps until converged or stalled; yield None after every step but the last, which yields a status.
+
+    If the density of the descent, at its start, is `ReweightedDirichlet`, it is used as long as two steps together at
+    least halve the energy. ``density`` is the one to minimise, and ``tol`` is that of `quasiharmonic.polish`.
+    """
+    values = [np.inf, descent.distortion]
+    surface = descent.model.surface
+    far = isinstance(surface, DeformationEnergy) and isinstance(surface.energy, ReweightedDirichlet)
+    while True:
+        if far:
+            assert isinstance(surface, DeformationEnergy)
+            surface.energy = ReweightedDirichlet.at(descent.distortion / float(surface.share.sum()))
+        with np.errstate(all="ignore"):
+            outcome = descent.step(tol)
+        values.append(descent.distortion)
+        if far and (outcome is not None or not values[-1] < 0.5 * values[-3]):
+            far, outcome = False, None
+            descent.use_density(density)
+        elif outcome is not None and descent.relax_barrier():
+            outcome = None
+        yield outcome
+        if outcome is not None:
+            return

@@ -1,0 +1,128 @@
+"""Result of a morph: the nodes of the mesh, its inverted elements, and the drift of a chain of steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.geometry.mesh.elements import corner_triangles, name_elements
+from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
+from quasiharmonic.util.outcome import Outcome
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MorphResult(Outcome):
+    """A planar mesh after its boundary has moved.
+
+    Attributes
+    ----------
+    points : (n, 2) float64
+        All nodes; those in no element keep their positions.
+    F : (f, 3), (f, 4) or (f, 6) int64
+        The elements in the given order, counterclockwise at rest.
+    inverted : (k,) int64
+        Elements that are inverted or degenerate somewhere, verified exactly on ``points``; see
+        `quasiharmonic.geometry.exact.jacobian_signs`.
+    forbidden : (k,) int64
+        Inverted elements that are inverted by nodes with given positions alone; no placement of the other nodes can
+        untangle them.
+    result : MapResult
+        The search: status, certificate, stages, seconds. Its ``uv`` has the nodes that elements use, in their order.
+        Its triangles cover the elements: two per quadrilateral, four per six-node triangle, whose mid-side nodes are
+        placed afterwards.
+    quality_before, quality_after : (f,) float64
+        `quasiharmonic.apps.mesh_motion.quality.element_quality` of every element: 1 for an equilateral triangle or a
+        square, 0 without area, negative if inverted.
+    """
+
+    points: FloatArray
+    F: IntArray
+    inverted: IntArray
+    forbidden: IntArray
+    result: MapResult
+    quality_before: FloatArray
+    quality_after: FloatArray
+    _one_step: Callable[[], FloatArray] = field(repr=False)
+
+    @property
+    def valid(self) -> bool:
+        """Whether no element is inverted or degenerate anywhere, verified exactly."""
+        return not self.inverted.size
+
+    @property
+    def success(self) -> bool:
+        """Whether the mesh is valid and the call was not interrupted."""
+        return self.valid and self.status.acceptable
+
+    @property
+    def status(self) -> Status:
+        """The status of the search."""
+        return self.result.status
+
+    @property
+    def message(self) -> str:
+        """The first line of `summary`."""
+        return self.summary().partition("\n")[0]
+
+    def drift(self) -> float:
+        """Return the maximum distance of a node from its position after one step from the rest mesh.
+
+        The boundary and pins of that step are those of this mesh.
+
+        Each call computes such a step; NaN if it finds no valid mesh. For a chain of steps that all use the first mesh
+        as ``rest``, the drift is small and falls with ``tol``. It is large if the energy has several minima and
+        the chain has reached another one.
+        """
+        return float(np.hypot(*(self.points - self._one_step()).T).max())
+
+    def summary(self) -> str:
+        """Return a text that says whether the mesh is valid, and otherwise what is wrong."""
+        if self.valid:
+            return f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere."
+        lines = [f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}."]
+        if self.forbidden.size:
+            lines.append(
+                f"Inverted for every position of the free nodes: {name_elements(self.F, self.forbidden)}. Move the "
+                "boundary less there, or split these elements."
+            )
+        if not self.result.injective:
+            lines.append(self.result.status.value)
+            if self.result.diagnosis is not None and self.result.diagnosis.obstructions:
+                lines.append(self.result.diagnosis.summary())
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result for JSON."""
+        both = (("quality_before", self.quality_before), ("quality_after", self.quality_after))
+        return {
+            **self.result.to_dict(),
+            "success": self.success,
+            "message": self.message,
+            "valid": self.valid,
+            "inverted": self.inverted.tolist(),
+            "forbidden": self.forbidden.tolist(),
+            **{
+                name: {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())}
+                for name, quality in both
+            },
+        }
+
+
+def find_forbidden(F: IntArray, points: FloatArray, given: IntArray) -> IntArray:
+    """Return elements inverted or degenerate at a corner whose relevant nodes all have given positions; ascending."""
+    known = np.zeros(len(points), dtype=bool)
+    known[given] = True
+    if F.shape[1] == 6:
+        x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)
+        # At a corner the derivatives depend on the corners and on the midpoints of its two sides.
+        nodes = np.array([(0, 1, 2, 3, 5), (0, 1, 2, 3, 4), (0, 1, 2, 4, 5)])
+        return np.flatnonzero((known[F[:, nodes]].all(axis=2) & (jacobian_coefficients(x, y)[:, :3] < 0)).any(axis=1))
+    triangles, of = (F, np.arange(len(F))) if F.shape[1] == 3 else corner_triangles(F)
+    sign = orientation(*(points[triangles[:, k]] for k in range(3)))
+    return np.unique(of[(sign <= 0) & known[triangles].all(axis=1)])

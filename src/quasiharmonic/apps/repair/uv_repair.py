@@ -1,0 +1,289 @@
+"""Repair a map with inverted triangles: keep its boundary and as much of its interior as possible.
+
+Seams split a map into islands. `IslandRepair` repairs each island separately.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.atlas.atlas_verdict import mirrored_islands
+from quasiharmonic.apps.repair.island_repair import IslandRepair
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
+from quasiharmonic.problem.diagnosis import Diagnosis
+from quasiharmonic.problem.result import Step
+from quasiharmonic.solver.search.options import MAX_ITERATIONS
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_bool,
+    check_callback,
+    check_integer,
+    count_of,
+    names_of,
+)
+from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.progress import reports_progress
+
+
+@dataclass(frozen=True, eq=False)
+class RepairedIsland:
+    """The repair report of one island; indices are the mesh's, from 0.
+
+    Attributes
+    ----------
+    triangles : (k,) int64
+        Triangles of the island, ascending.
+    inverted_before, inverted : (a,), (b,) int64
+        Triangles that were not strictly positive before the repair, and those that still are not.
+    moved_vertices : (c,) int64
+        Vertices whose position changed.
+    mirrored : bool
+        Whether every triangle was strictly negative. In a map of several islands this is often intended. The island
+        is left unchanged unless ``unmirror`` is set, and is certified as its reflection.
+    bijective : bool
+        Whether the repaired island is bijective. Overlaps of its fixed boundary remain.
+    reason : str
+        Why triangles are still inverted; empty if there are none.
+    diagnosis : Diagnosis or None
+        The obstruction to a map with this boundary, computed if triangles are still inverted.
+    """
+
+    triangles: IntArray
+    inverted_before: IntArray
+    inverted: IntArray
+    moved_vertices: IntArray
+    mirrored: bool
+    bijective: bool
+    reason: str = ""
+    diagnosis: Diagnosis | None = None
+
+    @property
+    def injective(self) -> bool:
+        """Whether every triangle is strictly positive."""
+        return not self.inverted.size
+
+    def summary(self) -> str:
+        """Describe the repair in one line."""
+        where = which_island(self.triangles)
+        overlap = "" if self.bijective or not self.injective else "; it overlaps itself"
+        if self.mirrored:
+            done = "turned over" if self.moved_vertices.size else "mirrored, left unchanged"
+            return f"{where}: {done}{overlap}"
+        if not self.inverted_before.size:
+            return f"{where}: nothing to repair{overlap}"
+        done = (
+            f"{len(self.inverted_before)} inverted before, {len(self.inverted)} now; "
+            f"{count_of('vertex', 'vertices', len(self.moved_vertices))} moved"
+        )
+        left = f"; {names_of('triangle', 'triangles', self.inverted)} left. {self.reason}" if self.inverted.size else ""
+        return f"{where}: {done}{overlap}{left}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report for JSON, with the first triangle and the number of triangles."""
+        return {
+            "first_triangle": int(self.triangles[0]),
+            "triangles": len(self.triangles),
+            "mirrored": self.mirrored,
+            "injective": self.injective,
+            "bijective": self.bijective,
+            "inverted_before": self.inverted_before.tolist(),
+            "inverted": self.inverted.tolist(),
+            "moved_vertices": self.moved_vertices.tolist(),
+            "reason": self.reason,
+            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RepairResult(Outcome):
+    """A repaired map with a report for every island.
+
+    Attributes
+    ----------
+    uv : (m, 2) float64
+        Vertex positions. Positions of vertices that did not move are bitwise unchanged.
+    FT : (f, 3) int64
+        For every corner its row of ``uv``. If a moved vertex shared its row with other vertices, it has a new row at
+        the end.
+    islands : tuple of RepairedIsland
+        Reports, in the order of each island's first triangle.
+    """
+
+    uv: FloatArray
+    FT: IntArray
+    islands: tuple[RepairedIsland, ...]
+
+    @property
+    def success(self) -> bool:
+        """Whether no triangle is inverted any more; equal to `injective`."""
+        return self.injective
+
+    @property
+    def message(self) -> str:
+        """The first line of `summary`."""
+        return self.summary().partition("\n")[0]
+
+    @property
+    def injective(self) -> bool:
+        """Whether there is an island, and every triangle of every island is strictly positive."""
+        return bool(self.islands) and all(island.injective for island in self.islands)
+
+    @property
+    def moved_vertices(self) -> IntArray:
+        """Vertices of the mesh whose position changed, ascending."""
+        return np.unique(
+            np.concatenate([np.empty(0, dtype=np.int64), *(island.moved_vertices for island in self.islands)])
+        )
+
+    def summary(self) -> str:
+        """Describe the repair, in total and for every island that needed it."""
+        before, now = (sum(len(getattr(i, name)) for i in self.islands) for name in ("inverted_before", "inverted"))
+        lines = [
+            f"{count_of('island', 'islands', len(self.islands))}: "
+            f"{count_of('triangle', 'triangles', before)} inverted before, {now} now; "
+            f"{count_of('vertex', 'vertices', len(self.moved_vertices))} moved"
+        ]
+        return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report for JSON, without the map."""
+        return {
+            "success": self.success,
+            "message": self.message,
+            "injective": self.injective,
+            "inverted_before": sum(len(island.inverted_before) for island in self.islands),
+            "inverted": sum(len(island.inverted) for island in self.islands),
+            "moved_vertices": len(self.moved_vertices),
+            "islands": [island.to_dict() for island in self.islands],
+        }
+
+
+@accepts_mesh
+@reports_progress
+def repair(
+    V: ArrayLike,
+    F: ArrayLike,
+    uv: ArrayLike,
+    *,
+    FT: ArrayLike | None = None,
+    whole: bool = False,
+    unmirror: bool = False,
+    max_iterations: int = MAX_ITERATIONS,
+    linear_solver: str = "auto",
+    callback: Callable[[Step], object] | None = None,
+) -> RepairResult:
+    """Repair the inverted triangles of a map, keeping its boundary and as much of its interior as possible.
+
+    Patches of growing size around inverted triangles are mapped again with their boundaries fixed. In a successful
+    patch, vertices return to their old positions where this inverts no triangle. The other vertices minimise the
+    symmetric Dirichlet energy. If a patch fails, the whole island is mapped again.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        The surface.
+    F : (f, 3) array of int
+        Triangles.
+    uv : (m, 2) array
+        Vertex positions of the map. Interior vertices may have any position, even NaN.
+    FT : (f, 3) array of int, optional
+        For a map with seams, the row of ``uv`` of each corner; ``F`` by default. Triangles with a corner of -1 have no
+        position and are left unchanged. `quasiharmonic.io.seamed_mesh.SeamedMesh` defines seams.
+    whole : bool
+        Map every island that has inverted triangles again as a whole, and polish it.
+    unmirror : bool
+        Reflect mirrored islands in place. By default they are left unchanged, because islands are often mirrored on
+        purpose to use an image twice.
+    max_iterations : int
+        Maximum number of linear solves when an island is mapped as a whole.
+    linear_solver : str
+        ``"auto"`` or one of `quasiharmonic.linsolve.available`.
+    callback : callable, optional
+        Called with a `Step` at every iteration. Between iterations it is called again with the last `Step` at least
+        every half second, except during a factorisation.
+
+    Returns
+    -------
+    RepairResult
+        The map and, for every island, the changes and the certified result. If triangles are still inverted, it
+        reports the reason and raises no exception.
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape or dtype, or indices are out of range.
+    KeyboardInterrupt
+        By Ctrl-C.
+
+    Examples
+    --------
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> uv = V.copy()
+    >>> uv[0] = [0.4, 0.1]
+    >>> result = repair(V, F, uv)
+    >>> len(result.islands[0].inverted_before), result.injective, result.moved_vertices.tolist()
+    (2, True, [0])
+    """
+    check_integer("max_iterations", max_iterations, minimum=1)
+    check_bool("whole", whole)
+    check_bool("unmirror", unmirror)
+    check_callback(callback)
+    mesh = SeamedMesh(V, F, FT, uv)
+    done = []
+    for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
+        if mirrored:
+            done.append(_report_mirrored(island, unmirror))
+            continue
+        one = IslandRepair(
+            mesh.V, island, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback
+        )
+        before = island.triangles[one.inverted]
+        if before.size:
+            one.run(whole)
+        certificate = certify(island.F, one.uv)
+        done.append(
+            (
+                one.uv,
+                RepairedIsland(
+                    triangles=island.triangles,
+                    inverted_before=before,
+                    inverted=island.triangles[one.inverted],
+                    moved_vertices=np.unique(island.vertices[one.moved_mask]),
+                    mirrored=False,
+                    bijective=bool(certificate.bijective),
+                    reason="" if certificate.injective else one.reason,
+                    diagnosis=None if certificate.injective else one.diagnosis,
+                ),
+            )
+        )
+    repaired = mesh.with_places([new for new, _ in done])
+    assert repaired.uv is not None
+    return RepairResult(repaired.uv, repaired.FT, tuple(report for _, report in done))
+
+
+def _report_mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:
+    """Report a mirrored island, reflected within its bounding box if ``turn``."""
+    uv = island.uv.copy()
+    if turn:
+        uv[:, 0] = uv[:, 0].min() + uv[:, 0].max() - uv[:, 0]
+    certificate = certify(island.F if turn else island.F[:, ::-1], uv)
+    wrong = np.sort(np.concatenate([certificate.inverted, certificate.degenerate]))
+    none = np.empty(0, dtype=np.int64)
+    return uv, RepairedIsland(
+        triangles=island.triangles,
+        inverted_before=none,
+        inverted=island.triangles[wrong],
+        moved_vertices=np.unique(island.vertices) if turn else none,
+        mirrored=True,
+        bijective=bool(certificate.bijective),
+        reason="Double precision cannot express it the other way around." if wrong.size else "",
+    )

@@ -1,0 +1,236 @@
+"""Cut a chart further: to the places of greatest stretch, or into two charts."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+# An extension reaches at most this number of peaks; fewer if less than this share of the area is over the bound.
+_MAX_PEAKS = 24
+_MANY_OVER = 0.2
+# Other peaks closer than this multiple of the depth of a peak are not reached by the same extension.
+_NEAR = 0.3
+# The cost of an edge for a dividing line decreases with the excess of the stretch by this factor.
+_ATTRACTION = 10.0
+# Number of averages of the stretch over neighbouring triangles, and the largest stretch in these averages.
+_SMOOTHINGS = 3
+_MAX_PEAK = 4.0
+# A dividing line stays between these values of the relative distance from its two ends.
+_BAND = (0.25, 0.75)
+# Around each end, up to this distance, triangles belong to the nearer end; the chart has area 1.
+_REACH = 0.15
+# The band of a large chart is narrowed until it has at most this number of triangles.
+_MAX_BAND = 30_000
+# Number of boundary positions between which a dividing line is sought, and what a balanced line is worth.
+_SAMPLES = 256
+_BALANCE = 0.2
+# A part with a smaller share of the triangles is a mere corner.
+_LEAST_PART = 0.004
+# Cost factor of boundary edges for a dividing line, and what a line costs at least, relative to the boundary's length.
+_DETOUR = 10.0
+_LINE_COST = 0.05
+# Costs of edges for flows are integers of about this size.
+_UNIT = 1000.0
+_MOST = 2**30
+
+
+def extend_cuts(chart: WorkingChart, bound: float) -> WorkingChart | None:
+    """Cut a chart from its boundary to the peaks of its stretch; None if all of these are at the boundary."""
+    graph = _graph(chart)
+    opened = graph.rim_vertices.copy()
+    cut = np.zeros(len(graph.ends), dtype=bool)
+    excess = _excess(chart, bound)
+    left = chart.share_over(bound)
+    most = max(1, int(_MAX_PEAKS * min(left / _MANY_OVER, 1)))
+    for _ in range(most):
+        depth, before = graph.distances(np.flatnonzero(opened), graph.cost)
+        score = excess * depth
+        tip = int(np.argmax(score))
+        if not score[tip] > 0:
+            break
+        path = graph.way_back(before, tip)
+        cut[path] = True
+        opened |= graph.mark_vertices(cut)
+        near, _ = graph.distances(np.array([tip]), graph.cost, limit=_NEAR * depth[tip])
+        excess[np.isfinite(near)] = 0
+    if not cut.any():
+        return None
+    (longer,) = _open(chart, cut[graph.side].T)
+    return longer
+
+
+def divide_overlap(chart: WorkingChart) -> list[WorkingChart]:
+    """Divide a chart into two or more along a short line between parts that overlap each other."""
+    graph = _graph(chart)
+    one, other = _overlapping_parts(chart)
+    parts = _open(chart, _line_between(chart, graph, one, other)[graph.side].T)
+    if max(len(part.F) for part in parts) < (1 - _LEAST_PART) * len(chart.F):
+        return parts
+    # The overlapping parts are so close to each other that the line cuts off a corner only.
+    return _open(chart, _line_from(chart, graph, int(one[0]), int(other[0]))[graph.side].T)
+
+
+def divide(chart: WorkingChart, bound: float) -> list[WorkingChart]:
+    """Divide a chart into two or more along a short line across its middle, where possible through much stretch."""
+    graph = _graph(chart)
+    if chart.uv is not None:
+        there = _excess(chart, bound)
+        graph.cost[:] /= 1 + _ATTRACTION * there[graph.ends].mean(axis=1)
+    return _open(chart, _line_between(chart, graph, *_far_ends(chart, graph))[graph.side].T)
+
+
+def _excess(chart: WorkingChart, bound: float) -> FloatArray:
+    """How much the logarithm of the stretch around each vertex (m,) exceeds the bound, at least 0."""
+    excess = np.log(np.minimum(chart.stretch, _MAX_PEAK)) - np.log(bound)
+    weight = chart.area
+    corners = chart.F.ravel()
+    total = np.bincount(corners, np.repeat(weight, 3), minlength=len(chart.V))
+    at = np.empty(0)
+    for _ in range(_SMOOTHINGS):
+        at = np.bincount(corners, np.repeat(weight * excess, 3), minlength=len(chart.V)) / total
+        excess = at[chart.F].mean(axis=1)
+    # A single triangle must not be lost by the averages.
+    np.maximum.at(at, chart.F[chart.too_long].ravel(), np.log(_MAX_PEAK))
+    return np.maximum(at, 0)
+
+
+def _graph(chart: WorkingChart) -> EdgeGraph:
+    """The edges of a chart with their costs."""
+    return edge_graph(chart.V, chart.F, chart.cost)
+
+
+def _overlapping_parts(chart: WorkingChart) -> tuple[IntArray, IntArray]:
+    """Boundary vertices of two parts of a chart that overlap each other.
+
+    One part lies on one arc of the boundary, the other outside of this arc. Of all arcs between sampled boundary
+    vertices, the one that parts most crossings is used, and of several the longest.
+    """
+    loop = np.concatenate(chart.piece.loops)
+    place = np.empty(len(chart.V), dtype=np.int64)
+    place[loop] = np.arange(loop.size)
+    pairs = place[chart.crossings[:, (0, 2)]]
+    count = min(loop.size, _SAMPLES)
+    bins = pairs * count // loop.size
+    crossed = np.zeros((count, count))
+    np.add.at(crossed, (bins[:, 0], bins[:, 1]), 1)
+    np.add.at(crossed, (bins[:, 1], bins[:, 0]), 1)
+    # Sums over all arcs from sample i up to before sample j.
+    both = np.zeros((count + 1, count + 1))
+    both[1:, 1:] = crossed.cumsum(axis=0).cumsum(axis=1)
+    ends = np.arange(count + 1)
+    i, j = (ends[:, None], ends[None, :])
+    inside = both[j, j] - both[i, j] - both[j, i] + both[i, i]
+    touching = both[j, count] - both[i, count]
+    length = np.minimum(j - i, count - (j - i)) / count
+    score = np.where(j > i, (touching - inside) / len(pairs) + _BALANCE * length, -np.inf)
+    first, last = np.unravel_index(int(np.argmax(score)), score.shape)
+    within = (bins >= first) & (bins < last)
+    parted = within[:, 0] != within[:, 1]
+    if not parted.any():
+        parted[:], within[:, 0], within[:, 1] = True, True, False
+    return loop[pairs[parted][within[parted]]], loop[pairs[parted][~within[parted]]]
+
+
+def _line_from(chart: WorkingChart, graph: EdgeGraph, one: int, other: int) -> BoolArray:
+    """Edges (e,) of a line that begins at the boundary between two of its vertices and divides the chart evenly."""
+    loop = next(loop for loop in chart.piece.loops if one in loop)
+    place = np.concatenate([[0.0], np.cumsum(graph.length[graph.numbers(loop, np.roll(loop, -1))])])
+    total = float(place[-1])
+    i = int(np.flatnonzero(loop == one)[0])
+    at = np.flatnonzero(loop == other)
+    j = int(at[0]) if at.size else (i + 1) % loop.size
+    i, j = min(i, j), max(i, j)
+    middle = (i + j) // 2 if place[j] - place[i] <= total / 2 else ((i + j + loop.size) // 2) % loop.size
+    arc = np.abs(place[:-1] - place[middle])
+    arc = np.minimum(arc, total - arc)
+    weight = np.where(graph.rim, _DETOUR, 1.0) * graph.cost
+    far, before = graph.distances(loop[[middle]], weight)
+    with np.errstate(all="ignore"):
+        score = np.where(arc > 0, (far[loop] + _LINE_COST * total) / arc, np.inf)
+    line = np.zeros(len(graph.ends), dtype=bool)
+    line[graph.way_back(before, int(loop[np.argmin(score)]))] = True
+    return line & ~graph.rim
+
+
+def _far_ends(chart: WorkingChart, graph: EdgeGraph) -> tuple[IntArray, IntArray]:
+    """Two vertices of a chart that are far from each other."""
+    ends = [0]
+    for _ in range(3):
+        distance, _ = graph.distances(np.array(ends[-1:]), graph.length)
+        ends.append(int(np.argmax(np.where(np.isfinite(distance), distance, -1))))
+    return np.array(ends[-1:]), np.array(ends[-2:-1])
+
+
+def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: IntArray) -> BoolArray:
+    """Edges (e,) of the cheapest line that separates two sets of vertices."""
+    near, far = (graph.distances(ends, graph.length)[0] for ends in (one, other))
+    with np.errstate(all="ignore"):
+        t = np.nan_to_num(near / (near + far), nan=0.5)[chart.F].mean(axis=1)
+    k, lowest, highest = len(chart.F), *_BAND
+    inside = np.abs(t - 0.5)
+    half = 0.5 * (highest - lowest)
+    if np.count_nonzero(inside < half) > _MAX_BAND:
+        half = float(np.partition(inside, _MAX_BAND)[_MAX_BAND])
+    # Around the ends, triangles belong to the nearer one, so that no part is tiny.
+    near, far = near[chart.F].mean(axis=1), far[chart.F].mean(axis=1)
+    source = (t <= 0.5 - half) | ((near < _REACH) & (near < far))
+    sink = (t >= 0.5 + half) | ((far < _REACH) & (far <= near))
+    if not source.any() or not sink.any():
+        # The chart is so small that no triangle is close to an end.
+        order = np.argsort(t, kind="stable")
+        source[order[0]], sink[order[-1]] = True, True
+        sink[order[0]] = source[order[-1]] = False
+    # Triangles in the band are nodes; all others are the source, k, or the sink, k + 1.
+    node = np.where(source, k, np.where(sink, k + 1, np.arange(k)))
+    numbers, node = np.unique(np.concatenate([node, [k, k + 1]]), return_inverse=True)
+    first, second, edge = _pairs(graph)
+    capacity = np.clip(graph.cost[edge] / np.mean(graph.cost) * _UNIT, 1, _MOST / (len(edge) + 1)).astype(np.int32)
+    a, b = node[first], node[second]
+    apart = a != b
+    a, b, capacity = a[apart], b[apart], capacity[apart]
+    size = numbers.size
+    network = csr_array(
+        (np.concatenate([capacity, capacity]), (np.concatenate([a, b]), np.concatenate([b, a]))),
+        shape=(size, size),
+        dtype=np.int32,
+    )
+    network.sum_duplicates()
+    flow = maximum_flow(network, size - 2, size - 1).flow
+    rest = (network - flow).tocsr()
+    rest.data[rest.data < 0] = 0
+    rest.eliminate_zeros()
+    reached = np.zeros(size, dtype=bool)
+    reached[breadth_first_order(rest, size - 2, return_predecessors=False)] = True
+    side = reached[node[:k]]
+    line = np.zeros(len(graph.ends), dtype=bool)
+    line[edge[side[first] != side[second]]] = True
+    return line
+
+
+def _pairs(graph: EdgeGraph) -> tuple[IntArray, IntArray, IntArray]:
+    """The two triangles (e,) at each interior edge, and the edges (e,)."""
+    side = graph.side.T.ravel()
+    order = np.argsort(side, kind="stable")
+    first = np.flatnonzero(np.diff(side[order]) == 0)
+    return order[first] // 3, order[first + 1] // 3, side[order[first]]
+
+
+def _open(chart: WorkingChart, cut: BoolArray) -> list[WorkingChart]:
+    """Open a chart at sides (k, 3) of its triangles; return its parts, which keep the map."""
+    split, component = fans(chart.F, cut)
+    parts = []
+    for number in range(int(component.max()) + 1):
+        rows = np.flatnonzero(component == number)
+        own, corner = renumber(split[rows], chart.F[rows])
+        origin = chart.F[rows].ravel()[corner]
+        part = WorkingChart(chart.triangles[rows], chart.vertices[origin], chart.V[origin], own, chart.cost[rows])
+        if chart.uv is not None:
+            part.uv = np.ldexp(chart.uv[origin], chart.piece.exponent - part.piece.exponent)
+        parts.append(part)
+    return parts

@@ -1,0 +1,229 @@
+"""Flatten one chart with a free boundary, and measure its stretch.
+
+The symmetric Dirichlet energy is a mean, so it accepts much stretch in few triangles. If more of the chart than allowed
+is stretched beyond the bound, the descent continues with `EvenStretch`, which weights large stretch more. The boundary
+is not guarded against overlaps. A chart that overlaps itself is divided by the caller, which also lowers its stretch.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from quasiharmonic.apps.flattening.disk_start import map_to_disk
+from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energies.energies import Deformation, Energy, Isotropic, SymmetricDirichlet
+from quasiharmonic.energies.newton.map_model import in_units
+from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
+from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.geometry.exact.loops import check_loops
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+
+#: No triangle may be stretched more than this, except triangles with a smaller angle than `THIN_ANGLE`.
+WORST_STRETCH = 3.0
+#: Angle in radians below which the stretch of a triangle is not bounded.
+THIN_ANGLE = np.pi / 180
+#: Share of the area that may be stretched beyond the bound.
+FREE_SHARE = 0.01
+# Relative tolerance of the descents: a more accurate minimum hardly changes the stretch.
+_TOLERANCE = 1e-2
+_MAX_STEPS = 100
+# A mean energy below this needs no further steps.
+_NOTHING = 1e-5
+# Smallest energy at the bound that `EvenStretch` uses.
+_LEAST_ENERGY = 0.1
+# From mean energies below this, Newton steps are used directly.
+_NEAR = 1.0
+
+
+class EvenStretch(Isotropic):
+    """``E + k E³`` with the symmetric Dirichlet energy E: few triangles with large stretch are worse than many.
+
+    Parameters
+    ----------
+    bound : float
+        Above 1. Where one singular value has this stretch and the other is 1, the second term is three times the first.
+    """
+
+    barrier = True
+
+    def __init__(self, bound: float) -> None:
+        self._base = SymmetricDirichlet()
+        self._k = 3 / max((bound - 1 / bound) ** 2, _LEAST_ENERGY) ** 2
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``E + k E³``."""
+        e = self._base.density(d)
+        return e + self._k * e**3
+
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``(1 + 3k E²) dE``."""
+        by_a, by_b = self._base.density_gradient(d)
+        factor = 1 + 3 * self._k * self._base.density(d) ** 2
+        return factor * by_a, factor * by_b
+
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``(1 + 3k E²) d²E + 6k E dE²``."""
+        e, (by_a, by_b) = self._base.density(d), self._base.density_gradient(d)
+        aa, ab, bb = self._base.density_hessian(d)
+        factor, square = 1 + 3 * self._k * e**2, 6 * self._k * e
+        return factor * aa + square * by_a**2, factor * ab + square * by_a * by_b, factor * bb + square * by_b**2
+
+
+@dataclass(eq=False)
+class WorkingChart:
+    """A chart during the search.
+
+    Attributes
+    ----------
+    triangles : (k,) int64
+        Rows of the mesh's triangles.
+    vertices : (m,) int64
+        Vertices of the mesh; a vertex on a cut can occur several times.
+    V : (m, 3) float64
+    F : (k, 3) int64
+        The triangles, by the chart's own vertices.
+    cost : (k, 3) float64
+        Factor on the cost of cutting each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
+    uv : (m, 2) float64 or None
+        An injective map, in the unit of `piece`, or None.
+    stretch : (k,) float64
+        The larger of σ₁ and 1/σ₂ on each triangle, if the map has the surface's area; infinite without a map.
+    crossings : (c, 4) int64
+        Pairs of boundary edges that intersect.
+    bijective : bool
+        Whether the map covers no point twice.
+    """
+
+    triangles: IntArray
+    vertices: IntArray
+    V: FloatArray
+    F: IntArray
+    cost: FloatArray
+    uv: FloatArray | None = None
+    stretch: FloatArray = field(default_factory=lambda: np.empty(0))
+    crossings: IntArray = field(default_factory=lambda: np.empty((0, 4), dtype=np.int64))
+    bijective: bool = False
+    # Number of successive extensions of cuts that lowered the stretch too little.
+    failures: int = 0
+
+    def __post_init__(self) -> None:
+        self.piece = Piece(self.V, self.F)
+        shapes = rest_shapes(self.piece.V, self.F)
+        self.area: FloatArray = shapes.m / shapes.m.sum()
+        self.surface_area = float(np.ldexp(self.piece.area, 2 * self.piece.exponent))
+        self._thin = smallest_angles(shapes.sides) < THIN_ANGLE
+
+    def over(self, bound: float) -> BoolArray:
+        """Mask (k,) of the triangles that are stretched beyond the bound."""
+        return self.stretch > bound
+
+    def share_over(self, bound: float) -> float:
+        """Share of the area that is stretched beyond the bound."""
+        return float(self.area[self.over(bound)].sum())
+
+    @property
+    def too_long(self) -> BoolArray:
+        """Mask (k,) of the triangles that are stretched beyond `WORST_STRETCH` although they are not thin."""
+        return ~self._thin & (self.stretch > WORST_STRETCH)
+
+    def use(self, uv: FloatArray) -> None:
+        """Use an injective map (m, 2), scaled to the surface's area, and measure it."""
+        self.uv = _fit_scale(self.piece, uv)
+        self.stretch = measure_stretch(self.piece.energy(SymmetricDirichlet(), None), self.uv)
+        self.crossings, reasons = check_loops(self.piece.loops, self.uv)
+        self.bijective = not reasons
+
+
+def smallest_angles(sides: ComplexArray) -> FloatArray:
+    """Smallest angle (f,) in radians of triangles given by their sides (3, f) complex128."""
+    length = np.abs(sides)
+    with np.errstate(all="ignore"):
+        angles = [np.abs(np.angle(-sides[k - 1].conj() * sides[k])) for k in range(3)]
+    return np.where(length.min(axis=0) > 0, np.min(angles, axis=0), 0.0)
+
+
+def measure_stretch(energy: DeformationEnergy, uv: FloatArray) -> FloatArray:
+    """The larger of σ₁ and 1/σ₂ (f,) on each triangle after scaling a map (n, 2) to the surface's area."""
+    d = energy.deform(in_units(uv, 0))
+    larger = np.abs(d.p) + np.abs(d.q)
+    with np.errstate(all="ignore"):
+        scale = 1 / np.sqrt((energy.share * d.det).sum() / energy.share.sum())
+        return np.maximum(scale * larger, larger / (scale * d.det))
+
+
+def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], object]) -> None:
+    """Flatten a chart, from its map if it has one; afterwards its map may overlap itself.
+
+    ``check_wanted`` is called before every step and may raise an exception. If no injective map is found in double
+    precision, the chart has no map.
+    """
+    if chart.uv is None:
+        flat = chart.piece.planar_map()
+        uv = _initial_map(chart.piece) if flat is None else flat
+        if uv is None:
+            chart.stretch = np.full(len(chart.F), np.inf)
+            return
+        chart.use(uv)
+        if flat is None:
+            _descend(chart, SymmetricDirichlet(), check_wanted)
+        if keeps_bound(chart, bound):
+            return
+    else:
+        chart.use(chart.uv)
+    before, good = chart.uv, chart.bijective and keeps_bound(chart, bound)
+    _descend(chart, EvenStretch(bound), check_wanted)
+    if good and not (chart.bijective and keeps_bound(chart, bound)):
+        assert before is not None
+        chart.use(before)
+
+
+def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None:
+    """Flatten a chart that must not overlap itself; slower than `flatten_chart` and with more stretch."""
+    settings = Settings("symmetric-dirichlet", _TOLERANCE, _MAX_STEPS, "auto", lambda _: check_wanted(), 0)
+    result = Flattening(chart.piece, settings, None).run(None)
+    chart.use(result.uv)
+
+
+def keeps_bound(chart: WorkingChart, bound: float) -> bool:
+    """Whether a chart on its own keeps the bound."""
+    return chart.share_over(bound) <= FREE_SHARE and not chart.too_long.any()
+
+
+def _initial_map(piece: Piece) -> FloatArray | None:
+    """An injective map (n, 2), or None if none was found in double precision."""
+    starts = [map_to_disk, flatten_coarse]
+    for start in reversed(starts) if len(piece.F) >= COARSE_FROM else starts:
+        uv = start(piece.V, piece.F, piece.loops)
+        if uv is not None:
+            return uv
+    return None
+
+
+def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> None:
+    """Lower an energy of the chart's map, which stays injective."""
+    assert chart.uv is not None
+    value = chart.piece.energy(density, None).value(in_units(chart.uv, 0))
+    far = value > _NEAR and isinstance(density, SymmetricDirichlet)
+    energy = chart.piece.energy(ReweightedDirichlet() if far else density, None)
+    descent = SurfaceDescent(energy, chart.uv, "auto")
+    for _ in itertools.islice(descend(descent, density, _TOLERANCE), _MAX_STEPS):
+        check_wanted()
+        if descent.distortion < _NOTHING:
+            break
+    chart.use(descent.uv)
+
+
+def _fit_scale(piece: Piece, uv: FloatArray) -> FloatArray:
+    """Scale a map to the surface's area; if this inverts a triangle, scale exactly by a power of two."""
+    area = float(signed_areas(piece.F, in_units(uv, 0)).sum())
+    factor = np.sqrt(piece.area / area)
+    scaled = (uv - uv.mean(axis=0)) * factor
+    return scaled if is_injective(piece.F, scaled) else np.ldexp(uv, round(np.log2(factor)))

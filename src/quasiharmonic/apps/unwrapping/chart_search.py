@@ -1,0 +1,209 @@
+"""Search for few charts with short cuts that keep a bound on stretch.
+
+    cuts into disks ─▶ flatten ─▶ overlaps itself much? ─ yes ─▶ divide ─────────────────┐
+                          ▲              │ no                                            │
+                          │        over the bound? ─ yes ─▶ extend cuts to the greatest  │
+                          │              │ no               stretch, or divide ──────────┤
+                          │        overlaps itself a little? ─ yes ─▶ separate, or divide┤
+                          └──────────────┼───────────────────────────────────────────────┘
+                                         ▼
+                                       done
+
+All charts together may exceed the bound on one per cent of the surface, so a small chart may exceed it on more.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from functools import partial
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from quasiharmonic.apps.unwrapping.chart_cuts import divide, divide_overlap, extend_cuts
+from quasiharmonic.apps.unwrapping.chart_maps import (
+    FREE_SHARE,
+    WorkingChart,
+    flatten_chart,
+    guard_chart,
+)
+from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+Callback = Callable[[str, int, int], object]
+
+# Maximum number of times that charts are cut further to reach the aim, and to keep the bound.
+_FEW_ROUNDS, _MANY_ROUNDS = 12, 24
+# An extension must lower the share over the bound to this fraction, or it has failed.
+_ENOUGH = 0.6
+# A chart is divided after this number of failed extensions.
+_MAX_FAILURES = 1
+# Charts are improved until this fraction of the free share remains, if all improvements succeed.
+_LEFT = 0.8
+# The search first aims at a bound with this fraction of the permitted stretch.
+_AIM = 0.6
+# Overlaps of at most this share of a chart are separated without dividing the chart.
+_SMALL_OVERLAP = 0.005
+# It divides charts to reach its aim only up to this number of charts, plus a multiple of the root of the number of
+# triangles; and to keep the bound up to this number.
+_FEW_CHARTS = 8, 0.125
+_MANY_CHARTS = 64, 1.0
+# Seconds between two calls of the callback while nothing is finished.
+_TICK = 0.25
+
+
+class Workers:
+    """A pool of threads that reports progress and stops when the callback raises an exception.
+
+    ``callback(phase, done, total)`` is called in the caller's thread.
+    """
+
+    def __init__(self, jobs: int | None, callback: Callback | None) -> None:
+        self._jobs = jobs or _cores()
+        self._callback = callback
+        self._stop = threading.Event()
+
+    def check_wanted(self) -> None:
+        """Raise KeyboardInterrupt if the caller no longer waits for results."""
+        if self._stop.is_set():
+            raise KeyboardInterrupt
+
+    def map(self, phase: str, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+        """Apply a function to every item, largest items first if they are so ordered; results in order of the items."""
+        self._report(phase, 0, len(items))
+        if self._jobs == 1 or len(items) < 2:
+            return self._map_here(phase, function, items)
+        pool = ThreadPoolExecutor(self._jobs, thread_name_prefix="find_charts")
+        try:
+            futures = [pool.submit(function, item) for item in items]
+            waiting: set[Future[R]] = set(futures)
+            while waiting:
+                done, waiting = wait(waiting, _TICK, FIRST_COMPLETED)
+                for future in done:
+                    future.result()
+                self._report(phase, len(items) - len(waiting), len(items))
+            return [future.result() for future in futures]
+        except BaseException:
+            self._stop.set()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _map_here(self, phase: str, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+        results = []
+        for item in items:
+            results.append(function(item))
+            self._report(phase, len(results), len(items))
+        return results
+
+    def _report(self, phase: str, done: int, total: int) -> None:
+        if self._callback is not None:
+            self._callback(phase, done, total)
+
+
+def search_charts(
+    charts: Sequence[WorkingChart], bound: float, *, max_charts: int | None, total_area: float, workers: Workers
+) -> list[WorkingChart]:
+    """Flatten charts and cut them further until they keep a bound on stretch or the limits are reached.
+
+    Parameters
+    ----------
+    charts : sequence of WorkingChart
+    bound : float
+        See `find_charts`.
+    max_charts : int or None
+        Maximum number of charts; more only if a chart has no injective map otherwise.
+    total_area : float
+        Area of the surface, which may have further charts.
+    workers : Workers
+
+    Returns
+    -------
+    list of WorkingChart
+        All have bijective maps.
+    """
+    aim = 1 + _AIM * (bound - 1)
+    root = sum(len(chart.F) for chart in charts) ** 0.5
+    few, many = (len(charts) + round(base + share * root) for base, share in (_FEW_CHARTS, _MANY_CHARTS))
+    here = [part for parts in workers.map("flatten", partial(_flatten, aim, workers), charts) for part in parts]
+    for goal, rounds, most in ((aim, _FEW_ROUNDS, few), (bound, _MANY_ROUNDS, many)):
+        for _ in range(rounds):
+            room = (most if max_charts is None else min(max_charts, most)) - len(here)
+            chosen = _select(here, goal, total_area)
+            if goal < bound and room <= 0 and any(stretched for _, stretched in chosen):
+                break
+            jobs = [
+                _Job(here[k], stretched, rank < room or (max_charts is None and not here[k].bijective))
+                for rank, (k, stretched) in enumerate(chosen)
+            ]
+            found = workers.map("improve", partial(_improve, goal, workers), jobs)
+            changed = {k: parts for (k, _), (parts, same) in zip(chosen, found, strict=True) if not same}
+            here = [part for k, chart in enumerate(here) for part in changed.get(k, [chart])]
+            if not changed:
+                break
+    overlapping = [chart for chart in here if not chart.bijective]
+    workers.map("separate", partial(guard_chart, check_wanted=workers.check_wanted), overlapping)
+    return here
+
+
+class _Job(NamedTuple):
+    """A chart to improve; whether it exceeds the bound on stretch; whether it may be divided."""
+
+    chart: WorkingChart
+    stretched: bool
+    divisible: bool
+
+
+def _select(charts: Sequence[WorkingChart], bound: float, total_area: float) -> list[tuple[int, bool]]:
+    """Charts to be improved, most urgent first, and whether they exceed the bound on stretch."""
+    share = np.array([chart.share_over(bound) * chart.surface_area / total_area for chart in charts])
+    # The charts that exceed the bound most; all others together exceed it on less than the free share.
+    order = np.argsort(-share, kind="stable")
+    rest = np.empty(len(charts))
+    rest[order] = share.sum() - np.cumsum(share[order]) + share[order]
+    missed = rest > (_LEFT * FREE_SHARE if share.sum() > FREE_SHARE else np.inf)
+    stretched = [bool(chart.too_long.any() or missed[k]) for k, chart in enumerate(charts)]
+    chosen = [k for k, chart in enumerate(charts) if stretched[k] or not chart.bijective]
+    return [(k, stretched[k]) for k in sorted(chosen, key=lambda k: (charts[k].bijective, -share[k], k))]
+
+
+def _flatten(bound: float, workers: Workers, chart: WorkingChart) -> list[WorkingChart]:
+    """Flatten a chart; divide it as long as it has no injective map."""
+    workers.check_wanted()
+    flatten_chart(chart, bound, workers.check_wanted)
+    if chart.uv is not None:
+        return [chart]
+    return [part for half in divide(chart, bound) for part in _flatten(bound, workers, half)]
+
+
+def _improve(bound: float, workers: Workers, job: _Job) -> tuple[list[WorkingChart], bool]:
+    """Cut a chart once and flatten its parts, or separate overlaps; the flag says that the chart is unchanged."""
+    chart = job.chart
+    apart = chart.bijective or overlapping_share(chart) < _SMALL_OVERLAP
+    if apart and not job.stretched:
+        if separate(chart, bound, workers.check_wanted):
+            return [chart], False
+        apart = False
+    if apart and chart.failures < _MAX_FAILURES and (longer := extend_cuts(chart, bound)) is not None:
+        parts = _flatten(bound, workers, longer)
+        enough = sum(part.share_over(bound) for part in parts) <= _ENOUGH * chart.share_over(bound)
+        for part in parts:
+            part.failures = 0 if enough else chart.failures + 1
+        return parts, False
+    if not job.divisible or len(chart.F) < 2:
+        return [chart], True
+    parts = divide(chart, bound) if apart else divide_overlap(chart)
+    return [done for part in parts for done in _flatten(bound, workers, part)], False
+
+
+def _cores() -> int:
+    """Number of cores available to this process."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1

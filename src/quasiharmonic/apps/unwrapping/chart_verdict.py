@@ -1,0 +1,197 @@
+"""The exact verdict on charts in a texture: each chart is bijective, and no two charts share a point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from quasiharmonic.apps.unwrapping.layout import ChartLayout
+from quasiharmonic.geometry.exact import certificate
+from quasiharmonic.geometry.exact.certificate import Certificate
+from quasiharmonic.geometry.exact.loops import Obstacle
+from quasiharmonic.geometry.exact.predicates import box_pairs
+from quasiharmonic.geometry.mesh.topology import label_components
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, names_of
+
+# Largest distance between the boxes of stacked charts, in sides of the texture. Congruent charts may differ by a share
+# of 1e-4 of their radius.
+_SAME_PLACE = 1e-4
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class UnwrapCertificate:
+    """The exact verdict on the stored texture coordinates of `unwrap`.
+
+    The orientation of every triangle is that of the cleaned mesh. Degenerate and repeated triangles of the input are
+    not part of it.
+
+    Attributes
+    ----------
+    bijective_charts : (c,) bool
+        Whether each chart covers no point of the plane twice, with every triangle strictly positive.
+    inverted, degenerate : (k,) int64
+        Triangles of the input whose images are clockwise, or have zero area. Rounding can cause this in triangles that
+        are extremely thin.
+    overlapping : (p, 2) int64
+        Pairs of charts that share points.
+    clearance : float
+        Smallest distance between two charts, in texels, in double precision; infinite if it exceeds the padding by
+        more than half.
+    """
+
+    bijective_charts: BoolArray
+    inverted: IntArray
+    degenerate: IntArray
+    overlapping: IntArray
+    clearance: float
+
+    def __repr__(self) -> str:
+        return f"<UnwrapCertificate: {self.summary()}>"
+
+    @property
+    def injective(self) -> bool:
+        """Whether every triangle is strictly positive."""
+        return not (self.inverted.size or self.degenerate.size)
+
+    @property
+    def disjoint(self) -> bool:
+        """Whether no two charts share a point."""
+        return not len(self.overlapping)
+
+    @property
+    def bijective(self) -> bool:
+        """Whether every chart is bijective and no two charts share a point."""
+        return bool(self.bijective_charts.all()) and self.disjoint
+
+    def summary(self) -> str:
+        """Describe the verdict in one or two sentences."""
+        count = len(self.bijective_charts)
+        said = [f"{int(self.bijective_charts.sum())} of {count_of('chart', 'charts', count)} bijective"]
+        said.append("no overlaps" if self.disjoint else f"{count_of('pair', 'pairs', len(self.overlapping))} overlap")
+        for found, what in ((self.inverted, "inverted"), (self.degenerate, "degenerate")):
+            if found.size:
+                said.append(f"{names_of('triangle', 'triangles', found)} {what}")
+        return ", ".join(said)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        return {
+            "bijective": self.bijective,
+            "injective": self.injective,
+            "disjoint": self.disjoint,
+            "not_bijective_charts": np.flatnonzero(~self.bijective_charts).tolist(),
+            "inverted": self.inverted.tolist(),
+            "degenerate": self.degenerate.tolist(),
+            "overlapping": self.overlapping.tolist(),
+            "clearance": self.clearance if np.isfinite(self.clearance) else None,
+        }
+
+
+def certify_charts(
+    layout: ChartLayout, triangles: IntArray, *, size: tuple[int, int], padding: float, stacked: bool
+) -> UnwrapCertificate:
+    """Certify charts exactly.
+
+    Parameters
+    ----------
+    layout : ChartLayout
+    triangles : (k,) int64
+        Number of each triangle of the layout in the input.
+    size : two int
+        Width and height of the texture in texels.
+    padding : float
+        Required distance between charts in texels.
+    stacked : bool
+        Whether charts at the same place are intended. They are certified side by side.
+    """
+    F, chart = layout.F, layout.chart
+    chart_of_vertex = np.zeros(len(layout.uv), dtype=np.int64)
+    chart_of_vertex[F] = chart[:, None]
+    uv = layout.uv
+    if stacked:
+        # A shift by a whole number is exact.
+        shift = np.ceil(np.abs(uv).max()) + 1
+        uv = uv + shift * _rank_in_stack(uv, chart_of_vertex)[chart_of_vertex, None]
+    whole = certificate.certify(F, uv)
+    wrong = np.concatenate([whole.inverted, whole.degenerate, whole.nonfinite])
+    good = np.ones(int(chart.max(initial=-1)) + 1, dtype=bool)
+    good[chart[wrong]] = False
+    overlapping = np.empty((0, 2), dtype=np.int64)
+    if any(reason.kind is not Obstacle.NOT_INJECTIVE for reason in whole.reasons):
+        good, overlapping = _find_faults(F, uv, chart, chart_of_vertex, whole)
+    return UnwrapCertificate(
+        bijective_charts=good,
+        inverted=np.sort(triangles[whole.inverted]),
+        degenerate=np.sort(triangles[np.concatenate([whole.degenerate, whole.nonfinite])]),
+        overlapping=overlapping,
+        clearance=_clearance(whole.loops, uv * size, chart_of_vertex, 1.5 * padding),
+    )
+
+
+def _rank_in_stack(uv: FloatArray, chart: IntArray) -> IntArray:
+    """Return for each chart the number of charts before it at the same place, up to rounding."""
+    order = np.argsort(chart, kind="stable")
+    starts = np.flatnonzero(np.diff(chart[order], prepend=-1))
+    boxes = np.hstack([np.minimum.reduceat(uv[order], starts), np.maximum.reduceat(uv[order], starts)])
+    pairs = cKDTree(boxes).query_pairs(_SAME_PLACE, output_type="ndarray").astype(np.int64)
+    label = label_components(pairs[:, 0], pairs[:, 1], len(boxes))
+    by_label = np.argsort(label, kind="stable")
+    first = np.flatnonzero(np.diff(label[by_label], prepend=-1))
+    rank = np.empty(len(boxes), dtype=np.int64)
+    rank[by_label] = np.arange(len(boxes)) - np.repeat(first, np.diff(first, append=len(boxes)))
+    return rank
+
+
+def _find_faults(
+    F: IntArray, uv: FloatArray, chart: IntArray, chart_of_vertex: IntArray, whole: Certificate
+) -> tuple[BoolArray, IntArray]:
+    """Return which charts are bijective, and which pairs overlap, of charts that are not all bijective together."""
+    order = np.argsort(chart, kind="stable")
+    parts = np.split(F[order], np.flatnonzero(np.diff(chart[order])) + 1)
+
+    def is_bijective(*rows: IntArray) -> bool:
+        used, own = np.unique(np.concatenate(rows), return_inverse=True)
+        return bool(certificate.certify(own.reshape(-1, 3), uv[used]).bijective)
+
+    good = np.array([is_bijective(rows) for rows in parts])
+    candidates: set[tuple[int, int]] = set()
+    for reason in whole.reasons:
+        around = sorted({int(chart_of_vertex[whole.loops[loop][0]]) for loop in reason.loops})
+        candidates.update((one, other) for k, one in enumerate(around) for other in around[k + 1 :])
+    pairs = [pair for pair in sorted(candidates) if not is_bijective(*(parts[k] for k in pair))]
+    sound = [pair for pair in pairs if good[list(pair)].all()]
+    return good, np.array(sound, dtype=np.int64).reshape(-1, 2)
+
+
+def _clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vertex: IntArray, reach: float) -> float:
+    """Return the smallest distance between boundaries of different charts; infinity if it exceeds ``reach``."""
+    if len(loops) < 2:
+        return np.inf
+    tail, head = np.concatenate(loops), np.concatenate([np.roll(loop, -1) for loop in loops])
+    p, q, owner = uv[tail], uv[head], chart_of_vertex[tail]
+    least = np.inf
+    for i, j in box_pairs(np.minimum(p, q) - reach / 2, np.maximum(p, q) + reach / 2):
+        apart = owner[i] != owner[j]
+        i, j = i[apart], j[apart]
+        for start in range(0, i.size, 1 << 16):
+            one, other = i[start : start + (1 << 16)], j[start : start + (1 << 16)]
+            for a, b, c in (
+                (p[one], p[other], q[other]),
+                (q[one], p[other], q[other]),
+                (p[other], p[one], q[one]),
+                (q[other], p[one], q[one]),
+            ):
+                least = min(least, float(_distances(a, b, c).min()))
+    return least if least <= reach else np.inf
+
+
+def _distances(points: FloatArray, p: FloatArray, q: FloatArray) -> FloatArray:
+    """Return the distances of points (k, 2) from segments pq (k, 2)."""
+    along, to = q - p, points - p
+    length = (along * along).sum(axis=1)
+    share = np.clip((to * along).sum(axis=1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+    distance: FloatArray = np.linalg.norm(to - share[:, None] * along, axis=1)
+    return distance

@@ -1,0 +1,219 @@
+"""Cut a surface into few charts and flatten them, under a bound on stretch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart
+from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
+from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
+from quasiharmonic.apps.unwrapping.unfolding import unfold
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.energies.newton.map_model import in_units
+from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.targets.cuts.find import find_cuts
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+#: Default of ``max_stretch``.
+MAX_STRETCH = 1.5
+# Minimum gain of the first cuts; see `find_cuts`.
+_MIN_GAIN = 0.1
+# Closed components of at most this number of triangles are unfolded without stretch.
+_SMALL = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A part of a surface with a bijective map into the plane.
+
+    Attributes
+    ----------
+    triangles : (k,) int64
+        Rows of the mesh's triangles, ascending.
+    F : (k, 3) int64
+        The same triangles, by the chart's own vertices.
+    vertices : (m,) int64
+        Vertices of the mesh. A vertex on a cut can occur several times.
+    uv : (m, 2) float64
+        Positions in the surface's unit of length; the chart has the area of its part of the surface.
+    stretch : (k,) float64
+        The larger of σ₁ and 1/σ₂ of each triangle.
+    misses : float
+        How much the chart exceeds the bound on stretch; 0 if all charts together keep it. It is the larger of two
+        differences: between the 99 % quantile by area and ``max_stretch``, and between the largest stretch and 3.
+    """
+
+    triangles: IntArray
+    F: IntArray
+    vertices: IntArray
+    uv: FloatArray
+    stretch: FloatArray
+    misses: float
+
+
+def find_charts(
+    V: FloatArray,
+    F: IntArray,
+    *,
+    max_stretch: float = MAX_STRETCH,
+    max_charts: int | None = None,
+    edge_costs: FloatArray | None = None,
+    uv_cuts: ArrayLike | None = None,
+    seed: int = 0,
+    callback: Callable[[str, int, int], object] | None = None,
+    jobs: int | None = None,
+) -> list[Chart]:
+    """Cut a surface into charts that flatten with little stretch.
+
+    Stretch is the larger of σ₁ and 1/σ₂, after all charts are scaled by one factor to the area of the surface. At most
+    1 % of the surface is stretched by more than ``max_stretch``, and no triangle by more than 3, except triangles with
+    an angle below 1°.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+    F : (f, 3) int64
+        Triangles of manifold, consistently oriented surfaces without degenerate triangles.
+    max_stretch : float
+        Bound of at least 1. While that takes only a few more charts, the search goes on to three fifths of the stretch
+        that the bound permits, to 1.3 by default.
+    max_charts : int, optional
+        Maximum number of charts. It is exceeded only by components, and by parts without an injective map.
+    edge_costs : (f, 3) float64, optional
+        Positive factor on the cost of cutting each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
+    uv_cuts : (l, 2) array of int, optional
+        Edges that are cut in any case, such as the seams of existing texture coordinates.
+    seed : int
+        Unused: the search has no random choices.
+    callback : callable, optional
+        Called with the phase, the number of finished parts and the number of all parts; may raise an exception.
+    jobs : int, optional
+        Number of threads; by default the number of cores.
+
+    Returns
+    -------
+    list of Chart
+        Ordered by first triangle. The result does not depend on ``jobs``.
+    """
+    workers = Workers(jobs, callback)
+    cost = np.ones(F.shape) if edge_costs is None else np.asarray(edge_costs, dtype=np.float64)
+    given = np.empty((0, 2), dtype=np.int64) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
+    flat, charts = _lay_flat(V, F, given)
+    small, unfolded = _unfold_small(V, F, np.flatnonzero(~flat), given)
+    charts += unfolded
+    rest = np.flatnonzero(~flat & ~small)
+    cut = partial(_cut, V, F, given=given, cost=cost)
+    working = [chart for some in workers.map("cut", cut, [rest] if rest.size else []) for chart in some]
+    areas = [chart.surface_area for chart in working]
+    total = sum(areas) + sum(float(signed_areas(chart.F, in_units(chart.uv, 0)).sum()) for chart in charts)
+    divisible = None if max_charts is None else max_charts - len(charts)
+    found = search_charts(working, max_stretch, max_charts=divisible, total_area=total, workers=workers)
+    return sorted(charts + _finish(found, max_stretch, total), key=lambda chart: int(chart.triangles[0]))
+
+
+def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:
+    """Lay out the planar parts between cuts; return a mask (f,) of their triangles, and their charts."""
+    parts = _split(F, np.arange(len(F)), cut, len(V))
+    vertices = np.concatenate([origin for _, _, origin in parts])
+    first = np.cumsum([0, *(len(origin) for _, _, origin in parts)])
+    rows = np.concatenate([rows for rows, _, _ in parts])
+    own = np.concatenate([own + start for (_, own, _), start in zip(parts, first, strict=False)])
+    component = np.repeat(np.arange(len(parts)), [len(rows) for rows, _, _ in parts])
+    flat, uv = lay_flat_parts(V[vertices], own, component)
+    charts = []
+    for k in np.flatnonzero(flat).tolist():
+        rows_of, own_of, origin = parts[k]
+        charts.append(Chart(rows_of, own_of, origin, uv[first[k] : first[k + 1]], np.ones(len(rows_of)), 0.0))
+    mask = np.zeros(len(F), dtype=bool)
+    mask[rows] = flat[component]
+    return mask, charts
+
+
+def _unfold_small(V: FloatArray, F: IntArray, rows: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:
+    """Unfold small closed components without cuts; return a mask (f,) of their triangles, and their charts."""
+    mask, charts = np.zeros(len(F), dtype=bool), list[Chart]()
+    if not rows.size:
+        return mask, charts
+    component = fans(F[rows])[1]
+    sides = edge_keys(F[rows], F[rows][:, (1, 2, 0)], len(V))
+    _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
+    chosen = np.bincount(component) <= _SMALL
+    chosen[component[(times[edge].reshape(sides.shape) < 2).any(axis=1)]] = False
+    chosen[component[np.isin(sides, _keys(cut, len(V))).any(axis=1)]] = False
+    rows = rows[chosen[component]]
+    if not rows.size:
+        return mask, charts
+    split, component, uv, good = unfold(V, F[rows])
+    order = np.argsort(component, kind="stable")
+    for k, some in enumerate(np.split(order, np.flatnonzero(np.diff(component[order])) + 1)):
+        if good[k]:
+            own, corner = renumber(split[some], F[rows[some]])
+            vertices = F[rows[some]].ravel()[corner]
+            charts.append(Chart(rows[some], own, vertices, uv[split[some].ravel()[corner]], np.ones(some.size), 0.0))
+    mask[rows[good[component]]] = True
+    return mask, charts
+
+
+def _cut(V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: FloatArray) -> list[WorkingChart]:
+    """Cut triangles into disks; return them as charts without maps."""
+    n = len(V)
+    sides = edge_keys(F[rows], F[rows][:, (1, 2, 0)], n)
+    there = given[np.isin(_keys(given, n), sides)]
+    vertices, own = np.unique(F[rows], return_inverse=True)
+    cut = vertices[
+        find_cuts(
+            V[vertices],
+            own.reshape(-1, 3),
+            edges=np.searchsorted(vertices, there),
+            edge_costs=cost[rows],
+            min_gain=_MIN_GAIN,
+        )
+    ]
+    parts = _split(F[rows], rows, cut, n)
+    return [WorkingChart(of, origin, V[origin], own, cost[of]) for of, own, origin in parts]
+
+
+def _split(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[tuple[IntArray, IntArray, IntArray]]:
+    """Split triangles along edges (l, 2); return rows, triangles by own vertices, and vertices of each part."""
+    sides = edge_keys(F, F[:, (1, 2, 0)], n)
+    split, component = fans(F, np.isin(sides, _keys(cut, n)))
+    order = np.argsort(component, kind="stable")
+    parts = []
+    for some in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
+        own, corner = renumber(split[some], F[some])
+        parts.append((rows[some], own, F[some].ravel()[corner]))
+    return parts
+
+
+def _keys(pairs: IntArray, n: int) -> IntArray:
+    return edge_keys(pairs[:, 0], pairs[:, 1], n)
+
+
+def _finish(charts: list[WorkingChart], bound: float, total: float) -> list[Chart]:
+    """Return the charts in the surface's unit; ``total`` is the area of the surface."""
+    kept = sum(chart.share_over(bound) * chart.surface_area for chart in charts) <= FREE_SHARE * total
+    done = []
+    for chart in charts:
+        assert chart.uv is not None
+        uv = np.ldexp(chart.uv, chart.piece.exponent)
+        done.append(Chart(chart.triangles, chart.F, chart.vertices, uv, chart.stretch, _excess(chart, bound, kept)))
+    return done
+
+
+def _excess(chart: WorkingChart, bound: float, kept: bool) -> float:
+    """How much a chart misses the bound; ``kept`` says that all charts together keep the bound on 99 %."""
+    missed = 0.0
+    if not kept:
+        order = np.argsort(chart.stretch, kind="stable")
+        below = np.cumsum(chart.area[order])
+        quantile = chart.stretch[order[min(int(np.searchsorted(below, 1 - FREE_SHARE)), len(order) - 1)]]
+        missed = max(missed, float(quantile) - bound)
+    if chart.too_long.any():
+        missed = max(missed, float(chart.stretch[chart.too_long].max()) - WORST_STRETCH)
+    return missed

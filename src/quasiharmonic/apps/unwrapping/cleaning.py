@@ -1,0 +1,282 @@
+"""Cleaning: the surfaces of any model, with maps between their elements and those of the model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quasiharmonic.apps.unwrapping.exclusion import exclude
+from quasiharmonic.apps.unwrapping.sheets import join_sheets
+from quasiharmonic.apps.unwrapping.widening import widen
+from quasiharmonic.geometry.mesh.topology import boundary_edges, components
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.problem.inspection import MeshReport, inspect_mesh, tabulate_elements
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Scalar,
+    check_bool,
+    count_of,
+    triangle_array,
+    vertex_array,
+)
+
+# Volume of a closed component, relative to the sum of its absolute parts, below which it is due to rounding.
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CleanedMesh:
+    """The surfaces of a model, made by `clean`.
+
+    Every edge has at most two triangles, which traverse it in opposite directions. The triangles around every vertex
+    form one fan. No triangle is degenerate or repeated.
+
+    Attributes
+    ----------
+    V : (n', 2) or (n', 3) float64
+        Positions, each that of a vertex of the model, unless it was moved.
+    F : (f', 3) int64
+        Triangles, in the order of the model. A triangle whose orientation is reversed has its last two corners
+        exchanged.
+    vertices : (n',) int64
+        One vertex of the model for each vertex, ascending.
+    triangles : (f',) int64
+        The triangle of the model for each row of ``F``, ascending.
+    corners : (f', 3) int64
+        The model's vertex at each corner of ``F``. It differs from ``vertices[F]`` where vertices were merged.
+    flipped : (f',) bool
+        Whether the orientation is reversed.
+    widened : (f',) bool
+        Whether the triangle has a height of less than 1e-7 of its longest side, or none, in the model. A vertex of it
+        was moved, so that the triangle can have a shape in the plane.
+    moved : (n',) bool
+        Whether the vertex was moved, by less than 1e-3 of the shortest edge there, or 1e-7 of a thin triangle.
+    component : (f',) int64
+        Component of each triangle. Components are numbered by their first vertices.
+    facing : (c,) int64
+        For each component 1 if it is closed and its triangles face outwards, -1 if they face inwards, 0 if this is
+        unknown. It is unknown for components with boundary and for those without volume.
+    excluded : (k,) int64
+        Triangles of the model that were left out, ascending.
+    repeated : (k,) bool
+        Whether the excluded triangle has the positions of an earlier one. The others are degenerate.
+    substitutes : (k,) int64
+        For each excluded triangle the row of ``F`` whose texture coordinates it takes.
+    substitute_corners : (k, 3) int64
+        For each of its corners the corner of that row, 0 … 2.
+    seams : (s, 2) int64
+        Edges of the model, by its vertices, that several triangles share and at which the surface has a boundary.
+    report : MeshReport
+        Topology and defects of the model.
+    """
+
+    V: FloatArray
+    F: IntArray
+    vertices: IntArray
+    triangles: IntArray
+    corners: IntArray
+    flipped: BoolArray
+    widened: BoolArray
+    moved: BoolArray
+    component: IntArray
+    facing: IntArray
+    excluded: IntArray
+    repeated: BoolArray
+    substitutes: IntArray
+    substitute_corners: IntArray
+    seams: IntArray
+    report: MeshReport
+
+    def __repr__(self) -> str:
+        return f"<CleanedMesh: {self._size()}, {count_of('triangle', 'triangles', self.excluded.size)} excluded>"
+
+    def _size(self) -> str:
+        inward = int(np.count_nonzero(self.facing < 0))
+        return (
+            f"{count_of('vertex', 'vertices', len(self.V))}, {count_of('triangle', 'triangles', len(self.F))}, "
+            f"{count_of('component', 'components', self.facing.size)}{f' ({inward} facing inwards)' if inward else ''}"
+        )
+
+    @property
+    def changes(self) -> dict[str, IntArray]:
+        """For each class of changes the indices of its elements in the model, ascending."""
+        return {
+            "degenerate triangles excluded": self.excluded[~self.repeated],
+            "repeated triangles excluded": self.excluded[self.repeated],
+            "thin triangles widened": self.triangles[self.widened],
+            "triangles reversed": self.triangles[self.flipped],
+            "vertices split": np.unique(self.vertices[1:][np.diff(self.vertices) == 0]),
+            "vertices merged": np.setdiff1d(self.corners, self.vertices),
+            "edges cut": self.seams,
+        }
+
+    def summary(self) -> str:
+        """Return the report on the model and, unless nothing changes, a table of the changes."""
+        table = self.tabulate_changes()
+        return f"{self.report.summary()}\ncleaned: {self._size()}\n{table}" if table else self.report.summary()
+
+    def tabulate_changes(self) -> str:
+        """Return a table of the changes with the first elements of each class; empty if nothing changes."""
+        return "\n".join(tabulate_elements("change", self.changes))
+
+    def restore_corners(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Return values at the corners of all triangles of the model, such as indices of texture coordinates.
+
+        Parameters
+        ----------
+        values : (f', 3) or (f', 3, …) array
+            Values at the corners of ``F``.
+
+        Returns
+        -------
+        (f, 3) or (f, 3, …) array
+            Values in the order of the model's triangles and corners. Excluded triangles take those of their
+            substitutes.
+        """
+        values = np.asarray(values)
+        if values.shape[:2] != self.F.shape:
+            raise ValueError(f"values must have shape {self.F.shape} or more dimensions, not {values.shape}")
+        restored = np.empty((self.report.triangles, *values.shape[1:]), dtype=values.dtype)
+        restored[self.triangles] = values
+        turned = self.triangles[self.flipped]
+        restored[turned] = restored[turned][:, (0, 2, 1)]
+        restored[self.excluded] = values[self.substitutes[:, None], self.substitute_corners]
+        return restored
+
+
+@accepts_mesh
+def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = True) -> CleanedMesh:
+    """Return the surfaces that any triangles form; every defect is cut open, oriented or listed.
+
+    Degenerate and repeated triangles are excluded. Each gets a substitute, so that no triangle of the model lacks
+    texture coordinates. A triangle with three positions on a line stays if it joins others: a vertex of it is moved a
+    little. At an edge of three or more triangles, pairs stay joined: those that share vertices in the
+    model first, then those whose orientations agree, then those that meet at the flattest angle. Other triangles are
+    separated there. Triangles are reversed so that each component is consistently oriented; the larger part by area
+    keeps its orientation. A surface that cannot be oriented, such as a Möbius band, is cut. Vertices where surfaces
+    touch are split. Vertices without triangle are dropped.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Positions.
+    F : (f, 3) array of int
+        Triangles.
+    outward : bool
+        Reverse closed components whose triangles face inwards.
+    weld : bool
+        Join triangles whose vertices have exactly the same positions, as at the seams of a glTF file.
+
+    Returns
+    -------
+    CleanedMesh
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape, a position is not finite, an index is out of range, there are no triangles, or
+        all triangles are degenerate.
+
+    Examples
+    --------
+    >>> from quasiharmonic.surfaces import annulus
+    >>> V, F = annulus(8)
+    >>> F[5] = F[5, ::-1]
+    >>> cleaned = clean(V, F)
+    >>> cleaned.triangles[cleaned.flipped], cleaned.report.clean
+    (array([5]), False)
+    """
+    V = vertex_array(V)
+    F = triangle_array(F, len(V))
+    check_bool("outward", outward)
+    check_bool("weld", weld)
+    report = inspect_mesh(V, F)
+    exponent = math.frexp(float(np.abs(V).max()))[1]
+    joint = _merge(V) if weld and report.coincident.size else np.arange(len(V))
+    # In this unit, products neither overflow nor underflow.
+    points = np.pad(np.ldexp(V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
+    points, moved, thin, degenerate, area = widen(points, joint[F], V.shape[1])
+    if degenerate.all():
+        raise ValueError(
+            f"all {count_of('triangle', 'triangles', len(F))} are degenerate: each uses a vertex twice or has no area"
+        )
+    exclusion = exclude(points, joint[F], degenerate)
+    rows = exclusion.triangles
+    sheets = join_sheets(points, joint[F[rows]], F[rows], area[rows], thin[rows])
+    corners = F[rows]
+    number, vertices = _number(sheets.fan, corners)
+    positions, moved = V[vertices], moved[joint[vertices]]
+    positions[moved] = np.ldexp(points[joint[vertices[moved]], : V.shape[1]], exponent)
+    component, facing = _orientations(points[joint[vertices]], _turn(number, sheets.turned))
+    flipped = sheets.turned
+    if outward:
+        flipped = flipped ^ (facing < 0)[component]
+        facing = np.abs(facing)
+    matched = exclusion.substitute_corners
+    return CleanedMesh(
+        V=positions,
+        F=_turn(number, flipped),
+        vertices=vertices,
+        triangles=rows,
+        corners=_turn(corners, flipped),
+        flipped=flipped,
+        widened=thin[rows],
+        moved=moved,
+        component=component,
+        facing=facing,
+        excluded=exclusion.excluded,
+        repeated=exclusion.repeated,
+        substitutes=exclusion.substitutes,
+        # Reversing a triangle exchanges its corners 1 and 2.
+        substitute_corners=np.where(flipped[exclusion.substitutes, None], -matched % 3, matched),
+        seams=sheets.seams,
+        report=report,
+    )
+
+
+def _merge(V: FloatArray) -> IntArray:
+    """Return for each vertex the first one at the same position."""
+    order = np.lexsort(V.T)
+    starts = np.ones(len(V), dtype=bool)
+    starts[1:] = (V[order[1:]] != V[order[:-1]]).any(axis=1)
+    first = np.empty(len(V), dtype=np.int64)
+    first[order] = order[starts][np.cumsum(starts) - 1]
+    return first
+
+
+def _number(fan: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:
+    """Number fans in the order of their vertices; return the triangles by fans, and the vertex of each fan."""
+    label = fan.ravel()
+    first = np.flatnonzero(label == np.arange(label.size))
+    owner = corners.ravel()[first]
+    order = np.argsort(owner, kind="stable")
+    number = np.empty(label.size, dtype=np.int64)
+    number[first[order]] = np.arange(first.size)
+    return number[fan], owner[order]
+
+
+def _turn(F: IntArray, turned: BoolArray) -> IntArray:
+    """Return triangles, some of them reversed."""
+    F = F.copy()
+    F[turned] = F[turned][:, (0, 2, 1)]
+    return F
+
+
+def _orientations(points: FloatArray, F: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the component of each triangle, and whether each component faces outwards (1), inwards (-1) or neither."""
+    label = components(F, len(points))
+    first = np.flatnonzero(label == np.arange(label.size))
+    of_vertex = np.searchsorted(first, label)
+    component = of_vertex[F[:, 0]]
+    origin = points[first][component]
+    a, b, c = (points[F[:, k]] - origin for k in range(3))
+    parts = (a * np.cross(b, c)).sum(axis=1)
+    volume, most = np.bincount(component, parts), np.bincount(component, np.abs(parts))
+    facing = np.where(np.abs(volume) > _ROUNDING * most, np.sign(volume), 0.0).astype(np.int64)
+    facing[of_vertex[boundary_edges(F, len(points))[:, 0]]] = 0
+    return component, facing

@@ -1,0 +1,75 @@
+"""All charts as one mesh in the texture, and its seams on the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.apps.atlas.packing.pack import Packing
+from quasiharmonic.apps.unwrapping.charts import Chart
+from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
+from quasiharmonic.apps.unwrapping.rounding import round_positions
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class ChartLayout:
+    """Charts in the texture.
+
+    Attributes
+    ----------
+    rows : (k, 3) int64
+        Rows of ``uv`` for the corners of each triangle. Charts have no common rows.
+    uv : (m, 2) float64
+        Texture coordinates, rounded by `round_positions`.
+    chart : (k,) int64
+        Chart of each triangle, from 0.
+    mirrored : (k,) bool
+        Whether the triangle's chart is mirrored.
+    """
+
+    rows: IntArray
+    uv: FloatArray
+    chart: IntArray
+    mirrored: BoolArray
+
+    @property
+    def F(self) -> IntArray:
+        """The triangles (k, 3), reversed in mirrored charts."""
+        return np.where(self.mirrored[:, None], self.rows[:, ::-1], self.rows)
+
+
+def join_charts(charts: Sequence[Chart], packing: Packing, count: int) -> ChartLayout:
+    """Return the layout of packed charts that have ``count`` triangles in all."""
+    rows, chart = np.full((count, 3), -1), np.full(count, -1)
+    start = 0
+    for k, one in enumerate(charts):
+        rows[one.triangles] = one.F + start
+        chart[one.triangles] = k
+        start += len(one.uv)
+    assert chart.min() >= 0, "every triangle has a chart"
+    mirrored = np.array([placement.mirrored for placement in packing.placements])[chart]
+    layout = ChartLayout(rows, np.concatenate(packing.uv), chart, mirrored)
+    return ChartLayout(rows, round_positions(layout.F, layout.uv), chart, mirrored)
+
+
+def find_seams(cleaned: CleanedMesh, layout: ChartLayout) -> IntArray:
+    """Return the model's edges (s, 2) at which triangles meet that are not joined in the texture, ascending."""
+    cut = cleaned.vertices[find_differing_edges(cleaned.F, layout.rows, len(cleaned.V))]
+    return np.unique(np.sort(np.concatenate([cut, cleaned.seams]), axis=1), axis=0)
+
+
+def find_differing_edges(F: IntArray, rows: IntArray, n: int) -> IntArray:
+    """Return the edges (k, 2) of triangles (f, 3) whose two sides have different ``rows`` (f, 3) at an end."""
+    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
+    here, there = rows.ravel(), rows[:, (1, 2, 0)].ravel()
+    upwards = tail < head
+    low, high = np.where(upwards, here, there), np.where(upwards, there, here)
+    key = edge_keys(tail, head, n)
+    order = np.argsort(key, kind="stable")
+    key, low, high = key[order], low[order], high[order]
+    at = order[1:][(key[1:] == key[:-1]) & ((low[1:] != low[:-1]) | (high[1:] != high[:-1]))]
+    return np.stack([tail[at], head[at]], axis=1)

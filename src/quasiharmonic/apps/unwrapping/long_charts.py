@@ -1,0 +1,94 @@
+"""Divide charts that are too long for the texture, so that the texture is used well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quasiharmonic.apps.atlas.packing.shapes import find_smallest_box, make_shape
+from quasiharmonic.apps.unwrapping.chart_cuts import divide
+from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.apps.unwrapping.charts import Chart
+from quasiharmonic.util.arrays import FloatArray
+
+# Share of the texture that charts are expected to cover.
+_EXPECTED = 0.6
+# Longest chart in sides of the texture at this scale, and longest chart that covers less than a share of its box.
+_LONGEST, _LONGEST_LOOSE, _LOOSE = 0.85, 0.7, 0.6
+
+
+def divide_long_charts(
+    charts: Sequence[Chart],
+    V: FloatArray,
+    cost: FloatArray,
+    *,
+    bound: float,
+    size: tuple[int, int],
+    tiles: int,
+    max_charts: int | None,
+) -> list[Chart]:
+    """Divide charts across their middle until each fits into a texture that the charts cover well.
+
+    The parts keep the maps of their charts.
+
+    Parameters
+    ----------
+    charts : sequence of Chart
+    V : (n, 3) float64
+        Vertices of the mesh.
+    cost : (f, 3) float64
+        Factors on the cost of seams; see `find_charts`.
+    bound : float
+        Bound on the stretch.
+    size : two int
+        Width and height of the texture.
+    tiles : int
+        Number of textures.
+    max_charts : int or None
+        Maximum number of charts.
+
+    Returns
+    -------
+    list of Chart
+        Ordered by first triangle.
+    """
+    area = sum(_area(chart) for chart in charts)
+    ratio = max(size) / min(size)
+    side = float(np.sqrt(area * ratio / (_EXPECTED * tiles)))
+    done: list[Chart] = []
+    waiting = list(charts)
+    while waiting:
+        chart = waiting.pop()
+        full = max_charts is not None and len(done) + len(waiting) + 1 >= max_charts
+        if full or len(chart.F) < 2 or not _is_too_long(chart, side):
+            done.append(chart)
+        else:
+            waiting += _divide(chart, V, cost, bound)
+    return sorted(done, key=lambda chart: int(chart.triangles[0]))
+
+
+def _area(chart: Chart) -> float:
+    return make_shape(chart.uv, chart.F).area
+
+
+def _is_too_long(chart: Chart, side: float) -> bool:
+    """Whether a chart prevents a scale at which the texture has this side."""
+    shape = make_shape(chart.uv, chart.F)
+    width, height = shape.extent(find_smallest_box(shape))
+    loose = shape.area < _LOOSE * width * height
+    return max(width, height) > side * (_LONGEST_LOOSE if loose else _LONGEST)
+
+
+def _divide(chart: Chart, V: FloatArray, cost: FloatArray, bound: float) -> list[Chart]:
+    """Divide a chart across its middle."""
+    working = WorkingChart(chart.triangles, chart.vertices, V[chart.vertices], chart.F, cost[chart.triangles])
+    working.uv, working.stretch = np.ldexp(chart.uv, -working.piece.exponent), chart.stretch
+    parts = []
+    for part in divide(working, bound):
+        assert part.uv is not None
+        stretch = chart.stretch[np.searchsorted(chart.triangles, part.triangles)]
+        uv = np.ldexp(part.uv, part.piece.exponent)
+        missed = chart.misses if (stretch > bound).any() else 0.0
+        parts.append(Chart(part.triangles, part.F, part.vertices, uv, stretch, missed))
+    return parts

@@ -1,0 +1,212 @@
+"""The result of `unwrap`: texture coordinates with seams, their certificate, and how much they stretch the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
+from quasiharmonic.io.adapters.trimesh import make_trimesh
+from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
+from quasiharmonic.util.outcome import Outcome
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+    from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
+
+# Maximum number of charts that the summary lists.
+_LISTED = 5
+
+
+class UnwrapStatus(Enum):
+    """How `unwrap` ended; the value is a message for the user with the outcome and the next action."""
+
+    UNWRAPPED = "Every chart is bijective and no two charts overlap, verified exactly. The stretch is within the bound."
+    STRETCHED = (
+        "Every chart is bijective and no two charts overlap, verified exactly. Some charts exceed the bound on the "
+        "stretch: see misses. Allow more charts (max_charts) or more stretch (max_stretch)."
+    )
+    ROUNDED = (
+        "Rounding to the stored coordinates inverts some extremely thin triangles: see certificate. All other "
+        "triangles are positive, and no two charts overlap."
+    )
+    OVERLAPPING = "Some charts overlap or are not bijective: see certificate."
+
+
+class Stretch(NamedTuple):
+    """Stretch max(σ₁, 1/σ₂) of a map after one scaling of all charts; quantiles are weighted by area.
+
+    Attributes
+    ----------
+    median, p99, worst : float
+        Half and 99 % of the surface are stretched by at most this factor, and the maximum over all triangles.
+    """
+
+    median: float
+    p99: float
+    worst: float
+
+
+class Miss(NamedTuple):
+    """A chart that exceeds the bound on the stretch.
+
+    Attributes
+    ----------
+    chart : int
+    stretch : Stretch
+        The chart's own stretch.
+    excess : float
+        The larger of two differences: between the 99 % quantile and ``max_stretch``, and between the worst stretch, of
+        triangles without an angle below 1°, and 3.
+    """
+
+    chart: int
+    stretch: Stretch
+    excess: float
+
+
+class UnwrapStep(NamedTuple):
+    """Progress of `unwrap`, passed to its callback.
+
+    Attributes
+    ----------
+    phase : str
+        First ``"clean"``, then phases of the search for charts, such as ``"cut"``, ``"flatten"`` and ``"improve"``,
+        which can repeat, then ``"pack"`` and ``"certify"``.
+    done, total : int
+        Finished parts of the phase, and all parts.
+    """
+
+    phase: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class UnwrapResult(Outcome):
+    """Texture coordinates of a model, made by `unwrap`; iterates as ``vmapping, indices, uvs``.
+
+    Attributes
+    ----------
+    vmapping : (m,) int64
+        Vertex of the model for each row of ``uvs``.
+    indices : (f, 3) int64
+        Rows of ``uvs`` for each triangle of the model, in its order: ``V[vmapping][indices]`` equals ``V[F]``.
+    uvs : (m, 2) float64
+        Texture coordinates in the unit square, or in the squares of several tiles. They are multiples of a power of
+        two that single precision stores exactly, also with v reversed as in glTF.
+    charts : (f,) int64
+        Chart of each triangle, from 0.
+    seams : (s, 2) int64
+        Edges of the model along which the map is cut, by vertices, smaller vertex first, ascending.
+    certificate : UnwrapCertificate
+        The exact verdict on ``uvs``.
+    triangle_stretch : (f,) float64
+        Stretch of each triangle; NaN for triangles without area.
+    stretch : Stretch
+        Median, 99 % and worst stretch.
+    misses : tuple of Miss
+        Charts that exceed the bound on the stretch, largest excess first; empty if it is kept.
+    utilisation : float
+        Area of all charts divided by the area of the texture.
+    cleaned : CleanedMesh
+        The cleaned mesh, and what was cleaned.
+    status : UnwrapStatus
+    resolution : (int, int)
+        Width and height of the texture in texels.
+    texels_per_unit : float
+        Texels per unit of length of the model.
+    V : (n, 2) or (n, 3) float64
+        Positions of the model's vertices.
+    """
+
+    vmapping: IntArray
+    indices: IntArray
+    uvs: FloatArray
+    charts: IntArray
+    seams: IntArray
+    certificate: UnwrapCertificate
+    triangle_stretch: FloatArray
+    stretch: Stretch
+    misses: tuple[Miss, ...]
+    utilisation: float
+    cleaned: CleanedMesh
+    status: UnwrapStatus
+    resolution: tuple[int, int]
+    texels_per_unit: float
+    V: FloatArray
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.vmapping, self.indices, self.uvs))
+
+    @property
+    def success(self) -> bool:
+        """Whether every chart is bijective and no two charts overlap; charts may still exceed the bound (`misses`)."""
+        return self.certificate.bijective
+
+    @property
+    def message(self) -> str:
+        """The message of `status`."""
+        return self.status.value
+
+    @property
+    def n_charts(self) -> int:
+        """Number of charts."""
+        return len(self.certificate.bijective_charts)
+
+    @property
+    def seam_length(self) -> float:
+        """Total length of the seams, each counted once, in the unit of the model."""
+        ends = self.V[self.seams]
+        return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum())
+
+    def to_trimesh(self) -> Trimesh:
+        """Return the model as a trimesh.Trimesh with texture coordinates; vertices are split at seams."""
+        return make_trimesh(self.V[self.vmapping], self.indices, self.uvs)
+
+    def summary(self) -> str:
+        """Return charts, seams, stretch and utilisation in a few lines."""
+        stretch = self.stretch
+        lines = [
+            f"{count_of('chart', 'charts', self.n_charts)}, {count_of('seam edge', 'seam edges', len(self.seams))} of "
+            f"length {self.seam_length:.4g}",
+            f"stretch {stretch.median:.3f} in the median, {stretch.p99:.3f} at 99 % of the surface, "
+            f"{stretch.worst:.3g} at most",
+            f"{100 * self.utilisation:.1f} % of the texture used, {self.texels_per_unit:.4g} texels per unit",
+            f"certificate: {self.certificate.summary()}",
+        ]
+        if self.misses:
+            shown = ", ".join(f"chart {miss.chart} by {miss.excess:.3g}" for miss in self.misses[:_LISTED])
+            more = f", … ({len(self.misses)} charts)" if len(self.misses) > _LISTED else ""
+            lines.append(f"beyond the bound on the stretch: {shown}{more}")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report for JSON, without the arrays."""
+        return {
+            "success": self.success,
+            "status": self.status.name.lower(),
+            "message": self.message,
+            "charts": self.n_charts,
+            "seam_edges": len(self.seams),
+            "seam_length": self.seam_length,
+            "stretch": {key: value if np.isfinite(value) else None for key, value in self.stretch._asdict().items()},
+            "misses": [miss._asdict() for miss in self.misses],
+            "utilisation": self.utilisation,
+            "texels_per_unit": self.texels_per_unit,
+            "resolution": list(self.resolution),
+            "certificate": self.certificate.to_dict(),
+            "reversed": int(self.cleaned.flipped.sum()),
+            "excluded": self.cleaned.excluded.tolist(),
+            "mesh": self.cleaned.report.to_dict(),
+        }
+
+
+def _finite(stretch: Stretch) -> dict[str, float | None]:
+    """Return a stretch for JSON, which has no infinity."""
+    return {key: value if np.isfinite(value) else None for key, value in stretch._asdict().items()}

@@ -1,0 +1,255 @@
+"""Texture coordinates for any model in one call: `unwrap`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.atlas.packing.pack import check_texture, pack_charts
+from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
+from quasiharmonic.apps.unwrapping.charts import MAX_STRETCH, find_charts
+from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
+from quasiharmonic.apps.unwrapping.layout import ChartLayout, find_differing_edges, find_seams, join_charts
+from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
+from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.targets.cuts.find import side_costs
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_bool,
+    check_callback,
+    check_integer,
+    real_array,
+    triangle_array,
+    vertex_array,
+)
+from quasiharmonic.util.progress import reports_progress
+
+
+@accepts_mesh
+@reports_progress
+def unwrap(
+    V: ArrayLike,
+    F: ArrayLike,
+    *,
+    max_stretch: float = MAX_STRETCH,
+    max_charts: int | None = None,
+    resolution: int | tuple[int, int] = 2048,
+    padding: float = 4,
+    texels_per_unit: float | None = None,
+    tiles: int = 1,
+    rotate: bool = True,
+    stack: bool = False,
+    outward: bool = False,
+    edge_costs: ArrayLike | None = None,
+    uv: ArrayLike | None = None,
+    seed: int = 0,
+    callback: Callable[[UnwrapStep], object] | None = None,
+    jobs: int | None = None,
+) -> UnwrapResult:
+    """Compute texture coordinates for any model: charts with little stretch, packed into a texture, certified.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Positions.
+    F : (f, 3) array of int
+        Any triangles. Degenerate and repeated triangles get the texture coordinates of a neighbour. Surfaces are cut at
+        edges of three or more triangles and where they cannot be oriented; see `clean`.
+    max_stretch : float
+        Bound on the stretch max(σ₁, 1/σ₂), at least 1. 99 % of the surface keep it. No triangle is stretched by more
+        than 3, except triangles with an angle below 1°. Lower values need more seams.
+    max_charts : int, optional
+        Maximum number of charts. Every connected part has at least one chart.
+    resolution : int or (int, int)
+        Side of the texture in texels, or width and height.
+    padding : float
+        Minimum distance between two charts in texels.
+    texels_per_unit : float, optional
+        Texels per unit of length of the model. Default: the largest value at which all charts fit.
+    tiles : int
+        Number of tiles (UDIM). Tile k is the unit square whose lower left corner is ``(k % 10, k // 10)``.
+    rotate : bool
+        Whether charts may be rotated to fit better.
+    stack : bool
+        Whether identical components share their texture coordinates; mirrored components, too.
+    outward : bool
+        Whether closed components that are inside out are treated as turned outward. Their texture is then mirrored
+        relative to the triangles of the input.
+    edge_costs : (f, 3) array, optional
+        Positive factor on the cost of a seam at each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
+        Large values keep seams away from visible parts.
+    uv : (n, 2) or (f, 3, 2) array, optional
+        Texture coordinates of each vertex, or of each corner, whose seams are used. By default all seams are new.
+    seed : int
+        Seed of random choices. Equal input and seed give equal results.
+    callback : callable, optional
+        Called with an `UnwrapStep`, at least every half second. Exceptions propagate.
+    jobs : int, optional
+        Number of threads. Default: all cores. The result does not depend on it.
+
+    Returns
+    -------
+    UnwrapResult
+        Iterates as ``vmapping, indices, uvs``, the arrays of ``xatlas.parametrize``. If the bound is not kept, the
+        result lists the charts (`UnwrapResult.misses`).
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape, a position is not finite, an index is out of range, or no triangle has an area.
+        The message names the elements. If the texture is too small for the padding of all charts, the message states
+        the smallest sufficient resolution.
+
+    Examples
+    --------
+    >>> from quasiharmonic.surfaces import starfish
+    >>> V, F = starfish(3, 12)
+    >>> result = unwrap(V, F)
+    >>> vmapping, indices, uvs = result
+    >>> bool((V[vmapping][indices] == V[F]).all()), result.certificate.bijective
+    (True, True)
+    """
+    V = vertex_array(V)
+    F = triangle_array(F, len(V))
+    size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)
+    _check_options(max_stretch, max_charts, seed, jobs)
+    check_bool("outward", outward)
+    check_callback(callback)
+    corner_uv = None if uv is None else _corner_positions(uv, F, len(V))
+    costs = None if edge_costs is None else side_costs(edge_costs, len(F))
+
+    def report(phase: str, done: int = 0, total: int = 1) -> None:
+        if callback is not None:
+            callback(UnwrapStep(phase, done, total))
+
+    report("clean")
+    cleaned = clean(V, F, outward)
+    points = np.pad(cleaned.V, [(0, 0), (0, 3 - V.shape[1])])
+    cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)
+    charts = find_charts(
+        points,
+        cleaned.F,
+        max_stretch=float(max_stretch),
+        max_charts=max_charts,
+        edge_costs=cost,
+        uv_cuts=None if corner_uv is None else _find_uv_cuts(corner_uv, cleaned),
+        seed=seed,
+        callback=report,
+        jobs=jobs,
+    )
+    charts = divide_long_charts(
+        charts, points, cost, bound=float(max_stretch), size=size, tiles=tiles, max_charts=max_charts
+    )
+    report("pack")
+    packing = pack_charts(
+        [(chart.uv, chart.F) for chart in charts],
+        resolution=size,
+        padding=float(padding),
+        texels_per_unit=texels_per_unit,
+        tiles=tiles,
+        rotate=rotate,
+        stack=stack,
+    )
+    report("certify")
+    layout = join_charts(charts, packing, len(cleaned.F))
+    certificate = certify_charts(layout, cleaned.triangles, size=size, padding=float(padding), stacked=stack)
+    # Rows of texture coordinates are ordered by vertex, then by chart.
+    key, indices = np.unique(F * len(layout.uv) + cleaned.restore_corners(layout.rows), return_inverse=True)
+    vmapping, row = np.divmod(key, len(layout.uv))
+    stretch, area = _measure(cleaned, layout, size)
+    misses = [
+        Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), chart.misses)
+        for k, chart in enumerate(charts)
+        if chart.misses > 0
+    ]
+    misses.sort(key=lambda miss: -miss.excess)
+    every = np.full(len(F), np.nan)
+    every[cleaned.triangles] = stretch
+    return UnwrapResult(
+        vmapping=vmapping,
+        indices=indices.reshape(-1, 3),
+        uvs=layout.uv[row],
+        charts=cleaned.restore_corners(np.repeat(layout.chart[:, None], 3, axis=1))[:, 0],
+        seams=find_seams(cleaned, layout),
+        certificate=certificate,
+        triangle_stretch=every,
+        stretch=_summarise(stretch, area),
+        misses=tuple(misses),
+        utilisation=packing.utilisation,
+        cleaned=cleaned,
+        status=_find_status(certificate, misses),
+        resolution=size,
+        texels_per_unit=packing.texels_per_unit,
+        V=V,
+    )
+
+
+def _check_options(max_stretch: float, max_charts: int | None, seed: int, jobs: int | None) -> None:
+    """Check the numbers that do not concern the texture."""
+    if not isinstance(max_stretch, Real) or isinstance(max_stretch, bool) or not 1 <= float(max_stretch) < np.inf:
+        raise ValueError(f"max_stretch must be a finite number of at least 1, not {max_stretch!r}")
+    check_integer("seed", seed, minimum=0)
+    for name, count in (("max_charts", max_charts), ("jobs", jobs)):
+        if count is not None:
+            check_integer(name, count, minimum=1)
+
+
+def _corner_positions(uv: ArrayLike, F: IntArray, n: int) -> FloatArray:
+    """Return given texture coordinates for every corner, (f, 3, 2); NaN where there are none."""
+    array = real_array("uv", getattr(uv, "uv", uv))
+    if array.shape == (n, 2):
+        return array[F]
+    if array.shape != (*F.shape, 2):
+        raise ValueError(f"uv must have shape ({n}, 2) or ({len(F)}, 3, 2), not {array.shape}")
+    return array
+
+
+def _turn_sides(costs: FloatArray, cleaned: CleanedMesh) -> FloatArray:
+    """Return the costs of the sides of the cleaned triangles."""
+    turned = costs[cleaned.triangles]
+    # Reversing a triangle exchanges its first and last side.
+    turned[cleaned.flipped] = turned[cleaned.flipped][:, ::-1]
+    return turned
+
+
+def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
+    """Return the edges (k, 2) of the cleaned mesh at which given texture coordinates differ."""
+    position = corner_uv[cleaned.triangles]
+    # Reversing a triangle exchanges its last two corners.
+    position[cleaned.flipped] = position[cleaned.flipped][:, (0, 2, 1)]
+    # Corners without coordinates count as one position.
+    position = np.nan_to_num(position, nan=np.finfo(np.float64).max) + 0.0
+    rows = np.unique(position.reshape(-1, 2), axis=0, return_inverse=True)[1]
+    return find_differing_edges(cleaned.F, rows.reshape(-1, 3), len(cleaned.V))
+
+
+def _find_status(certificate: UnwrapCertificate, misses: Sequence[Miss]) -> UnwrapStatus:
+    if certificate.bijective:
+        return UnwrapStatus.STRETCHED if misses else UnwrapStatus.UNWRAPPED
+    return UnwrapStatus.ROUNDED if certificate.disjoint and not certificate.injective else UnwrapStatus.OVERLAPPING
+
+
+def _measure(cleaned: CleanedMesh, layout: ChartLayout, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return stretch and share of the area (f',) of the cleaned triangles; NaN and 0 for those without area."""
+    V, texels = np.empty((len(layout.uv), cleaned.V.shape[1])), layout.uv * size
+    V[layout.rows] = cleaned.V[cleaned.F]
+    # The orientation of a mirrored chart does not matter for its stretch.
+    texels[layout.rows[layout.mirrored], 0] *= -1
+    measured = distortion(V, layout.rows, texels)
+    flat = cleaned.widened
+    return np.where(flat, np.nan, measured.isometric), np.where(flat, 0.0, measured.share)
+
+
+def _summarise(stretch: FloatArray, area: FloatArray) -> Stretch:
+    """Return median, 99 % and maximum of values, weighted by area; NaN is ignored."""
+    order = np.argsort(stretch, kind="stable")[: np.count_nonzero(~np.isnan(stretch))]
+    below = np.cumsum(area[order])
+    at = np.minimum(np.searchsorted(below, np.array([0.5, 0.99]) * below[-1]), len(order) - 1)
+    median, p99 = stretch[order[at]].tolist()
+    return Stretch(median, p99, float(stretch[order[-1]]))

@@ -1,0 +1,360 @@
+"""Newton steps in the positions of free vertices and the arc lengths of sliding boundary vertices.
+
+A sliding vertex has one unknown, a length δ along its curve. To first order it moves by ``δ τ`` with the unit tangent
+τ, to second order also by ``½ κ δ² iτ``. Let P be the matrix from unknowns to displacements, g the energy's gradient by
+positions and H its second derivative::
+
+    gradient  Pᵀ g        Hessian  Pᵀ H P + diag(κ g · iτ)
+
+The unknown across the curve keeps its row and column, without entries, so that the pattern is that of the mesh. A step
+is projected to the curve by moving the length δ along it.
+
+The objective is the energy plus a small barrier that keeps the boundary's edges near the curves
+(`quasiharmonic.geometry.curves.deviation`).
+
+At a kink the energy has two one-sided derivatives. If it decreases to neither side, the vertex stays for this step.
+Otherwise it may move to the side with the steeper descent. If a step across kinks does not lower the energy, a step
+that stops at kinks is tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from quasiharmonic.energies.deformation import DeformationEnergy
+from quasiharmonic.energies.energies import QuadraticForm, damp
+from quasiharmonic.energies.newton.line_search import Trial, backtrack, extend
+from quasiharmonic.energies.newton.map_model import FRACTION, HALVINGS, Coordinates, in_units
+from quasiharmonic.energies.newton.newton_descent import NewtonState
+from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves, Track, sliding_curves
+from quasiharmonic.geometry.curves.deviation import DeviationBarrier
+from quasiharmonic.geometry.exact.certificate import inverted_triangles, is_injective
+from quasiharmonic.geometry.exact.loops import check_loops
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, names_of
+
+# Weight of the barrier, as a share of the current energy.
+_WEIGHT = 1e-2
+# Minimum of an edge's distance to the barrier's bound after a step, as a share of the distance before it. Next to the
+# bound, derivatives from interpolated curves are too inaccurate to find a direction of descent.
+_LEAST_ROOM = 0.3
+
+
+def move_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) -> Track:
+    """Move the boundary of an injective map onto the curves it slides along.
+
+    Raise a ValueError as `BoundaryCurves.lay`, or if moving the boundary onto the curves inverts triangles.
+    """
+    track = sliding_curves(slide, domain.loops, uv).lay(domain.loops, uv)
+    inverted = inverted_triangles(domain.F, track.uv)
+    if inverted.size:
+        raise ValueError(
+            f"with the boundary moved onto its curves, {names_of('triangle', 'triangles', inverted)} inverted or "
+            "degenerate: find the map with the boundary on the curves (injective_map with slide, or qhm map --slide)"
+        )
+    return track
+
+
+def move_onto(slide: bool | BoundaryCurves, problem: Problem) -> Problem:
+    """Return the problem with its boundary's target moved onto the curves it slides along."""
+    positions = np.zeros((problem.n, 2))
+    positions[problem.fixed] = problem.target
+    loops = problem.domain.loops
+    track = sliding_curves(slide, loops, positions).lay(loops, positions)
+    return problem.with_target(track.uv[problem.fixed])
+
+
+class _Boundary(NamedTuple):
+    """Arc lengths (k,) of sliding vertices along the curves, and the mean energy of the map without the barrier."""
+
+    s: FloatArray
+    energy: float
+
+
+class _Frame(NamedTuple):
+    """First derivatives at a map, and the directions in which sliding vertices may move.
+
+    Attributes
+    ----------
+    gradient : (n - k,) complex128
+        Derivative by the unknowns; for a sliding vertex it is in the real part, and the imaginary part is zero.
+    tangent : (k,) complex128
+        Unit tangents; zero for vertices that stay for this step.
+    forces : (k,) float64
+        Contribution of the curves' curvature to the second derivative, in units.
+    side : (k,) float64
+        At kinks, the sign of the side to which the vertex may move; otherwise 0.
+    barrier_hessian : (e, 2, 2) float64
+        Second derivatives of the barrier by the ends of each edge.
+    """
+
+    gradient: ComplexArray
+    tangent: ComplexArray
+    forces: FloatArray
+    side: FloatArray
+    barrier_hessian: FloatArray
+
+
+class SlidingSystem(NewtonSystem):
+    """Newton system in which the vertices ``sliding`` (k,) have one unknown each, the length along their curve.
+
+    The other parameters are as in `NewtonSystem`; ``fixed`` excludes the sliding vertices.
+    """
+
+    def __init__(
+        self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str, sliding: IntArray
+    ) -> None:
+        super().__init__(F, g, n, fixed, linear_solver)
+        size = self.free.size
+        self.sliding = sliding
+        self.at: IntArray = np.searchsorted(self.free, sliding)
+        slider = np.full(size, -1)
+        slider[self.at] = np.arange(sliding.size)
+        row = np.searchsorted(self._indptr, self._side_slots[0], side="right") - 1
+        ends = slider[row // 2], slider[self._indices[self._side_slots[0]] // 2]
+        # Blocks with a row or a column of a sliding vertex, and the numbers of these vertices.
+        self._by_row, self._by_column = (np.flatnonzero(end >= 0) for end in ends)
+        self._of_row, self._of_column = ends[0][self._by_row], ends[1][self._by_column]
+        self._row = row // 2
+        self.tangent: ComplexArray = np.zeros(sliding.size, dtype=np.complex128)
+        self.curve_stiffness: FloatArray = np.zeros(sliding.size)
+        self._coupled: IntArray = np.empty(0, dtype=np.int64)
+        self.coupling: FloatArray = np.zeros(0)
+
+    def couple(self, pairs: IntArray) -> None:
+        """Set the pairs (e, 2) of sliding vertices, each an edge of the mesh, to which ``coupling`` belongs."""
+        low, high = np.sort(self.at[pairs], axis=1).T
+        column = self._indices[self._side_slots[0]] // 2
+        size = self.free.size
+        keys = self._row * size + column
+        self._coupled = self._side_slots[0, np.searchsorted(keys, low * size + high)]
+        self.coupling = np.zeros(len(pairs))
+
+    def assemble(self, form: QuadraticForm) -> None:
+        """Sum the triangles' forms in the unknowns along ``tangent``, and add ``curve_stiffness`` to the diagonal."""
+        super().assemble(form)
+        values, slots = self._values, self._side_slots
+        x, y = self.tangent.real, self.tangent.imag
+        xx, xy, yx, yy = slots[:, self._by_row]
+        a, b = x[self._of_row], y[self._of_row]
+        values[xx], values[xy] = a * values[xx] + b * values[yx], a * values[xy] + b * values[yy]
+        values[yx] = values[yy] = 0
+        xx, xy, yx, yy = slots[:, self._by_column]
+        a, b = x[self._of_column], y[self._of_column]
+        values[xx], values[yx] = a * values[xx] + b * values[xy], a * values[yx] + b * values[yy]
+        values[xy] = values[yy] = 0
+        xx, xy, yy = self._corner_slots[:, self.at]
+        along = x * x * values[xx] + 2 * x * y * values[xy] + y * y * values[yy]
+        values[xx] = np.where(self.tangent == 0, 0, along + self.curve_stiffness)
+        values[xy] = values[yy] = 0
+        values[self._coupled] += self.coupling
+        self._diagonal = values[self._first]
+
+
+class SlidingModel:
+    """The model of a Newton descent whose boundary vertices slide on curves; see `NewtonModel`.
+
+    Parameters
+    ----------
+    energy : DeformationEnergy
+    track : Track
+        The map, and the sliding vertices on their curves.
+    fixed : (k,) int64
+        Fixed vertices; sliding ones are excluded.
+    loops : sequence of (l,) int64
+        The boundary, which must not meet itself.
+    exponent, linear_solver
+        As in `newton_descent`.
+    system : SlidingSystem, optional
+        From an earlier model of the same triangles with the same ``fixed``; reused if the same vertices slide.
+
+    Attributes
+    ----------
+    deviation_barrier, weight : DeviationBarrier, float
+        The barrier and its factor, in the energy's units.
+    """
+
+    slack = 1.0
+
+    def __init__(
+        self,
+        energy: DeformationEnergy,
+        track: Track,
+        fixed: IntArray,
+        loops: Sequence[IntArray],
+        exponent: int,
+        linear_solver: str,
+        system: SlidingSystem | None = None,
+    ) -> None:
+        self.energy, self._track, self._loops = energy, track, list(loops)
+        self.deviation_barrier = DeviationBarrier(track, self._loops)
+        self.coordinates = Coordinates.of(track.uv, np.setdiff1d(fixed, track.vertices), exponent)
+        if system is not None and np.array_equal(system.sliding, track.vertices):
+            system.take_gradients(energy.g)
+            self.system = system
+        else:
+            self.system = SlidingSystem(
+                energy.F, energy.g, len(track.uv), self.coordinates.fixed, linear_solver, sliding=track.vertices
+            )
+        both = (self.deviation_barrier.pairs >= 0).all(axis=1)
+        self._both = np.flatnonzero(both)
+        self.system.couple(self.deviation_barrier.pairs[both])
+        # A boundary that already overlaps itself may overlap further.
+        self._simple = not check_loops(self._loops, track.uv)[1]
+        self.weight = 0.0
+        self._frame: _Frame | None = None
+
+    def start(self) -> NewtonState:
+        """Return the state of the track's map."""
+        w = in_units(self._track.uv, self.coordinates.exponent)
+        derivatives = self.energy.deform(w)
+        energy = self.energy.value_of(derivatives)
+        return self.prepare(NewtonState(w, derivatives, energy, _Boundary(self._track.s, energy)))
+
+    def positions(self, w: ComplexArray) -> FloatArray:
+        """Convert a map to positions (n, 2); see `Coordinates`."""
+        return self.coordinates.positions(w)
+
+    def mean_energy(self, state: NewtonState) -> float:
+        """The energy at a state, without the barrier."""
+        boundary: _Boundary = state.extra
+        return boundary.energy
+
+    def prepare(self, state: NewtonState) -> NewtonState:
+        """Set the barrier's weight to its share of the current energy, which only decreases."""
+        boundary: _Boundary = state.extra
+        self.weight = _WEIGHT * boundary.energy
+        return state._replace(value=boundary.energy + self.weight * self.deviation_barrier.value(boundary.s))
+
+    def gradient(self, state: NewtonState) -> ComplexArray:
+        """See `NewtonModel`; also sets the unknowns of the sliding vertices for this step."""
+        self._frame = self.frame(state)
+        self.system.tangent = self._frame.tangent
+        return self._frame.gradient
+
+    def frame(self, state: NewtonState) -> _Frame:
+        """Derivatives at a state by the unknowns; see `_Frame`."""
+        s = state.extra.s
+        pull = self.energy.gradient_of(state.derivatives, state.w.size)
+        at, system = pull[self._track.vertices], self.system
+        barrier_gradient, barrier_hessian = self._barrier(s)
+        kink = self._track.at_kink(s)
+        ahead, curvature = self._track.frame(s, np.ones(at.size, dtype=bool))
+        back, curvature_back = self._track.frame(s, ~kink)
+        slope, slope_back = _along(ahead, at) + barrier_gradient, _along(back, at) + barrier_gradient
+        # If the energy decreases to both sides, take the steeper one.
+        turned = kink & (slope_back > np.maximum(-slope, 0))
+        stays = kink & (slope >= 0) & (slope_back <= 0)
+        tangent = np.where(stays, 0, np.where(turned, back, ahead))
+        forces = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature)
+        # A vertex may leave a kink only to the chosen side.
+        side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
+        gradient = pull[system.free]
+        gradient[system.at] = np.where(tangent == 0, 0, _along(tangent, at) + barrier_gradient)
+        return _Frame(gradient, tangent, forces * 2.0**self.coordinates.exponent, side, barrier_hessian)
+
+    def _barrier(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of the barrier in units: first by the sliding vertices' lengths, second per edge (e, 2, 2)."""
+        by_ends, by_both = self.deviation_barrier.derivatives(s)
+        unit = self.weight * 2.0**self.coordinates.exponent
+        barrier_gradient = np.zeros(s.size)
+        for end in (0, 1):
+            number = self.deviation_barrier.pairs[:, end]
+            np.add.at(barrier_gradient, number[number >= 0], unit * by_ends[number >= 0, end])
+        return barrier_gradient, unit * 2.0**self.coordinates.exponent * by_both
+
+    def assemble(self, state: NewtonState, negative: float) -> None:
+        """See `NewtonModel`."""
+        system, frame = self.system, self._frame
+        assert frame is not None
+        system.curve_stiffness = damp(frame.forces, negative)
+        for end in (0, 1):
+            number = self.deviation_barrier.pairs[:, end]
+            np.add.at(system.curve_stiffness, number[number >= 0], frame.barrier_hessian[number >= 0, end, end])
+        both_move = (system.tangent[self.deviation_barrier.pairs[self._both]] != 0).all(axis=1)
+        system.coupling = np.where(both_move, frame.barrier_hessian[self._both, 0, 1], 0)
+        system.assemble(self.energy.curvature_of(state.derivatives, negative=negative))
+
+    def solve(self, load: ComplexArray) -> ComplexArray:
+        """See `NewtonModel`."""
+        return self.system.solve(load)
+
+    def restrict(
+        self, state: NewtonState, gradient: ComplexArray, direction: ComplexArray, expected_decrease: float
+    ) -> tuple[ComplexArray, float]:
+        """Keep vertices at kinks whose direction leads to the other side."""
+        assert self._frame is not None
+        at = self.system.at
+        wrong = direction[at].real * self._frame.side < 0
+        if wrong.any():
+            expected_decrease += float(np.sum((gradient[at] * direction[at]).real[wrong]))
+            direction[at[wrong]] = 0
+        return direction, expected_decrease
+
+    def search(
+        self, state: NewtonState, direction: ComplexArray, expected_decrease: float, shortened: bool
+    ) -> tuple[NewtonState, bool] | None:
+        """See `NewtonModel`; maps of a step are projected to the curves."""
+        at, vertices = self.system.at, self._track.vertices
+        full = np.zeros_like(state.w)
+        full[self.system.free] = direction
+        full[vertices] = self.system.tangent * direction[at].real
+        along = np.ldexp(direction[at].real, self.coordinates.exponent)
+        limit = FRACTION * float(self.energy.steps_to_collapse(state.w, full).min())
+        s = state.extra.s
+        room = _LEAST_ROOM * self.deviation_barrier.room(s)
+
+        def make_trial(stops: Sequence[bool]) -> Trial[NewtonState]:
+            """Evaluate steps projected to the curves, across kinks or stopping at them."""
+
+            def trial(t: float, bound: float) -> tuple[float, NewtonState | None]:
+                value, there = np.inf, None
+                for stop in stops:
+                    value, there = self._evaluate_trial(state.w + t * full, s, t * along, room, bound, stop=stop)
+                    if there is not None:
+                        break
+                return value, there
+
+            return trial
+
+        taken = backtrack(
+            make_trial((False, True)), state.value, expected_decrease, longest=min(1.0, limit), tries=HALVINGS
+        )
+        if taken is None:
+            return None
+        return extend(make_trial((False,)), taken, limit).state, taken.t < 1
+
+    def _evaluate_trial(
+        self, w: ComplexArray, s: FloatArray, step: FloatArray, least_room: FloatArray, bound: float, *, stop: bool
+    ) -> tuple[float, NewtonState | None]:
+        """Return the objective with the boundary moved along its curves, and the state if it is accepted."""
+        there = self._track.advance(s, step, stop=stop)
+        if stop and np.array_equal(there, self._track.advance(s, step)):
+            return np.inf, None  # no kink within the step, so this repeats the previous trial
+        room = self.deviation_barrier.room(there)
+        if (room < least_room).any() or not self._track.in_order(there):
+            return np.inf, None
+        barrier = self.weight * self.deviation_barrier.value_of(room)
+        w[self._track.vertices] = in_units(self._track.position(there), self.coordinates.exponent)
+        derivatives = self.energy.deform(w)
+        energy = self.energy.value_of(derivatives)
+        value = energy + barrier
+        if not value < bound:
+            return value, None
+        uv = self.positions(w)
+        if not is_injective(self.energy.F, uv) or (self._simple and check_loops(self._loops, uv)[1]):
+            return value, None
+        return value, NewtonState(w, derivatives, value, _Boundary(there, energy))
+
+    def check_numbers(self, state: NewtonState) -> None:
+        """See `NewtonModel`."""
+        self.energy.check_numbers(state.derivatives)
+
+
+def _along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:
+    """Components of vectors along unit tangents."""
+    return tangent.real * vector.real + tangent.imag * vector.imag

@@ -1,0 +1,27 @@
+"""Conversion of a mesh and its map to an object of trimesh."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+
+def make_trimesh(V: FloatArray, F: IntArray, uv: FloatArray) -> Trimesh:
+    """Return a trimesh.Trimesh with the map as texture coordinates; vertices and triangles keep their order.
+
+    A planar mesh is placed at z = 0. ImportError if trimesh is not installed.
+    """
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError(f"to_trimesh needs trimesh ({error}): pip install trimesh") from error
+    points = np.pad(V, [(0, 0), (0, 3 - V.shape[1])])
+    made = trimesh.Trimesh(vertices=points, faces=F, process=False)
+    made.visual = trimesh.visual.TextureVisuals(uv=uv.copy())  # type: ignore[no-untyped-call]
+    return made

@@ -1,0 +1,305 @@
+"""glTF 2.0 files, binary (.glb) or JSON (.gltf): read the document and its numbers, change them, and encode the file.
+
+The module runs no code from a file and fetches nothing. It reads bytes only from the file itself and from files in its
+folder.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.errors import MeshFileError, printable
+from quasiharmonic.io.lowlevel.textual import read_bytes
+
+_KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_SHAPES = {width: shape for shape, width in _WIDTHS.items()}
+# Compression extensions, which need external libraries and are refused.
+_COMPRESSIONS = "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"
+_LISTS = (
+    *("accessors", "bufferViews", "buffers", "images", "materials", "textures"),
+    *("animations", "cameras", "meshes", "nodes", "scenes", "skins"),
+)
+_PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX 20": "image/ktx2"}
+# Errors that reading a damaged document may raise.
+DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+
+
+class Document:
+    """A glTF file: its JSON, and the bytes of each of ``tree["bufferViews"]``."""
+
+    def __init__(self, tree: dict[str, Any], views: list[bytes | memoryview]) -> None:
+        self.tree = tree
+        self.views = views
+
+    @property
+    def size(self) -> int:
+        """Total number of bytes of all views."""
+        return sum(map(len, self.views))
+
+    def copy(self) -> Document:
+        """Return a copy to modify; the bytes are shared."""
+        return Document(json.loads(json.dumps(self.tree)), list(self.views))
+
+    def numbers(self, index: int) -> NDArray[Any]:
+        """Return the numbers of an accessor, (count, width), in the type of the file; raise one of `DAMAGE`."""
+        accessor = self.tree["accessors"][whole(index)]
+        kind = np.dtype(_look_up(accessor, "componentType", _KINDS, index))
+        width = _look_up(accessor, "type", _WIDTHS, index)
+        count, sparse = whole(accessor["count"]), accessor.get("sparse")
+        if "bufferView" in accessor:
+            table = self._rows(accessor, count, kind, width)
+        elif sparse is None or count > self.size:
+            raise ValueError(f"accessor {index} has no data")
+        else:
+            table = np.zeros((count, width), dtype=kind)
+        if sparse is not None:
+            many, of = whole(sparse["count"]), sparse["indices"]
+            rows = self._rows(of, many, np.dtype(_look_up(of, "componentType", _KINDS, index)), 1)[:, 0]
+            table[rows] = self._rows(sparse["values"], many, kind, width)
+        return table
+
+    def reals(self, index: int) -> NDArray[np.float64]:
+        """Return the values of an accessor, (count, width); normalised integers are divided by the largest one."""
+        table = self.numbers(index)
+        if table.dtype.kind == "f" or not self.tree["accessors"][index].get("normalized"):
+            return table.astype(np.float64)
+        return np.maximum(table / np.iinfo(table.dtype).max, -1.0)
+
+    def add(self, table: NDArray[Any], *, indices: bool = False) -> int:
+        """Add an accessor for numbers (count, width), either indices or vertex data; return its index."""
+        accessors = self.tree.setdefault("accessors", [])
+        accessors.append({})
+        self.put(len(accessors) - 1, table, indices=indices)
+        return len(accessors) - 1
+
+    def put(self, index: int, table: NDArray[Any], *, indices: bool = False, repeated: bool = False) -> None:
+        """Replace the numbers (count, width) of an accessor; ``repeated`` means that they only repeat its old rows."""
+        accessor = self.tree["accessors"][index]
+        old = accessor.get("bufferView")
+        for stale in ("sparse", "byteOffset", *(() if repeated else ("min", "max", "normalized"))):
+            accessor.pop(stale, None)
+        table = np.ascontiguousarray(table)
+        raw = table.view(np.uint8).reshape(len(table), -1)
+        # Rows of vertex data start at multiples of four bytes.
+        padding = 0 if indices else -raw.shape[1] % 4
+        view = {"buffer": 0, "target": 34963 if indices else 34962}
+        if padding:
+            raw = np.pad(raw, ((0, 0), (0, padding)))
+            view["byteStride"] = raw.shape[1]
+        views = self.tree.setdefault("bufferViews", [])
+        if old is None or self._count_references(old) > 1:
+            old = len(views)
+            views.append({})
+            self.views.append(b"")
+        views[old], self.views[old] = view, raw.tobytes()
+        accessor |= {"bufferView": old, "count": len(table), "type": _SHAPES[table.shape[1]]}
+        accessor["componentType"] = _CODES[table.dtype]
+
+    def add_bytes(self, data: bytes) -> int:
+        """Add a view of the bytes of an image; return its index."""
+        self.tree.setdefault("bufferViews", []).append({"buffer": 0})
+        self.views.append(data)
+        return len(self.views) - 1
+
+    def encode(self, *, binary: bool) -> bytes:
+        """Return the bytes of the file: binary, or JSON with base64 data; raise `ValueError` if it is too large."""
+        if self.size >= 1 << 31:
+            raise ValueError("a glTF file has at most 2 GiB: write .ply or .obj")
+        tree, buffer = dict(self.tree), bytearray()
+        views = []
+        for view, data in zip(self.tree.get("bufferViews", []), self.views, strict=True):
+            buffer += b"\0" * (-len(buffer) % 4)
+            views.append(view | {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)})
+            buffer += data
+        buffer += b"\0" * (-len(buffer) % 4)
+        tree["bufferViews"], tree["buffers"] = views, [{"byteLength": len(buffer)}]
+        if not binary:
+            uri = "data:application/octet-stream;base64," + base64.b64encode(buffer).decode()
+            tree["buffers"][0]["uri"] = uri
+            return json.dumps(tree, ensure_ascii=False, indent=1).encode() + b"\n"
+        text = json.dumps(tree, ensure_ascii=False, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = (b"JSON", text), (b"BIN\0", bytes(buffer))
+        body = b"".join(len(data).to_bytes(4, "little") + name + data for name, data in chunks)
+        return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
+
+    def _count_references(self, view: int) -> int:
+        """Return the number of references to a view."""
+
+        def count(node: object) -> int:
+            if isinstance(node, dict):
+                return (node.get("bufferView") == view) + sum(map(count, node.values()))
+            return sum(map(count, node)) if isinstance(node, list) else 0
+
+        return count(self.tree)
+
+    def _rows(self, where: dict[str, Any], count: int, kind: np.dtype[Any], width: int) -> NDArray[Any]:
+        """Return a copy of rows of numbers in a view."""
+        index = whole(where["bufferView"])
+        view, begin, row = self.views[index], whole(where.get("byteOffset", 0)), kind.itemsize * width
+        stride = whole(self.tree["bufferViews"][index].get("byteStride", row))
+        if count and (stride < row or begin + (count - 1) * stride + row > len(view)):
+            raise ValueError(f"buffer view {index} is too short for its numbers")
+        found = np.ndarray((count, row), np.uint8, view, begin if count else 0, (stride, 1))
+        return np.array(found).view(kind).reshape(count, width)
+
+
+def load(path: str | os.PathLike[str]) -> Document:
+    """Read a glTF file.
+
+    MeshFileError if the file is not glTF, is damaged or compressed, or refers to bytes outside its own folder.
+    """
+    data = read_bytes(path)
+    try:
+        text, chunk = _chunks(data) if data[:4] == b"glTF" else (data, None)
+        tree = json.loads(text, parse_constant=_no_number)
+        version = str(tree["asset"]["version"])
+        _check_lists(tree)
+    except (*DAMAGE, RecursionError) as error:
+        raise MeshFileError(path, f"is not a glTF file: {fault(error)}") from error
+    if not version.startswith("2."):
+        raise MeshFileError(path, f"is glTF {version[:20]}", remedy="save it as glTF 2.0")
+    compressed = [name for name in _COMPRESSIONS if f'"{name}"' in json.dumps(tree.get("extensionsUsed", []))]
+    if compressed:
+        raise MeshFileError(path, f"is compressed by {compressed[0]}", remedy="save it without compression")
+    try:
+        buffers = [_buffer(path, buffer, chunk) for buffer in tree.get("buffers", [])]
+        views = [_view(view, buffers) for view in tree.get("bufferViews", [])]
+    except MeshFileError:
+        # An error in a file that this one refers to.
+        raise
+    except DAMAGE as error:
+        raise MeshFileError(path, f"is damaged: {fault(error)}") from error
+    return Document(tree, views)
+
+
+def fault(error: Exception) -> str:
+    """Return a description of a document's fault, from the error that it raised."""
+    match error:
+        case ValueError():
+            return str(error)
+        case KeyError():
+            return f"an entry lacks {printable(str(error.args[0]))[:80]}"
+        case IndexError():
+            return "an entry refers to another entry that does not exist"
+        case RecursionError():
+            return "its entries are nested too deeply"
+    return "an entry has the wrong type"
+
+
+def picture_type(data: bytes) -> str | None:
+    """Return the media type of an image that glTF supports; None for anything else."""
+    return next((kind for magic, kind in _PICTURES.items() if data.startswith(magic)), None)
+
+
+def embed_pictures(document: Document, folder: Path) -> list[str]:
+    """Embed images from files in the document's folder; return the names of those that cannot be embedded."""
+    missing = []
+    for image in document.tree.get("images", []):
+        uri = image.get("uri")
+        if not isinstance(uri, str) or uri.startswith("data:"):
+            continue
+        try:
+            data = read_bytes(beside(folder, uri))
+        except ValueError:
+            missing.append(uri)
+            continue
+        kind = picture_type(data)
+        if kind is None:
+            missing.append(uri)
+            continue
+        del image["uri"]
+        image |= {"bufferView": document.add_bytes(data), "mimeType": kind}
+    return missing
+
+
+def whole(value: object) -> int:
+    """Return a non-negative integer of a document; raise `ValueError` for anything else."""
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 53:
+        raise ValueError(f"{ascii(value)[:40]} is not a whole number")
+    return value
+
+
+def _look_up(accessor: dict[str, Any], name: str, table: dict[Any, Any], index: int) -> Any:
+    """What an entry of an accessor stands for; `ValueError` for a value that is not in the table."""
+    value = accessor[name]
+    if value not in table:
+        choices = ", ".join(map(str, table))
+        raise ValueError(f"{name} of accessor {index} must be one of {choices}, not {ascii(value)[:40]}")
+    return table[value]
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is not JSON")
+
+
+def _check_lists(tree: dict[str, Any]) -> None:
+    """Raise a ValueError if an entry that must be a list of objects is not."""
+    for name in _LISTS:
+        there = tree.get(name, [])
+        if not isinstance(there, list) or not all(isinstance(one, dict) for one in there):
+            raise ValueError(f"its {name} must be a list of objects")
+
+
+def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
+    """Return the JSON and the binary chunk of a binary file."""
+    if data[4:8] != b"\2\0\0\0":
+        raise ValueError("its binary version is not 2")
+    found: dict[bytes, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        size, name = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
+        if at + 8 + size > len(data):
+            raise ValueError("it ends too early")
+        found.setdefault(name, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    return found[b"JSON"], found.get(b"BIN\0")
+
+
+def _buffer(path: str | os.PathLike[str], buffer: dict[str, Any], chunk: bytes | None) -> bytes:
+    """Return the bytes of a buffer."""
+    size, uri = whole(buffer["byteLength"]), buffer.get("uri")
+    if uri is None:
+        data = chunk
+    elif uri.startswith("data:"):
+        head, _, text = uri.partition(",")
+        if not head.endswith(";base64"):
+            raise ValueError("a buffer is not base64")
+        try:
+            data = base64.b64decode(text, validate=True)
+        except binascii.Error as error:
+            raise ValueError(f"a buffer is not base64: {error}") from error
+    else:
+        data = read_bytes(beside(Path(path).parent, uri))
+    if data is None or len(data) < size:
+        raise ValueError("a buffer is shorter than its length states")
+    return data[:size]
+
+
+def beside(folder: Path, uri: str) -> Path:
+    """Return the path of a file in the document's folder or in a folder below it."""
+    name = unquote(uri)
+    inside = Path(os.path.normpath(folder / name))
+    if ":" in name or "\\" in name or name.startswith("/") or ".." in Path(name).parts:
+        raise ValueError(f"{ascii(uri)[:80]} is not in the folder of the file")
+    return inside
+
+
+def _view(view: dict[str, Any], buffers: list[bytes]) -> bytes | memoryview:
+    begin, size = whole(view.get("byteOffset", 0)), whole(view["byteLength"])
+    buffer = buffers[whole(view["buffer"])]
+    if begin + size > len(buffer):
+        raise ValueError("a buffer view ends after the end of its buffer")
+    # No copy, so that many views of one buffer need no more memory than the buffer.
+    return memoryview(buffer)[begin : begin + size]

@@ -1,0 +1,309 @@
+"""Surfaces in glTF documents. glTF repeats vertices along seams; vertices at equal positions are merged."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
+from quasiharmonic.io.formats.normals import normal_lines
+from quasiharmonic.io.formats.welding import weld
+from quasiharmonic.io.models.meshdata import Carried, MeshData
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+PLACES = "TEXCOORD_0"
+# Modes of a glTF primitive.
+_TRIANGLES = 4
+_STRIP = 5
+_FAN = 6
+_READ = "POSITION", "NORMAL", "COLOR_0", PLACES
+
+
+@dataclass(frozen=True, eq=False)
+class VertexPool:
+    """Vertices that one or several primitives of a mesh share."""
+
+    #: Accessors by name.
+    attributes: dict[str, int]
+    #: Accessors by name, for each morph target.
+    targets: list[dict[str, int]]
+    mesh: int
+    #: Index of the first vertex among those of all pools, and number of vertices.
+    first: int
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Primitive:
+    """A primitive: its mesh, its index in the mesh, its pool, and the range of its triangles."""
+
+    mesh: int
+    primitive: int
+    pool: int
+    begin: int
+    end: int
+
+
+class CarriedGltf(Carried):
+    """A glTF document, the folder of its image files, and the relation of the surface to its primitives.
+
+    ``rows`` (f, 3) has for every corner its vertex among those of all pools.
+    """
+
+    def __init__(
+        self,
+        document: Document,
+        folder: Path,
+        pools: list[VertexPool],
+        parts: list[Primitive],
+        rows: IntArray,
+        mesh: MeshData,
+    ) -> None:
+        super().__init__(mesh.V, mesh.F)
+        self.document, self.folder, self.pools, self.parts, self.rows = document, folder, pools, parts, rows
+
+    def further(self) -> list[str]:
+        tree = self.document.tree
+        found = [name for name in ("materials", "animations", "skins", "cameras") if tree.get(name)]
+        if any(pool.targets for pool in self.pools):
+            found.append("morph targets")
+        names = sorted({name for pool in self.pools for name in pool.attributes if name not in _READ})
+        return found + [f"{name} of vertices" for name in names]
+
+
+def read_gltf(path: str | os.PathLike[str]) -> MeshData:
+    """Read the triangles of a glTF 2.0 file, binary (.glb) or JSON (.gltf).
+
+    A vertex of a glTF file has one texture coordinate, so vertices are repeated along seams. Vertices of one mesh at
+    exactly equal positions are merged, and the texture coordinates keep the seams. Positions are those in the scene. If
+    a mesh occurs several times, its first occurrence is used.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file. Its buffers are in the file or in its folder; no other file is opened.
+
+    Returns
+    -------
+    MeshData
+        Triangles in the order of the file, vertices in the order of their first occurrence. Texture coordinates are
+        ``TEXCOORD_0`` with v upwards, 1 - v. A merged vertex has the colour of the first vertex at its position.
+        Objects and materials become statements. Its ``carried`` has all other data, for `write_gltf`.
+
+    Raises
+    ------
+    MeshFileError
+        If the file is not glTF 2.0, is damaged, is compressed by an extension, or has no triangles.
+    """
+    document = load(path)
+    try:
+        # Overflow is reported later, by the checks for finite numbers.
+        with np.errstate(over="ignore", invalid="ignore"):
+            mesh = _mesh(document, os.fspath(path))
+    except (*DAMAGE, RecursionError) as error:
+        raise MeshFileError(path, f"is damaged: {fault(error)}") from error
+    if mesh is None:
+        raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
+    return mesh
+
+
+def _mesh(document: Document, source: str) -> MeshData | None:
+    """Return the surface with all other data of the file; None if there are no triangles."""
+    pools, parts, rows, statements = _parts(document)
+    if not len(rows):
+        return None
+    points, kind = _positions(document, pools)
+    # Merge equal positions within each mesh.
+    V, which = weld(np.column_stack([kind, points]))
+    F = which[rows]
+    vt, known = _attribute(document, pools, PLACES, 2)
+    vt[:, 1] = 1 - vt[:, 1]
+    normals, shaded = _attribute(document, pools, "NORMAL", 3)
+    colours, coloured = _attribute(document, pools, "COLOR_0", None)
+    extra = np.full((len(V), colours.shape[1]), np.nan)
+    order = np.flatnonzero(coloured)[::-1]
+    extra[which[order]] = colours[order]
+    mesh = MeshData(
+        V[:, 1:],
+        F,
+        vt=vt if known.any() else None,
+        FT=np.where(known[rows], rows, -1) if known.any() else None,
+        extra=extra if coloured.any() else None,
+        normals=normal_lines(_transform_normals(document, pools, normals)) if shaded.any() else b"",
+        FN=np.where(shaded[rows], rows, -1) if shaded.any() else None,
+        statements=b"".join(line for line, _ in statements),
+        statement_faces=np.array([face for _, face in statements], dtype=np.int64),
+        source=source,
+    )
+    return replace(mesh, carried=CarriedGltf(document, Path(source).parent, pools, parts, rows, mesh))
+
+
+def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntArray, list[tuple[bytes, int]]]:
+    """Return pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
+    tree, pools, parts, known = document.tree, list[VertexPool](), list[Primitive](), dict[str, int]()
+    triangles, statements, vertices, faces = [np.empty((0, 3), dtype=np.int64)], [], 0, 0
+    for m, mesh in enumerate(tree.get("meshes", [])):
+        for p, primitive in enumerate(mesh["primitives"]):
+            attributes, targets = primitive["attributes"], primitive.get("targets", [])
+            mode = primitive.get("mode", _TRIANGLES)
+            if mode not in (_TRIANGLES, _STRIP, _FAN) or "POSITION" not in attributes:
+                continue
+            key = json.dumps([attributes, targets], sort_keys=True)
+            if key not in known:
+                known[key] = len(pools)
+                count = _common_count(document, [attributes, *targets])
+                pools.append(VertexPool(attributes, targets, m, vertices, count))
+                vertices += count
+            pool = pools[known[key]]
+            if "indices" not in primitive:
+                corners = np.arange(pool.count)
+            else:
+                corners = document.numbers(primitive["indices"])[:, 0].astype(np.int64)
+            if corners.size and corners.max() >= pool.count:
+                raise ValueError(f"mesh {m} refers to vertex {corners.max()}, but there are {pool.count}")
+            own = _triangles(corners, mode)
+            if faces + len(own) + vertices > document.size:
+                raise ValueError("its meshes repeat the same data too often")
+            parts.append(Primitive(m, p, known[key], faces, faces + len(own)))
+            if p == 0 and isinstance(mesh.get("name"), str):
+                statements.append((_statement("o", mesh["name"]), faces))
+            if "material" in primitive:
+                material = tree["materials"][whole(primitive["material"])]
+                # A single material without a name needs no statement.
+                if "name" in material or len(tree["materials"]) > 1:
+                    name = str(material.get("name", primitive["material"]))
+                    statements.append((_statement("usemtl", name), faces))
+            triangles.append(pool.first + own)
+            faces += len(own)
+    return pools, parts, np.concatenate(triangles), statements
+
+
+def _common_count(document: Document, of: list[dict[str, int]]) -> int:
+    """Return the common number of vertices of some attributes; the accessors are read, as their counts may be wrong."""
+    count = len(document.numbers(of[0]["POSITION"]))
+    for name, accessor in (pair for attributes in of for pair in attributes.items()):
+        if len(document.numbers(accessor)) != count:
+            raise ValueError(f"{name} and POSITION have different numbers of vertices")
+    return count
+
+
+def _triangles(corners: IntArray, mode: int) -> IntArray:
+    """Return the triangles (k, 3) of a list, a strip or a fan."""
+    if mode == _TRIANGLES:
+        if len(corners) % 3:
+            raise ValueError(f"{len(corners)} indices are not a valid number for triangles")
+        return corners.reshape(-1, 3)
+    i = np.arange(max(len(corners) - 2, 0))
+    if mode == _FAN:
+        return np.stack([corners[i + 1], corners[i + 2], corners[np.zeros_like(i)]], axis=1)
+    strip = np.stack([corners[i], corners[i + 1 + i % 2], corners[i + 2 - i % 2]], axis=1)
+    # Degenerate triangles only join strips; drop them.
+    return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
+
+
+def _statement(keyword: str, name: str) -> bytes:
+    # Remove line breaks and backslashes from names, which would damage a line of OBJ.
+    return f"{keyword} {' '.join(name.split()) or '-'}".encode("utf-8", "replace").replace(b"\\", b"/") + b"\n"
+
+
+def _attribute(
+    document: Document, pools: list[VertexPool], name: str, width: int | None
+) -> tuple[FloatArray, BoolArray]:
+    """Return numbers at the vertices of all pools, (v, width), and which vertices have the attribute, (v,) bool."""
+    tables = [document.reals(pool.attributes[name]) if name in pool.attributes else None for pool in pools]
+    if width is None:
+        width = max((table.shape[1] for table in tables if table is not None), default=3)
+    total = sum(pool.count for pool in pools)
+    numbers, known = np.zeros((total, width)), np.zeros(total, dtype=np.bool_)
+    for pool, table in zip(pools, tables, strict=True):
+        if table is None:
+            continue
+        if table.shape[1] > width:
+            raise ValueError(f"{name} has {table.shape[1]} numbers for each vertex")
+        rows = slice(pool.first, pool.first + pool.count)
+        numbers[rows, : table.shape[1]] = table
+        numbers[rows, table.shape[1] :] = 1.0
+        known[rows] = True
+    return numbers, known
+
+
+def _positions(document: Document, pools: list[VertexPool]) -> tuple[FloatArray, FloatArray]:
+    """Return positions (v, 3) in the scene, and the mesh (v,) of each."""
+    points, _ = _attribute(document, pools, "POSITION", 3)
+    placed = _placements(document.tree)
+    for pool in pools:
+        if pool.mesh in placed:
+            rows = slice(pool.first, pool.first + pool.count)
+            matrix = placed[pool.mesh]
+            points[rows] = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+    return points, np.repeat([pool.mesh for pool in pools], [pool.count for pool in pools]).astype(np.float64)
+
+
+def _transform_normals(document: Document, pools: list[VertexPool], normals: FloatArray) -> FloatArray:
+    """Return normals (v, 3) in the scene, of unit length if a transformation was applied."""
+    placed = _placements(document.tree)
+    for pool in pools:
+        if pool.mesh in placed:
+            rows = slice(pool.first, pool.first + pool.count)
+            linear = placed[pool.mesh][:3, :3]
+            # Normals transform by the cofactor matrix, which also exists for singular matrices.
+            cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
+            turned = normals[rows] @ cofactors.T
+            length = np.linalg.norm(turned, axis=1, keepdims=True)
+            normals[rows] = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0)
+    return normals
+
+
+def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
+    """Return the transformation (4, 4) of each mesh in the scene by its first node, without identities."""
+    nodes = tree.get("nodes", [])
+    scenes = tree.get("scenes", [])
+    roots = scenes[whole(tree.get("scene", 0))].get("nodes", []) if scenes else []
+    waiting = [(whole(root), np.eye(4)) for root in reversed(roots)]
+    placed: dict[int, FloatArray] = {}
+    seen = set()
+    while waiting:
+        index, above = waiting.pop()
+        if index in seen:
+            continue
+        seen.add(index)
+        node = nodes[index]
+        here = above @ _local(node, index)
+        if "mesh" in node:
+            # The transformation of a node with a skin is ignored, as glTF specifies.
+            placed.setdefault(whole(node["mesh"]), np.eye(4) if "skin" in node else here)
+        waiting += [(whole(child), here) for child in reversed(node.get("children", []))]
+    return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
+
+
+def _local(node: dict[str, Any], index: int) -> FloatArray:
+    """Return the matrix of a node."""
+    if "matrix" in node:
+        return _numbers(node, "matrix", [0] * 16, index).reshape(4, 4).T
+    matrix = np.eye(4)
+    x, y, z, w = _numbers(node, "rotation", [0, 0, 0, 1], index)
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] = np.array(rotation) * _numbers(node, "scale", [1, 1, 1], index)
+    matrix[:3, 3] = _numbers(node, "translation", [0, 0, 0], index)
+    return matrix
+
+
+def _numbers(node: dict[str, Any], name: str, default: list[int], index: int) -> FloatArray:
+    """The numbers of a node's entry, as many as its default has; `ValueError` for anything else."""
+    values = node.get(name, default)
+    if not isinstance(values, list) or len(values) != len(default):
+        count = f"{len(values)}" if isinstance(values, list) else ascii(values)[:40]
+        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {count}")
+    if not all(isinstance(value, int | float) for value in values):
+        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {ascii(values)[:40]}")
+    return np.array(values, dtype=np.float64)

@@ -1,0 +1,299 @@
+"""Write glTF: the file that was read with a new map, or a new file; vertices are split along seams."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.errors import check_path
+from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
+from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
+from quasiharmonic.io.formats.normals import normal_rows
+from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.models.materials import materials_lost
+from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.textures import Texture
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of
+
+_EXACT = 2.0**-53
+
+
+def write_gltf(path: str | os.PathLike[str], mesh: MeshData) -> None:
+    """Write a mesh as a glTF 2.0 file, binary if its name ends in .glb, atomically.
+
+    Texture coordinates and new positions are in single precision. Vertices keep their order. A vertex with several
+    texture coordinates gets copies at the end of its pool. A mesh that was read from a glTF file keeps all other data
+    of that file, unchanged where no vertex was split; images from files beside it are embedded. For other meshes, each
+    run of faces with one material becomes a primitive, and polygons are written as triangles.
+
+    Raises
+    ------
+    ValueError
+        If a number exceeds single precision, or the data exceed the limits of glTF.
+    OutputError
+        If the file cannot be written. An existing file is then unchanged.
+    """
+    carried = mesh.carried
+    if isinstance(carried, CarriedGltf) and carried.fits(mesh):
+        document = _replace_map(carried, mesh)
+        embed_pictures(document, carried.folder)
+    else:
+        document = _new(mesh)
+    if mesh.texture is not None:
+        _paint(document, mesh.texture)
+    check_path("path", path)
+    write_whole(path, document.encode(binary=Path(path).suffix.lower() == ".glb"))
+
+
+def not_in_gltf(mesh: MeshData) -> list[str]:
+    """Return descriptions of the mesh data that a glTF file will not contain."""
+    carried, lost = mesh.carried, materials_lost(mesh)
+    if isinstance(carried, CarriedGltf) and carried.fits(mesh):
+        missing = embed_pictures(carried.document.copy(), carried.folder)
+        lost += [f"the image {name}, which is not an image file in the folder of {mesh.source}" for name in missing]
+        return lost
+    lost += ["digits beyond single precision"] if carried is None else carried.further()
+    with np.errstate(over="ignore"):
+        apart = len(np.unique(mesh.V.astype(np.float32), axis=0))
+    if apart < len(mesh.V):
+        same = count_of("vertex", "vertices", len(mesh.V) - apart)
+        lost.append(f"{same} at positions that coincide with others in single precision")
+    if mesh.polygons is not None:
+        lost.append("polygons, which are written as triangles")
+    if mesh.extra is not None and _colours(mesh) is None:
+        lost.append("data after the coordinates of some vertices, unless they are colours")
+    if mesh.FN is not None and _normals(mesh) is None:
+        lost.append("normals, because some faces have none")
+    words = {line.split(None, 1)[0] for line in mesh.statements.splitlines() if line.split()}
+    if words & {b"o", b"g", b"s"}:
+        lost.append("groups")
+    if b"mtllib" in words and mesh.texture is None:
+        lost.append("the appearance of materials")
+    return lost
+
+
+def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
+    """Return the document that was read, with the texture coordinates of a mesh."""
+    document = carried.document.copy()
+    users = _users(carried)
+    for number, pool in enumerate(carried.pools):
+        parts = [part for part in carried.parts if part.pool == number]
+        faces = np.concatenate([np.arange(part.begin, part.end) for part in parts])
+        FT = None if mesh.FT is None else mesh.FT[faces]
+        primitives = [document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in parts]
+        if FT is None or (FT < 0).all():
+            continue
+        if (FT < 0).any() or mesh.vt is None:
+            raise ValueError("some faces of a primitive have no texture coordinates, which glTF does not support")
+        places = _convert_places(mesh.vt)[FT]
+        rows, origin, corner = _split(carried.rows[faces] - pool.first, _bits(places), pool.count)
+        table = places.reshape(-1, 2)[corner]
+        if PLACES in pool.attributes:
+            old = document.reals(pool.attributes[PLACES])[origin]
+            table = np.where(corner[:, None] < 0, old.astype(np.float32), table)
+        if len(origin) > pool.count:
+            _extend(document, pool, primitives, origin, users)
+            bounds = np.cumsum([part.end - part.begin for part in parts])[:-1]
+            for primitive, own in zip(primitives, np.split(rows, bounds), strict=True):
+                primitive["mode"] = 4
+                primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
+        _set_attribute(document, pool, primitives, PLACES, table, users)
+    return document
+
+
+def _paint(document: Document, texture: Texture) -> None:
+    """Show a texture on all triangles with texture coordinates."""
+    tree = document.tree
+    colour = {"index": len(tree.setdefault("textures", []))}
+    tree["textures"].append({"source": len(tree.setdefault("images", []))})
+    tree["images"].append({"bufferView": document.add_bytes(texture.data), "mimeType": texture.media_type})
+    look = {"baseColorTexture": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    tree.setdefault("materials", []).append({"name": "map", "pbrMetallicRoughness": look, "doubleSided": True})
+    for shape in tree["meshes"]:
+        for primitive in shape["primitives"]:
+            if PLACES in primitive["attributes"]:
+                primitive["material"] = len(tree["materials"]) - 1
+
+
+def _users(carried: CarriedGltf) -> dict[int, int]:
+    """Return the number of attributes that refer to each accessor."""
+    users: dict[int, int] = {}
+    for pool in carried.pools:
+        for accessor in (*pool.attributes.values(), *(a for target in pool.targets for a in target.values())):
+            users[accessor] = users.get(accessor, 0) + 1
+    return users
+
+
+def _split(rows: IntArray, keys: IntArray, count: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Split vertices whose corners differ, one vertex for each kind of corner; corners of one kind have equal keys.
+
+    Of ``rows`` (k, 3), triangles among ``count`` vertices, and ``keys`` (k, 3, d), return new rows, the old vertex of
+    each vertex, and a corner at each vertex as an index into the flattened triangles, -1 for none. The first kind in
+    the file keeps the old index; further kinds get indices at the end.
+    """
+    kinds = np.column_stack([rows.ravel(), keys.reshape(rows.size, -1)])
+    unique, first, which = np.unique(kinds, axis=0, return_index=True, return_inverse=True)
+    # Sort by vertex, then by first occurrence in the file.
+    order = np.lexsort((first, unique[:, 0]))
+    vertex = unique[order, 0]
+    further = np.diff(vertex, prepend=-1) == 0
+    number = vertex.copy()
+    number[further] = count + np.arange(np.count_nonzero(further))
+    corner = np.full(count + np.count_nonzero(further), -1)
+    corner[number] = first[order]
+    of_kind = np.empty_like(number)
+    of_kind[order] = number
+    return of_kind[which.ravel()].reshape(-1, 3), np.concatenate([np.arange(count), vertex[further]]), corner
+
+
+def _bits(coordinates: NDArray[np.float32]) -> IntArray:
+    """Return texture coordinates (..., 2) as integers that are equal where the coordinates are."""
+    return (coordinates + np.float32(0)).view(np.int32).astype(np.int64)
+
+
+def _extend(
+    document: Document, pool: VertexPool, primitives: list[dict[str, Any]], origin: IntArray, users: dict[int, int]
+) -> None:
+    """Copy the attributes of a pool's vertices to their copies."""
+    for name in pool.attributes:
+        if name != PLACES:
+            table = document.numbers(pool.attributes[name])[origin]
+            _set_attribute(document, pool, primitives, name, table, users, repeated=True)
+    for t, target in enumerate(pool.targets):
+        for name, accessor in target.items():
+            new = _other(document, accessor, document.numbers(accessor)[origin], users, repeated=True)
+            for primitive in primitives:
+                primitive["targets"][t][name] = new
+
+
+def _set_attribute(
+    document: Document,
+    pool: VertexPool,
+    primitives: list[dict[str, Any]],
+    name: str,
+    table: NDArray[Any],
+    users: dict[int, int],
+    *,
+    repeated: bool = False,
+) -> None:
+    old = pool.attributes.get(name)
+    new = document.add(table) if old is None else _other(document, old, table, users, repeated=repeated)
+    for primitive in primitives:
+        primitive["attributes"][name] = new
+
+
+def _other(document: Document, accessor: int, table: NDArray[Any], users: dict[int, int], *, repeated: bool) -> int:
+    """Replace the numbers of an accessor, or of a copy of it if something else refers to it; return the index."""
+    if users[accessor] > 1:
+        document.tree["accessors"].append(dict(document.tree["accessors"][accessor]))
+        accessor = len(document.tree["accessors"]) - 1
+        users[accessor] = 1
+    document.put(accessor, table, repeated=repeated)
+    return accessor
+
+
+def _convert_places(vt: FloatArray) -> NDArray[np.float32]:
+    """Return texture coordinates (m, 2) in glTF's convention: v downwards, in single precision."""
+    v = 1 - vt[:, 1]
+    # Round v so that 1 - v is exact in double precision, and readers lose nothing.
+    v = np.where(np.abs(v) < 2.0**-29, np.rint(v / _EXACT) * _EXACT, v)
+    return _single("a place", np.stack([vt[:, 0], v], axis=1))
+
+
+def _single(what: str, numbers: FloatArray) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):
+        single = numbers.astype(np.float32)
+    if not np.isfinite(single).all():
+        raise ValueError(f"{what} exceeds single precision, the only one in glTF: write .ply or .obj")
+    return single
+
+
+def _indices(rows: IntArray, count: int) -> NDArray[Any]:
+    """Return triangles as a column of indices, in 16 bits if possible."""
+    return rows.reshape(-1, 1).astype(np.uint16 if count < 1 << 16 else np.uint32)
+
+
+def _new(mesh: MeshData) -> Document:
+    """Return a document of one mesh."""
+    tree: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "quasiharmonic"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": []}],
+    }
+    document = Document(tree, [])
+    bare: BoolArray = np.full(len(mesh.F), mesh.FT is None)
+    places = np.zeros((*mesh.F.shape, 2), dtype=np.float32)
+    if mesh.FT is not None and mesh.vt is not None:
+        bare = np.asarray((mesh.FT < 0).any(axis=1))
+        places[~bare] = _convert_places(mesh.vt)[mesh.FT[~bare]]
+    normals, colours = _normals(mesh), _colours(mesh)
+    line = np.zeros_like(mesh.F) if normals is None or mesh.FN is None else mesh.FN
+    keys = np.concatenate([_bits(places), line[:, :, None]], axis=2)
+    rows, origin, corner = _split(mesh.F, keys, len(mesh.V))
+    points = _single("a position", mesh.V[origin])
+    attributes = {"POSITION": document.add(points)}
+    bounds = points.min(axis=0).astype(float).tolist(), points.max(axis=0).astype(float).tolist()
+    tree["accessors"][0]["min"], tree["accessors"][0]["max"] = bounds
+    if normals is not None:
+        attributes["NORMAL"] = document.add(_single("a normal", normals[line.ravel()[corner]]))
+    if colours is not None:
+        attributes["COLOR_0"] = document.add(colours[origin].astype(np.float32))
+    placed = document.add(places.reshape(-1, 2)[corner]) if not bare.all() else None
+    names: list[str] = []
+    for begin, end, name, plain in _runs(mesh, bare):
+        primitive: dict[str, Any] = {"attributes": dict(attributes), "mode": 4}
+        if placed is not None and not plain:
+            primitive["attributes"][PLACES] = placed
+        primitive["indices"] = document.add(_indices(rows[begin:end], len(origin)), indices=True)
+        if name is not None:
+            if name not in names:
+                names.append(name)
+            primitive["material"] = names.index(name)
+        tree["meshes"][0]["primitives"].append(primitive)
+    tree["materials"] = [{"name": name} for name in names]
+    if any("material" not in primitive for primitive in tree["meshes"][0]["primitives"]):
+        # Some readers use texture coordinates only with a material.
+        tree["materials"].append({})
+        for primitive in tree["meshes"][0]["primitives"]:
+            primitive.setdefault("material", len(names))
+    return document
+
+
+def _runs(mesh: MeshData, bare: BoolArray) -> Iterator[tuple[int, int, str | None, bool]]:
+    """Yield runs of triangles with one material, all with texture coordinates or all without.
+
+    Each run is its first triangle, its end, its material, and whether it has no texture coordinates.
+    """
+    lines = mesh.statements.split(b"\n")[:-1]
+    uses = [(line, int(at)) for line, at in zip(lines, mesh.statement_faces, strict=True) if line.startswith(b"usemtl")]
+    first = np.arange(len(mesh.F) + 1) if mesh.polygons is None else mesh.polygons.first_triangle
+    label = np.zeros(len(mesh.F), dtype=np.int64)
+    names: list[str | None] = [None]
+    for line, at in uses:
+        names.append(line[6:].strip().decode("utf-8", "replace"))
+        label[first[max(at, 0)] :] = len(names) - 1
+    change = np.flatnonzero((np.diff(label) != 0) | (np.diff(bare) != 0)) + 1
+    edges = [0, *change.tolist(), len(mesh.F)]
+    for begin, end in pairwise(edges):
+        yield begin, end, names[label[begin]], bool(bare[begin])
+
+
+def _colours(mesh: MeshData) -> FloatArray | None:
+    """Return colours of vertices, with or without opacity; None unless all vertices have one."""
+    extra = mesh.extra
+    if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
+        return None
+    return extra
+
+
+def _normals(mesh: MeshData) -> FloatArray | None:
+    """Return all normals; None if a corner has none."""
+    return None if mesh.FN is None or (mesh.FN < 0).any() else normal_rows(mesh.normals)

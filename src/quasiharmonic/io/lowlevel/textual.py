@@ -1,0 +1,192 @@
+"""Read text files of numbers: regular blocks at once, other lines one by one."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import stat
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.io.errors import MeshFileError, check_path
+
+# First bytes of common files that are not plain text.
+_FOREIGN = {
+    b"\xff\xfe": ("is UTF-16 text", "save it as UTF-8"),
+    b"\xfe\xff": ("is UTF-16 text", "save it as UTF-8"),
+    b"\x1f\x8b": ("is compressed by gzip", "unpack it first"),
+    b"PK\x03\x04": ("is a zip archive", "unpack it first"),
+    b"BZh": ("is compressed by bzip2", "unpack it first"),
+    b"\xfd7zXZ": ("is compressed by xz", "unpack it first"),
+}
+_NUMERIC = b"0123456789.eE+-"
+# An exponent in Fortran notation.
+_FORTRAN = re.compile(rb"(?<=[0-9.])[dD](?=[+-]?[0-9])")
+_INTEGER = re.compile(rb"[+-]?[0-9]+")
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Read the bytes of a file; MeshFileError if it does not exist or cannot be read."""
+    check_path("path", path)
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            raise MeshFileError(path, "is a directory", remedy="name a file")
+        if not stat.S_ISREG(mode):
+            raise MeshFileError(path, "is not a regular file")
+        return Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise MeshFileError(path, "there is no such file") from error
+    except OSError as error:
+        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
+    except MeshFileError:
+        raise
+    except ValueError as error:
+        raise MeshFileError(path, f"is not a file name: {error}") from error
+
+
+def read_text(path: str | os.PathLike[str]) -> bytes:
+    """Read a text file; MeshFileError if it cannot be read or is not text.
+
+    Each line ends with a single newline, and there is no byte order mark. The contents need not be valid UTF-8: only
+    names and comments contain non-ASCII characters, and these are passed through.
+    """
+    data = read_bytes(path)
+    for start, (what, remedy) in _FOREIGN.items():
+        if data.startswith(start):
+            raise MeshFileError(path, what, remedy=remedy)
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    nul = data.find(b"\0")
+    if nul >= 0:
+        line = data.count(b"\n", 0, nul) + 1
+        raise MeshFileError(path, "a NUL byte", line, "this is a binary or a damaged file")
+    return data if data.endswith(b"\n") or not data else data + b"\n"
+
+
+def shown(token: bytes) -> str:
+    """Quote a piece of a file for a message, shortened and in ASCII."""
+    text = ascii(token[:40].decode("utf-8", "replace"))
+    return text if len(token) <= 40 else f"{text[:-1]}...'"
+
+
+def number(token: bytes) -> float:
+    """Convert decimal text to the nearest double; raise `ValueError` with a clear message for anything else."""
+    try:
+        # Reject what Python accepts but files do not mean: 1_000, or words for infinity.
+        value = math.nan if b"_" in token else float(_FORTRAN.sub(b"e", token))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{shown(token)} is not a finite number")
+    return value
+
+
+def is_number(token: bytes) -> bool:
+    """Return whether `number` accepts a piece of text."""
+    try:
+        number(token)
+    except ValueError:
+        return False
+    return True
+
+
+def integer(token: bytes) -> int:
+    """Convert decimal text to an integer below 10¹⁸; raise `ValueError` with a clear message for anything else."""
+    if len(token) <= 18 and token.isdigit():
+        return int(token)
+    if not _INTEGER.fullmatch(token):
+        raise ValueError(f"{shown(token)} is not an integer")
+    digits = token.lstrip(b"+-").lstrip(b"0")
+    if len(digits) > 18:
+        raise ValueError(f"{shown(token)} is far too large")
+    value = int(digits or b"0")
+    return -value if token.startswith(b"-") else value
+
+
+def number_table(block: bytes, keyword: bytes, rows: int) -> NDArray[np.float64] | None:
+    """Read lines of numbers that all have the same form, at once: (rows, k) float64 with 1 ≤ k ≤ 8.
+
+    Each line of the block starts with ``keyword``, which may be empty, and ends with a newline. None if the lines
+    differ in form or contain anything but finite numbers.
+    """
+    block = _collapse_blanks(block)
+    separators = block[: block.index(b"\n")].count(b" ")
+    columns = separators if keyword else separators + 1
+    if not 1 <= columns <= 8:
+        return None
+    # Without its numbers every line must be the same. Two separators enclose at most one number, so the right total
+    # means that no number is missing.
+    if block.translate(None, _NUMERIC) != (keyword + b" " * separators + b"\n") * rows:
+        return None
+    numbers = block.translate(None, keyword).split()
+    if len(numbers) != rows * columns:
+        return None
+    try:
+        # float() rounds correctly and is as fast as any array function.
+        values = np.array(list(map(float, numbers)))
+    except ValueError:
+        return None
+    return values.reshape(rows, columns) if np.isfinite(values).all() else None
+
+
+def integer_table(block: bytes, form: bytes, rows: int) -> NDArray[np.int64] | None:
+    r"""Read lines of non-negative integers that all have the same form, at once: (rows, k) int64.
+
+    ``form`` is a line with ``1`` for every number: ``b"f 1/1 1/1 1/1\n"``. Numbers that are too large become 2⁶³ - 1.
+    None if a line has another form.
+    """
+    block = _collapse_blanks(block)
+    frame = form.replace(b"1", b"")
+    if block.translate(None, b"0123456789") != frame * rows:
+        return None
+    # As in `number_table`. In addition, reject digits where the form has none.
+    for joint in {form[i : i + 2] for i in range(len(form) - 1)}:
+        if b"1" not in joint and block.count(joint) != form.count(joint) * rows:
+            return None
+    columns = form.count(b"1")
+    separators = bytes(set(frame))
+    plain = block.translate(bytes.maketrans(separators, b" " * len(separators)))
+    values = np.fromstring(plain, dtype=np.int64, sep=" ")
+    return values.reshape(rows, columns) if values.size == rows * columns else None
+
+
+def _collapse_blanks(block: bytes) -> bytes:
+    """Replace runs of blanks by single ones and remove those at the ends of lines."""
+    block = block.replace(b"\t", b" ")
+    while b"  " in block:
+        block = block.replace(b"  ", b" ")
+    return block.replace(b" \n", b"\n")
+
+
+def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, list[float]]]:
+    """Read lines with ``columns`` numbers each; return line numbers, counted from 1, and numbers.
+
+    Blanks, tabs and commas separate numbers. In a line with semicolons, semicolons separate numbers and commas are
+    decimal points, as in spreadsheets of many countries. Exponents have an e, or a d as in Fortran. A comment starts
+    with ``#``. A first line without numbers is a heading. MeshFileError if the file cannot be read, or a line has
+    another count of numbers or anything but finite numbers.
+    """
+    rows = []
+    for at, line in enumerate(read_text(path).split(b"\n"), 1):
+        text = line.partition(b"#")[0].strip()
+        if not text:
+            continue
+        if b";" in text:
+            words = [word.strip().replace(b",", b".") for word in text.split(b";")]
+        else:
+            words = text.replace(b",", b" ").split()
+        if at == 1 and not any(is_number(word) for word in words):
+            continue
+        if len(words) != columns:
+            plural = "number" if columns == 1 else "numbers"
+            raise MeshFileError(path, f"not {columns} {plural}: {shown(text)}", at)
+        try:
+            rows.append((at, [number(word) for word in words]))
+        except ValueError as error:
+            raise MeshFileError(path, str(error), at) from None
+    return rows

@@ -1,0 +1,107 @@
+"""Read and write mesh files; the suffix of the file name selects the format."""
+
+from __future__ import annotations
+
+import os
+
+from numpy.typing import ArrayLike
+
+from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays
+from quasiharmonic.io.lowlevel.atomic import check_writable
+from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.registry import find_format
+
+
+def read_mesh(path: str | os.PathLike[str]) -> MeshData:
+    """Read a triangle mesh from an OBJ, OFF, PLY, GLB, glTF or STL file; the suffix of its name selects the format.
+
+    See `read_obj`, `read_off`, `read_ply`, `read_gltf` and `read_stl`.
+
+    Raises
+    ------
+    MeshFileError
+        If the format is not supported, or the file is not valid in its format.
+    """
+    read = find_format(path, "read").read
+    assert read is not None
+    return read(path)
+
+
+def write_map(path: str | os.PathLike[str], mesh: MeshLike, uv: ArrayLike) -> None:
+    """Write a mesh with one position per vertex as its map; see `write_mapped`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file to write.
+    mesh : MeshData, path or mesh object
+        A path is read. Of a mesh object of another library, positions and triangles are written.
+    uv : (n, 2) float
+        Position of every vertex in the plane.
+
+    Raises
+    ------
+    MeshFileError, OutputError
+        As `write_mapped`.
+    ValueError
+        If ``uv`` has another shape or is not finite.
+    """
+    if isinstance(mesh, str | os.PathLike):
+        mesh = read_mesh(mesh)
+    elif not isinstance(mesh, MeshData):
+        mesh = MeshData(*mesh_arrays(mesh))
+    write_mapped(path, mesh.with_map(getattr(uv, "uv", uv)))
+
+
+def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
+    """Write a mesh with its map; the suffix of the file name selects the format.
+
+    OBJ, PLY and glTF files contain the mesh as it was read, with the map as its texture coordinates. OFF files contain
+    the map alone, as a mesh in the plane z = 0. Numbers are written so that reading them returns the same doubles,
+    except in glTF, which has single precision. An error never leaves a partial file. `not_held` lists the data that the
+    file will not contain.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file to write.
+    mesh : MeshData
+        The mesh, as `read_mesh` returned it, with a map (`MeshData.with_map`, `MeshData.with_places`).
+
+    Raises
+    ------
+    MeshFileError
+        If the format is not supported, or cannot store the seams of the map.
+    OutputError
+        If the file cannot be written. An existing file is then unchanged.
+    """
+    write = find_format(path, "write_map").write_map
+    assert write is not None
+    write(path, mesh)
+
+
+def check_output(path: str | os.PathLike[str]) -> None:
+    """Check before a computation whether `write_map` could write to ``path``.
+
+    Raises
+    ------
+    MeshFileError
+        If the format is not supported.
+    OutputError
+        If the file cannot be written.
+    """
+    find_format(path, "write_map")
+    check_writable(path)
+
+
+def not_held(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:
+    """Return descriptions of the mesh data that `write_mapped` would not write; empty if nothing is lost.
+
+    Raises
+    ------
+    MeshFileError
+        If the format is not supported.
+    """
+    list_losses = find_format(path, "write_map").list_losses
+    assert list_losses is not None
+    return list_losses(mesh)

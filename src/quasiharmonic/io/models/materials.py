@@ -1,0 +1,88 @@
+"""Materials of OBJ files: the libraries (.mtl) that they name, and a new library with a texture."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.textures import Texture
+
+_NAME = "map"
+
+
+def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
+    """Return the mesh with its library names changed to paths relative to the folder of ``path``.
+
+    A name is unchanged if the library also exists beside the new file, or does not exist beside the source.
+    """
+
+    def rename(name: str, here: Path, there: Path) -> str:
+        if (there / name).is_file() or not (here / name).is_file():
+            return name
+        try:
+            return os.path.relpath(here / name, there).replace(os.sep, "/")
+        except ValueError:  # The library is on another drive.
+            return (here / name).resolve().as_posix()
+
+    lines = mesh.statements.split(b"\n")
+    if not any(map(_names_library, lines)):
+        return mesh
+    new = [_with_names(line, path, mesh, rename) if _names_library(line) else line for line in lines]
+    return replace(mesh, statements=b"\n".join(new))
+
+
+def companions(path: str | os.PathLike[str], texture: Texture) -> tuple[Path, Path]:
+    """Return the paths of the library and of the image of an OBJ file with a texture."""
+    path = Path(path)
+    # In OBJ files a blank ends a name.
+    stem = "_".join(path.stem.split()) + "-texture"
+    return path.with_name(stem + ".mtl"), path.with_name(stem + texture.suffix)
+
+
+def materials_lost(mesh: MeshData) -> list[str]:
+    """Return a description of the file's own materials if `write_material` drops them; otherwise an empty list."""
+    uses = any(line.startswith(b"usemtl") for line in mesh.statements.split(b"\n"))
+    return ["its own materials, which the image replaces"] if mesh.texture is not None and uses else []
+
+
+def write_material(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> MeshData:
+    """Write the library and the image of an OBJ file with a texture; return the mesh with the new material instead of
+    its own. ``durable`` is as in `write_whole`.
+    """
+    assert mesh.texture is not None
+    library, picture = companions(path, mesh.texture)
+    text = f"newmtl {_NAME}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture.name}\n"
+    write_whole(picture, mesh.texture.data, durable=durable)
+    write_whole(library, text.encode(), durable=durable)
+    lines = mesh.statements.split(b"\n")[:-1]
+    kept = [i for i, line in enumerate(lines) if not _names_library(line) and not line.startswith(b"usemtl")]
+    head = sum(1 for i in kept if mesh.statement_faces[i] < 0)
+    new = [lines[i] for i in kept]
+    at = mesh.statement_faces[kept].tolist()
+    new[head:head] = [f"mtllib {library.name}".encode(), f"usemtl {_NAME}".encode()]
+    at[head:head] = [-1, 0]
+    return replace(
+        mesh, statements=b"".join(line + b"\n" for line in new), statement_faces=np.array(at, dtype=np.int64)
+    )
+
+
+def _names_library(line: bytes) -> bool:
+    return line.split(None, 1)[:1] == [b"mtllib"]
+
+
+def _with_names(
+    line: bytes, path: str | os.PathLike[str], mesh: MeshData, change: Callable[[str, Path, Path], str]
+) -> bytes:
+    """Return a ``mtllib`` line with its names changed: several names, or a single name with blanks."""
+    here, there = Path(mesh.source).parent, Path(path).parent
+    rest = os.fsdecode(line.split(None, 1)[1].strip()) if len(line.split(None, 1)) > 1 else ""
+    whole = (here / rest).is_file() or (there / rest).is_file()
+    names = [rest] if whole else rest.split()
+    new = [change(name, here, there) for name in names]
+    return line if new == names else os.fsencode("mtllib " + " ".join(new))

@@ -1,0 +1,76 @@
+"""Textures for mapped surfaces: an image file or a checkerboard.
+
+The texture covers the unit square, v upwards, and repeats beyond it, as in every viewer.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.lowlevel.textual import read_bytes
+
+_IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
+# Colours of the checkerboard, 8 bits per channel.
+_LIGHT = (237, 237, 230)
+_DARK = (41, 97, 191)
+# Squares along a side.
+_SQUARES = 16
+# Pixels along the side of a square.
+_PIXELS = 32
+
+
+@dataclass(frozen=True)
+class Texture:
+    """An image, as the bytes of its file.
+
+    Attributes
+    ----------
+    data : bytes
+    media_type, suffix : str
+        The format: ``image/png`` and ``.png``, or ``image/jpeg`` and ``.jpg``.
+    """
+
+    data: bytes
+    media_type: str
+    suffix: str
+
+
+def read_texture(path: str | os.PathLike[str]) -> Texture:
+    """Read a PNG or JPEG image.
+
+    Raises
+    ------
+    MeshFileError
+        If the file does not exist, or is neither PNG nor JPEG.
+    """
+    if (texture := texture_of(read_bytes(path))) is not None:
+        return texture
+    raise MeshFileError(path, "is not a PNG or JPEG image", remedy="save it as PNG or JPEG")
+
+
+def texture_of(data: bytes) -> Texture | None:
+    """Return the image of a file's bytes; None if it is neither PNG nor JPEG."""
+    return next((Texture(data, *kind) for start, kind in _IMAGE_TYPES.items() if data.startswith(start)), None)
+
+
+def checkerboard() -> Texture:
+    """Return a checkerboard texture that repeats without seams."""
+    dark = np.indices((_SQUARES, _SQUARES)).sum(axis=0) % 2 == 1
+    pixels = np.where(dark[..., None], _DARK, _LIGHT).astype(np.uint8).repeat(_PIXELS, axis=0).repeat(_PIXELS, axis=1)
+    side = _SQUARES * _PIXELS
+    # Each line starts with a filter byte; 0 means unfiltered.
+    lines = np.concatenate([np.zeros((side, 1), dtype=np.uint8), pixels.reshape(side, -1)], axis=1)
+    head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    parts = (b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b"")
+    (start, kind), *_ = _IMAGE_TYPES.items()
+    return Texture(start + b"".join(_chunk(*part) for part in parts), *kind)
+
+
+def _chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))

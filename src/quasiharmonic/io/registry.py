@@ -1,0 +1,181 @@
+"""The file formats: for each suffix, the functions that read and write it and what it can store.
+
+A new format is a module of `formats` (surfaces) or `fem` (finite elements) and an entry of `FORMATS`. Functions, help
+texts and error messages take the accepted suffixes from here. The module imports no reader, so that the command prints
+its help without NumPy.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from quasiharmonic.io.errors import MeshFileError, check_path
+
+if TYPE_CHECKING:
+    from quasiharmonic.io.fem.meshparts import MeshParts
+    from quasiharmonic.io.models.meshdata import MeshData
+    from quasiharmonic.io.models.textures import Texture
+    from quasiharmonic.util.arrays import FloatArray, IntArray
+
+FilePath = str | os.PathLike[str]
+#: Something that a format can do: the name of a field of `Format` that is set.
+Feature = Literal["read", "write_map", "seams", "image", "single_file", "read_elements", "encode_values"]
+
+# What files of a format without the feature cannot do, for error messages.
+_FAULTS: dict[Feature, str] = {
+    "read": "cannot be read as a surface",
+    "write_map": "cannot be written",
+    "seams": "cannot store seams",
+    "image": "cannot store an image",
+    "single_file": "may refer to further files",
+    "read_elements": "cannot be read as a mesh of finite elements",
+    "encode_values": "cannot store values per triangle",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """A file format.
+
+    Attributes
+    ----------
+    name : str
+        Name in help texts.
+    suffix : str
+        Suffix of its files, in lower case, with the dot.
+    read : callable, optional
+        Reads the surface of a file, with its map if there is one.
+    write_map : callable, optional
+        Writes a mesh that has a map.
+    list_losses : callable, optional
+        Returns descriptions of the data of a mesh that ``write_map`` drops. Required with ``write_map``.
+    seams : bool
+        Whether the file has texture coordinates, so that a vertex can have several.
+    image : bool
+        Whether the file can have a texture image.
+    companions : callable, optional
+        Returns the paths of further files that ``write_map`` writes for a texture.
+    single_file : bool
+        Whether a file that is read never refers to further files that are needed.
+    read_elements : callable, optional
+        Parses the bytes of a planar mesh of finite elements.
+    encode_values : callable, optional
+        Returns the bytes of a file with ``V, F, uv`` and columns of values per triangle.
+    """
+
+    name: str
+    suffix: str
+    read: Callable[[FilePath], MeshData] | None = None
+    write_map: Callable[[FilePath, MeshData], None] | None = None
+    list_losses: Callable[[MeshData], list[str]] | None = None
+    seams: bool = False
+    image: bool = False
+    companions: Callable[[FilePath, Texture], tuple[Path, ...]] | None = None
+    single_file: bool = True
+    read_elements: Callable[[bytes], MeshParts] | None = None
+    encode_values: Callable[[FloatArray, IntArray, FloatArray, Mapping[str, FloatArray]], bytes] | None = None
+
+
+def import_later(module: str, name: str) -> Callable[..., Any]:
+    """Return a function of a module of this package that is imported when it is first called."""
+
+    def call(*args: Any) -> Any:
+        return getattr(import_module(f"{__package__}.{module}"), name)(*args)
+
+    return call
+
+
+#: All formats, in the order of help texts and messages.
+FORMATS: tuple[Format, ...] = (
+    Format(
+        name="OBJ",
+        suffix=".obj",
+        read=import_later("formats.obj", "read_obj"),
+        write_map=import_later("formats.obj", "write_obj"),
+        list_losses=import_later("formats.obj", "not_in_obj"),
+        seams=True,
+        image=True,
+        companions=import_later("models.materials", "companions"),
+    ),
+    Format(
+        name="OFF",
+        suffix=".off",
+        read=import_later("formats.off", "read_off"),
+        write_map=import_later("formats.off", "write_off_map"),
+        list_losses=lambda mesh: ["the surface: only the map is written"],
+    ),
+    Format(
+        name="PLY",
+        suffix=".ply",
+        read=import_later("formats.ply", "read_ply"),
+        write_map=import_later("formats.ply", "write_ply"),
+        list_losses=import_later("formats.ply", "not_in_ply"),
+        seams=True,
+        encode_values=import_later("formats.per_triangle", "encode_ply"),
+    ),
+    *(
+        Format(
+            name=name,
+            suffix=suffix,
+            read=import_later("formats.gltf.reader", "read_gltf"),
+            write_map=import_later("formats.gltf.writer", "write_gltf"),
+            list_losses=import_later("formats.gltf.writer", "not_in_gltf"),
+            seams=True,
+            image=True,
+            single_file=suffix == ".glb",
+        )
+        for name, suffix in (("GLB", ".glb"), ("glTF", ".gltf"))
+    ),
+    Format(name="STL", suffix=".stl", read=import_later("formats.stl", "read_stl")),
+    Format(name="Gmsh (version 2 or 4)", suffix=".msh", read_elements=import_later("fem.gmsh", "read_gmsh")),
+    Format(name="legacy VTK", suffix=".vtk", read_elements=import_later("fem.legacy_vtk", "read_legacy_vtk")),
+    Format(name="VTU", suffix=".vtu", read_elements=import_later("fem.vtu", "read_vtu")),
+    Format(name="CSV", suffix=".csv", encode_values=import_later("formats.per_triangle", "encode_csv")),
+    Format(name="NPZ", suffix=".npz", encode_values=import_later("formats.per_triangle", "encode_npz")),
+)
+
+
+def find_format(path: FilePath, *needs: Feature) -> Format:
+    """Return the format of a file by the suffix of its name.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file, which need not exist.
+    *needs : str
+        What the format must be able to do.
+
+    Raises
+    ------
+    MeshFileError
+        If the suffix is unknown, or the format lacks a feature. The message lists the suffixes of all formats that have
+        the features.
+    """
+    check_path("path", path)
+    suffix = Path(path).suffix.lower()
+    form = next((form for form in FORMATS if form.suffix == suffix), None)
+    lacking = [need for need in needs if form is None or not getattr(form, need)]
+    if form is None or lacking:
+        fault = f"{suffix} files {_FAULTS[lacking[0]]}" if suffix else "has no suffix, so its format is unknown"
+        raise MeshFileError(path, fault, remedy=f"supported: {', '.join(suffixes(*needs))}")
+    return form
+
+
+def suffixes(*needs: Feature) -> tuple[str, ...]:
+    """Return the suffixes of all formats that have some features."""
+    return tuple(form.suffix for form in _formats(needs))
+
+
+def format_names(*needs: Feature) -> str:
+    """Return the names of all formats that have some features, as a list for help texts: "OBJ, PLY or STL"."""
+    *names, last = [form.name for form in _formats(needs)]
+    return f"{', '.join(names)} or {last}" if names else last
+
+
+def _formats(needs: tuple[Feature, ...]) -> list[Format]:
+    return [form for form in FORMATS if all(getattr(form, need) for need in needs)]

@@ -1,0 +1,253 @@
+"""What a mesh is: its components, boundaries and genus, and every class of defect that methods for surfaces reject."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.reference import flat_triangles
+from quasiharmonic.geometry.mesh.topology import Edges, boundary_edges, edges, find_twins, trace_loops
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.adapters.objects import MeshLike, mesh_triangles
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_integer,
+    check_range,
+    count_of,
+    triangle_array,
+    triangle_rows,
+    vertex_array,
+)
+
+# Maximum number of elements that the text lists for a class of defects.
+_LISTED = 5
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MeshReport:
+    """Topology and defects of a mesh, made by `inspect_mesh`.
+
+    Two triangles are joined at an edge that exactly they share, with opposite directions. Components, boundary loops
+    and genus are those of the surface that joined triangles form. At defects, that surface is cut.
+
+    Attributes
+    ----------
+    vertices, triangles : int
+    components : int
+        Connected parts of the surface.
+    closed : int
+        Components without boundary.
+    loops : int
+        Boundary loops.
+    genus : int
+        Number of handles, summed over the components.
+    inward : int
+        Closed components whose triangles face inwards (negative volume).
+    defects : dict of str to array
+        For each class of defects the indices of its elements, ascending: triangles and vertices (k,) int64, edges
+        (k, 2) int64. Empty arrays for classes that do not occur.
+    coincident : (k,) int64
+        Vertices at the position of an earlier vertex. They are not a defect: files often store seams this way.
+    """
+
+    vertices: int
+    triangles: int
+    components: int
+    closed: int
+    loops: int
+    genus: int
+    inward: int
+    defects: dict[str, IntArray]
+    coincident: IntArray
+
+    def __repr__(self) -> str:
+        return f"<MeshReport: {self.summary().partition(chr(10))[0]}>"
+
+    @property
+    def clean(self) -> bool:
+        """Whether the mesh has no defect."""
+        return not any(found.size for found in self.defects.values())
+
+    def summary(self) -> str:
+        """Return the topology in one sentence, and a table of the defects with the first elements of each class."""
+        lines = [
+            f"{count_of('vertex', 'vertices', self.vertices)}, {count_of('triangle', 'triangles', self.triangles)}, "
+            f"{count_of('component', 'components', self.components)} ({self.closed} closed), "
+            f"{count_of('boundary loop', 'boundary loops', self.loops)}, genus {self.genus}"
+        ]
+        if self.inward:
+            inward = count_of("closed component", "closed components", self.inward)
+            lines.append(f"{inward} with triangles facing inwards")
+        if self.coincident.size:
+            lines.append(
+                f"{count_of('vertex', 'vertices', self.coincident.size)} at the position of an earlier vertex, "
+                f"first {_first(self.coincident)}"
+            )
+        return "\n".join([*lines, *(tabulate_elements("defect", self.defects) or ["no defects"])])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report for JSON."""
+        return {
+            "vertices": self.vertices,
+            "triangles": self.triangles,
+            "components": self.components,
+            "closed_components": self.closed,
+            "boundary_loops": self.loops,
+            "genus": self.genus,
+            "inward_components": self.inward,
+            "coincident_vertices": self.coincident.tolist(),
+            "defects": {name: found.tolist() for name, found in self.defects.items()},
+        }
+
+
+def tabulate_elements(title: str, classes: dict[str, IntArray]) -> list[str]:
+    """Return the lines of a table with the number and the first elements of each class; none if all are empty."""
+    rows = [(name, found) for name, found in classes.items() if found.size]
+    if not rows:
+        return []
+    width = max(len(title), *(len(name) for name, _ in rows))
+    table = [f"{name:<{width}} {len(found):>9,}  {_first(found)}" for name, found in rows]
+    return [f"{title:<{width}} {'count':>9}  first", *table]
+
+
+def boundary_loops(F: ArrayLike | MeshLike, n: int | None = None) -> list[IntArray]:
+    """Return the vertices of each boundary loop, in order with the surface to the left.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int, or a mesh
+        Triangles, consistently oriented.
+    n : int, optional
+        Number of vertices. Default: the largest index plus one.
+
+    Returns
+    -------
+    list of (k,) int64
+        Each loop starts at its smallest vertex. It runs counterclockwise around the outside of a planar mesh and
+        clockwise around its holes. Loops are sorted by their first vertex.
+
+    Raises
+    ------
+    ValueError
+        If the array has the wrong shape, an index is out of range, or the boundary does not form loops, because
+        surfaces touch at a vertex or orientations differ; names the vertices.
+    """
+    triangles = triangle_rows(mesh_triangles(F))
+    if n is None:
+        n = int(triangles.max(initial=-1)) + 1
+    check_integer("n", n, minimum=0)
+    check_range("F", triangles, n)
+    return trace_loops(boundary_edges(triangles, n))
+
+
+@accepts_mesh
+def inspect_mesh(V: ArrayLike, F: ArrayLike) -> MeshReport:
+    """Return topology and defects of any triangles; nothing is rejected but malformed arrays.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Positions.
+    F : (f, 3) array of int
+        Triangles.
+
+    Returns
+    -------
+    MeshReport
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape, a position is not finite, an index is out of range, or there are no triangles.
+
+    Examples
+    --------
+    >>> from quasiharmonic.surfaces import annulus
+    >>> report = inspect_mesh(*annulus(8))
+    >>> report.clean, report.components, report.loops, report.genus
+    (True, 1, 2, 0)
+    """
+    V = vertex_array(V)
+    F = triangle_array(F, len(V))
+    collapsed = (F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0])
+    surface = F[~collapsed]
+    split, part = fans(surface)
+    defects = _defects(V, F, collapsed, split)
+    rim = edges(split, surface.size).boundary
+    loops = trace_loops(rim)
+    closed = np.ones(int(part.max(initial=-1)) + 1, dtype=bool)
+    of_vertex = np.zeros(surface.size, dtype=np.int64)
+    of_vertex[split] = part[:, None]
+    closed[of_vertex[rim[:, 0]]] = False
+    vertices, sides = int(split.max(initial=-1)) + 1, (3 * len(split) + len(rim)) // 2
+    genus = (2 * closed.size - len(loops) - (vertices - sides + len(split))) // 2
+    inward = closed & (_volumes(V, surface, part, closed.size) < 0)
+    return MeshReport(
+        vertices=len(V),
+        triangles=len(F),
+        components=closed.size,
+        closed=int(np.count_nonzero(closed)),
+        loops=len(loops),
+        genus=genus,
+        inward=int(np.count_nonzero(inward)),
+        defects=defects,
+        coincident=_coincident(V),
+    )
+
+
+def _defects(V: FloatArray, F: IntArray, collapsed: BoolArray, split: IntArray) -> dict[str, IntArray]:
+    """Return the elements of every class of defects; ``split`` are the fans of the triangles that are not collapsed."""
+    repeated = np.flatnonzero((find_twins(F) < np.arange(len(F))) & ~collapsed)
+    flat = flat_triangles(V, F)
+    found = edges(F, len(V))
+    used = np.zeros(len(V), dtype=bool)
+    used[F] = True
+    return {
+        "triangles that use a vertex twice": np.flatnonzero(collapsed),
+        "triangles repeated": repeated,
+        "triangles without area": flat[~collapsed[flat]],
+        "edges of three or more triangles": found.nonmanifold,
+        "edges with mixed winding": found.inconsistent[found.inconsistent[:, 0] != found.inconsistent[:, 1]],
+        "vertices where surfaces touch": _touching(F[~collapsed], split, len(V), found),
+        "vertices without triangle": np.flatnonzero(~used),
+    }
+
+
+def _touching(F: IntArray, split: IntArray, n: int, found: Edges) -> IntArray:
+    """Return vertices with several fans of triangles that no defective edge explains, ascending."""
+    vertex_of_fan = np.empty(int(split.max(initial=-1)) + 1, dtype=np.int64)
+    vertex_of_fan[split] = F
+    several = np.bincount(vertex_of_fan, minlength=n) > 1
+    several[found.nonmanifold] = False
+    several[found.inconsistent] = False
+    return np.flatnonzero(several)
+
+
+def _volumes(V: FloatArray, F: IntArray, part: IntArray, count: int) -> FloatArray:
+    """Return six times the signed volume of each component, in an arbitrary unit; zeros for a planar mesh."""
+    if V.shape[1] == 2:
+        return np.zeros(count)
+    points = V - V.mean(axis=0)
+    points = points / max(float(np.abs(points).max()), np.finfo(float).tiny)
+    a, b, c = (points[F[:, k]] for k in range(3))
+    volumes: FloatArray = np.bincount(part, (a * np.cross(b, c)).sum(axis=1), minlength=count).astype(np.float64)
+    return volumes
+
+
+def _coincident(V: FloatArray) -> IntArray:
+    """Return vertices at exactly the position of an earlier vertex, ascending."""
+    order = np.lexsort((np.arange(len(V)), *V.T))
+    same = (V[order[1:]] == V[order[:-1]]).all(axis=1)
+    return np.sort(order[1:][same])
+
+
+def _first(found: IntArray) -> str:
+    """Name the first elements."""
+    listed = (str(tuple(one)) if isinstance(one, list) else str(one) for one in found[:_LISTED].tolist())
+    return ", ".join(listed) + (", …" if len(found) > _LISTED else "")

@@ -1,0 +1,281 @@
+"""Run the first stage of many small searches in one batch (`quasiharmonic.solver.field.objective_batch`).
+
+VectorAdam treats each triangle separately, so up to rounding every search visits the same maps as it would alone.
+Solved problems leave the batch. After the first iterations the unsolved problems of several batches are joined, and a
+batch is compacted when half of it is solved. After the stage, each unsolved search continues separately.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+from typing import NamedTuple, TypeGuard
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.batched_loops import certify_each
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.objective_batch import MapBatch, ObjectiveBatch, Patterns
+from quasiharmonic.solver.field.tensor import Parameterisation, TensorField
+from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.solver.methods.relocation import RetrySchedule, relocate_each
+from quasiharmonic.solver.methods.vector_adam import AdamState
+from quasiharmonic.solver.search.options import SearchOptions
+from quasiharmonic.solver.search.search import Search
+from quasiharmonic.solver.search.solving import result_of
+from quasiharmonic.solver.search.stage_run import Round, StageRun, visit_rounds
+from quasiharmonic.solver.search.stages import Stages
+from quasiharmonic.solver.search.strategy import stages_of
+from quasiharmonic.util.arrays import ComplexArray
+
+# Meshes with more triangles are solved separately: the overhead per NumPy call is then negligible.
+SMALL = 4_000
+# Maximum number of triangles of a batch. Twice as many are not faster per triangle, because the arrays exceed the
+# cache. At this size QDLDL is still the default solver if MKL is not installed.
+GROUP = 28_000
+# Iterations before batches are joined. After two, nine in ten easy problems are solved; the rest of one batch would be
+# too small.
+_ITERATIONS_APART = 2
+
+
+def group_by_first_stage(problems: Mapping[int, Problem], strategy: str | Stages) -> list[tuple[VectorAdam, list[int]]]:
+    """Return the first stages of small problems that can run in a batch, each with the keys of its problems.
+
+    Other problems are left out.
+    """
+    alike: list[tuple[VectorAdam, list[int]]] = []
+    for k, problem in problems.items():
+        if len(problem.F) > SMALL or not problem.encloses_area:
+            continue
+        descent = stages_of(strategy, problem)[0]
+        if not _is_plain(descent) or problem.reference not in (None, "equilateral"):
+            continue
+        for other, keys in alike:
+            if other == descent:
+                keys.append(k)
+                break
+        else:
+            alike.append((descent, [k]))
+    return alike
+
+
+def _is_plain(stage: object) -> TypeGuard[VectorAdam]:
+    """Whether a stage can run in a batch."""
+    if not isinstance(stage, VectorAdam) or type(stage) is not VectorAdam:
+        return False
+    return stage.functional == "dirichlet" and stage.reference == "equilateral"
+
+
+def run_first_stage(
+    problems: Sequence[Problem], descent: VectorAdam, patterns: Patterns, options: SearchOptions
+) -> list[MapResult | Search | None]:
+    """Run the first stage of many searches in batches.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        Their targets enclose an area; their reference triangles are unset or equilateral.
+    descent : VectorAdam
+        Descent of V₃ with equilateral reference triangles.
+    patterns : Patterns
+        Cache of the calling thread.
+    options : SearchOptions
+        Without ``start`` and ``record_every``.
+
+    Returns
+    -------
+    list
+        For each problem its result, or the search after the stage. None if rounding broke the factorisation of its
+        batch; a new search must then begin.
+    """
+    members = []
+    for problem in problems:
+        run = Search(problem, options).begin_in_batch(descent)
+        members.append(_Member(run, descent.objective(problem, options.linear_solver), RetrySchedule()))
+    end, batches = descent.iterations + 1, []
+    for first, last in _divide([len(problem.F) for problem in problems]):
+        xi = np.zeros(sum(len(problem.F) for problem in problems[first:last]), dtype=np.complex128)
+        batch = _BatchDescent(members[first:last], xi, descent.make_state(xi.size), descent, patterns)
+        batch.run(range(min(_ITERATIONS_APART, end)))
+        batches.append(batch)
+    for batch in _join(batches):
+        batch.run(range(_ITERATIONS_APART, end))
+    runs = [member.run for member in members]
+    for run in runs:
+        run.end(Status.OUT_OF_ITERATIONS)
+    results = iter(_certify([run for run in runs if run.status is Status.INJECTIVE]))
+    found: list[MapResult | Search | None] = []
+    for run in runs:
+        if run.status is Status.INJECTIVE:
+            found.append(next(results))
+        else:
+            found.append(None if run.status is Status.UNSOLVABLE else run.search)
+    return found
+
+
+class _Member(NamedTuple):
+    """One search of a batch, its objective, and its schedule of relocation."""
+
+    run: StageRun
+    objective: Objective
+    retries: RetrySchedule
+
+    @property
+    def is_running(self) -> bool:
+        """Whether its stage still runs."""
+        return self.run.status is None
+
+    @property
+    def size(self) -> int:
+        """Number of triangles."""
+        return len(self.objective.problem.F)
+
+
+class _BatchDescent:
+    """`VectorAdam.iterates` on many meshes at once.
+
+    ``xi`` (f,) and ``adam`` have the variables and the state of the triangles of all members, one mesh after another.
+    """
+
+    def __init__(
+        self, members: Sequence[_Member], xi: ComplexArray, adam: AdamState, descent: VectorAdam, patterns: Patterns
+    ) -> None:
+        self.members, self.xi, self.adam, self.descent, self.patterns = members, xi, adam, descent, patterns
+
+    def run(self, iterations: range) -> None:
+        """Descend until all stages have ended or the iterations are over.
+
+        If a factorisation fails because of rounding, all stages that still run end as unsolvable.
+        """
+        try:
+            visit_rounds(self._rounds(iterations))
+        except NotPositiveDefinite:
+            for member in self.members:
+                if member.is_running:
+                    member.run.status = Status.UNSOLVABLE
+
+    def _rounds(self, iterations: range) -> Iterator[Round]:
+        """Yield the next maps of all stages that still run."""
+        since, batch = time.perf_counter(), self._combine()
+        for iteration in iterations:
+            is_running = [k for k, member in enumerate(self.members) if member.is_running]
+            maps = batch.evaluate(self.xi)
+            yield [(self.members[k].run, batch.iterate(maps, k)) for k in is_running]
+            if self.descent.relocation and iteration < self.descent.iterations:
+                yield self._relocate(batch, maps)
+            # The time of one problem within an iteration cannot be measured; divide it equally.
+            now = time.perf_counter()
+            for k in is_running:
+                self.members[k].run.seconds += (now - since) / len(is_running)
+            since = now
+            left = sum(member.is_running for member in self.members)
+            if not left:
+                return
+            self.xi = batch.step(maps, self.adam.step(maps.gradient))
+            if self._is_too_large(left, iterations.stop - iteration - 1):
+                (fewer,) = _join([self])
+                self.members, self.xi, self.adam = fewer.members, fewer.xi, fewer.adam
+                batch = self._combine()
+
+    def _combine(self) -> ObjectiveBatch:
+        """Return the objectives of all members as a batch."""
+        batch = ObjectiveBatch([member.objective for member in self.members], self.patterns)
+        for member in self.members:
+            member.run.search.linear_solver = batch.laplacian.solver.name
+        return batch
+
+    def _relocate(self, batch: ObjectiveBatch, maps: MapBatch) -> Round:
+        """Relocate the vertices of inverted triangles where a try is due; return the maps without any left."""
+        due = [
+            k
+            for k, (member, sums) in enumerate(zip(self.members, maps.sums, strict=True))
+            if member.is_running and member.retries.is_due(sums.inverted)
+        ]
+        if not due:
+            return []
+        F = np.concatenate([batch.F[batch.triangles_of(k)] for k in due])
+        mesh = np.repeat(np.arange(len(due)), [self.members[k].size for k in due])
+        w, solved = relocate_each(F, maps.w, batch.fixed, mesh)
+        good = [k for k, is_good in zip(due, solved.tolist(), strict=True) if is_good]
+        if not good:
+            return []
+        return [(self.members[k].run, here) for k, here in zip(good, batch.of_maps(good, w), strict=True)]
+
+    def _is_too_large(self, left: int, iterations: int) -> bool:
+        """Whether compacting the batch pays, given the number of running members and the iterations to come."""
+        if _have_one_mesh(self.members):
+            return iterations > 0 and 5 * _next_power_of_two(left) <= 3 * len(self.members)
+        # The analysis of a pattern takes as long as two iterations.
+        return iterations > 1 and 2 * left <= len(self.members)
+
+
+def _join(batches: Sequence[_BatchDescent]) -> list[_BatchDescent]:
+    """Join the running members of batches that have made equally many iterations into as few batches as possible."""
+    members = [member for batch in batches for member in batch.members]
+    chosen = [k for k, member in enumerate(members) if member.is_running]
+    if not chosen:
+        return []
+    if _have_one_mesh(members):
+        # Use a power of two as count, so that batches of one mesh recur in equal sizes and their pattern is cached.
+        done = (k for k, member in enumerate(members) if not member.is_running)
+        chosen = sorted([*chosen, *islice(done, _next_power_of_two(len(chosen)) - len(chosen))])
+    ends = np.cumsum([member.size for member in members])
+    xi, adam = np.concatenate([batch.xi for batch in batches]), AdamState.join([batch.adam for batch in batches])
+    descent, patterns, joined = batches[0].descent, batches[0].patterns, []
+    for first, last in _divide([members[k].size for k in chosen]):
+        part = chosen[first:last]
+        triangles = np.concatenate([np.arange(ends[k] - members[k].size, ends[k]) for k in part])
+        own = [members[k] for k in part]
+        joined.append(_BatchDescent(own, xi[triangles], adam.part(triangles), descent, patterns))
+    return joined
+
+
+def _have_one_mesh(members: Sequence[_Member]) -> bool:
+    """Whether all members have the same domain."""
+    return len({member.objective.problem.domain for member in members}) == 1
+
+
+def _next_power_of_two(count: int) -> int:
+    """Return the smallest power of two that is not below ``count``."""
+    return 1 << (count - 1).bit_length()
+
+
+def _divide(sizes: Sequence[int]) -> list[tuple[int, int]]:
+    """Return start and end indices of consecutive portions of at most ``GROUP`` triangles."""
+    portions, first, total = list[tuple[int, int]](), 0, 0
+    for k, size in enumerate(sizes):
+        if k > first and total + size > GROUP:
+            portions.append((first, k))
+            first, total = k, 0
+        total += size
+    return [*portions, (first, len(sizes))] if sizes else []
+
+
+def _certify(runs: Sequence[StageRun]) -> list[MapResult]:
+    """Certify the maps of solved searches together and return the results."""
+    searches = [run.search for run in runs]
+    problems = [search.problem for search in searches]
+    uv = [search.problem.positions(search.best_map) for search in searches]
+    certificates = certify_each([problem.F for problem in problems], uv, [problem.domain.loops for problem in problems])
+    mu = _beltrami_coefficients([search.best_field for search in searches if search.best_field is not None])
+    parts = zip(runs, uv, certificates, mu, strict=True)
+    return [
+        result_of(run.search, positions, certificate, own, run.seconds) for run, positions, certificate, own in parts
+    ]
+
+
+def _beltrami_coefficients(fields: Sequence[TensorField]) -> list[ComplexArray]:
+    """Return the Beltrami coefficients of each field, computed together."""
+    mu = [np.empty(0, dtype=np.complex128)] * len(fields)
+    alike: dict[Parameterisation, list[int]] = {}
+    for k, field in enumerate(fields):
+        alike.setdefault(field.parameterisation, []).append(k)
+    for parameterisation, indices in alike.items():
+        whole = parameterisation.field(np.concatenate([fields[k].xi for k in indices])).mu
+        for k, own in zip(indices, np.split(whole, np.cumsum([fields[k].xi.size for k in indices])[:-1]), strict=True):
+            mu[k] = own.copy()
+    return mu

@@ -1,0 +1,207 @@
+"""Boundary vertices with chosen target positions: chosen by the user, or by matching corners of loop and contour."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.targets.boundary.correspondence import arc_parameters, points_at
+from quasiharmonic.targets.boundary.turning import BoundaryLoop, mean_turns
+from quasiharmonic.targets.outlines.contours import as_complex, turns
+from quasiharmonic.targets.outlines.contours import corners as corners_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, describe, index_array, names_of
+
+Corners = Sequence[int] | Mapping[int, int | ArrayLike]
+# Maximum distance from the outline for a point to count as on it, as a share of the outline's larger side.
+_ON_OUTLINE = 1e-6
+# Maximum number of corners that a message lists.
+_MAX_LISTED = 12
+# Maximum loss of similarity, relative to the best value (2 at most), that is accepted for an upright map.
+_SIMILAR = 0.1
+
+
+class Pins:
+    """Boundary vertices with target positions chosen by the user, as ``corners`` in `boundary_to`.
+
+    The ``contours`` have unit scale, with the binary ``exponent`` of the unit, and start at their first corners.
+    ``backwards`` tells which are reversed relative to the user's. ``n`` is the number of vertices of the surface.
+    ``contour_of`` maps the loops for which the user gave points to their contours.
+    """
+
+    def __init__(
+        self,
+        corners: Corners | None,
+        loops: list[IntArray],
+        contours: list[FloatArray],
+        backwards: list[bool],
+        corner_angle: float,
+        exponent: int,
+        n: int,
+    ) -> None:
+        self.loops, self.contours, self.exponent = loops, contours, exponent
+        self.sharp = [corners_of(c, corner_angle) for c in contours]
+        # An outline without corners uses its first point as its only corner.
+        self.sharp = [marks if marks.size else np.zeros(1, dtype=np.int64) for marks in self.sharp]
+        # In the user's order, starting with the first.
+        turned = zip(self.sharp, backwards, strict=True)
+        self.sharp = [np.roll(marks[::-1], 1) if back else marks for marks, back in turned]
+        self.contour_of: dict[int, int] = {}
+        # For every loop, a dict from position in the loop to target: a corner's number, or a parameter along the
+        # contour.
+        self.wanted: dict[int, dict[int, int | float]] = {}
+        self.all_corners = corners is not None and not isinstance(corners, Mapping)
+        if corners is None:
+            return
+        if not isinstance(corners, Iterable):
+            raise ValueError(f'corners are boundary vertices or "auto", not {describe(corners)}')
+        pairs = list(corners.items()) if isinstance(corners, Mapping) else [(v, k) for k, v in enumerate(corners)]
+        self._check_vertices([vertex for vertex, _ in pairs], n)
+        where = {int(v): (i, k) for i, loop in enumerate(loops) for k, v in enumerate(loop.tolist())}
+        for vertex, goal in pairs:
+            loop, position = where[int(vertex)]
+            if isinstance(goal, int | np.integer):
+                self.wanted.setdefault(loop, {})[position] = int(goal)
+                continue
+            contour, along = self._nearest(np.asarray(goal, dtype=np.float64), int(vertex))
+            self.wanted.setdefault(loop, {})[position] = along
+            if self.contour_of.setdefault(loop, contour) != contour:
+                raise ValueError(
+                    f"vertex {vertex} goes to a different contour than other vertices of its boundary loop"
+                )
+        if self.all_corners and len(self.wanted) > 1:
+            raise ValueError(
+                f"corners in order must lie on one boundary loop, but {len(self.wanted)} loops have some: "
+                "say which corner each vertex goes to"
+            )
+        if len(set(self.contour_of.values())) < len(self.contour_of):
+            raise ValueError("two boundary loops have vertices that go to the same contour of the outline")
+
+    def _check_vertices(self, chosen: list[Any], n: int) -> None:
+        vertices = index_array("corners", chosen)
+        if vertices.ndim != 1 or not vertices.size:
+            raise ValueError("corners must name boundary vertices by their integer indices")
+        check_range("corners", vertices, n)
+        alone, times = np.unique(vertices, return_counts=True)
+        if (times > 1).any():
+            raise ValueError(f"corners name {names_of('vertex', 'vertices', alone[times > 1])} more than once")
+        inner = np.setdiff1d(alone, np.concatenate(self.loops))
+        if inner.size:
+            raise ValueError(f"{names_of('vertex', 'vertices', inner)} in corners, but not on the boundary")
+
+    def along(self, loop: int, contour: int) -> list[tuple[int, float]]:
+        """Return (position in the loop, parameter along its contour) for each pin, in order around the contour."""
+        wanted = self.wanted.get(loop, {})
+        marks, t = self.sharp[contour], arc_parameters(self.contours[contour])
+        if self.all_corners and wanted and len(wanted) != len(marks):
+            raise ValueError(
+                f"{len(wanted)} corner {'vertex' if len(wanted) == 1 else 'vertices'} for a contour with {len(marks)} "
+                f"{'corner' if len(marks) == 1 else 'corners'} ({self._listed(contour)}): name one for each, or say "
+                "which corner each goes to"
+            )
+        names = self.loops[loop]
+        found = []
+        for position, goal in wanted.items():
+            if isinstance(goal, int):
+                if not 0 <= goal < len(marks):
+                    last = len(marks) - 1
+                    raise ValueError(
+                        f"vertex {names[position]} goes to corner {goal}, but the contour has corners 0 to {last}: "
+                        f"{self._listed(contour)}"
+                    )
+                goal = float(t[marks[goal]])
+            found.append((goal, position))
+        found.sort()
+        places, positions = [goal for goal, _ in found], np.array([position for _, position in found], dtype=np.int64)
+        for one, other in itertools.pairwise(found):
+            if one[0] == other[0]:
+                raise ValueError(
+                    f"vertices {names[one[1]]} and {names[other[1]]} have the same target position on the outline"
+                )
+        if positions.size and (np.diff((positions - positions[0]) % len(names)) < 0).any():
+            there = positions[np.argsort((positions - positions[0]) % len(names))]
+            against = (np.diff((positions[::-1] - positions[-1]) % len(names)) > 0).all()
+            remedy = ": reverse their order" if against else ""
+            raise ValueError(
+                f"corner vertices {', '.join(map(str, names[positions]))} follow each other in this order around the "
+                f"outline, but in the order {', '.join(map(str, names[there]))} along the boundary, which has the "
+                f"surface to its left{remedy}"
+            )
+        return list(zip(positions.tolist(), places, strict=True))
+
+    def _listed(self, contour: int) -> str:
+        """List the corners of a contour with their numbers, for messages."""
+        points = np.ldexp(self.contours[contour][self.sharp[contour]], self.exponent).tolist()
+        named = [f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)]
+        return ", ".join(named[:_MAX_LISTED]) + (", …" if len(named) > _MAX_LISTED else "")
+
+    def _nearest(self, point: FloatArray, vertex: int) -> tuple[int, float]:
+        """Return the contour on which a point lies and the parameter along it."""
+        if point.shape != (2,) or not np.isfinite(point).all():
+            raise ValueError(f"vertex {vertex} goes to a corner's number or a point (x, y), not to {point.tolist()}")
+        # Clip, so that a point far from a tiny outline does not overflow.
+        with np.errstate(over="ignore"):
+            near = np.clip(np.ldexp(point, -self.exponent), -1e9, 1e9)
+        least = _ON_OUTLINE * float(np.ptp(self.contours[0], axis=0).max())
+        best = (np.inf, 0, 0.0)
+        for c, contour in enumerate(self.contours):
+            t = np.append(arc_parameters(contour), 1.0)
+            from_points = np.linalg.norm(contour - near, axis=1)
+            k = int(np.argmin(from_points))
+            if from_points[k] <= least:
+                # Snap exactly to a contour point within the tolerance.
+                return c, float(t[k])
+            side = np.roll(contour, -1, axis=0) - contour
+            share = np.clip(((near - contour) * side).sum(axis=1) / (side**2).sum(axis=1), 0, 1)
+            away = np.linalg.norm(contour + share[:, None] * side - near, axis=1)
+            k = int(np.argmin(away))
+            best = min(best, (float(away[k]), c, float(t[k] + share[k] * (t[k + 1] - t[k])) % 1.0))
+        off, c, along = best
+        if off > least:
+            x, y = np.ldexp(points_at(self.contours[c], np.array([along]))[0], self.exponent)
+            raise ValueError(
+                f"vertex {vertex} goes to ({point[0]:g}, {point[1]:g}), {np.ldexp(off, self.exponent):.3g} off the "
+                f"outline at ({x:g}, {y:g})"
+            )
+        return c, along
+
+
+def pins_by_angle(
+    loop: BoundaryLoop, flat: FloatArray, contour: FloatArray, corner_angle: float
+) -> list[tuple[int, float]]:
+    """Find as many corners of a boundary loop as a contour has, and assign them to the contour's corners.
+
+    The corners keep their cyclic order, so only the first one must be chosen. Turning angles and the lengths between
+    corners determine it: convex corners go to convex ones, long sides to long ones. If several choices are about
+    equally good, as for a square, the one with the least rotation of ``flat`` (l, 2), the projected loop, is taken. The
+    result has positions in the loop and parameters from 0 to 1 along the contour, in order around. ValueError when the
+    loop has fewer vertices than the contour has corners.
+    """
+    sharp = corners_of(contour, corner_angle)
+    if not sharp.size:
+        return []
+    positions, turning = loop.corners(len(sharp))
+    sides = np.linalg.norm(np.roll(contour, -1, axis=0) - contour, axis=1)
+    ends = arc_parameters(contour)[sharp]
+    lengths = np.cumsum(loop.lengths / loop.lengths.max())
+    runs = lengths[positions - 1] / lengths[-1]
+    alike = _likeness(turning + 0j, mean_turns(sides, turns(contour), sharp) + 0j)
+    alike += _likeness(_gaps(runs) + 0j, _gaps(ends) + 0j)
+    seen, goal = as_complex(flat[positions]), as_complex(contour[sharp])
+    upright = _likeness(seen - seen.mean(), goal - goal.mean())
+    first = int(np.argmax(np.where(alike >= alike.max() - _SIMILAR, upright, -np.inf)))
+    return list(zip(np.roll(positions, -first).tolist(), ends.tolist(), strict=True))
+
+
+def _gaps(along: FloatArray) -> FloatArray:
+    """Distances from each of some parameters on a closed curve of length 1 to the next."""
+    return np.asarray((np.roll(along, -1) - along) % 1.0)
+
+
+def _likeness(one: np.ndarray, other: np.ndarray) -> FloatArray:
+    """Correlation of two cyclic complex sequences, for each cyclic shift of the first; at most 1."""
+    size = np.linalg.norm(one) * np.linalg.norm(other)
+    return np.array([np.vdot(other, np.roll(one, -k)).real for k in range(len(one))]) / (size or 1.0)

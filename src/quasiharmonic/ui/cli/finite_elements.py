@@ -1,0 +1,106 @@
+"""Planar finite-element meshes as inputs of ``check``, ``measure`` and ``plot``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.io.fem.files import FemMesh
+
+
+def has_elements(path: Path) -> bool:
+    """Return whether a file is a finite-element mesh by its suffix."""
+    from quasiharmonic.io.registry import suffixes
+
+    return path.suffix.lower() in suffixes("read_elements")
+
+
+def check(options: argparse.Namespace) -> int:
+    """Report what the mesh is and which elements are inverted; return the exit status of ``qhm check``."""
+    from quasiharmonic.geometry.mesh.elements import name_elements
+    from quasiharmonic.io.fem.files import read_fem
+    from quasiharmonic.problem.inspection import inspect_mesh
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.util.arrays import count_of
+
+    _reject(options, ("precision", "--as"), ("any_triangulation", "--any-triangulation"), ("fixed", "--fixed"))
+    mesh = read_fem(options.input)
+    triangles, _, inverted = _split(mesh)
+    with report.about(options.input):
+        found = inspect_mesh(mesh.points, triangles)
+    elements = count_of("element", "elements", len(mesh.F))
+    verdict = f"inverted: {name_elements(mesh.F, inverted)}" if inverted.size else f"None of {elements} is inverted."
+    facts = {
+        "input": str(options.input),
+        "mesh": found.to_dict(),
+        "elements": len(mesh.F),
+        "injective": not inverted.size,
+        "inverted": inverted.tolist(),
+    }
+    text = f"{options.input}: {elements}, split into triangles: {found.summary()}\n{verdict}"
+    report.emit_verdict(facts, options.json, text)
+    return 1 if inverted.size else 0
+
+
+def measure(options: argparse.Namespace) -> int:
+    """Report the quality of the elements; return the exit status of ``qhm measure``."""
+    from quasiharmonic.apps.mesh_motion.quality import element_quality
+    from quasiharmonic.io.fem.files import read_fem
+    from quasiharmonic.ui.cli import report
+
+    _reject(options, ("export", "--export"), ("distances", "--distances"))
+    mesh = read_fem(options.input)
+    quality = element_quality(mesh.F, mesh.points)
+    facts: dict[str, Any] = {
+        "input": str(options.input),
+        "elements": len(mesh.F),
+        "quality": {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())},
+    }
+    text = (
+        f"quality of {len(mesh.F)} elements (1: equilateral or square, 0: no area, negative: inverted): "
+        f"mean {quality.mean():.4g}, minimum {quality.min():.4g} at element {quality.argmin()}"
+    )
+    report.emit_verdict(facts, options.json, text)
+    return 0
+
+
+def plot(options: argparse.Namespace) -> int:
+    """Draw the elements, inverted ones in red; return the exit status of ``qhm plot``."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.io.fem.files import read_fem
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.ui.plot import save_map_figure
+
+    if options.kind not in (None, "map"):
+        raise ValueError(f"--kind {options.kind} needs a surface with a map: omit it for {options.input.suffix} files")
+    _reject(options, ("texture", "--texture"), ("measure", "--measure"))
+    mesh = read_fem(options.input)
+    triangles, of, inverted = _split(mesh)
+    V, F, uv = io.without_idle(mesh.points, triangles, mesh.points)
+    save_map_figure(options.output, V, F, uv, inverted=np.flatnonzero(np.isin(of, inverted)))
+    with report.after_writing(options.output):
+        print(f"wrote {options.output}", flush=True)
+    return 0
+
+
+def _split(mesh: FemMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return triangles that cover the elements, the element of each, and the inverted elements."""
+    from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+    from quasiharmonic.geometry.mesh.elements import covering_triangles
+
+    triangles, of = covering_triangles(mesh.F)
+    return triangles, of, inverted_elements(mesh.F, mesh.points)
+
+
+def _reject(options: argparse.Namespace, *names: tuple[str, str]) -> None:
+    """Raise ValueError for options that have no meaning for finite-element meshes."""
+    for name, option in names:
+        if getattr(options, name) not in (None, False):
+            raise ValueError(f"{option} needs a surface with a map: omit it for {options.input.suffix} files")

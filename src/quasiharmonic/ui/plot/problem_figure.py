@@ -1,0 +1,82 @@
+"""Figures of problems: a surface beside the target positions of its boundary and pins, and the obstructions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.ui.plot.canvas import BORDER, INK, RED, as_mesh, caption, fit, new_figure, paint_surface, panels
+from quasiharmonic.ui.plot.shading import drawable, view
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, fixed_vertices, index_array, target_positions
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@accepts_mesh
+def plot_problem(
+    V: ArrayLike,
+    F: ArrayLike,
+    fixed: ArrayLike,
+    target: ArrayLike,
+    *,
+    vertices: ArrayLike = (),
+    edges: ArrayLike = (),
+) -> Figure:
+    """Draw a surface beside the targets of its fixed vertices: boundary edges as lines, pins as dots.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+    F : (f, 3) array of int
+    fixed : (k,) array of int
+        The boundary and any pins.
+    target : (k, 2) array
+        Target positions of the fixed vertices.
+    vertices : (a,) array of int
+    edges : (b, 2) array of int
+        Vertices and edges to mark in red, as a diagnosis lists them. In the plane only fixed ones are marked.
+
+    Returns
+    -------
+    matplotlib Figure
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape, contains an invalid index, or is not finite.
+    """
+    rest, F = as_mesh(V, F)
+    held = fixed_vertices(fixed, len(rest))
+    places = np.full((len(rest), 2), np.nan)
+    places[held] = drawable(target_positions(target, len(held)))
+    border, marked = boundary_edges(F, len(rest)), index_array("vertices", vertices)
+    pairs = index_array("edges", edges).reshape(-1, 2)
+    check_range("vertices", marked, len(rest))
+    check_range("edges", pairs, len(rest))
+    figure, seen = new_figure((8, 4.5)), view(rest, F)
+    surface, plane = panels(figure, 2)
+    paint_surface(surface, seen, F, seen.color)
+    caption(surface, f"surface: {len(F):,} triangles")
+    fit(plane, places[held])
+    _lines(plane, places, border, INK, BORDER)
+    pins = np.setdiff1d(held, border)
+    plane.plot(*places[pins].T, "o", markersize=5, color="white", mec=INK, mew=1.4, zorder=5)
+    caption(plane, f"where {len(held):,} vertices go")
+    for ax, points in ((surface, seen.points), (plane, places)):
+        _lines(ax, points, pairs, RED, 2 * BORDER)
+        ax.plot(*points[marked].T, "o", markersize=5, color=RED, zorder=7)
+    return figure
+
+
+def _lines(ax: Axes, points: FloatArray, edges: IntArray, color: tuple[float, float, float], width: float) -> None:
+    """Draw the edges whose two ends have positions."""
+    ends = points[edges].reshape(-1, 2, 2)
+    gap = np.full((len(ends), 1, 2), np.nan)
+    x, y = np.concatenate([ends, gap], axis=1).reshape(-1, 2).T
+    ax.plot(x, y, color=color, linewidth=width, solid_capstyle="round", zorder=6)

@@ -1,0 +1,159 @@
+"""Numbers of a report: records as arrays, and their statistics."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.problems import MARKER
+from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.util.arrays import FloatArray
+
+PHASES = "read", "setup", "map", "polish", "write", "measure"
+
+
+@dataclass(frozen=True)
+class Run:
+    """Records of a run, or of another program on the same problems."""
+
+    name: str  # Name on the page
+    rows: list[Record]  # The records
+    results: Path | None  # Folder of the maps, if it exists
+    about: Record  # Contents of the run's marker file; empty if there is none
+
+    @property
+    def wanted(self) -> str:
+        """Requested property of the maps: ``"bijective"`` if boundaries were free, else ``"injective"``."""
+        free = any(row.get("outcome") in ("bijective", "not bijective") for row in self.rows)
+        return "bijective" if free or self.about.get("settings", {}).get("flatten") is True else "injective"
+
+    def column(self, name: str) -> FloatArray:
+        """Return a column of numbers, NaN where there is none; (records,)."""
+        values = (row.get(name) for row in self.rows)
+        return np.array([np.nan if not _is_number(v) else v for v in values], dtype=np.float64)
+
+    @property
+    def certified(self) -> NDArray[np.bool_]:
+        """Mask of the records whose map is certified as requested."""
+        return np.array([row.get("certified") is True for row in self.rows], dtype=np.bool_)
+
+
+def load(source: str | os.PathLike[str]) -> Run:
+    """Read the records of a run from its folder or a table; ValueError if there are none or they cannot be read."""
+    path = Path(source)
+    if not path.exists():
+        raise ValueError(f"{source}: no such folder or table of records")
+    if not path.is_dir():
+        rows = list(records.read_table(path))
+        folder = path.parent
+    else:
+        folder = path
+        table = next((path / name for name in records.TABLES if (path / name).exists()), None)
+        rows = list(_read_records(path / "results") if table is None else records.read_table(table))
+    if not rows:
+        raise ValueError(f"there are no records in {source}: give the folder of a run or a table of records")
+    results = folder / "results"
+    return Run(path.resolve().name, rows, results if results.is_dir() else None, _about(folder))
+
+
+def _about(folder: Path) -> Record:
+    """Return the contents of a run's marker file; empty if it is missing or invalid."""
+    try:
+        about = json.loads((folder / MARKER).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return about if isinstance(about, dict) and isinstance(about.get("settings"), dict) else {}
+
+
+def _read_records(results: Path) -> Iterable[Record]:
+    """Yield the existing records of a run without a table."""
+    for path in sorted(results.rglob(records.FILE)):
+        record = records.read_record(path.parent)
+        if record is not None:
+            yield record
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Statistics of a group of records."""
+
+    name: str
+    problems: int
+    certified: int
+    # Median, 95 % quantile and maximum of the times of certified problems; NaN if there are none
+    seconds: tuple[float, float, float]
+    # ``stretch``, ``mips``: Maximum and median of the worst stretch and of the MIPS distortion of certified problems;
+    # NaN if there are none
+    stretch: tuple[float, float]
+    mips: tuple[float, float]
+    triangles: int
+
+
+def groups(run: Run) -> list[Group]:
+    """Return the statistics by the first part of the problems' names, and of all problems."""
+    first = np.array([row["problem"].partition("/")[0] if "/" in row["problem"] else "" for row in run.rows])
+    parts = [_group(run, str(name), first == name) for name in np.unique(first)]
+    everything = _group(run, "all", np.ones(len(run.rows), dtype=np.bool_))
+    # More than 40 groups, for example one per problem, are not useful.
+    return [*(parts if 1 < len(parts) <= 40 else []), everything]
+
+
+def _group(run: Run, name: str, chosen: NDArray[np.bool_]) -> Group:
+    good = run.certified & chosen
+    seconds, stretch, mips, triangles = (run.column(column) for column in ("seconds", "isometric", "mips", "triangles"))
+    return Group(
+        name=name,
+        problems=int(chosen.sum()),
+        certified=int(good.sum()),
+        seconds=(quantile(seconds[good], 0.5), quantile(seconds[good], 0.95), quantile(seconds[good], 1.0)),
+        stretch=(worst(stretch[good]), quantile(stretch[good], 0.5)),
+        mips=(worst(mips[good]), quantile(mips[good], 0.5)),
+        triangles=int(np.nansum(triangles[chosen])),
+    )
+
+
+def quantile(values: FloatArray, share: float) -> float:
+    """Return a quantile of the finite values, NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.quantile(finite, share)) if finite.size else float("nan")
+
+
+def worst(values: FloatArray) -> float:
+    """Return the largest value, including infinity; NaN if there are no values."""
+    known = values[~np.isnan(values)]
+    return float(known.max()) if known.size else float("nan")
+
+
+def outcomes(run: Run) -> list[tuple[str, int]]:
+    """Return the number of records per outcome, in the order of `records.OUTCOMES`; unknown outcomes come last."""
+    counted = Counter(str(row.get("outcome") or _guess(row)) for row in run.rows)
+    order = [*records.OUTCOMES, *sorted(set(counted) - set(records.OUTCOMES))]
+    return [(name, counted[name]) for name in order if counted[name]]
+
+
+def _guess(row: Record) -> str:
+    return "injective" if row.get("certified") is True else "not injective"
+
+
+def match_column(run: Run, other: Run, column: str) -> tuple[FloatArray, FloatArray]:
+    """Return a column of both runs for the problems that both contain."""
+    theirs = {row["problem"]: row.get(column) for row in other.rows}
+    pairs = [
+        (row[column], theirs[row["problem"]])
+        for row in run.rows
+        if _is_number(row.get(column)) and _is_number(theirs.get(row["problem"]))
+    ]
+    ours, others = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+    return ours, others

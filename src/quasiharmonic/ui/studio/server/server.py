@@ -1,0 +1,205 @@
+"""Web server of the application: static files, and one worker process for each open page.
+
+The server listens only on this machine. Every request needs the token in the address, which other sites do not know.
+Requests with another host name are refused, which prevents DNS rebinding. Sockets from other origins are refused too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import logging
+import secrets
+from collections.abc import Callable
+from http import HTTPStatus
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.http11 import Request, Response
+
+from quasiharmonic.ui.studio.assets import assets
+from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
+from quasiharmonic.ui.studio.server.pages import Page
+
+HOST = "127.0.0.1"
+#: Maximum size of an uploaded file in bytes.
+MAX_BYTES = 128 << 20
+#: Maximum number of open pages.
+MAX_PAGES = 8
+#: Close code of a socket if too many pages are open.
+TRY_LATER = 1013
+# Load nothing from other sites, forbid framing, and never send the address with its token as a referrer.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+class Studio:
+    """Web server; pages open the file ``source``, or a built-in surface if it is empty.
+
+    The token is the secret part of the address; random by default.
+    """
+
+    def __init__(self, source: str = "", token: str | None = None) -> None:
+        self.source = source
+        self.token = secrets.token_urlsafe(24) if token is None else token
+        self.port = 0
+        self._pages: set[Page] = set()
+        self._open = 0
+
+    @property
+    def address(self) -> str:
+        """The address to open in a browser."""
+        return f"http://{HOST}:{self.port}/{self.token}/"
+
+    async def run(self, port: int = 0, ready: Callable[[str], object] = lambda address: None) -> None:
+        """Serve until cancelled.
+
+        Parameters
+        ----------
+        port : int
+            0 for any free port.
+        ready : callable
+            Called with the address.
+
+        Raises
+        ------
+        OSError
+            If the port is in use.
+        """
+        async with serve(
+            self._page,
+            HOST,
+            port,
+            process_request=self._request,
+            max_size=MAX_BYTES + (1 << 20),
+            # Read a message only after the previous one was taken, so that at most one large message waits.
+            max_queue=0,
+            compression=None,
+            logger=_logger(),
+            server_header=None,
+            ping_timeout=60,
+            close_timeout=2,
+        ) as server:
+            self.port = _port_of(server)
+            ready(self.address)
+            try:
+                await server.serve_forever()
+            finally:
+                await asyncio.gather(*(page.ended() for page in list(self._pages)))
+
+    def _request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuse a request, answer it with a file, or return None to open a socket."""
+        hosts = request.headers.get_all("Host")
+        if len(hosts) != 1 or hosts[0] not in {f"{HOST}:{self.port}", f"localhost:{self.port}"}:
+            return _answer(HTTPStatus.MISDIRECTED_REQUEST, "unknown address")
+        if getattr(request, "method", "GET") != "GET":
+            return _answer(HTTPStatus.METHOD_NOT_ALLOWED, "files are read with GET", allow="GET")
+        path = request.path.partition("?")[0]
+        key = "".join(request.headers.get_all("Sec-WebSocket-Key"))
+        if not path.startswith("/") or not path.isascii() or not key.isascii():
+            return _answer(HTTPStatus.BAD_REQUEST, "the request is malformed")
+        token, slash, name = path[1:].partition("/")
+        if not hmac.compare_digest(token.encode(), self.token.encode()):
+            return _answer(HTTPStatus.FORBIDDEN, "the token in the address is missing or wrong: copy all of it")
+        if not slash:
+            # Relative addresses of the page need the final slash.
+            return _answer(HTTPStatus.PERMANENT_REDIRECT, "the address ends with a slash", location=f"/{self.token}/")
+        if name == "socket":
+            origins = request.headers.get_all("Origin")
+            if origins != [f"http://{hosts[0]}"]:
+                return _answer(HTTPStatus.FORBIDDEN, "requests from other sites are not allowed")
+            return None
+        asset = assets().get(name or "index.html")
+        if asset is None:
+            return _answer(HTTPStatus.NOT_FOUND, "there is no such file")
+        return _answer(HTTPStatus.OK, asset.content, asset.kind)
+
+    async def _page(self, connection: ServerConnection) -> None:
+        """Connect a page with a process, unless too many pages are open."""
+        if self._open >= MAX_PAGES:
+            # Close the socket instead of refusing the request, because scripts cannot read the answer to a refusal.
+            await connection.close(TRY_LATER, f"{MAX_PAGES} pages are open, which is the maximum")
+            return
+        # Count before the first await, so that pages opened at the same time cannot exceed the limit.
+        self._open += 1
+        try:
+            await self._carry(connection)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._open -= 1
+
+    async def _carry(self, connection: ServerConnection) -> None:
+        """Forward messages between a page and its process until one of them ends."""
+
+        async def tell(message: bytes) -> None:
+            await connection.send(message)
+
+        await tell(encode({"kind": "hello", "most_bytes": MAX_BYTES}))
+        try:
+            page = await Page.start(self.source, tell)
+        except OSError as error:
+            reason = f"no process can be started for this page: {error.strerror or error}"
+            await tell(encode({"kind": "note", "level": "error", "text": reason}))
+            await connection.close(TRY_LATER, reason[:100])
+            return
+        self._pages.add(page)
+        listening = asyncio.ensure_future(self._listen(connection, page))
+        try:
+            why = await page.run()
+            await tell(encode({"kind": "note", "level": "gone", "text": f"{why}. The page restarts."}))
+            await connection.close(1011, "the process has ended")
+        finally:
+            listening.cancel()
+            await page.ended()
+            self._pages.discard(page)
+
+    async def _listen(self, connection: ServerConnection, page: Page) -> None:
+        """Forward the messages of the page to its process."""
+        try:
+            async for message in connection:
+                if isinstance(message, str):
+                    await connection.close(1003, "messages are binary")
+                    break
+                try:
+                    stops = decode(message).header.get("do") == "stop"
+                except ProtocolError as error:
+                    await connection.close(1007, str(error)[:100])
+                    break
+                await page.send(message, stops=stops)
+        except ConnectionClosed:
+            pass
+        finally:
+            # The page is gone, so its process is not needed.
+            page.end()
+
+
+def _logger() -> logging.Logger:
+    """Return a logger that records errors of the server but not those caused by clients."""
+    logger = logging.getLogger(__name__)
+    logger.addFilter(_not_the_clients)
+    return logger
+
+
+def _not_the_clients(record: logging.LogRecord) -> bool:
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, (WebSocketException, EOFError, ConnectionError))
+
+
+def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; charset=utf-8", **further: str) -> Response:
+    content = body.encode() + b"\n" if isinstance(body, str) else body
+    headers = Headers({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content)), "Connection": "close"})
+    headers.update({name.title(): value for name, value in further.items()})
+    return Response(status.value, status.phrase, headers, content)
+
+
+def _port_of(server: Server) -> int:
+    port: int = next(iter(server.sockets)).getsockname()[1]
+    return port

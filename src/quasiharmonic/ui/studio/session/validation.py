@@ -1,0 +1,65 @@
+"""Extract and validate the parameters of messages from a page, which are untrusted."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from quasiharmonic.ui.studio.protocol import Frame
+from quasiharmonic.util.arrays import FloatArray
+
+
+class RequestError(ValueError):
+    """A request cannot be fulfilled and the page is unchanged; the message states the reason."""
+
+
+def vertex(frame: Frame, n: int) -> int:
+    """Return the vertex index, below ``n``."""
+    value = number(frame, "vertex")
+    if not 0 <= value < n:
+        raise RequestError(f"there is no vertex {value}: the surface has {n}, counted from 0")
+    return value
+
+
+def number(frame: Frame, name: str) -> int:
+    """Return an integer."""
+    value = frame.header.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or abs(value) >= 2**53:
+        raise RequestError(f"the message lacks {name}, a whole number")
+    return value
+
+
+def place(frame: Frame) -> FloatArray:
+    """Return the target position of a drag, (2,) float64."""
+    value = frame.header.get("to")
+    if not isinstance(value, list) or len(value) != 2:
+        raise RequestError("the message lacks the target position, two numbers")
+    for one in value:
+        if isinstance(one, bool) or not isinstance(one, int | float) or not math.isfinite(one) or abs(one) > 1e150:
+            raise RequestError("the target position of a vertex must be finite")
+    return np.array(value, dtype=np.float64)
+
+
+def text(frame: Frame, name: str) -> str:
+    """Return a string of at most 200 characters."""
+    value = frame.header.get(name)
+    if not isinstance(value, str) or len(value) > 200:
+        raise RequestError(f"the message lacks {name}, a text")
+    return value
+
+
+def content(frame: Frame) -> bytes:
+    """Return the bytes of a file."""
+    array = frame.arrays.get("content")
+    if array is None or array.dtype != np.uint8:
+        raise RequestError("the message lacks the file")
+    return array.tobytes()
+
+
+def points(frame: Frame) -> FloatArray:
+    """Return points in the plane, (k, 2) float64."""
+    array = frame.arrays.get("points")
+    if array is None or array.dtype != np.float64 or array.size % 2:
+        raise RequestError("the message lacks the points")
+    return array.reshape(-1, 2)

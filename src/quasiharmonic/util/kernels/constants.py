@@ -1,0 +1,71 @@
+"""Constants that the C kernels share with their NumPy versions: read from the Python source, written to a C header.
+
+`setup.py` runs this file by its path before the extension is built, so it imports only the standard library. The
+compiled extension lists the values in ``constants``; a test compares them with the Python source.
+"""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+#: Name in C: Python file below the package folder, and the name there without its leading underscore.
+SHARED = {
+    "TINY": "solver/field/tensor.py",
+    "TANH_BOUND": "solver/field/tensor.py",
+    "RELATIVE_BOUND": "geometry/exact/predicates.py",
+    "UNDERFLOW_BOUND": "geometry/exact/predicates.py",
+    "BITS": "geometry/exact/nested_grid.py",
+    "MARGIN": "geometry/exact/nested_grid.py",
+    "UNDERFLOW_MARGIN": "geometry/exact/nested_grid.py",
+    "UNSURE": "geometry/exact/point_location.py",
+    "UNDECIDED": "geometry/exact/point_location.py",
+    "MOST_NEIGHBOURS": "geometry/coarsening/removal.py",
+    "PASSES": "geometry/coarsening/removal.py",
+    "PER_NEIGHBOUR": "geometry/coarsening/removal.py",
+    "GOOD": "geometry/coarsening/prolongation.py",
+    "TOWARDS_MIDDLE": "geometry/coarsening/prolongation.py",
+    "INWARDS": "geometry/coarsening/prolongation.py",
+    "SWEEPS": "solver/methods/relocation.py",
+    "IN_VAIN": "solver/methods/relocation.py",
+    "SHARING": "solver/methods/relocation.py",
+    "MOST_AROUND": "solver/methods/relocation.py",
+    "PATTERN_RIGHT": "linsolve/base.py",
+    "PATTERN_EMPTY_ROW": "linsolve/base.py",
+    "PATTERN_NO_DIAGONAL": "linsolve/base.py",
+    "PATTERN_NOT_ASCENDING": "linsolve/base.py",
+}
+
+
+def shared_constants(package: Path) -> dict[str, object]:
+    """Return the values of all shared constants: int, float, or nested tuples of them."""
+    files = {path: _assignments((package / path).read_text(encoding="utf-8")) for path in set(SHARED.values())}
+    return {name: files[path][name] for name, path in SHARED.items()}
+
+
+def _assignments(text: str) -> dict[str, object]:
+    """Return the top-level constants of a Python file by name, without leading underscores."""
+    values: dict[str, object] = {}
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            try:
+                code = compile(ast.Expression(node.value), "constant", "eval")
+                values[node.targets[0].id.lstrip("_")] = eval(code, {"__builtins__": {}})
+            except Exception:
+                continue
+    return values
+
+
+def header(values: dict[str, object]) -> str:
+    """Return the C header that defines the constants as macros, and lists the scalars for the extension."""
+    lines = ["/* Written by kernels/constants.py from the Python source; do not edit. */"]
+    lines += [f"#define {name} {_in_c(value)}" for name, value in values.items()]
+    scalars = [name for name, value in values.items() if not isinstance(value, tuple)]
+    lines.append("#define SHARED_CONSTANTS(with) " + " ".join(f"with({name})" for name in scalars))
+    return "\n".join(lines) + "\n"
+
+
+def _in_c(value: object) -> str:
+    if isinstance(value, tuple):
+        return "{" + ", ".join(_in_c(one) for one in value) + "}"
+    return f"({value!r})"

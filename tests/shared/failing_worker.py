@@ -1,0 +1,73 @@
+"""The worker process of `quasiharmonic.batch` with failures, chosen by the name of the problem."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import re
+import signal
+import sys
+import time
+
+from quasiharmonic.io.lowlevel import atomic
+from quasiharmonic.ui.batch import groups, metadata, worker
+
+fill_record, ready = worker.fill_record, groups.read_problem
+
+
+def use_all_memory():
+    blocks = []
+    while True:
+        blocks.append(b"\1" * (1 << 22))
+        time.sleep(0.001)
+
+
+def raise_disk_full(*arguments):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def raise_memory_error(V, F, uv):
+    raise MemoryError
+
+
+def print_text():
+    print("a library says hello")
+    os.system("echo and so does another")
+    sys.stdout.flush()
+
+
+FAILURES = {
+    "sleep": lambda: time.sleep(600),
+    # Runs in C and holds the interpreter's lock, so no other thread of the process can run.
+    "spin": lambda: re.match(r"(a+)+$", "a" * 60 + "b"),
+    "hog": use_all_memory,
+    "refused": lambda: bytearray(1 << 62),
+    "segfault": lambda: ctypes.string_at(0),
+    "killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
+    "exit": lambda: sys.exit(3),
+    "bug": lambda: {}["lost"],
+    "noise": print_text,
+    "late": lambda: setattr(metadata, "distortion", raise_memory_error),
+    "full": lambda: setattr(atomic.os, "replace", raise_disk_full),
+}
+
+
+def fail_by_name(name):
+    for word, failure in FAILURES.items():
+        if word in name:
+            failure()
+
+
+def fill_record_or_fail(job, folder, record, tell):
+    fail_by_name(record["problem"])
+    fill_record(job, folder, record, tell)
+
+
+def prepare_batch_or_fail(job):
+    fail_by_name(job["record"]["problem"])
+    return ready(job)
+
+
+worker.fill_record, groups.read_problem = fill_record_or_fail, prepare_batch_or_fail
+worker.serve()

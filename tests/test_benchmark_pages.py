@@ -1,0 +1,58 @@
+"""The pages of benchmarks state what the data files contain."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+import speed
+import tlc_foldover
+
+DOCS = Path(__file__).parent.parent / "docs"
+
+
+def test_the_table_by_size_belongs_to_the_recorded_run():
+    records = speed.read_csv(DOCS / "speed" / "speed.csv")
+    for name, table in (("summary.md", speed.size_table), ("speed.md", speed.table)):
+        described, _, text = (DOCS / "speed" / name).read_text(encoding="utf-8").partition("\n\n")
+        assert "2 cores" in described
+        assert text == table(records)
+    assert not any(record.injective for record in records if record.tool in (speed.YARDSTICK, "scipy splu"))
+    assert all(record.injective for record in records if record.tool == speed.OURS)
+
+
+def test_composites_fail_or_find_a_map_and_mouette_always_finds_one():
+    runs = {}
+    for record in speed.read_csv(DOCS / "speed" / "speed.csv"):
+        runs.setdefault(record.tool, []).append(record)
+    assert all(record.injective for tool in ("igl composite", "mouette") for record in runs[tool] if record.seconds)
+    assert [len(runs["igl composite"]), sum(not record.seconds for record in runs["igl composite"])] == [19, 6]
+    assert [len(runs["mouette"]), sum(not record.seconds for record in runs["mouette"])] == [6, 0]
+
+
+def test_the_table_of_other_programs_belongs_to_the_records():
+    text = (DOCS / "comparisons" / "tlc_foldover.md").read_text(encoding="utf-8")
+    assert text == tlc_foldover.table_of_records()
+
+
+def scenes():
+    """Return the rows of each scene of `mesh_motion.csv`, by method and start."""
+    found = {}
+    with (DOCS / "mesh_motion" / "mesh_motion.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            found.setdefault(row["scene"], {})[row["method"], row["from"]] = row
+    return found
+
+
+@pytest.mark.parametrize("scene", scenes())
+def test_order_of_the_methods_of_mesh_motion(scene):
+    rows = scenes()[scene]
+    steps = {key: int(row["steps"]) for key, row in rows.items()}
+    end = int(rows["morph", "first"]["of"])
+    assert steps.pop(("morph", "first")) == end
+    first, second = sorted(steps, key=steps.get, reverse=True)[:2]
+    assert (first, second) == (("MovingMesh", "last"), ("elasticity", "last"))
+    assert steps[first] > steps[second]
+    assert (steps[first] == end) == (scene not in ("turning disk", "sliding walls"))

@@ -1,0 +1,87 @@
+"""``qhm check``, ``measure`` and ``plot`` of finite-element meshes, as ``qhm morph`` writes them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from quasiharmonic.surfaces import grid
+from quasiharmonic.ui.cli import main
+
+CELLS = {
+    "triangles": (np.array([[0, 1, 2], [0, 2, 3]]), 5),
+    "quadrilaterals": (np.array([[0, 1, 2, 3]]), 9),
+}
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
+def write_vtk(path, points, cells, kind):
+    """Write a legacy VTK file in text."""
+    lines = ["# vtk DataFile Version 3.0", "mesh", "ASCII", "DATASET UNSTRUCTURED_GRID", f"POINTS {len(points)} double"]
+    lines += [f"{float(x)!r} {float(y)!r} 0.0" for x, y in points]
+    lines += [f"CELLS {len(cells)} {cells.size + len(cells)}"]
+    lines += [" ".join(map(str, [len(cell), *cell.tolist()])) for cell in cells]
+    lines += [f"CELL_TYPES {len(cells)}", *[str(kind)] * len(cells)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def run(capsys, command, path, *options):
+    """The exit status and the report."""
+    status = main([command, str(path), *options, "--json", "-"])
+    return status, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_valid_meshes_pass(tmp_path, capsys, name):
+    path = write_vtk(tmp_path / "a.vtk", SQUARE, *CELLS[name])
+    status, facts = run(capsys, "check", path)
+    assert (status, facts["injective"], facts["elements"]) == (0, True, len(CELLS[name][0]))
+    status, facts = run(capsys, "measure", path)
+    assert status == 0
+    assert 0.8 < facts["quality"]["minimum"] <= facts["quality"]["mean"] <= 1
+    assert main(["plot", str(path), "-o", str(tmp_path / "a.png")]) == 0
+    assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_inverted_elements_are_named(tmp_path, capsys, name):
+    bent = SQUARE.copy()
+    bent[2] = -0.2
+    path = write_vtk(tmp_path / "a.vtk", bent, *CELLS[name])
+    status, facts = run(capsys, "check", path)
+    assert (status, facts["injective"]) == (1, False)
+    assert facts["inverted"]
+    status, facts = run(capsys, "measure", path)
+    assert facts["quality"]["minimum"] < 0
+
+
+def test_what_morph_writes_is_accepted(tmp_path, capsys):
+    points, F = grid(4, 4)
+    source = write_vtk(tmp_path / "in.vtk", points, F, 5)
+    (tmp_path / "to.csv").write_text("0,-0.1,-0.1\n")
+    out = tmp_path / "out.vtk"
+    assert main(["morph", str(source), "-o", str(out), "--positions", str(tmp_path / "to.csv")]) == 0
+    capsys.readouterr()
+    assert run(capsys, "check", out)[0] == 0
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        ("check", "--as", "float32"),
+        ("check", "--any-triangulation"),
+        ("measure", "--distances"),
+        ("measure", "--export", "a.csv"),
+        ("plot", "-o", "a.png", "--kind", "distortion"),
+        ("plot", "-o", "a.png", "--texture", "checkerboard"),
+    ],
+)
+def test_options_for_surfaces_are_rejected(tmp_path, capsys, monkeypatch, call):
+    monkeypatch.chdir(tmp_path)
+    write_vtk(tmp_path / "a.vtk", SQUARE, *CELLS["triangles"])
+    command, *options = call
+    assert main([command, "a.vtk", *options]) == 2
+    assert "needs a surface with a map" in capsys.readouterr().err

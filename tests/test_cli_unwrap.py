@@ -1,0 +1,141 @@
+"""``qhm unwrap`` as a user calls it: files, exit statuses, reports."""
+
+from __future__ import annotations
+
+import inspect
+import json
+
+import numpy as np
+import pytest
+
+from quasiharmonic import io, unwrap
+from quasiharmonic.surfaces import starfish
+from quasiharmonic.ui.cli import parser_of
+from shared.commands import run
+
+V, F = starfish(3, 12)
+
+
+@pytest.fixture
+def model(tmp_path):
+    io.write_obj(tmp_path / "model.obj", io.MeshData(V, F))
+    return tmp_path / "model.obj"
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".gltf"])
+def test_writes_certified_coordinates(model, tmp_path, capsys, suffix):
+    out, report = tmp_path / f"out{suffix}", tmp_path / "report.json"
+    assert run("unwrap", model, "-o", out, "--resolution", 256, "--json", report) == 0
+    written = io.read_mesh(out)
+    assert written.vt is not None
+    assert written.vt.min() >= 0
+    assert written.vt.max() <= 1
+    facts = json.loads(report.read_text())
+    assert facts["success"] is True
+    assert facts["certificate"]["bijective"] is True
+    assert facts["triangles"] == len(F) == len(written.F)
+    said = capsys.readouterr().out
+    for words in ("chart", "seam", "stretch", "of the texture used"):
+        assert words in said
+
+
+def test_materials_groups_and_attributes_stay(tmp_path):
+    lines = [f"v {x!r} {y!r} {z!r} 0.5 0.25 1\n" for x, y, z in V.tolist()]
+    faces = [f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in F.tolist()]
+    half = len(faces) // 2
+    head = ["mtllib some.mtl\n", *lines, "g arm\n", "usemtl red\n", *faces[:half], "g rest\n", *faces[half:]]
+    (tmp_path / "model.obj").write_text("".join(head))
+    assert run("unwrap", tmp_path / "model.obj", "-o", tmp_path / "out.obj", "--resolution", 256) == 0
+    text = (tmp_path / "out.obj").read_text()
+    order = [text.index(word) for word in ("mtllib some.mtl", "g arm", "usemtl red", "g rest")]
+    assert order == sorted(order)
+    assert text.count(" 0.5 0.25 1\n") == len(V)
+    written = io.read_mesh(tmp_path / "out.obj")
+    np.testing.assert_array_equal(written.V, V)
+    np.testing.assert_array_equal(written.F, F)
+
+
+CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1
+g one\nf 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nusemtl two\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"""
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
+def test_polygons_stay(tmp_path, suffix):
+    (tmp_path / "cube.obj").write_text(CUBE)
+    report = tmp_path / "report.json"
+    assert run("unwrap", tmp_path / "cube.obj", "-o", tmp_path / f"out{suffix}", "--json", report) == 0
+    written = io.read_mesh(tmp_path / f"out{suffix}")
+    assert len(written.F) == 12
+    divided = json.loads(report.read_text())["divided_polygons"]
+    if suffix != ".glb":
+        assert written.faces == 6 + divided
+
+
+def test_polygons_that_seams_cross_are_divided(tmp_path):
+    """Seams of the input cross the diagonals of a face."""
+    lines = ["v 0 0 0", "v 1 0 0", "v 1 1 0", "v 0 1 0", "v 2 0 0", "v 2 1 0", "g first", "f 1 2 3 4", "g second"]
+    (tmp_path / "model.obj").write_text("\n".join([*lines, "f 2 5 6 3", ""]))
+    mesh = io.read_mesh(tmp_path / "model.obj")
+    divided = mesh.polygons.divide(np.array([True, False]))
+    assert divided.sizes.tolist() == [3, 3, 4]
+    assert sorted(mesh.F.ravel()[divided.corners[:3]].tolist()) == sorted(mesh.F[0].tolist())
+
+
+def test_defects_are_reported(tmp_path, capsys):
+    spoilt = np.concatenate([F, F[:1], [[0, 0, 1]]])
+    io.write_obj(tmp_path / "model.obj", io.MeshData(V, spoilt))
+    assert run("unwrap", tmp_path / "model.obj", "-o", tmp_path / "out.obj", "--resolution", 256) == 0
+    said = capsys.readouterr().out
+    assert "triangles repeated" in said
+    assert "triangles that use a vertex twice" in said
+    assert len(io.read_mesh(tmp_path / "out.obj").F) == len(spoilt)
+
+
+def test_seams_of_the_file_and_edge_costs(model, tmp_path):
+    first, second = tmp_path / "first.obj", tmp_path / "second.obj"
+    assert run("unwrap", model, "-o", first, "--resolution", 256) == 0
+    assert run("unwrap", first, "-o", second, "--keep-seams", "--resolution", 256) == 0
+    seams = [{tuple(edge) for edge in io.mapped(io.read_mesh(path)).seams.tolist()} for path in (first, second)]
+    assert seams[0] <= seams[1]
+    (tmp_path / "costs.txt").write_text("".join(f"{i} {j} 50\n" for i, j in seams[0]))
+    costs = ["--edge-costs", tmp_path / "costs.txt"]
+    assert run("unwrap", model, "-o", second, "--resolution", 256, *costs) == 0
+    assert {tuple(edge) for edge in io.mapped(io.read_mesh(second)).seams.tolist()} != seams[0]
+    (tmp_path / "costs.txt").write_text("0 99999 2\n")
+    assert run("unwrap", model, "-o", second, *costs) == 2
+
+
+def test_wrong_input_writes_nothing(model, tmp_path, capsys):
+    out = tmp_path / "out.obj"
+    for options in (["--max-stretch", "0.5"], ["--keep-seams"], ["--memory", "1M"]):
+        assert run("unwrap", model, "-o", out, *options) == 2
+        assert not out.exists()
+        assert capsys.readouterr().err.startswith("qhm unwrap: ")
+    assert run("unwrap", model, "-o", tmp_path / "out.off") == 2
+
+
+def test_interrupt_writes_nothing(model, tmp_path, monkeypatch):
+    def interrupt(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("quasiharmonic.apps.unwrapping.unwrap.certify_charts", interrupt)
+    assert run("unwrap", model, "-o", tmp_path / "out.obj") == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.obj"]
+
+
+def test_the_default_bound_is_that_of_the_function():
+    parser = parser_of(["unwrap"])
+    options = parser.parse_args(["unwrap", "model.obj", "-o", "out.obj"])
+    for name in (
+        "max_stretch",
+        "max_charts",
+        "padding",
+        "texels_per_unit",
+        "tiles",
+        "stack",
+        "outward",
+        "seed",
+        "jobs",
+    ):
+        assert getattr(options, name) == inspect.signature(unwrap).parameters[name].default
+    assert options.resolution == (2048, 2048)

@@ -1,0 +1,444 @@
+"""Quasi-harmonised energies: the gradient through the solve, the descent, and its results."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import Problem, Status, boundary_loops, certify, harmonise, polish, quasi_harmonic_map
+from quasiharmonic.energies import polishing
+from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energies.derivatives import check_energy, derivative_error
+from quasiharmonic.energies.energies import MIPS, AreaPreserving, Combination, Energy
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.linsolve import available
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.field.regularisers import Conformal
+from quasiharmonic.solver.methods import LBFGS
+from quasiharmonic.solver.methods.base import Steps
+from quasiharmonic.solver.search.harmonised import Harmonised
+from quasiharmonic.solver.search.harmonising import ENERGIES, ETA
+from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from quasiharmonic.targets import arc_length
+from shared.distinct_steps import DistinctSteps
+from shared.meshes import bend, boundary_of, lift, random_xi
+
+BARRIERS = set(polishing.ENERGIES)
+
+
+def bowl(n=80):
+    """A curved disk, a map of it, and its boundary."""
+    V, F = random_delaunay(n, seed=3)
+    return lift(V), F, bend(V), boundary_of(F)
+
+
+def folded():
+    """A square mapped to an L, and its Tutte embedding, which has inverted triangles at the corner."""
+    V, F = grid(14, 14, alternating=True)
+    (loop,) = boundary_loops(F, len(V))
+    outline = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3.0]])
+    problem = Problem(V, F, loop, arc_length(V[loop], outline))
+    uv = quasi_harmonic_map(problem)
+    assert certify(F, uv).inverted.size
+    return problem, uv
+
+
+def objective_of(V, F, uv, fixed, energy, *, eta=0.3, conformal=0.2, weights=None, reference="rest", sigmoid="tanh"):
+    """Return Q as the library constructs it."""
+    problem = Problem(V, F, fixed, uv[fixed])
+    objective = Objective(problem, "dirichlet", sigmoid, reference)
+    area = float(signed_areas(F, problem.frame.inward(uv)).sum())
+    deformation = None if energy is None else DeformationEnergy(V, F, energy, area=area, weights=weights)
+    regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
+    return objective.descending(
+        Harmonised(problem, objective.mesh, area, deformation, regulariser, eta=eta, conformal=conformal)
+    )
+
+
+def energies_of(result):
+    return np.array([step.energy for step in result.history])
+
+
+class TestObjective:
+    @pytest.mark.parametrize("name", [*ENERGIES, None])
+    @pytest.mark.parametrize("reference", ["rest", "equilateral"])
+    @pytest.mark.parametrize("sigmoid", ["tanh", "si-log"])
+    def test_gradient_is_that_of_the_value(self, name, reference, sigmoid):
+        V, F, uv, fixed = bowl()
+        energy = None if name is None else ENERGIES[name](V, F)
+        weights = None if name is None else np.random.default_rng(1).uniform(0, 3, len(F))
+        objective = objective_of(V, F, uv, fixed, energy, weights=weights, reference=reference, sigmoid=sigmoid)
+        xi = objective.near_map(objective.problem.frame.inward(uv)).xi + random_xi(F, 0.02)
+        assert np.isfinite(objective.evaluate(xi).value)
+
+        def along(x, d):
+            return np.sum(np.conj(objective.evaluate(x).gradient) * d).real
+
+        assert derivative_error(lambda x: objective.evaluate(x).value, along, xi) < 1e-7
+
+    @pytest.mark.parametrize("name", sorted(set(ENERGIES) - BARRIERS))
+    def test_gradient_where_triangles_are_inverted(self, name):
+        V, F, uv, fixed = bowl()
+        objective = objective_of(V, F, uv, fixed, ENERGIES[name](V, F))
+        xi = random_xi(F, 1.0)
+        assert objective.evaluate(xi).inverted > 3
+
+        def along(x, d):
+            return np.sum(np.conj(objective.evaluate(x).gradient) * d).real
+
+        assert derivative_error(lambda x: objective.evaluate(x).value, along, xi) < 1e-6
+
+    def test_terms_add_up(self):
+        V, F, uv, fixed = bowl()
+        xi = random_xi(F, 0.05)
+        at = objective_of(V, F, uv, fixed, MIPS(), eta=0.3, conformal=0.2).evaluate(xi)
+        area = at.objective.functional.area
+        assert area == pytest.approx(at.dw.area.sum())
+        measured = distortion(V, F, at.objective.problem.positions(at.w))
+        regulariser = np.sum(measured.share * 4 * np.sinh(np.abs(xi)) ** 2)
+        expected = at.dirichlet / area + 0.3 * (measured.statistics("mips").mean + 0.2 * regulariser)
+        assert at.value == pytest.approx(expected, rel=1e-12)
+
+    def test_does_not_depend_on_scales(self):
+        V, F, uv, fixed = bowl()
+        xi = random_xi(F, 0.05)
+        for name in ENERGIES:
+            one, other = (
+                objective_of(a * V, F, b * uv, fixed, ENERGIES[name](a * V, F)).evaluate(xi).value
+                for a, b in ((1, 1), (64, 0.25))
+            )
+            assert other == pytest.approx(one, rel=1e-12)
+
+    def test_at_the_maps_own_tensors(self):
+        """There V₃ is zero, and R₁ is MIPS, which is the purpose of eq. 35."""
+        V, F, uv, fixed = bowl()
+        objective = objective_of(V, F, uv, fixed, None, eta=1.0, conformal=1.0)
+        at = objective.near_map(objective.problem.frame.inward(uv))
+        np.testing.assert_allclose(objective.problem.positions(at.w), uv, atol=1e-12)
+        mips = distortion(V, F, uv).statistics("mips").mean
+        assert at.value == pytest.approx(mips, rel=1e-10)
+        assert objective.functional.distortion_of_map(at) == pytest.approx(mips, rel=1e-10)
+
+    def test_regulariser_of_a_map_with_inverted_triangles(self):
+        V, F, uv, fixed = bowl()
+        objective = objective_of(V, F, uv, fixed, None)
+        at = objective.evaluate(random_xi(F, 1.0))
+        assert np.isfinite(objective.functional.distortion(at))
+        assert objective.functional.distortion_of_map(at) == np.inf
+
+
+class TestLBFGS:
+    @pytest.mark.parametrize("name", [*ENERGIES, None])
+    def test_decreases_at_every_step(self, name):
+        V, F, uv, fixed = bowl()
+        energy = None if name is None else ENERGIES[name](V, F)
+        objective = objective_of(V, F, uv, fixed, energy, conformal=1e-2)
+        start = objective.near_map(objective.problem.frame.inward(uv))
+        stiffness = np.abs(start.gradient) + 1e-3 * np.abs(start.gradient).mean()
+        with np.errstate(all="ignore"):
+            values = [at.value for at in LBFGS(iterations=100, stiffness=stiffness).iterates(objective, start)]
+        assert len(values) > 30
+        assert np.all(np.diff([start.value, *values]) < 0)
+
+    def test_converges_to_a_minimum(self):
+        V, F, uv, fixed = bowl(40)
+        objective = objective_of(V, F, uv, fixed, MIPS(), conformal=1e-2)
+        start = objective.evaluate(np.zeros(len(F), dtype=complex))
+        assert np.isfinite(start.value)
+        with np.errstate(all="ignore"):
+            steps = Steps(LBFGS(iterations=5000, tol=1e-13).iterates(objective, start))
+            last = list(steps)
+        assert steps.converged
+        assert len(last) < 4000
+        assert np.abs(last[-1].gradient).max() < 1e-5 * np.abs(start.gradient).max()
+
+    def test_stops_after_the_given_number_of_evaluations(self):
+        V, F, uv, fixed = bowl()
+        objective = objective_of(V, F, uv, fixed, MIPS())
+        calls = []
+        evaluate = objective.evaluate
+        objective.evaluate = lambda xi: (calls.append(xi), evaluate(xi))[1]
+        start = evaluate(np.zeros(len(F), dtype=complex))
+        steps = Steps(LBFGS(iterations=7).iterates(objective, start))
+        assert list(steps)
+        assert not steps.converged
+        assert len(calls) == 7
+
+
+class TestHarmonise:
+    @pytest.mark.parametrize("name", ENERGIES)
+    def test_lowers_the_energy_and_stays_certified(self, name):
+        V, F, uv, fixed = bowl(150)
+        result = harmonise(V, F, uv, fixed=fixed, energy=name)
+        assert result.status in (Status.POLISHED, Status.STILL_FALLING)
+        assert certify(F, result.uv).injective
+        assert result.certificate.injective
+        np.testing.assert_array_equal(result.uv[fixed], uv[fixed])
+        area = float(signed_areas(F, uv @ (1, 1j)).sum())
+        before, after = (
+            DeformationEnergy(V, F, ENERGIES[name](V, F), area=area).value(w @ (1, 1j)) for w in (uv, result.uv)
+        )
+        assert after < 0.95 * before
+        if name in BARRIERS:
+            # Newton's method on the map itself, without tensors, finds this.
+            least = polish(V, F, uv, fixed=fixed, energy=name, tol=1e-10).history[-1].energy
+            assert least * (1 - 1e-9) < after < 1.01 * least
+
+    def test_areas_become_as_equal_as_the_boundary_allows(self):
+        V, F, uv, fixed = bowl(150)
+        found = harmonise(V, F, uv, fixed=fixed, energy="area", conformal=0, max_iterations=80)
+        barrier = Combination((1.0, AreaPreserving()), (1e-5, MIPS()))
+        least = polish(V, F, uv, fixed=fixed, energy=barrier, tol=1e-10)
+        assert least.status is found.status is Status.POLISHED
+        uneven = [np.sum(d.share * (d.area_ratio - 1) ** 2) for d in (distortion(V, F, r.uv) for r in (least, found))]
+        assert uneven[0] * (1 - 1e-3) < uneven[1] < 1.2 * uneven[0]
+
+    @pytest.mark.parametrize("name", ["arap", "arap-unsigned", "area", "springs", None])
+    def test_starts_from_any_map(self, name):
+        """The map may even have inverted triangles, if the energy is finite."""
+        problem, uv = folded()
+        result = harmonise(
+            problem.V, problem.F, uv, fixed=problem.fixed, energy=name, conformal=1.0 if name is None else 1e-3
+        )
+        assert result.injective
+        assert result.certificate.bijective
+        np.testing.assert_array_equal(result.uv[problem.fixed], problem.target)
+        assert result.history[0].inverted > 0
+
+    def test_as_the_paper_has_it(self):
+        """One round with η = 1e-4 and without a barrier."""
+        problem, uv = folded()
+        result = harmonise(
+            problem.V,
+            problem.F,
+            uv,
+            fixed=problem.fixed,
+            energy="arap-unsigned",
+            eta=1e-4,
+            conformal=0,
+            max_iterations=100,
+        )
+        assert result.injective
+        assert result.stages[0].name == "harmonise, arap-unsigned, η = 0.0001"
+
+    def test_conformal_without_an_energy(self):
+        """R₁ alone ends near the map with the least MIPS."""
+        V, F, uv, fixed = bowl(150)
+        found = harmonise(V, F, uv, fixed=fixed, energy=None, conformal=1.0)
+        least = harmonise(V, F, uv, fixed=fixed, energy="mips", max_iterations=80)
+        mips = [distortion(V, F, w).statistics("mips").mean for w in (uv, found.uv, least.uv)]
+        assert mips[2] < mips[1] < mips[2] + 0.1 * (mips[0] - mips[2])
+
+    def test_pins_and_inner_loops_do_not_move(self):
+        V, F = annulus(12)
+        pin = int(np.argmin(np.linalg.norm(V - [0.75, 0.1], axis=1)))
+        uv, fixed = bend(V), np.append(boundary_of(F), pin)[::-1]
+        result = harmonise(V, F, uv, fixed=fixed, energy="area")
+        assert result.injective
+        assert result.certificate.bijective
+        np.testing.assert_array_equal(result.uv[fixed], uv[fixed])
+        free = harmonise(V, F, uv, fixed=fixed[1:], energy="area")
+        assert not np.array_equal(free.uv[pin], uv[pin])
+
+    def test_weights_shift_the_distortion(self):
+        V, F, uv, fixed = bowl(150)
+        left = V[F].mean(axis=1)[:, 0] < 0
+        shares = []
+        for weights in (None, np.where(left, 30.0, 1.0), np.where(left, 1.0, 0.0)):
+            result = harmonise(V, F, uv, fixed=fixed, energy="arap", weights=weights)
+            assert result.injective
+            found = distortion(V, F, result.uv)
+            shares.append(np.sum((found.share * found.arap)[left]))
+        assert shares[1] < 0.9 * shares[0]
+        assert shares[2] < 0.9 * shares[0]
+
+    def test_the_surfaces_own_scale(self):
+        """Weighted triangles are undistorted in the surface's own scale; if the whole map is scaled, they are not."""
+        V, F = disk(10)
+        loose = np.linalg.norm(V[F].mean(axis=1), axis=1) > 0.5
+        uv, fixed = 2 * V, boundary_of(F)
+        inner = DeformationEnergy(V, F[~loose], ENERGIES["arap"](V, F))
+        found = {}
+        for scaled in (True, False):
+            result = harmonise(V, F, uv, fixed=fixed, weights=~loose, scaled=scaled, max_iterations=100)
+            assert result.injective
+            found[scaled] = inner.value(result.uv @ (1, 1j))
+        # σ₁ = σ₂ = 2 if it is scaled: a similarity, as before.
+        assert found[True] == pytest.approx(2, rel=1e-6)
+        assert found[False] < 0.02
+
+    def test_the_scale_of_an_unscaled_energy(self):
+        """E of the unscaled map, in any unit."""
+        V, F, uv, fixed = bowl()
+        for unit, energy in ((1, "arap"), (2.0**40, "springs"), (0.3, "symmetric-dirichlet")):
+            known = DeformationEnergy(V * unit, F, ENERGIES[energy](V, F)).value(uv @ (1, 1j) * unit * 1.7)
+            result = harmonise(
+                V * unit, F, uv * unit * 1.7, fixed=fixed, energy=energy, conformal=0, scaled=False, max_iterations=2
+            )
+            assert result.history[0].energy == pytest.approx(known, rel=1e-9)
+
+    def test_a_user_defined_energy(self):
+        class Shear(Energy):
+            """|q|² per unit of area: smooth, without a barrier and without second derivatives."""
+
+            def density(self, d):
+                return d.b
+
+            def gradient(self, d):
+                return np.zeros_like(d.p), 2 * d.q
+
+        assert check_energy(Shear()).passed
+        V, F, uv, fixed = bowl()
+        result = harmonise(V, F, uv, fixed=fixed, energy=Shear())
+        assert result.injective
+        assert result.stages[0].name.startswith("harmonise, Shear")
+        # With a fixed boundary this is the Dirichlet energy up to a constant: the harmonic map.
+        harmonic = quasi_harmonic_map(Problem(V, F, fixed, uv[fixed]), reference="rest")
+        np.testing.assert_allclose(result.uv, harmonic, atol=0.02)
+
+    def test_is_deterministic_and_does_not_change_its_input(self):
+        V, F, uv, fixed = bowl()
+        before = [x.copy() for x in (V, F, uv, fixed)]
+        for x in (V, F, uv, fixed):
+            x.flags.writeable = False
+        first, second = (harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=15) for _ in range(2))
+        np.testing.assert_array_equal(first.uv, second.uv)
+        assert energies_of(first).tolist() == energies_of(second).tolist()
+        for x, y in zip((V, F, uv, fixed), before, strict=True):
+            np.testing.assert_array_equal(x, y)
+        assert not np.shares_memory(first.uv, uv)
+
+    def test_is_never_worse_than_the_given_map(self):
+        V, F, uv, fixed = bowl()
+        best = harmonise(V, F, uv, fixed=fixed, energy="mips", max_iterations=100, eta=(1,) * 6, conformal=0)
+        for eta in (1e-6, 1.0, 1e3):
+            again = harmonise(V, F, best.uv, fixed=fixed, energy="mips", max_iterations=3, eta=eta, conformal=0)
+            assert again.injective
+            assert distortion(V, F, again.uv).statistics("mips").mean <= (
+                distortion(V, F, best.uv).statistics("mips").mean * (1 + 1e-12)
+            )
+
+    def test_maps_that_cannot_be_improved(self, monkeypatch):
+        """If all maps found have inverted triangles, the given map is returned, and the status says so."""
+        V, F, uv, fixed = bowl()
+        monkeypatch.setattr(
+            "quasiharmonic.solver.search.harmonic_descent.inverted_triangles", lambda F, w: np.arange(3)
+        )
+        monkeypatch.setattr("quasiharmonic.solver.search.harmonic_descent.UNTANGLING_STEPS", 1)
+        result = harmonise(V, F, uv, fixed=fixed, energy="arap", max_iterations=5)
+        assert result.injective
+        assert result.status is not Status.POLISHED
+
+    def test_a_perfect_map_does_not_change(self):
+        V, F = random_delaunay(60)
+        for name in ENERGIES:
+            result = harmonise(V, F, 3 * V, fixed=boundary_of(F), energy=name, max_iterations=20)
+            assert result.injective
+            np.testing.assert_allclose(result.uv, 3 * V, atol=1e-6)
+
+    def test_steps_stages_and_interruption(self):
+        V, F, uv, fixed = bowl()
+        seen = DistinctSteps()
+        result = harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=10, callback=seen.append)
+        assert seen == result.history
+        assert [step.iteration for step in seen] == list(range(len(seen)))
+        assert sum(stage.n_iterations for stage in result.stages) == len(seen) - 1
+        assert [stage.name for stage in result.stages[: len(ETA)]] == [f"harmonise, area, η = {eta:g}" for eta in ETA]
+        assert result.stages[0].energy[0] == seen[0].energy
+        assert all(stage.n_iterations <= 10 for stage in result.stages[: len(ETA)])
+
+        def interrupt(step):
+            if step.iteration == 12:
+                raise KeyboardInterrupt
+
+        stopped = harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=10, callback=interrupt)
+        assert stopped.status is Status.INTERRUPTED
+        assert stopped.injective
+        assert len(stopped.history) == 13
+
+    @pytest.mark.parametrize("linear_solver", available())
+    def test_other_linear_solvers(self, linear_solver):
+        V, F, uv, fixed = bowl()
+        result = harmonise(V, F, uv, fixed=fixed, energy="mips", linear_solver=linear_solver)
+        assert result.linear_solver == linear_solver
+        expected = harmonise(V, F, uv, fixed=fixed, energy="mips")
+        np.testing.assert_allclose(result.uv, expected.uv, atol=1e-2)
+
+    @pytest.mark.parametrize("name", ENERGIES)
+    def test_triangles_of_almost_zero_area(self, name):
+        """Tensors beyond the range of doubles are clipped without an error."""
+        V, F = disk(8)
+        uv = V * np.linalg.norm(V, axis=1, keepdims=True) ** 11
+        assert distortion(V, F, uv).area_ratio.min() < 1e-15
+        result = harmonise(V, F, uv, fixed=boundary_of(F), energy=name)
+        assert result.injective
+
+    def test_malformed_input(self):
+        V, F, uv, fixed = bowl()
+        moved = uv.copy()
+        moved[np.setdiff1d(np.arange(len(V)), fixed)[0]] = 5, 5
+        with pytest.raises(ValueError, match=r"uv is not injective: triangles \d+.*start from an injective map"):
+            harmonise(V, F, moved, fixed=fixed, energy="mips")
+        with pytest.raises(ValueError, match="energy must be one of arap, arap-unsigned, area"):
+            harmonise(V, F, uv, fixed=fixed, energy="beauty")
+        with pytest.raises(ValueError, match=r"uv must have shape \(80, 2\)"):
+            harmonise(V, F, uv[1:], fixed=fixed)
+        with pytest.raises(ValueError, match="encloses no area"):
+            harmonise(V, F, uv * [1, -1], fixed=fixed)
+        for eta in (0, -1, np.nan, [], [[1.0]], [1.0, np.inf]):
+            with pytest.raises(ValueError, match="eta must be a positive number"):
+                harmonise(V, F, uv, fixed=fixed, eta=eta)
+        with pytest.raises(ValueError, match="eta must contain real numbers"):
+            harmonise(V, F, uv, fixed=fixed, eta="much")
+        for wrong in (-1, np.inf, np.nan, None, "little"):
+            with pytest.raises(ValueError, match="conformal must be a finite number of at least 0"):
+                harmonise(V, F, uv, fixed=fixed, conformal=wrong)
+            with pytest.raises(ValueError, match="tol must be a finite number of at least 0"):
+                harmonise(V, F, uv, fixed=fixed, tol=wrong)
+        with pytest.raises(ValueError, match="conformal must be positive if energy is None"):
+            harmonise(V, F, uv, fixed=fixed, energy=None, conformal=0)
+        with pytest.raises(ValueError, match="weights belong to the energy"):
+            harmonise(V, F, uv, fixed=fixed, energy=None, conformal=1, weights=np.ones(len(F)))
+        with pytest.raises(ValueError, match="weights must have shape"):
+            harmonise(V, F, uv, fixed=fixed, weights=np.ones(3))
+        with pytest.raises(ValueError, match="reference must be one of"):
+            harmonise(V, F, uv, fixed=fixed, reference="round")
+        with pytest.raises(ValueError, match="iterations must be an integer"):
+            harmonise(V, F, uv, fixed=fixed, max_iterations=0)
+
+    def test_flat_rest_triangles(self):
+        """The energy is undefined there; R₁ with triangles of another shape is not."""
+        V, F, uv, fixed = bowl()
+        flat = V.copy()
+        flat[F[7, 0]] = flat[F[7, 1]]
+        for reference in ("rest", "equilateral", "corrected"):
+            with pytest.raises(ValueError, match=r"7.* of zero area in the rest mesh: distortion is undefined there"):
+                harmonise(flat, F, uv, fixed=fixed, reference=reference)
+        with pytest.raises(ValueError, match="choose the reference 'equilateral'"):
+            harmonise(flat, F, uv, fixed=fixed, energy=None, conformal=1)
+        result = harmonise(flat, F, uv, fixed=fixed, energy=None, conformal=1, reference="equilateral")
+        assert result.injective
+        assert result.history[-1].energy < result.history[0].energy
+
+    def test_overflow_is_not_convergence(self):
+        V, F, uv, fixed = bowl()
+        for options in ({"eta": 1e300}, {"weights": np.full(len(F), 1e300)}):
+            result = harmonise(V, F, uv, fixed=fixed, energy="area", max_iterations=10, **options)
+            assert result.injective
+            assert result.status in (Status.STILL_FALLING, Status.UNIMPROVED)
+
+    def test_problems_without_a_map(self):
+        """The reason is searched for and reported."""
+        V, F = grid(3, 3)
+        (loop,) = boundary_loops(F, len(V))
+        # The boundary crosses itself.
+        target = V[loop].copy()
+        target[[1, 5]] = target[[5, 1]]
+        problem = Problem(V, F, loop, target)
+        result = harmonise(
+            problem.V, problem.F, quasi_harmonic_map(problem), fixed=problem.fixed, energy="arap", max_iterations=5
+        )
+        assert not result.injective
+        assert result.status is Status.IMPOSSIBLE
+        assert result.diagnosis.forbids_injective
+        assert result.to_dict()["diagnosis"] is not None
