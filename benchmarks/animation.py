@@ -16,17 +16,17 @@ Report CPU milliseconds per unpolished frame for the star, the bar and the hole 
 from __future__ import annotations
 
 import argparse
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import Problem, __version__, animate, boundary_loops, io, solve
+from quasiharmonic import Problem, animate, boundary_loops, io, solve
 from quasiharmonic.surfaces import annulus, cat, grid
 from quasiharmonic.targets import boundary_to, letter
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from speed import machine
 
 FRAMES = 100
 ENERGY = "symmetric-dirichlet"
@@ -179,7 +179,7 @@ def unpolished(frames: int) -> None:
 def main() -> None:
     """Run the scenes, print the table and draw the plot."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("-o", "--output", type=Path, help="folder for animation.md and animation.png")
+    parser.add_argument("-o", "--output", type=Path, help="folder for sequences.md and sequences.png")
     parser.add_argument("--hand", type=Path, help="a further surface for the turning star")
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--only", nargs="+", choices=SCENES, default=list(SCENES))
@@ -194,6 +194,7 @@ def main() -> None:
         loop = boundary_loops(mesh.F, len(mesh.V))[0]
         scenes = {"hand": turning_star(mesh.V, mesh.F, loop, options.frames), **scenes}
     lines = [
+        f"{machine()}; {options.frames} frames, {ENERGY}\n",
         "| scene | triangles | polished alone: largest move, energy, s | from the last frame | `animate` "
         "| its energy over alone |",
         "|---|---|---|---|---|---|",
@@ -206,15 +207,10 @@ def main() -> None:
         lines.append(f"| {name} | {len(scene[1]):,} | {' | '.join(cells)} | {ratio:.3f} |")
         print(lines[-1], flush=True)
         drawn[name] = found
-    lines.append("")
-    lines.append(
-        f"quasiharmonic {__version__}, {options.frames} frames, {ENERGY}; {platform.processor() or platform.machine()}"
-    )
-    print("\n".join(lines))
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
-        (options.output / "animation.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        draw(drawn, options.output / "animation.png")
+        (options.output / "sequences.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        draw(drawn, options.output / "sequences.png")
 
 
 def draw(found: dict[str, dict[str, tuple[FloatArray, FloatArray, float]]], path: Path) -> None:

@@ -3,7 +3,8 @@
     python benchmarks/campaign.py -n 10000 -o results.jsonl [--families maze,pins] [-j 2]
     python benchmarks/campaign.py -n 1000 -o hard.jsonl --adversarial
     python benchmarks/campaign.py -n 1000 -o refined.jsonl --refine [--only-simple]
-    python benchmarks/campaign.py --summary results.jsonl
+    python benchmarks/campaign.py --summary results.jsonl [--table docs/choose/refinement.md]
+    python benchmarks/campaign.py --compare before.jsonl after.jsonl
     python benchmarks/campaign.py --case maze:7:0.8
 
 A campaign writes one line of JSON per problem when the problem is done, and skips problems that the file contains. It
@@ -19,6 +20,7 @@ problems without a simple target: they take most of the time, and a bijective ma
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import multiprocessing
 import signal
@@ -37,8 +39,8 @@ import numpy as np
 from problems import ADVERSARIAL, FAMILIES, make, parse
 from quasiharmonic import Problem, Status, solve
 from quasiharmonic.solver.construction.simplicity import is_simple
-from quasiharmonic.solver.refine.attempts import solve_refining
 from quasiharmonic.solver.search.strategy import STRATEGIES
+from speed import machine
 
 Record = dict[str, Any]
 
@@ -90,30 +92,30 @@ def run(
 
 def _solved(problem: Problem, strategy: str, max_iterations: int, refine: bool) -> Record:
     began, effort = time.perf_counter(), time.process_time()
-    way = solve_refining if refine else solve
-    result = way(problem, strategy=strategy, max_iterations=max_iterations)
+    result = solve(problem, strategy=strategy, max_iterations=max_iterations, refine=refine)
     seconds, cpu = time.perf_counter() - began, time.process_time() - effort
-    told = {}
+    facts = {}
     if refine:
         # These problems have a bijective map on a sufficiently fine mesh, if double precision can represent it.
-        told = {"promised": is_simple(problem), "no_room": result.status is Status.PRECISION_LIMIT}
-        told |= {"added": result.added, "rung": result.refinement_attempts[-1].name}
+        facts = {"promised": is_simple(problem), "no_room": result.status is Status.PRECISION_LIMIT}
+        facts |= {"added": result.added, "attempt": result.refinement_attempts[-1].name}
     verdict = "injective" if result.injective else "not injective"
     energy = min((step.energy for step in result.history), default=np.nan)
     return {
         "outcome": verdict if np.isfinite(result.uv).all() else "not finite",
+        "uv": hashlib.sha256(result.uv.tobytes()).hexdigest()[:16],
         "status": result.status.name.lower(),
         "inverted": len(result.certificate.inverted) + len(result.certificate.degenerate),
         "bijective": result.certificate.bijective,
-        "iterations": result.iterations,
+        "iterations": result.n_iterations,
         "energy": energy if np.isfinite(energy) else None,
         "seconds": round(seconds, 4),
         "cpu": round(cpu, 4),
         "loops": len(problem.domain.loops),
         "pins": len(problem.domain.pins),
         "interior": problem.n - len(problem.fixed),
-        "stages": [(s.name, s.iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
-        **told,
+        "stages": [(s.name, s.n_iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
+        **facts,
     }
 
 
@@ -272,8 +274,8 @@ def summary(records: Sequence[Record]) -> str:
         "",
     ]
     lines += [*_by_stage(feasible), ""]
-    if any("rung" in r for r in records):
-        lines += [*_by_rung([r for r in records if "rung" in r]), ""]
+    if any("attempt" in r for r in records):
+        lines += [*_by_attempt([r for r in records if "attempt" in r]), ""]
     last = Counter(r["stages"][-1][0] if r.get("stages") else "-" for r in records if r["outcome"] == "injective")
     lines += ["found by: " + "; ".join(f"{k}: {n}" for k, n in last.most_common())]
     lines += [
@@ -330,8 +332,8 @@ def _row(title: str, records: Sequence[Record]) -> str:
     return f"{title:10}" + "".join(f"{share:>12}" for share in shares) + f"{effort[0]:>13}{effort[1]:>15}"
 
 
-def _by_rung(records: Sequence[Record]) -> list[str]:
-    """Return problems solved by each refinement stage, vertices added and time."""
+def _by_attempt(records: Sequence[Record]) -> list[str]:
+    """Return problems solved by each refinement attempt, vertices added and time."""
     lines = []
     for title, kind in (("simple targets", True), ("others", False)):
         group = [r for r in records if r["promised"] is kind]
@@ -340,19 +342,47 @@ def _by_rung(records: Sequence[Record]) -> list[str]:
             f"{title}: {len(done)} of {len(group)} mapped, {sum(r['bijective'] for r in group)} of them bijectively, "
             f"{sum(r['no_room'] for r in group)} without room in doubles"
         )
-        for rung in dict.fromkeys(r["rung"] for r in done):
-            by = [r for r in done if r["rung"] == rung]
+        for attempt in dict.fromkeys(r["attempt"] for r in done):
+            by = [r for r in done if r["attempt"] == attempt]
             added, cpu = [r["added"] for r in by], [r["cpu"] for r in by]
             lines.append(
-                f"  {rung}: {len(by)}; vertices added (50 %, 95 %, most) {_spread(added, 95, 'g')}; "
+                f"  {attempt}: {len(by)}; vertices added (50 %, 95 %, most) {_spread(added, 95, 'g')}; "
                 f"CPU seconds (50 %, 99 %, most) {_spread(cpu, 99, '.2f')}"
             )
     return lines
 
 
+def refinement_table(records: Sequence[Record]) -> str:
+    """Return a Markdown table of the attempts that mapped the problems with simple targets."""
+    group = [r for r in records if r.get("promised")]
+    lines = [
+        machine(),
+        "",
+        "| attempt | problems | bijective | vertices added: median, 95 %, most | CPU s: median, 99 %, most |",
+        "|---|---|---|---|---|",
+    ]
+    for attempt in [*dict.fromkeys(r["attempt"] for r in group), "all"]:
+        some = [r for r in group if attempt in (r["attempt"], "all")]
+        added, cpu = _spread([r["added"] for r in some], 95, "g"), _spread([r["cpu"] for r in some], 99, ".2g")
+        lines.append(f"| {attempt} | {len(some)} | {sum(r['bijective'] for r in some)} | {added} | {cpu} |")
+    return "\n".join(lines)
+
+
 def _spread(values: Sequence[float], upper: int, form: str) -> str:
     """Return the median, an upper percentile and the maximum."""
     return ", ".join(f"{value:{form}}" for value in np.percentile(values, [50, upper, 100], method="higher"))
+
+
+def differences(before: Sequence[Record], after: Sequence[Record]) -> list[str]:
+    """Return a line for every problem of both campaigns whose maps or iteration counts differ."""
+    earlier = {record["name"]: record for record in before}
+    lines = []
+    for record in after:
+        other = earlier.get(record["name"], record)
+        changed = [key for key in ("uv", "iterations", "status", "outcome") if other.get(key) != record.get(key)]
+        if changed:
+            lines.append(f"{record['name']}: " + ", ".join(f"{k} {other.get(k)} → {record.get(k)}" for k in changed))
+    return lines
 
 
 def _story(record: Record) -> str:
@@ -379,7 +409,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-j", "--processes", type=int, default=1, help="problems at a time (%(default)s)")
     parser.add_argument("--limit", type=float, default=120.0, help="seconds a problem (%(default)s)")
     parser.add_argument("--summary", type=Path, metavar="RESULTS", help="summarise records and end")
+    parser.add_argument("--compare", type=Path, nargs=2, metavar="RESULTS", help="list the maps that differ and end")
     parser.add_argument("--case", action="append", metavar="NAME", help="run just this problem, e.g. maze:7:0.8")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="write a table of refinement attempts")
     options = parser.parse_args(arguments)
     families = (
         options.families.split(",") if options.families else list(ADVERSARIAL if options.adversarial else FAMILIES)
@@ -392,6 +424,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parse(name)
         except ValueError as error:
             parser.error(f"--case {name}: {error}")
+    if options.compare:
+        before, after = (read(path) for path in options.compare)
+        lines = differences(before, after)
+        print("\n".join([*lines, f"{len(lines)} of {len(after)} maps differ"]))
+        return bool(lines)
     if options.summary and not options.summary.exists():
         parser.error(f"there is no file {options.summary}")
 
@@ -425,6 +462,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("interrupted; the same command goes on from here", file=sys.stderr)
         records = read(options.output)
     print(summary(records))
+    if options.table:
+        options.table.write_text(refinement_table(records) + "\n", encoding="utf-8")
     return int(any(map(failed, records)))
 
 

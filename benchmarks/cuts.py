@@ -23,7 +23,6 @@ os.environ.setdefault("MKL_NUM_THREADS", "1")
 import argparse
 import csv
 import itertools
-import platform
 import sys
 import time
 from collections.abc import Iterator
@@ -32,13 +31,14 @@ from pathlib import Path
 import numpy as np
 
 from quasiharmonic import flatten, io, surfaces
-from quasiharmonic.geometry.mesh.opening import opened_along
+from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edges
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.targets.cuts.graph import edge_graph
 from quasiharmonic.targets.cuts.shrinking import Shrinking
 from quasiharmonic.ui.plot.shading import lit
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from speed import machine
 
 Surface = tuple[str, FloatArray, IntArray]
 
@@ -78,7 +78,7 @@ def judged(name: str, way: str, V: FloatArray, F: IntArray, cut: IntArray, secon
     degree = np.bincount(cut.ravel(), minlength=len(V))
     shrinking, opened = Shrinking(graph), graph.rim_vertices.copy()
     opened[cut] = True
-    FT, origin = opened_along(F, cut, len(V))
+    FT, origin = open_along(F, cut, len(V))
     began = time.process_time()
     result = flatten(V[origin], FT)
     return {
@@ -118,7 +118,7 @@ def draw(path: Path, V: FloatArray, F: IntArray, cut: IntArray) -> None:
 
     figure = Figure(figsize=(15, 5), layout="tight")
     axes = figure.subplots(1, 3)
-    FT, origin = opened_along(F, cut, len(V))
+    FT, origin = open_along(F, cut, len(V))
     uv = flatten(V[origin], FT).uv
     graph = edge_graph(V, F)
     marked = np.zeros(len(graph.ends), dtype=bool)
@@ -207,9 +207,10 @@ def main() -> None:
     parser.add_argument("--gain", nargs="+", type=float, default=[0.1], metavar="G", help="default: 0.1")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER")
     parser.add_argument("--csv", type=Path, metavar="FILE")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="a table of the last gain and the baseline")
     parser.add_argument("--large", action="store_true")
     options = parser.parse_args()
-    print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}\n")
+    print(f"{machine()}\n")
     cases = given_surfaces(options.paths) if options.paths else own_surfaces()
     rows = compare(cases, options.gain, options.pictures)
     print("| " + " | ".join(rows[0]) + " |\n" + "|---" * len(rows[0]) + "|")
@@ -220,8 +221,23 @@ def main() -> None:
             writer = csv.DictWriter(file, list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
+    if options.output is not None:
+        options.output.write_text(f"{machine()}\n\n{make_table(rows, options.gain[-1])}", encoding="utf-8")
     for line in large() if options.large else ():
         print(f"\n{line}")
+
+
+def make_table(rows: list[dict[str, object]], gain: float) -> str:
+    """Return lengths and energies in Markdown, in units of the square root of the surface's area."""
+    lines = ["| surface | triangles | length | energy | baseline: length | baseline: energy |", "|---" * 6 + "|"]
+    for name in dict.fromkeys(row["surface"] for row in rows):
+        row, before = (
+            next(row for row in rows if (row["surface"], row["cuts"]) == (name, way))
+            for way in (f"gain {gain:g}", "before")
+        )
+        cells = [f"{found[key]:.3g}" for found in (row, before) for key in ("length", "energy")]
+        lines.append(f"| {name} | {row['triangles']:,} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
 
 
 def _shown(value: object) -> str:

@@ -1,7 +1,7 @@
 """Write a data set of generated problems with the composition of the Locally Injective Mappings Benchmark.
 
     python benchmarks/dataset.py FOLDER -n 2000
-    qhm batch FOLDER -o OUT && qhm report OUT
+    qhm batch FOLDER -o OUT --report
 
 Every problem is a folder with ``input.obj`` (the rest mesh, and Tutte's embedding as a first guess) and
 ``handles.txt``. As in the benchmark, there are three kinds:

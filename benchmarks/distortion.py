@@ -23,20 +23,21 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import Problem, boundary_loops, distortion, io, solve, surfaces, targets
-from quasiharmonic.energies.polishing import ENERGIES, polish_map
-from quasiharmonic.geometry.mesh.shapes import rest_shapes
-from quasiharmonic.solver.search.harmonising import harmonise_map
+from quasiharmonic import Problem, boundary_loops, distortion, harmonise, io, polish, solve, surfaces, targets
+from quasiharmonic.energies.polishing import ENERGIES
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.util.arrays import FloatArray
 
 Found = tuple[FloatArray, float]
 
 LETTERS = "GSRAPH"
 METHODS: dict[str, Callable[[Problem, FloatArray], FloatArray]] = {
-    "harmonised, MIPS": lambda problem, uv: harmonise_map(problem.domain, uv, energy="mips").uv,
-    "polished, MIPS": lambda problem, uv: polish_map(problem.domain, uv, energy="mips").uv,
-    "polished, blend": lambda problem, uv: polish_map(problem.domain, uv, energy="blend").uv,
-    "polished, sym. Dirichlet": lambda problem, uv: polish_map(problem.domain, uv, energy="symmetric-dirichlet").uv,
+    "harmonised, MIPS": lambda problem, uv: harmonise(problem.V, problem.F, uv, fixed=problem.fixed, energy="mips").uv,
+    "polished, MIPS": lambda problem, uv: polish(problem.V, problem.F, uv, fixed=problem.fixed, energy="mips").uv,
+    "polished, blend": lambda problem, uv: polish(problem.V, problem.F, uv, fixed=problem.fixed, energy="blend").uv,
+    "polished, sym. Dirichlet": lambda problem, uv: (
+        polish(problem.V, problem.F, uv, fixed=problem.fixed, energy="symmetric-dirichlet").uv
+    ),
 }
 STEPS = 5, 10, 20, 40
 
@@ -85,7 +86,7 @@ def forced(problem: Problem) -> float:
 def measured(problem: Problem, uv: FloatArray) -> tuple[float, float]:
     """Return the MIPS energy and the worst stretch."""
     found = distortion(problem.V, problem.F, uv)
-    return found.summary("mips").mean, found.summary("isometric").maximum
+    return found.statistics("mips").mean, found.statistics("isometric").maximum
 
 
 def compare(folders: list[Path]) -> None:
@@ -125,7 +126,7 @@ def unasked(folders: list[Path]) -> None:
         for energy in ENERGIES:
             for steps in STEPS:
                 began = time.perf_counter()
-                uv = polish_map(problem.domain, first[0], energy=energy, max_iterations=steps).uv
+                uv = polish(problem.V, problem.F, first[0], fixed=problem.fixed, energy=energy, max_iterations=steps).uv
                 after = np.array([time.perf_counter() - began, *measured(problem, uv)])
                 gains.setdefault((energy, steps), []).append(tuple(after / before))
     print("| energy | steps | seconds | MIPS | worst in | max(σ₁, 1/σ₂) | worst in |\n" + "|---" * 7 + "|")

@@ -132,10 +132,10 @@ def measured(name: str) -> dict[str, Any]:
         if run == "paper":
             row["start_flipped"] = result.history[0].inverted
         row[f"{run}_stage"] = len(result.stages) if result.injective else 0
-        row[f"{run}_iterations"] = result.iterations
+        row[f"{run}_iterations"] = result.n_iterations
         row[f"{run}_seconds"] = f"{seconds:.4f}"
         if result.injective:
-            found = distortion(problem.V, problem.F, result.uv).summary("mips")
+            found = distortion(problem.V, problem.F, result.uv).statistics("mips")
             row[f"{run}_mips"], row[f"{run}_median"] = f"{found.mean:.5g}", f"{found.median:.5g}"
     return row
 

@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter
 
 from quasiharmonic.apps.displacement_fields.nearest import fold_free, nearest_invertible
 from quasiharmonic.util.arrays import FloatArray
+from speed import machine
 
 # Spacing of the bumps' lattice in pixels, and number of bumps of each field.
 CELL, COUNTS = 12, (1, 50, 5000)
@@ -101,8 +102,19 @@ def main(output: Path, counts: tuple[int, ...] = COUNTS) -> list[dict[str, float
         )
         print(json.dumps(rows[-1]), flush=True)
     output.mkdir(parents=True, exist_ok=True)
-    (output / "fields.json").write_text(json.dumps(rows, indent=1) + "\n")
+    (output / "fields.md").write_text(f"{machine()}\n\n{table(rows)}", encoding="utf-8")
     return rows
+
+
+def table(rows: list[dict[str, float]]) -> str:
+    """Return the rows in Markdown."""
+    heads = "bumps", "pixels", "cells that fold", "pixels moved", "distance: RMS", "maximum", "Gaussian: RMS", "maximum"
+    lines = [f"| {' | '.join(heads)} | CPU seconds |", "|---" * (1 + len(heads)) + "|"]
+    for row in rows:
+        cells = f"{row['bumps']:,}", f"{row['side']}²", f"{row['cells']:,}", f"{row['moved']:.1%}"
+        distances = (f"{row[key]:.3f}" for key in ("rms", "largest", "smoothed rms", "smoothed largest"))
+        lines.append(f"| {' | '.join([*cells, *distances])} | {row['seconds']:.2g} |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

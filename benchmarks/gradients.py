@@ -3,7 +3,7 @@
     python benchmarks/gradients.py [--size CELLS] [-r REPEATS] [--unrolled ITERATIONS]
 
 For each kind of map, measure CPU seconds of the map alone, of preparing its derivative, and of one gradient by all
-inputs. The last columns are ratios of both passes to the map alone and to the forward pass. To prepare the derivative,
+inputs. The last column is the ratio of both passes to the map alone. To prepare the derivative,
 a polished or flattened map is converged to rounding and factored once more. Runs are interleaved in one process; the
 minimum of the repeats counts.
 
@@ -19,6 +19,7 @@ import argparse
 import resource
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -36,6 +37,7 @@ from quasiharmonic import (
 from quasiharmonic.surfaces import cat
 from quasiharmonic.targets import boundary_to, filled, letter
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from speed import machine
 
 T = TypeVar("T")
 # Parameters of the recorded heavy-ball descent; the step length is the largest that stayed feasible in tests.
@@ -58,8 +60,8 @@ def bean(V: FloatArray, loop: IntArray) -> FloatArray:
     return np.stack([np.cos(t) + 0.3 * np.cos(t) ** 2, 0.7 * np.sin(t) + 0.35 * np.cos(t) ** 2], axis=1)
 
 
-def forth_and_back(size: int, repeats: int) -> None:
-    """Print the table of forward and backward passes."""
+def forth_and_back(size: int, repeats: int) -> str:
+    """Return the table of forward and backward passes in Markdown."""
     V, F = cat(size)
     (loop,) = boundary_loops(F, len(V))
     onto_bean, onto_letter = Problem(V, F, loop, bean(V, loop)), Problem(V, F, *boundary_to(V, F, filled(letter("R"))))
@@ -75,20 +77,22 @@ def forth_and_back(size: int, repeats: int) -> None:
     )
     ways: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
         BUT_REST: tensors,
-        "quasi-harmonic, by all": tensors,
-        "polished, bean": (
+        "quasi-harmonic, by rest positions too": tensors,
+        "polished, onto a bean": (
             lambda: polished(onto_bean),
             lambda found: polish_derivative(V, F, found.uv, fixed=loop),
         ),
-        "polished, letter": (
+        "polished, onto the letter R": (
             lambda: polished(onto_letter),
             lambda found: polish_derivative(V, F, found.uv, fixed=onto_letter.fixed),
         ),
         "flattened": (lambda: flatten(V, F), lambda found: flatten_derivative(V, F, found.uv)),
     }
-    print(f"{len(F):,} triangles, seconds of the processor, the least of {repeats}\n")
-    print("| map | map | at rest, factored | one gradient | both ways / map | both ways / forth |")
-    print("|---|---|---|---|---|---|")
+    lines = [
+        f"{machine()}; {len(F):,} triangles, CPU seconds, minimum of {repeats}\n",
+        "| map | map: s | converged and factored: s | one gradient: s | both passes / map |",
+        "|---|---|---|---|---|",
+    ]
     for name, (forth, derive) in ways.items():
         rows = []
         for _ in range(repeats):
@@ -105,10 +109,9 @@ def forth_and_back(size: int, repeats: int) -> None:
         # The derivative of a quasi-harmonic map computes the map itself.
         way = two if derive is tensors[1] else one + two
         besides = two - one if derive is tensors[1] else two
-        print(
-            f"| {name} | {one:.3f} | {max(besides, 0):.3f} | {three:.3f} | {(way + three) / one:.2f} | "
-            f"{(way + three) / way:.2f} |"
-        )
+        lines.append(f"| {name} | {one:.3f} | {max(besides, 0):.3f} | {three:.3f} | {(way + three) / one:.2f} |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines) + "\n"
 
 
 def peak() -> float:
@@ -128,8 +131,8 @@ def unrolled(size: int, most: int) -> None:
     derivative, more = clocked(lambda: polish_derivative(V, F, found.uv, fixed=loop))
     cotangent = COTANGENTS.standard_normal((len(V), 2))
     exact, last = clocked(lambda: derivative.vjp(cotangent).target)
-    print(f"\n{len(F):,} triangles, gradient by the {len(loop)} places of the boundary\n")
-    print("| way | iterations | s forth | s back | MB | gradient off by |")
+    print(f"\n{machine()}; {len(F):,} triangles, gradient with respect to {len(loop)} boundary positions\n")
+    print("| derivative | iterations | forward: s | backward: s | MB | error of the gradient |")
     print("|---|---|---|---|---|---|")
     print(f"| exact | – | {seconds + more:.2f} | {last:.3f} | {peak() - began:.0f} | – |")
     triangles, rest = torch.tensor(F), torch.tensor(V)
@@ -186,13 +189,16 @@ def unrolled(size: int, most: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=58, help="cells across the cat's head (58: 20,000 triangles)")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the table, without --unrolled")
     parser.add_argument("-r", "--repeats", type=int, default=5)
     parser.add_argument("--unrolled", type=int, default=0, metavar="ITERATIONS", help="record up to so many iterations")
     options = parser.parse_args()
     if options.unrolled:
         unrolled(options.size, options.unrolled)
     else:
-        forth_and_back(options.size, options.repeats)
+        table = forth_and_back(options.size, options.repeats)
+        if options.output is not None:
+            options.output.write_text(table, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ def riemannian(gradient: ComplexArray, xi: ComplexArray) -> ComplexArray:
 class HyperbolicAdam(VectorAdam):
     """VectorAdam with steps along geodesics; tanh only."""
 
-    word: ClassVar[str] = "hyperbolic-adam"
+    label: ClassVar[str] = "hyperbolic-adam"
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`."""

@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic import InverseMap, SurfacePoints, boundary_loops, injective_map, io
+from quasiharmonic import InverseMap, boundary_loops, injective_map, io
+from quasiharmonic.results import SurfacePoints
 from quasiharmonic.surfaces import cat, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
 from quasiharmonic.util.arrays import FloatArray

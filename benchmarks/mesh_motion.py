@@ -4,8 +4,8 @@
 
 In each of six scenes (`moving_scenes`), every method (`mesh_movers`) takes steps until a triangle is inverted or the
 scene ends. Inversion is certified exactly. The steps of `morph` are independent, so it runs at every eighth step only.
-Write mesh_motion.csv, mesh_motion.md and mesh_motion.png: the displacement at the last valid step, the worst and the
-mean triangle quality, and CPU time per step. The baseline is one solve of linear elasticity, interleaved with the
+Write mesh_motion.md, mesh_motion.png, and mesh_motion.csv with the displacement at the last valid step, the worst and
+the mean triangle quality, and CPU time per step. The baseline is one solve of linear elasticity, interleaved with the
 steps. Kratos is skipped if it is not installed.
 """
 
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import csv
 import importlib.util
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -28,11 +27,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from mesh_movers import Extended, Kratos, MorphResult, Mover, Ours, compact, elasticity, harmonic, thin_plate
 from moving_scenes import SCENES, Scene
-from quasiharmonic import __version__, inverted_triangles
+from quasiharmonic import inverted_triangles
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.util.arrays import FloatArray
+from speed import machine
 
-OURS, MORPH = "ours", "morph"
+OURS, MORPH = "MovingMesh", "morph"
 #: Methods by name and start of each step. Kratos' solvers have only one kind of start.
 METHODS: dict[tuple[str, str], Callable[[Scene], Mover]] = {
     (name, base): partial(Extended, extension=extension, from_rest=base == "first")
@@ -178,44 +178,34 @@ def rows(name: str, scene: Scene, runs: dict[tuple[str, str], Run], yardstick: l
 
 
 def table(found: list[dict[str, object]], scenes: dict[str, Scene]) -> str:
-    """Return the rows in Markdown, scene by scene."""
-    lines = []
+    """Return a description of the scenes, and a Markdown table of the last valid step of each method in each scene."""
+    lines = [f"{machine()}, scikit-fem {version('scikit-fem')}, {_kratos()}", ""]
     for name, scene in scenes.items():
         about = (SCENES[name].__doc__ or "").split("\n")[0]
         about += f" {len(scene.F):,} triangles, {scene.steps} steps; ends with {scene.end}."
         if name in TURNING:
-            about += f" Its edges allow no turn beyond {forbidden_beyond(scene):,.0f}°; no obstruction is known before."
-        lines += [f"**{name.capitalize()}.** {about}", ""]
-        lines += [
-            "| method | each step from | valid to | worst, mean shape | worst, mean likeness | ms | elasticity solves |"
-        ]
-        lines += ["|---|---|---|---|---|---|---|"]
-        for row in (row for row in found if row["scene"] == name):
-            base = "its own" if row["from"] == "own" else f"the {row['from']} mesh"
-            end = "**the end**, " if row["steps"] == row["of"] else ""
-            cells = [
-                f"**{row['method']}**" if row["method"] == OURS else row["method"],
-                base,
-                f"{end}{row['valid to']:.4g} {row['unit']}",
-                f"{row['worst shape']:.2g}, {row['mean shape']:.2f}",
-                f"{row['worst likeness']:.2g}, {row['mean likeness']:.2f}",
-                f"{row['ms a step']:.0f}",
-                f"{row['elasticity solves']:.2f}",
-            ]
-            lines.append(f"| {' | '.join(map(str, cells))} |")
-        lines.append("")
-    lines.append(f"{_versions()}; {platform.processor() or platform.machine()}, one thread.")
+            about += f" Its edges allow no turn beyond {forbidden_beyond(scene):,.0f}°."
+        lines.append(f"- **{name.capitalize()}.** {about}")
+    heads = [f"{name}, {scene.unit}" for name, scene in scenes.items()]
+    lines += ["", f"| method | each step from | {' | '.join(heads)} | elasticity solves |"]
+    lines.append("|---" * (len(scenes) + 3) + "|")
+    for method, base in dict.fromkeys((row["method"], row["from"]) for row in found):
+        runs = {row["scene"]: row for row in found if (row["method"], row["from"]) == (method, base)}
+        cells = [str(method), "its own" if base == "own" else f"the {base} mesh"]
+        for name in scenes:
+            row = runs[name]
+            end = "**" if row["steps"] == row["of"] else ""
+            cells.append(f"{end}{row['valid to']:.4g}{end}")
+        costs = sorted(float(row["elasticity solves"]) for row in runs.values())
+        lines.append(f"| {' | '.join(cells)} | {costs[0]:.2g} – {costs[-1]:.2g} |")
     return "\n".join(lines) + "\n"
 
 
-def _versions() -> str:
-    known = [f"quasiharmonic {__version__}"]
-    for package in ("scikit-fem", "numpy", "scipy", "KratosMeshMovingApplication", "mkl"):
-        try:
-            known.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            known.append(f"no {package}")
-    return ", ".join([*known, f"Python {platform.python_version()}"])
+def _kratos() -> str:
+    try:
+        return f"KratosMeshMovingApplication {version('KratosMeshMovingApplication')}"
+    except PackageNotFoundError:
+        return "no Kratos"
 
 
 def draw(races: dict[str, dict[tuple[str, str], Run]], scenes: dict[str, Scene], path: Path) -> None:

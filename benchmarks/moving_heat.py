@@ -19,6 +19,7 @@ import argparse
 import json
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +33,11 @@ from moving_scenes import Scene, travelling_hole
 from quasiharmonic import inverted_triangles
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from speed import machine
 
 CONDUCTIVITY, LAPS, PERIOD = 0.02, 2.5, 10.0
 MOVERS = {
-    "ours": Ours,
+    "MovingMesh": Ours,
     "elasticity": partial(Extended, extension=elasticity, from_rest=False),
     "elasticity, from the first": partial(Extended, extension=elasticity, from_rest=True),
     "harmonic": partial(Extended, extension=harmonic, from_rest=False),
@@ -132,7 +134,7 @@ def draw(scene: Scene, histories: dict[str, History], steps: int, path: Path) ->
 
     figure = Figure(figsize=(13, 6.4), layout="constrained")
     grid = figure.add_gridspec(3, 4, height_ratios=[0.75, 0.75, 1])
-    ours = histories["ours"]
+    ours = histories["MovingMesh"]
     for i, k in enumerate(np.linspace(0, len(ours.meshes) - 1, 8).astype(int)):
         ax = figure.add_subplot(grid[i // 4, i % 4])
         V, u = ours.meshes[k], ours.temperatures[k]
@@ -143,7 +145,7 @@ def draw(scene: Scene, histories: dict[str, History], steps: int, path: Path) ->
         ax.set_title(f"step {k}", fontsize=9)
     quality, law = figure.add_subplot(grid[2, :2]), figure.add_subplot(grid[2, 2:])
     for name, history in histories.items():
-        (line,) = quality.semilogy(history.quality, lw=2.2 if name == "ours" else 1.2, label=name)
+        (line,) = quality.semilogy(history.quality, lw=2.2 if name == "MovingMesh" else 1.2, label=name)
         if len(history.quality) <= steps:
             quality.plot(len(history.quality) - 1, history.quality[-1], "x", color=line.get_color())
     quality.set_ylabel("worst mean ratio")
@@ -174,7 +176,23 @@ def main() -> None:
         }
         for name, history in histories.items()
     }
+    (options.output / "moving_heat.md").write_text(table(numbers), encoding="utf-8")
     print(json.dumps(numbers, indent=2))
+
+
+def table(numbers: dict[str, dict[str, float]]) -> str:
+    """Return a Markdown table of the numbers of all methods."""
+    heads = list(next(iter(numbers.values())))
+    lines = [
+        f"{machine()}, scikit-fem {version('scikit-fem')}\n",
+        f"| mesh | {' | '.join(heads)} |",
+        "|---" * (1 + len(heads)) + "|",
+    ]
+    for name, row in numbers.items():
+        lines.append(
+            f"| {name} | {' | '.join(f'{row[head]:.2g}' if row[head] < 1 else str(row[head]) for head in heads)} |"
+        )
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ def laid(z: ComplexArray, F: IntArray, contours: list[FloatArray]) -> ComplexArr
             placed = arc_length(points(z[loop]), contour)
         except ValueError:
             # There are too few vertices to keep all corners.
-            placed = arc_length(points(z[loop]), contour, corner_angle=181)
+            placed = arc_length(points(z[loop]), contour, corner_angle=180)
         image[loop] = placed[:, 0] + 1j * placed[:, 1]
     return image
 

@@ -12,9 +12,9 @@ from typing import Any
 from quasiharmonic.geometry.mesh import reference
 from quasiharmonic.linsolve import base, laplacian
 from quasiharmonic.problem import domain
+from quasiharmonic.solver import mapping
 from quasiharmonic.solver.field.objective import Iterate, Objective
-from quasiharmonic.solver.refine import mapping
-from quasiharmonic.solver.search import coarse, solving, stages
+from quasiharmonic.solver.search import coarse, search, solving, stage_run
 
 # The available clocks: wall time or CPU time.
 clock = time.perf_counter
@@ -42,7 +42,7 @@ _CLOCKED: tuple[tuple[Any, str, str], ...] = (
     (laplacian.Laplacian, "__init__", "set-up"),
     (coarse, "coarsen", "coarsening"),
     (coarse, "prolong", "prolongation"),
-    (stages, "polish_map", "polish"),
+    (search, "polish_map", "polish"),
     (base.LinearSolver, "__init__", "analysis"),
     (Objective, "evaluate", "assembly"),
     (laplacian.Laplacian, "factor", "assembly"),
@@ -50,9 +50,9 @@ _CLOCKED: tuple[tuple[Any, str, str], ...] = (
     (base.LinearSolver, "factor", "factor"),
     (base.LinearSolver, "solve", "solve"),
     (Iterate, "_sweep", "gradient"),
-    (stages.Search, "run", "optimiser"),
+    (search.Search, "run", "optimiser"),
     (solving, "certify", "certificate"),
-    (stages, "triangle_signs", "certificate"),
+    (stage_run, "triangle_signs", "certificate"),
 )
 
 

@@ -20,8 +20,7 @@ import numpy as np
 
 import planar
 import problems
-from quasiharmonic import certify
-from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic import certify, flatten
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.io.formats.obj import read_obj
 from quasiharmonic.surfaces import cat
@@ -75,7 +74,7 @@ def make(name: str, scans: Sequence[Path] = ()) -> Pinned:
         rng = np.random.default_rng([zlib.crc32(family.encode()), int(number), attempt])
         kind, V, F = _surface(rng, scans)
         # The flat map has low distortion, is a disk, or is a blend of both.
-        flat = flatten(V, F, max_iterations=int(rng.choice([0, 3, 100])), tolerance=1e-2).uv @ (1, 1j)
+        flat = flatten(V, F, max_iterations=int(rng.choice([0, 3, 100])), tol=1e-2).uv @ (1, 1j)
         size = planar.span(flat)
         image, strength = FAMILIES[family](rng, (flat - flat.mean()) / size, F)
         # Weak deformations make no useful problem; meshes with slivers allow only those.

@@ -28,8 +28,7 @@ import numpy as np
 
 from campaign import read
 from pin_problems import FAMILIES, make
-from quasiharmonic import certify
-from quasiharmonic.apps.flattening.flattened import flatten
+from quasiharmonic import certify, flatten
 
 Record = dict[str, Any]
 
@@ -62,7 +61,7 @@ def run(name: str, scans: Sequence[Path]) -> Record:
                 "summary": certificate.summary(),
                 "energy": result.history[-1].energy if result.history else None,
                 "diagnosis": result.diagnosis.summary() if result.diagnosis is not None else None,
-                "stages": [(s.name, s.iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
+                "stages": [(s.name, s.n_iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
             }
         except Exception as error:
             record |= {"outcome": "exception", "message": repr(error), "trace": traceback.format_exc(limit=-4)}

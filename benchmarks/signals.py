@@ -12,7 +12,6 @@ Requires a system with process groups.
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import signal
@@ -29,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from damaged_files import read_trials
 from quasiharmonic import boundary_loops, injective_map
 from quasiharmonic.io import MeshData, map_of, read_mesh, write_map
 from quasiharmonic.surfaces import cat, disk
@@ -214,17 +214,7 @@ def _not_resumed(call: str, folder: Path) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Interrupt commands and list the failures; return 1 if there is any."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-n", "--count", type=int, default=60, help="signals (%(default)s)")
-    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="begin with this seed (%(default)s)")
-    parser.add_argument("--kinds", default=",".join(CALLS), help="separated by commas (all)")
-    parser.add_argument("--case", action="append", metavar="NAME", help="interrupt just this, e.g. polish:41")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="leave the files there")
-    options = parser.parse_args(arguments)
-    kinds = options.kinds.split(",")
-    names = options.case or [f"{kinds[i % len(kinds)]}:{options.first + i // len(kinds)}" for i in range(options.count)]
-    if unknown := {name.split(":")[0] for name in names} - set(CALLS):
-        parser.error(f"no kind {', '.join(sorted(unknown))}; there are {', '.join(CALLS)}")
+    options, names = read_trials(arguments, str(__doc__), "signals", 60, CALLS)
     ends: Counter[str] = Counter()
     failures, slowest = 0, 0.0
     with tempfile.TemporaryDirectory() as given:

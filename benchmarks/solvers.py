@@ -23,7 +23,7 @@ from quasiharmonic.linsolve import BACKENDS, available
 from speed import OURS, Arrays, cat, machine, peak_megabytes
 
 SIZES = 1_000, 4_000, 16_000, 64_000, 100_000
-BASE, MKL = "base", "pardiso"
+BASE, MKL = "base", "mkl"
 MILLION = 1_000_000
 
 Task = tuple[str, int, Callable[[str], object]]

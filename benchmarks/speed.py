@@ -14,20 +14,21 @@
 A generated problem maps a cat's head to the letters C, R and S. A folder is a problem (``input.obj`` +
 ``handles.txt``) or contains problems at any depth. Tools are interleaved, and the table has medians. If a tool exceeds
 ``--limit`` seconds, it gets no larger problem. Peak memory is that of a separate process, minus its memory before the
-call. Write to ``--output``: ``speed.csv``, ``speed.md`` with machine and versions, ``speed.png``.
+call. Write ``speed.csv``, ``speed.md`` with machine and versions, ``summary.md`` by size, and ``speed.png``.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import os
 import platform
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -39,8 +40,8 @@ import phases
 from peers import PEERS
 from quasiharmonic import Problem, boundary_loops, io, is_injective, solve, surfaces
 from quasiharmonic.linsolve import available
+from quasiharmonic.solver import mapping
 from quasiharmonic.solver.methods import Descent, VectorAdam
-from quasiharmonic.solver.refine import mapping
 from quasiharmonic.solver.search.strategy import STRATEGIES
 from quasiharmonic.targets import arc_length, letter, rectangle
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -51,6 +52,8 @@ Strategy = str | list[Descent]
 OURS = "quasiharmonic"
 YARDSTICK = "igl.harmonic"
 LETTERS = "CRS"
+# Limits of the groups of the summary, in triangles.
+_SIZES = 0, 2_000, 8_000, 25_000, 50_000, 100_000, 200_000, 400_000, 700_000, 10**9
 SIZES = (1_000, 4_000, 16_000, 64_000, 130_000)
 FRAMES = 100
 _MOVING = f"{FRAMES} frames"
@@ -134,7 +137,7 @@ def measure(
                     began = phases.clock()
                     if record.tool == OURS:
                         result = mapping.injective_map(*arrays, strategy=strategy, linear_solver=linear_solver)
-                        uv, record.iterations = result.uv, result.iterations
+                        uv, record.iterations = result.uv, result.n_iterations
                     else:
                         uv = PEERS[record.tool](*arrays)
                     record.seconds.append(phases.clock() - began)
@@ -218,14 +221,14 @@ def animation(triangles: int) -> list[Record]:
                 last = result.uv
             record.seconds.append(phases.clock() - began)
             record.injective &= result.injective
-            record.iterations += result.iterations
+            record.iterations += result.n_iterations
     for record in (afresh, onwards):
         record.seconds = [sum(record.seconds)]
     return [afresh, onwards]
 
 
 def machine() -> str:
-    """Return CPU, cores, requested threads and versions."""
+    """Return CPU, cores, requested threads, versions and the date."""
     model = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").exists():
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -236,25 +239,56 @@ def machine() -> str:
             versions.append(f"{package} {version(package)}")
         except PackageNotFoundError:
             continue
-    threads = os.environ.get("OMP_NUM_THREADS", "as many as it likes")
-    return f"{model}, {os.cpu_count()} cores, OMP_NUM_THREADS {threads}; {', '.join(versions)}"
+    threads = os.environ.get("OMP_NUM_THREADS", "not set")
+    described = f"{model}, {os.cpu_count()} cores, OMP_NUM_THREADS {threads}; {', '.join(versions)}"
+    return f"{described}, {time.strftime('%Y-%m-%d')}"
 
 
 def table(records: list[Record]) -> str:
-    """Return a Markdown table of the tools side by side, with memory if it was measured."""
+    """Return a Markdown table of median times by the number of triangles, a column per tool."""
     tools = list(dict.fromkeys(record.tool for record in records))
-    measured = any(record.megabytes is not None for record in records)
-    heads = ["problem", "triangles", *(f"{tool} s" for tool in tools), f"ratio to {YARDSTICK}"]
-    heads += [f"{tool} MB" for tool in tools if measured]
     rows = []
-    for name, triangles in _rows(records):
-        row = {r.tool: r for r in records if (r.problem, r.triangles) == (name, triangles)}
-        yardstick = row.get(YARDSTICK)
-        cells = [name, f"{triangles:,}", *(_time(row.get(tool)) for tool in tools)]
-        cells.append(f"{row[OURS].median / yardstick.median:.2f}" if yardstick and OURS in row else "")
-        found = [row[tool].megabytes if tool in row else None for tool in tools if measured]
-        rows.append(cells + ["" if megabytes is None else f"{megabytes:.0f}" for megabytes in found])
-    return f"{_markdown(heads, rows)}\n×: has inverted triangles.\n"
+    for of_size in _by_size(records):
+        cells = [_span([triangles for _, triangles in of_size], "{:,}")]
+        for tool in tools:
+            runs = [r for r in records if r.tool == tool and (r.problem, r.triangles) in of_size]
+            done = [r.median for r in runs if r.seconds]
+            fails = f" ({len(runs) - len(done)} of {len(runs)} fail)" if len(done) < len(runs) else ""
+            cells.append(f"{np.median(done):.3g}{fails}" if done else fails.strip(" ()"))
+        rows.append(cells)
+    return _markdown(["triangles", *(f"{tool}, s" for tool in tools)], rows)
+
+
+def size_table(records: list[Record]) -> str:
+    """Return a Markdown table of this package's time and memory and their baseline, by the number of triangles."""
+    rows = []
+    for of_size in _by_size(records):
+        times, ratios, memory = [], [], {OURS: [], YARDSTICK: []}
+        for key in of_size:
+            row = {r.tool: r for r in records if (r.problem, r.triangles) == key}
+            if OURS in row and YARDSTICK in row:
+                times.append(1e3 * row[OURS].median)
+                ratios.append(row[OURS].median / row[YARDSTICK].median)
+                for tool, found in memory.items():
+                    found += [row[tool].megabytes] if row[tool].megabytes is not None else []
+        if ratios:
+            cells = [str(len(ratios)), _span([triangles for _, triangles in of_size], "{:,}")]
+            cells += [_span([float(f"{x:.2g}") for x in found], "{:g}") for found in (times, ratios)]
+            cells += [_span(found, "{:.0f}") for found in memory.values()]
+            rows.append(cells)
+    heads = ["problems", "triangles", "map, ms", f"ratio to {YARDSTICK}", "peak memory, MB", f"{YARDSTICK}, MB"]
+    return _markdown(heads, rows)
+
+
+def _by_size(records: list[Record]) -> list[list[tuple[str, int]]]:
+    """Return the problems in groups of similar size."""
+    groups = ([key for key in _rows(records) if low <= key[1] < high] for low, high in itertools.pairwise(_SIZES))
+    return [group for group in groups if group]
+
+
+def _span(values: Sequence[float], shape: str) -> str:
+    """Return the least and the greatest value, once if they are equal."""
+    return " – ".join(dict.fromkeys(shape.format(value) for value in (min(values), max(values)))) if values else ""
 
 
 def phase_table(records: list[Record]) -> str:
@@ -406,7 +440,8 @@ def main(arguments: list[str] | None = None) -> None:
     frames += animation(20_000) if options.animation else []
     text = f"{machine()}{'; seconds of the processor' if options.processor else ''}\n"
     if records:
-        text += f"\n{table(records)}\nOur time by phase, in percent:\n\n{phase_table(records)}"
+        text += f"\n{table(records)}"
+        print(f"\nTime of quasiharmonic by phase, in percent:\n\n{phase_table(records)}")
     for record in frames:
         text += (
             f"\n{record.problem}, {record.triangles} triangles: {record.median:.2f} s, {record.iterations} iterations, "
@@ -416,6 +451,7 @@ def main(arguments: list[str] | None = None) -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     (options.output / "speed.md").write_text(text)
     write_csv(records + frames, options.output / "speed.csv")
+    (options.output / "summary.md").write_text(f"{machine()}\n\n{size_table(records)}", encoding="utf-8")
     if records:
         draw(records, options.output / "speed.png")
 

@@ -22,6 +22,7 @@ from evaluation import FEASIBLE
 from quasiharmonic import MapResult, Problem, distortion, solve
 from quasiharmonic.problem.result import Stage
 from quasiharmonic.solver.search.strategy import STRATEGIES
+from speed import machine
 
 
 class Outcome(NamedTuple):
@@ -40,7 +41,7 @@ def outcomes(names: Iterable[str], strategy: str) -> list[Outcome]:
         start = time.process_time()
         result = solve(Problem(case.V, case.F, case.fixed, case.target), strategy=strategy)
         seconds = time.process_time() - start
-        mips = distortion(case.V, case.F, result.uv).summary("mips").mean if result.injective else np.nan
+        mips = distortion(case.V, case.F, result.uv).statistics("mips").mean if result.injective else np.nan
         found.append(Outcome(result, seconds, float(mips)))
     return found
 
@@ -87,7 +88,9 @@ def main() -> None:
     options = parser.parse_args()
     names = list(campaign.names(options.count, FEASIBLE))
     runs = {strategy: outcomes(names, strategy) for strategy in STRATEGIES}
-    text = "\n\n".join([strategies(runs), *(stages(name, found) for name, found in runs.items())]) + "\n"
+    text = (
+        "\n\n".join([f"% {machine()}", strategies(runs), *(stages(name, found) for name, found in runs.items())]) + "\n"
+    )
     print(text)
     if options.output:
         options.output.write_text(text, encoding="utf-8")

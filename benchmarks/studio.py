@@ -20,6 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from speed import machine
+
 ARGUMENTS = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
     *("--disable-background-networking", "--disable-component-update"),
@@ -34,8 +36,8 @@ def main():
     parser.add_argument("--window", default="1000x600", help="of the browser (default: 1000x600)")
     parser.add_argument("--chromium", default=shutil.which("chromium"), help="none for CPU time alone")
     options = parser.parse_args()
-    print("| triangles | maps a second | pictures a second | mouse to picture | 95 % | CPU of a map | and told |")
-    print("|---|---|---|---|---|---|---|")
+    heads = "maps per second", "images per second", "mouse to image", "95 %", "CPU per map", "CPU with transfer"
+    print(f"{machine()}\n\n| triangles | {' | '.join(heads)} |\n" + "|---" * (1 + len(heads)) + "|")
     for triangles in options.triangles:
         rings = round((triangles / 6) ** 0.5)
         shown = "– | – | – | –"
@@ -100,23 +102,23 @@ def session_of(rings):
     from quasiharmonic.io import MeshData
     from quasiharmonic.surfaces import cat
     from quasiharmonic.ui.studio.protocol import encode
-    from quasiharmonic.ui.studio.session import Session
-    from quasiharmonic.ui.studio.surface import sheet_of
+    from quasiharmonic.ui.studio.session.session import Session
+    from quasiharmonic.ui.studio.session.surface import make_sheet
 
     session = Session(encode)
-    session.open(sheet_of(MeshData(*cat(rings), source="cat.obj"), "cat.obj"))
+    session.open(make_sheet(MeshData(*cat(rings), source="cat.obj"), "cat.obj"))
     return session
 
 
 def following(rings):
     """Return the CPU seconds of one updated map, certificate included."""
-    from quasiharmonic.ui.studio.falloff import grip
-    from quasiharmonic.ui.studio.following import Follower
+    from quasiharmonic.ui.studio.session.drag import Follower
+    from quasiharmonic.ui.studio.session.falloff import drag_weights
 
-    moment = session_of(rings).moment
+    moment = session_of(rings).state
     problem, corner = moment.problem, moment.corners[2]
     follower = Follower(problem, moment.result.uv, moment.result.certificate)
-    share = grip(corner, problem.fixed, problem.target, problem.domain.loops, moment.corners)
+    share = drag_weights(corner, problem.fixed, problem.target, problem.domain.loops, moment.corners)
     return timed(lambda way: follower.to(problem.target + share[:, None] * way))
 
 
@@ -125,8 +127,8 @@ def told(rings):
     from quasiharmonic.ui.studio.protocol import Frame
 
     session = session_of(rings)
-    corner = session.moment.corners[2]
-    place = session.moment.result.uv[corner]
+    corner = session.state.corners[2]
+    place = session.state.result.uv[corner]
     session.handle(Frame({"do": "grab", "vertex": corner}, {}))
     return timed(lambda way: session.handle(Frame({"do": "drag", "seq": 1, "to": (place + way).tolist()}, {})))
 

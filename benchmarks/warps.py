@@ -19,6 +19,7 @@ import numpy as np
 
 from quasiharmonic import distortion, warp_by_landmarks
 from quasiharmonic.util.arrays import FloatArray
+from speed import machine
 
 RESOLUTIONS = (16, 32, 64, 128, 256)
 SIDE = 257
@@ -109,7 +110,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main(output: Path, resolutions: list[int]) -> None:
     rows = measured(resolutions)
     output.mkdir(parents=True, exist_ok=True)
-    (output / "warps.md").write_text(table(rows))
+    (output / "warps.md").write_text(f"{machine()}\n\n{table(rows)}", encoding="utf-8")
     plotted(rows, output / "warps.png")
     print(table(rows))
 

@@ -1,6 +1,6 @@
 """Many small problems: `injective_maps`, `qhm batch`, and one call of `injective_map` or `qhm map` per problem.
 
-    python benchmarks/many.py [-n 10000] [--triangles 500] [-j 1,2] [--each 1000] [--files 200] [-o docs/speed/many.md]
+    python benchmarks/small_problems.py [-n 10000] [--triangles 500] [-j 1,2] [--each 1000] [--files 200] [-o TABLE]
 
 Three sets: one mesh with many outlines, a separate mesh for each outline, and generated problems that are hard for
 their size (`problems.py`). Methods for arrays are interleaved, portion by portion. Single calls are made for ``--each``
@@ -207,7 +207,7 @@ def main() -> None:
     jobs = [int(number) for number in options.jobs.split(",")]
     load = f"{os.getloadavg()[0]:.0f} processes waiting for {os.cpu_count()} cores"
     lines = [f"{machine()} (busy with other work: {load}); {options.triangles} triangles\n"]
-    lines.append("| set | how | problems | solved | a second | processor, ms each | times as many |")
+    lines.append("| set | call | problems | solved | per second | CPU ms each | ratio of CPU rates |")
     lines.append("|---|---|---|---|---|---|---|")
     for name in options.sets:
         lines += measure(name, options, jobs)

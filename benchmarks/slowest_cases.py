@@ -1,10 +1,10 @@
 """Slowest cases: hundreds of scanned surfaces mapped to outlines, and the time of the slowest ones.
 
-    python benchmarks/tail.py --scans FOLDER [-n 700] [-o tail.jsonl]
-    python benchmarks/tail.py --summary tail.jsonl [OTHER.jsonl …]
-    python benchmarks/tail.py --scans FOLDER --case 17
-    python benchmarks/tail.py --family spirals [-n 20] [-o spirals.jsonl] [--case 17]
-    python benchmarks/tail.py --family pins [-n 20] [-o pins.jsonl] [--case 17]
+    python benchmarks/slowest_cases.py --scans FOLDER [-n 700] [-o tail.jsonl]
+    python benchmarks/slowest_cases.py --summary tail.jsonl [OTHER.jsonl …]
+    python benchmarks/slowest_cases.py --scans FOLDER --case 17
+    python benchmarks/slowest_cases.py --family spirals [-n 20] [-o spirals.jsonl] [--case 17]
+    python benchmarks/slowest_cases.py --family pins [-n 20] [-o pins.jsonl] [--case 17]
 
 A number and the folder's files determine a pair: a disk of 1,000 to 20,000 triangles around a random point of a scan,
 and its boundary on a letter, a polygon, a star, a comb or a whirl. Interior edges between boundary vertices are split,
@@ -32,7 +32,7 @@ import planar
 from campaign import read
 from pin_problems import patch_of_scan
 from quasiharmonic import Status, injective_map
-from quasiharmonic.geometry.exact.loops import judge_loops
+from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.refinement import split_edges
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.surfaces import disk, grid
@@ -89,7 +89,7 @@ def make(number: int, scans: Sequence[Path]) -> Pair:
             target = arc_length(V[loop], contour)
         except ValueError:
             continue
-        if judge_loops([np.arange(len(loop))], target)[1]:
+        if check_loops([np.arange(len(loop))], target)[1]:
             continue  # too few vertices: the target would cross itself
         return Pair(V, F, loop, target, path.parent.name if path.stem == "input" else path.stem, word)
 
@@ -140,9 +140,9 @@ def run(number: int, pose: Callable[[int], Pair]) -> Record:
         "seconds": round(time.process_time() - began, 4),
         "injective": result.injective,
         "impossible": result.status is Status.IMPOSSIBLE,
-        "iterations": result.iterations,
+        "iterations": result.n_iterations,
         "inverted": len(result.certificate.inverted),
-        "stages": [(s.name, s.iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
+        "stages": [(s.name, s.n_iterations, *s.inverted, round(s.seconds, 4)) for s in result.stages],
     }
 
 

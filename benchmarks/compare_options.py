@@ -1,6 +1,6 @@
 """Cost and benefit of each choice: functional, parameterisation, descent method, strategy, energy.
 
-    OMP_NUM_THREADS=1 python benchmarks/choices.py -o docs/choose [--scans FOLDER …]
+    OMP_NUM_THREADS=1 python benchmarks/compare_options.py -o docs/choose [--scans FOLDER …]
 
 Seven surfaces are mapped to letters (``examples/sculptures.py``); only one choice varies at a time. ``--scans`` adds
 the problems of folders. Write a Markdown table for each choice, which the page *How to choose* includes. Figures are
@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 from quasiharmonic import MapResult, Problem, distortion, harmonise, io, polish, solve
 from quasiharmonic.solver.methods import LBFGS, Alternating, Descent, Newton, Untangling, VectorAdam
 from quasiharmonic.solver.search.strategy import STRATEGIES
+from speed import machine
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))
 from sculptures import seven
@@ -44,7 +45,7 @@ def clocked(run: Callable[[], MapResult]) -> tuple[MapResult, float]:
 
 def mips(problem: Problem, uv: np.ndarray) -> float:
     """Return the mean MIPS energy over the surface."""
-    return float(distortion(problem.V, problem.F, uv).summary("mips").mean)
+    return float(distortion(problem.V, problem.F, uv).statistics("mips").mean)
 
 
 def searched(problems: list[Problem], strategy: str | list[Descent]) -> list[tuple[MapResult, float]]:
@@ -66,7 +67,7 @@ def compared(problems: list[Problem], choices: dict[str, str | list[Descent]]) -
             [
                 name,
                 f"{len(angles)} of {len(problems)}",
-                f"{np.median([result.iterations for result, _ in runs]):.0f}",
+                f"{np.median([result.n_iterations for result, _ in runs]):.0f}",
                 f"{seconds / unit:.1f}",
                 f"{np.median(angles):.2g}" if angles else "",
             ]
@@ -126,7 +127,7 @@ def pins(problems: list[Problem]) -> Table:
 def methods(problems: list[Problem]) -> Table:
     """Return the table of descent methods, each from ξ = 0; tanh on equilateral triangles unless stated otherwise."""
     choices: dict[str, str | list[Descent]] = {
-        f"`{method.word}`": [method(iterations=LIMIT)] for method in (VectorAdam, LBFGS, Newton, Alternating)
+        f"`{method.label}`": [method(iterations=LIMIT)] for method in (VectorAdam, LBFGS, Newton, Alternating)
     }
     choices["`l-bfgs`, si-log"] = [LBFGS(parameterisation="si-log", reference="corrected", iterations=LIMIT)]
     choices["`untangling`"] = [Untangling(iterations=LIMIT)]
@@ -158,8 +159,8 @@ def energies(problems: list[Problem]) -> Table:
                 raise RuntimeError(f"{name} lost the map")
             found = distortion(problem.V, problem.F, result.uv)
             sizes = np.exp(quantile(np.abs(np.log(found.area_ratio)), found.share))
-            isometric = found.summary("isometric")
-            row = seconds, found.summary("mips").mean, isometric.median, isometric.maximum, sizes
+            isometric = found.statistics("isometric")
+            row = seconds, found.statistics("mips").mean, isometric.median, isometric.maximum, sizes
             columns.setdefault(name, []).append(row)
     unit = float(np.median([row[0] for row in columns["first map"]]))
     rows = [["", "time", "MIPS", "isometric, median", "isometric, worst", "areas off by"]]
@@ -210,7 +211,7 @@ def main() -> None:
         print(f"{measure.__name__}\n{text}", flush=True)
         if options.output:
             options.output.mkdir(parents=True, exist_ok=True)
-            (options.output / f"{measure.__name__}.md").write_text(text, encoding="utf-8")
+            (options.output / f"{measure.__name__}.md").write_text(f"% {machine()}\n\n{text}", encoding="utf-8")
 
 
 if __name__ == "__main__":

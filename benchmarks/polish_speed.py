@@ -1,6 +1,6 @@
 """Time until a polish is within 2 % of its converged energy, and the phases of its steps.
 
-    OMP_NUM_THREADS=1 python benchmarks/polish_pace.py [FOLDER …] --solvers pardiso rslab
+    OMP_NUM_THREADS=1 python benchmarks/polish_speed.py [FOLDER …] --solvers mkl rslab
 
 A folder is a problem (``input.obj`` and ``handles.txt``) or contains problems at any depth; by default, a cat's head is
 mapped to the letter R. Each first map is polished by the symmetric Dirichlet energy. The converged energy is that at a
@@ -21,7 +21,7 @@ import phases
 from quasiharmonic import Problem, io, solve
 from quasiharmonic.energies import polishing
 from quasiharmonic.energies.deformation import DeformationEnergy
-from quasiharmonic.energies.newton import newton_descent
+from quasiharmonic.energies.newton import map_model
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import available, base
 from quasiharmonic.problem.result import Step
@@ -43,12 +43,12 @@ _CLOCKED = (
     (DeformationEnergy, "gradient_of", "gradient"),
     (base.LinearSolver, "factor", "factor"),
     (base.LinearSolver, "solve", "solve"),
-    (newton_descent.NewtonDescent, "_search", "line search"),
+    (map_model.MapModel, "search", "line search"),
 )
 PHASES = tuple(dict.fromkeys(phase for *_, phase in _CLOCKED))
 
 
-class AdamState(NamedTuple):
+class PolishRun(NamedTuple):
     """One polish: CPU seconds and energy after each step, total seconds, and seconds by phase."""
 
     seconds: list[float]
@@ -64,12 +64,12 @@ class AdamState(NamedTuple):
         return None
 
 
-def pace(problem: Problem, uv: FloatArray, solver: str, *, tolerance: float = 1e-4, most: int = 200) -> AdamState:
+def measure(problem: Problem, uv: FloatArray, solver: str, *, tolerance: float = 1e-4, most: int = 200) -> PolishRun:
     """Polish a first map and record its steps."""
     seconds: list[float] = []
     energies: list[float] = []
 
-    def told(step: Step) -> None:
+    def record(step: Step) -> None:
         # The callback may report the last step again.
         if step.iteration == len(seconds):
             seconds.append(phases.clock() - began)
@@ -79,10 +79,12 @@ def pace(problem: Problem, uv: FloatArray, solver: str, *, tolerance: float = 1e
     with clock.clocking():
         began = phases.clock()
         polishing.polish_map(
-            problem.domain, uv, tolerance=tolerance, max_iterations=most, linear_solver=solver, callback=told
+            problem.domain,
+            uv,
+            polishing.PolishOptions(tol=tolerance, max_iterations=most, linear_solver=solver, callback=record),
         )
         whole = phases.clock() - began
-    return AdamState(seconds, energies, whole, clock.seconds)
+    return PolishRun(seconds, energies, whole, clock.seconds)
 
 
 def cases(folders: list[Path], sizes: list[int]) -> Iterator[tuple[str, Problem]]:
@@ -121,9 +123,9 @@ def main(arguments: list[str] | None = None) -> None:
         if not first.injective:
             continue
         best = options.solvers[0]
-        rest = pace(problem, first.uv, best, tolerance=_REST, most=_MOST).energies[-1]
+        rest = measure(problem, first.uv, best, tolerance=_REST, most=_MOST).energies[-1]
         for solver in options.solvers:
-            turns = [pace(problem, first.uv, solver) for _ in range(options.runs)]
+            turns = [measure(problem, first.uv, solver) for _ in range(options.runs)]
             one = min(turns, key=lambda turn: turn.whole)
             near = one.near(rest)
             shares = " | ".join(f"{100 * one.by_phase[phase] / one.whole:.0f}" for phase in PHASES)
@@ -132,7 +134,7 @@ def main(arguments: list[str] | None = None) -> None:
                 f"| {one.whole:.2f} | {len(one.energies) - 1} | {one.energies[-1] / rest - 1:.1%} | {shares} |"
             )
             print(lines[-1], flush=True)
-        found = [pace(problem, first.uv, best, tolerance=tolerance) for tolerance in TOLERANCES]
+        found = [measure(problem, first.uv, best, tolerance=tolerance) for tolerance in TOLERANCES]
         cells = " | ".join(f"{one.whole:.2f}, {one.energies[-1] / rest - 1:.1%}" for one in found)
         ends.append(f"| {name} | {cells} |")
     lines += ["", *ends]

@@ -1,7 +1,7 @@
 """Compare with records of TLC and Foldover-free: problems solved, time and distortion.
 
-    python benchmarks/rivals.py                       # from the records
-    python benchmarks/rivals.py --anew speed untangling [-n 20] [-o ANEW.csv]
+    python benchmarks/tlc_foldover.py > docs/comparisons/tlc_foldover.md  # from the records
+    python benchmarks/tlc_foldover.py --anew speed untangling [-n 20] [-o ANEW.csv]
 
 ``--anew`` runs this package again on the same problems, in their order, and certifies the maps in the same way. It runs
 strategies, or `Untangling` alone, which descends Foldover-free's regularised energy with this package's own method.
@@ -33,6 +33,18 @@ PROGRAMS = "ours speed", "ours quality", "TLC-PN", "TLC-QN", "SBP", "SBP until f
 #: The methods that can be run again, and the names of their stored runs.
 WAYS = *STRATEGIES, "untangling"
 ANEW = tuple(f"anew {way}" for way in WAYS)
+#: What the table calls the runs of this package.
+LABELS = {
+    "ours speed": "quasiharmonic, `speed`",
+    "anew speed": "quasiharmonic repeated, `speed`",
+    "anew paper": "quasiharmonic repeated, `paper`",
+    "anew untangling": "quasiharmonic repeated, `Untangling` alone",
+}
+#: Where the runs were measured; ``records/README.md`` has the details.
+PROVENANCE = (
+    "Intel Xeon, 2 cores, 2026-11-22, quasiharmonic 0.1.0 at eb0ed78; repeated: AMD EPYC, 2 cores, 2026-11-23, "
+    "quasiharmonic 0.1.0 (development)"
+)
 #: Less than a tick of the recording clock; ratios use this value for it.
 TICK = 0.004
 
@@ -66,7 +78,7 @@ class Run(NamedTuple):
     stretch: float
 
 
-def recorded() -> list[Run]:
+def read_records() -> list[Run]:
     """Return all recorded runs on generated problems."""
     with (RECORDS / "rivals.csv").open(encoding="utf-8", newline="") as file:
         return [
@@ -85,7 +97,7 @@ def recorded() -> list[Run]:
         ]
 
 
-def kept(path: Path = RECORDS / "anew.csv") -> list[Run]:
+def read_repeated_runs(path: Path = RECORDS / "anew.csv") -> list[Run]:
     """Return this package's repeated runs, as written with ``-o``."""
     with path.open(encoding="utf-8", newline="") as file:
         return [
@@ -135,7 +147,7 @@ def anew(rows: dict[str, dict[str, Run]], way: str) -> Iterator[Run]:
         if result.injective:
             better = polish(case.V, case.F, result.uv, fixed=case.fixed, energy="mips")
             found, after = (distortion(case.V, case.F, uv) for uv in (result.uv, better.uv))
-            row = [found.summary("mips").mean, after.summary("mips").mean, found.summary("isometric").maximum]
+            row = [found.statistics("mips").mean, after.statistics("mips").mean, found.statistics("isometric").maximum]
         yield Run(name, f"anew {way}", len(case.F), seconds, result.injective, case.feasible, before, *row)
 
 
@@ -179,17 +191,28 @@ def median(values: Sequence[float]) -> float:
     return float(f"{np.median(known):.4g}") if known.size else float("nan")
 
 
-def print_table(table: dict[str, dict[str, Any]]) -> None:
-    """Print the table in Markdown."""
-    first = next(iter(table))
-    print(f"| program | feasible | unknown | seconds / {first}: 10, 50, 90 % | quicker | MIPS | polished | least |")
-    print("|---|---|---|---|---|---|---|---|")
+def table_text(table: dict[str, dict[str, Any]]) -> str:
+    """Return the table in Markdown."""
+    lines = [
+        "| program | known map: solved | unknown: solved | ratio of CPU seconds: 10, 50, 90 % | quicker | "
+        "first map's MIPS | polished |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for name, row in table.items():
         ratio = ", ".join(f"{q:g}" for q in row["ratio"])
-        solved = f"{row['feasible solved']}/{row['feasible']} | {row['unknown solved']}/{row['unknown']}"
-        quicker = f"{row['quicker']}/{row['of']}"
-        least = f"{row['least']}/{row['of all']}"
-        print(f"| {name} | {solved} | {ratio} | {quicker} | {row['MIPS']:g} | {row['polished']:g} | {least} |")
+        solved = f"{row['feasible solved']} of {row['feasible']} | {row['unknown solved']} of {row['unknown']}"
+        quicker = f"{row['quicker']} of {row['of']}"
+        lines.append(
+            f"| {LABELS.get(name, name)} | {solved} | {ratio} | {quicker} | {row['MIPS']:.3g} | {row['polished']:.3g} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def table_of_records() -> str:
+    """Return the table of all recorded and repeated runs, without a strategy that no longer exists."""
+    programs = [name for name in (*PROGRAMS, *ANEW) if name != "ours quality"]
+    table = table_text(summary(on_common_problems([*read_records(), *read_repeated_runs()]), programs))
+    return f"{PROVENANCE}\n\n{table}"
 
 
 def main() -> None:
@@ -199,8 +222,11 @@ def main() -> None:
     parser.add_argument("-n", type=int, default=68, metavar="N", help="the first N problems (68)")
     parser.add_argument("-o", "--output", type=Path, metavar="CSV", help="rows of what was run anew")
     options = parser.parse_args()
-    rows = dict(list(on_common_problems([*recorded(), *([] if options.anew else kept())]).items())[: options.n])
-    programs = [*PROGRAMS, *(() if options.anew else ANEW)]
+    if not options.anew:
+        print(table_of_records(), end="")
+        return
+    rows = dict(list(on_common_problems(read_records()).items())[: options.n])
+    programs = [*PROGRAMS]
     runs = []
     for way in options.anew:
         for run in anew(rows, way):
@@ -212,7 +238,7 @@ def main() -> None:
     if runs and options.output:
         with options.output.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file).writerows([Run._fields, *runs])
-    print_table(summary(rows, programs))
+    print(table_text(summary(rows, programs)), end="")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
 """Run the command on malicious files; each must give a one-line message within ten seconds and a gigabyte.
 
-    python benchmarks/malicious.py
-    python benchmarks/malicious.py --case vtu-zlib-bomb
+    python benchmarks/malicious_files.py
+    python benchmarks/malicious_files.py --case vtu-zlib-bomb
 
 The files contain huge counts, deep nesting, entities and compressed data that expand without limit, invalid numbers,
 references out of the folder or to themselves, pickles, wrong encodings, and missing ends. A *failure* is any of: an
 exit status other than 2 (or 0 and 1 if the file may be accepted); a message of more than one line or without the
-program's name; a traceback or a warning; files left behind. `damage.py` tests randomly damaged files. Time is CPU time.
-Requires a system with fork.
+program's name; a traceback or a warning; files left behind. `damaged_files.py` tests randomly damaged files. Time is
+CPU time. Requires a system with fork.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from damage import valid_files
+from damaged_files import valid_files
 
 SECONDS, GIGABYTES, LETTERS = 10.0, 1.0, 600
 # Limits beyond which a process is killed and counts as failed.
@@ -215,7 +215,7 @@ def _pictures() -> Iterator[Evil]:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    call = "map mesh.obj --to disk --picture {} -o out.glb"
+    call = "map mesh.obj --to disk --texture {} -o out.glb"
     for name, size, data in ("huge", 2**31 - 1, b"x"), ("bomb", 60000, _deflated(2 << 30)):
         head = chunk(b"IHDR", struct.pack(">2I5B", size, size, 8, 6, 0, 0, 0))
         picture = b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", data) + chunk(b"IEND", b"")

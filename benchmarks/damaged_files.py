@@ -1,7 +1,7 @@
 """Run the command on thousands of damaged files; each must be rejected properly or give a correct result.
 
-    python benchmarks/damage.py -n 2000
-    python benchmarks/damage.py --case mesh.ply:41 --keep FOLDER
+    python benchmarks/damaged_files.py -n 2000
+    python benchmarks/damaged_files.py --case mesh.ply:41 --keep FOLDER
 
 Files of every kind that the command reads are truncated, spliced, repeated, and have numbers and bytes replaced. A
 *failure* is any of: an exit status other than 0, 1 or 2; excessive time or memory; a traceback, a warning or a crash; a
@@ -25,7 +25,7 @@ import time
 import traceback
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from io import FileIO, TextIOWrapper
@@ -330,19 +330,28 @@ def trials(names: Sequence[str], keep: Path | None = None) -> Iterator[Trial]:
                 shutil.rmtree(folder)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Try files and list the failures; return 1 if there is any."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-n", "--count", type=int, default=1000, help="files (%(default)s)")
+def read_trials(
+    arguments: Sequence[str] | None, about: str, what: str, count: int, kinds: Collection[str]
+) -> tuple[argparse.Namespace, list[str]]:
+    """Parse the command line of a script that tries ``count`` random cases; return it and the cases' names."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-n", "--count", type=int, default=count, help=f"{what} (%(default)s)")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="begin with this seed (%(default)s)")
-    parser.add_argument("--kinds", default=",".join(CALLS), help="separated by commas (all)")
-    parser.add_argument("--case", action="append", metavar="NAME", help="try just this file, e.g. mesh.ply:41")
+    parser.add_argument("--kinds", default=",".join(kinds), help="separated by commas (all)")
+    parser.add_argument("--case", action="append", metavar="KIND:SEED", help="try only this case")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="leave the files there")
     options = parser.parse_args(arguments)
-    kinds = options.kinds.split(",")
-    names = options.case or [f"{kinds[i % len(kinds)]}:{options.first + i // len(kinds)}" for i in range(options.count)]
-    if unknown := {name.split(":")[0] for name in names} - set(CALLS):
-        parser.error(f"no kind {', '.join(sorted(unknown))}; there are {', '.join(CALLS)}")
+    chosen = options.kinds.split(",")
+    numbers = range(options.count)
+    names = options.case or [f"{chosen[i % len(chosen)]}:{options.first + i // len(chosen)}" for i in numbers]
+    if unknown := {name.split(":")[0] for name in names} - set(kinds):
+        parser.error(f"no kind {', '.join(sorted(unknown))}; there are {', '.join(kinds)}")
+    return options, names
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Try files and list the failures; return 1 if there is any."""
+    options, names = read_trials(arguments, str(__doc__), "files", 1000, CALLS)
     ends: Counter[int] = Counter()
     worst = [0.0, 0.0]
     failures = 0

@@ -1,8 +1,9 @@
 """Experiments on the paper's future work: hyperbolic steps, asymmetric weights, determinants, other starts.
 
-    python benchmarks/future.py [hyperbolic] [weights] [determinants] [starts] [-o TABLE.json]
+    python benchmarks/future_work.py [hyperbolic] [weights] [determinants] [starts] [-o TABLE.json]
 
-Each method runs alone on small problems, from its start to the first injective map. `docs/future.md` has the results.
+Each method runs alone on small problems, from its start to the first injective map.
+`docs/development/open_questions.md` has the results.
 ``starts`` requires libigl.
 """
 
@@ -29,7 +30,7 @@ from quasiharmonic.util.arrays import FloatArray
 
 sys.path.append(str(Path(__file__).parent.parent / "examples"))
 from common import ring
-from figure_17 import swapped
+from figure_17 import swap_points
 from sculptures import sculpture
 
 FAMILIES = "noise", "jam", "flow", "swirl", "adrift", "spiral", "comb", "maze", "limbs", "pins"
@@ -48,7 +49,7 @@ def trials(seeds: int = 1, surfaces: Sequence[str] = ("angel", "rabbit", "hand")
     for degrees in (90, 135, 180):
         yield f"ring turned by {degrees}°", ring(12, (-0.35, -0.35, 0.35, 0.35), float(np.radians(degrees)))
     for cells in (12, 20, 40):
-        yield f"points swapped, {cells}", swapped(cells)
+        yield f"points swapped, {cells}", swap_points(cells)
     for family in FAMILIES:
         for seed in range(seeds):
             case = problems.make(family, seed, 0.6, triangles=500)
@@ -58,7 +59,7 @@ def trials(seeds: int = 1, surfaces: Sequence[str] = ("angel", "rabbit", "hand")
 def outcome(problem: Problem, stage: VectorAdam, start: FloatArray | None = None) -> Outcome:
     """Return the outcome of one method alone."""
     result = solve(problem, strategy=[stage], start=start, max_iterations=stage.iterations)
-    return len(result.certificate.inverted) + len(result.certificate.degenerate), result.iterations
+    return len(result.certificate.inverted) + len(result.certificate.degenerate), result.n_iterations
 
 
 def hyperbolic(problem: Problem) -> dict[str, Outcome]:

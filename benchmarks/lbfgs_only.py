@@ -1,7 +1,7 @@
 """Solve thirty problems by L-BFGS alone, with each functional and parameterisation (the paper's Figure 10).
 
-    python benchmarks/letters_alone.py TABLE.csv [--scans FOLDER] [--size 64] [-n 600] [--columns "V₃ tanh" …]
-    python benchmarks/letters_alone.py --summary
+    python benchmarks/lbfgs_only.py TABLE.csv [--scans FOLDER] [--size 64] [-n 600] [--columns "V₃ tanh" …]
+    python benchmarks/lbfgs_only.py --summary
 
 Five surfaces are mapped to the six letters of the figure, by arc length along the outer outline. The surfaces are the
 gallery's; with scans, they are the first problem of each name in a folder (``FOLDER/lucy_G/input.obj``). Each run adds
@@ -85,8 +85,8 @@ def measure(surface: str, V: FloatArray, F: IntArray, letter: str, column: str, 
     result = solve(problem, strategy=[stage], max_iterations=iterations)
     seconds = time.process_time() - began
     flips = len(result.certificate.inverted) + len(result.certificate.degenerate)
-    mips = f"{distortion(V, F, result.uv).summary('mips').mean:.3g}" if result.injective else ""
-    return Run(surface, letter, len(F), column, result.iterations, flips, mips, round(seconds, 2))
+    mips = f"{distortion(V, F, result.uv).statistics('mips').mean:.3g}" if result.injective else ""
+    return Run(surface, letter, len(F), column, result.n_iterations, flips, mips, round(seconds, 2))
 
 
 def read(path: Path) -> list[Run]:
