@@ -26,7 +26,7 @@ PLATFORMS = {
 }
 # Blender 4.5 and 5.0 come with Python 3.11 and NumPy 1.26 to 2.
 PYTHON = "3.11"
-NEEDED = ["scipy>=1.14,<1.17", "qdldl>=0.1.7", "rslab>=1.7"]
+NEEDED = ["lazy_loader>=0.4", "scipy>=1.14,<1.17", "qdldl>=0.1.7", "rslab>=1.7"]
 
 
 def main(arguments: list[str] | None = None) -> int:

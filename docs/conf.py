@@ -12,6 +12,7 @@ sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent / "examples")]
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from pictures import picture_scraper  # noqa: E402
+from standalone import write_gallery  # noqa: E402
 
 from quasiharmonic import __version__  # noqa: E402
 
@@ -34,7 +35,16 @@ extensions = [
     "names",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["_build", "_templates", "sg_execution_times.rst", "choose/*", "speed/*"]
+exclude_patterns = [
+    "_build",
+    "_examples",
+    "_templates",
+    "sg_execution_times.rst",
+    "choose/*",
+    "comparisons/*",
+    "mesh_motion/*",
+    "speed/*",
+]
 templates_path = ["_templates"]
 suppress_warnings = [
     "config.cache",  # the gallery's scraper is a function
@@ -52,11 +62,11 @@ napoleon_use_ivar = True
 default_role = "py:obj"
 nitpicky = False
 
+write_gallery(HERE.parent / "examples", HERE / "_examples")
 sphinx_gallery_conf = {
-    "examples_dirs": ["../examples"],
+    "examples_dirs": ["_examples"],
     "gallery_dirs": ["gallery"],
     "filename_pattern": r"\.py$",
-    "ignore_pattern": r"(common|sculptures)\.py$",
     "image_scrapers": (picture_scraper,),
     "reset_modules": (),
     "download_all_examples": False,
@@ -64,7 +74,6 @@ sphinx_gallery_conf = {
     "remove_config_comments": True,
     "within_subsection_order": "order.by_kind",
     "notebook_images": False,
-    "first_notebook_cell": "# Run this in the folder examples/ of a checkout, where what the scripts share is.",
 }
 
 html_theme = "furo"

@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy
 
-from quasiharmonic import Step
+from quasiharmonic.results import Step
 
 from .surface import Refused
 

@@ -8,19 +8,20 @@ from typing import Any
 import bpy
 import numpy as np
 
-from quasiharmonic import Step, atlas, repair
-from quasiharmonic.apps.atlas import seaming
-from quasiharmonic.apps.atlas.mapped import each_island
-from quasiharmonic.apps.repair.fitting import laid_along
+from quasiharmonic import atlas, repair
+from quasiharmonic.apps.atlas import seam_cuts
+from quasiharmonic.apps.atlas.mapped_atlas import each_island
+from quasiharmonic.apps.repair.fitting import fit_boundary
 from quasiharmonic.atlas import AtlasVerdict, Island, SeamedMesh
-from quasiharmonic.energies.polishing import polished
-from quasiharmonic.geometry.exact.convexity import not_convex
-from quasiharmonic.geometry.exact.overlapping import lying_on_others
+from quasiharmonic.energies.polishing import PolishOptions, polish_result
+from quasiharmonic.geometry.exact.convexity import find_concave
+from quasiharmonic.geometry.exact.triangles import find_overlapping
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.solver.search.solving import solve
-from quasiharmonic.targets.boundary.corner_spec import AskedCorners
-from quasiharmonic.util.arrays import IntArray, counted
+from quasiharmonic.results import Step
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+from quasiharmonic.util.arrays import IntArray, count_of
 
 from . import outline, surface
 from .job import Work, Working
@@ -53,7 +54,9 @@ class UvWorking(Working):
         verdict = atlas.certify(surface.write(context.active_object.data, self.surface, mapped))
         lost = np.setdiff1d(verdict.inverted, atlas.certify(mapped).inverted)
         if lost.size:
-            remark = f"{counted('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
+            remark = (
+                f"{count_of('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
+            )
         kind = "INFO" if verdict.injective else "WARNING"
         self.report({kind}, f"{self.bl_label}: {remark}{_told(verdict)}")
 
@@ -89,10 +92,10 @@ class QHM_OT_check(UvWorking):
         inverted = np.unique(face[verdict.inverted])
         chosen = np.union1d(inverted, face[lying])
         surface.select_faces(context, self.surface, chosen)
-        text = f"{counted('face', 'faces', len(chosen))} selected, of which {len(inverted)} inverted. {_told(verdict)}"
+        text = f"{count_of('face', 'faces', len(chosen))} selected, of which {len(inverted)} inverted. {_told(verdict)}"
         if len(bent):
             text += (
-                f" {counted('face is', 'faces are', len(bent))} not convex: cut into other triangles, some would flip."
+                f" {count_of('face is', 'faces are', len(bent))} not convex: cut into other triangles, some would flip."
             )
         sound = verdict.bijective and not len(verdict.overlapping)
         self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {text}")
@@ -144,12 +147,12 @@ class QHM_OT_flatten(UvWorking):
         def work(reports_progress: Callable[[Step], None]) -> SeamedMesh:
             here = mesh
             if len(seams):
-                here = seaming.cut_along(mesh, seams, polygons=polygons)
+                here = seam_cuts.cut_along(mesh, seams, polygons=polygons)
             elif 1 < len(polygons) == len(mesh.islands):
                 # A new UV layer of Blender looks the same: every face fills the square.
                 here = SeamedMesh(mesh.V, mesh.F)
             if cut:
-                here = seaming.cut_apart(here, polygons=polygons)
+                here = seam_cuts.cut_apart(here, polygons=polygons)
             _require_borders(here)
             mapped = atlas.flatten(here, energy=energy, callback=reports_progress)
             if mapped.status is Status.INTERRUPTED:
@@ -216,17 +219,19 @@ class QHM_OT_fit(ChosenWorking):
             raise Refused(f"there are {len(mesh.islands)} islands: in edit mode, select a face of the one to fit")
         _require_borders(mesh)
         contours = self._contours(context)
-        corners = AskedCorners("auto") if self.to == "RECTANGLE" else None
+        corners = CornerSpec("auto") if self.to == "RECTANGLE" else None
 
         def find(island: Island, reports_progress: Callable[[Step], None]) -> MapResult:
-            problem = laid_along(island.V, island.F, contours, corners=corners).problem
+            problem = fit_boundary(island.V, island.F, contours, corners=corners).problem
             result = solve(problem, callback=reports_progress)
             if result.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             if not result.injective:
                 reason = result.status.value if result.diagnosis is None else result.diagnosis.summary()
                 raise Refused(f"no map without flips was found. {reason}")
-            return polished(problem, result, energy="blend", max_iterations=20, callback=reports_progress)
+            return polish_result(
+                problem, result, PolishOptions(energy="blend", max_iterations=20, callback=reports_progress)
+            )
 
         return lambda reports_progress: (
             each_island(mesh, lambda island: find(island, reports_progress), reflect=False).mesh
@@ -267,13 +272,13 @@ def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:
     triangles = np.concatenate([verdict.islands[k].triangles for k in sorted(concerned)])
     turned = np.isin(triangles, _mirrored(verdict))
     FT = np.where(turned[:, None], mesh.FT[triangles, ::-1], mesh.FT[triangles])
-    return np.sort(triangles[lying_on_others(FT, mesh.uv)])
+    return np.sort(triangles[find_overlapping(FT, mesh.uv)])
 
 
 def _bent(mesh: SeamedMesh, polygons: Any, verdict: AtlasVerdict) -> IntArray:
     """Return faces that are not convex in the plane although no triangle of theirs is inverted, in ascending order."""
     mirrored = polygons.of_triangle[_mirrored(verdict)]
-    front, back = (not_convex(polygons, mesh.FT, mesh.uv * [side, 1.0]) for side in (1.0, -1.0))
+    front, back = (find_concave(polygons, mesh.FT, mesh.uv * [side, 1.0]) for side in (1.0, -1.0))
     bent = np.union1d(np.setdiff1d(front, mirrored), np.intersect1d(back, mirrored))
     return np.setdiff1d(bent, polygons.of_triangle[verdict.inverted])
 

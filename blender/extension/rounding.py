@@ -10,10 +10,10 @@ import itertools
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.verdict import is_mirrored
+from quasiharmonic.apps.atlas.atlas_verdict import is_mirrored
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Numbers tried on each side in each coordinate, and passes over the vertices of wrong triangles.

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 
 from quasiharmonic.geometry.mesh.polygons import Polygons
-from quasiharmonic.geometry.mesh.seams import SeamedMesh
+from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 from .rounding import in_single_precision

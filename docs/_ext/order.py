@@ -1,4 +1,4 @@
-"""The order of the gallery: the paper's figures, its tables, then what else one does with maps."""
+"""The order of a section of the gallery: figures, tables, then other scripts by name."""
 
 from __future__ import annotations
 
