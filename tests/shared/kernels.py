@@ -10,7 +10,8 @@ import numpy as np
 
 from quasiharmonic import boundary_loops
 from quasiharmonic.geometry.coarsening.removal import allocate_round, remove_vertices
-from quasiharmonic.surfaces import disk
+from quasiharmonic.surfaces import annulus, disk
+from quasiharmonic.targets.cuts.graph import edge_graph
 from shared.meshes import tangled
 
 Arguments = tuple[Any, ...]
@@ -614,3 +615,33 @@ def _(rng):
     """Triangles in column-major order, and vertices without triangles."""
     V, F = disk(5)
     return numbers(rng, len(V)), np.asfortranarray(F[: len(F) // 2]), np.zeros(len(V), dtype=bool)
+
+
+def open_ring(rng: np.random.Generator, costs: str, limit: float, borders: float) -> Arguments:
+    """An annulus between its two boundary loops, with a share of the other edges as further borders."""
+    V, F = annulus(8)
+    graph = edge_graph(V, F)
+    opposite, side = graph.half_edges
+    count = len(graph.ends)
+    cost = {"equal": np.ones(count), "few": rng.integers(1, 4, count).astype(float), "own": graph.cost}[costs]
+    cost[rng.random(count) < 0.05] = np.inf
+    loops = np.sort([loop[0] for loop in boundary_loops(F, len(V))])
+    start, goal = (int(np.flatnonzero(graph.rim[side] & (F.ravel() == vertex))[0]) for vertex in loops)
+    return opposite, side, graph.rim | (rng.random(count) < borders), cost, start, goal, limit, np.zeros_like(side)
+
+
+for costs in ("equal", "few", "own"):
+    for borders in (0.0, 0.01, 0.2):
+        arguments_of("cross_ring")(partial(open_ring, costs=costs, limit=np.inf, borders=borders))
+    arguments_of("cross_ring")(partial(open_ring, costs=costs, limit=0.5, borders=0.0))
+    arguments_of("cross_ring")(partial(open_ring, costs=costs, limit=6.0, borders=0.01))
+
+
+@arguments_of("cross_ring")
+def _(rng):
+    """A start away from all borders."""
+    V, F = disk(3)
+    graph = edge_graph(V, F)
+    opposite, side = graph.half_edges
+    start = int(np.flatnonzero(~graph.rim_vertices[F.ravel()])[0])
+    return opposite, side, graph.rim, graph.cost, start, int(np.flatnonzero(graph.rim[side])[0]), 9.0, 0 * side

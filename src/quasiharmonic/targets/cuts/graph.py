@@ -82,6 +82,19 @@ class EdgeGraph:
         return found
 
     @cached_property
+    def half_edges(self) -> tuple[IntArray, IntArray]:
+        """Opposite half-edge and edge of each half-edge, (3 f,) each; number 3 t + k runs from corner k of triangle t.
+
+        Half-edges on the outside have -1 for their opposite.
+        """
+        side = np.ascontiguousarray(self.side.T).ravel()
+        order = np.argsort(side, kind="stable")
+        first = np.flatnonzero(np.diff(side[order]) == 0)
+        opposite = np.full(side.size, -1)
+        opposite[order[first]], opposite[order[first + 1]] = order[first + 1], order[first]
+        return opposite, side
+
+    @cached_property
     def _stars(self) -> tuple[IntArray, IntArray]:
         """Triangles around the vertices: where those of each vertex start (n + 1,), and the triangles (3 f,)."""
         order = np.argsort(self.F.ravel(), kind="stable")

@@ -14,12 +14,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
 
-from quasiharmonic.geometry.coarsening.levels import has_marked_corner
-from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.targets.cuts.graph import EdgeGraph, distinct
+from quasiharmonic.targets.cuts.ring import find_path_across
 from quasiharmonic.util.arrays import BoolArray, IntArray
 
 # Minimum relative saving for which a stretch is exchanged.
@@ -144,7 +141,7 @@ def _cheapest(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntArray | Non
     loose = np.flatnonzero((degree == 1) & ~held)
     limit = (1 - _SAVES) * float(graph.cost[way].sum())
     if loose.size == 0:
-        return _across(graph, cut, way, others, held, limit)
+        return _across(graph, way, others, held, limit)
     goals = np.flatnonzero(held) if loose.size == 1 else loose[1:]
     distance, before = graph.distances(goals, graph.cost, limit=limit)
     if np.isinf(distance[loose[0]]):
@@ -154,70 +151,25 @@ def _cheapest(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntArray | Non
     return None if loose.size == 2 and instead.size == 1 else instead
 
 
-def _across(
-    graph: EdgeGraph, cut: BoolArray, way: IntArray, others: BoolArray, held: BoolArray, limit: float
-) -> IntArray | None:
+def _across(graph: EdgeGraph, way: IntArray, others: BoolArray, held: BoolArray, limit: float) -> IntArray | None:
     """Cheapest path across the ring that remains without a stretch; None if all cost more than ``limit``."""
-    left, right, copied = _open(graph, cut)
-    m = copied.size
-    sewn = _label(np.concatenate([left[way], right[way]], axis=1)[:, [0, 2, 1, 3]].reshape(-1, 2), m)
-    border = others | graph.rim
-    sides = np.concatenate([left[border], right[border]])
-    sides = sewn[sides[sides[:, 0] >= 0]]
-    loop = _label(sides, m)
-    on_border = np.zeros(m, dtype=bool)
-    on_border[sides] = True
     # The two ends of the stretch lie on different borders of the ring.
-    first, last = held[graph.ends[way[0]]], held[graph.ends[way[-1]]]
-    one, other = int(np.argmax(first)), 1 - int(np.argmax(last[::-1]))
-    start, goal = sewn[left[way[0], one]], sewn[left[way[-1], other]]
-    near, far = on_border & (loop == loop[start]), on_border & (loop == loop[goal])
-    inner = sewn[np.where(left < 0, right, left)[~border]]
-    blocked = on_border & ~near & ~far
-    usable = ~blocked[inner].any(axis=1)
-    ring = csr_array((graph.cost[~border][usable], tuple(inner[usable].astype(np.int32).T)), shape=(m, m))
-    distance, before, _ = dijkstra(
-        ring, directed=False, indices=np.flatnonzero(near), return_predecessors=True, min_only=True, limit=limit
+    first, last = graph.ends[way[0]], graph.ends[way[-1]]
+    start, goal = first[np.argmax(held[first])], last[1 - np.argmax(held[last[::-1]])]
+    opposite, side = graph.half_edges
+    path = find_path_across(
+        opposite,
+        side,
+        others | graph.rim,
+        graph.cost,
+        _corner_at(graph, int(way[0]), int(start)),
+        _corner_at(graph, int(way[-1]), int(goal)),
+        limit,
     )
-    distance[~far] = np.inf
-    end = int(np.argmin(distance))
-    if np.isinf(distance[end]):
-        return None
-    path = [end]
-    while before[path[-1]] >= 0:
-        path.append(int(before[path[-1]]))
-    origin = np.empty(m, dtype=np.int64)
-    origin[sewn] = copied
-    return graph.numbers(origin[path[:-1]], origin[path[1:]])
+    return path if path.size else None
 
 
-def _open(graph: EdgeGraph, cut: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Open a surface along cuts.
-
-    Returns
-    -------
-    left, right : (e, 2) int64
-        Vertex copies at the ends of every edge on its left side, seen from the smaller to the larger vertex, and on its
-        right side; -1 outside the surface.
-    origin : (m,) int64
-        The vertex of each copy.
-    """
-    on_border = graph.mark_vertices(cut) | graph.rim_vertices
-    near = has_marked_corner(graph.F, on_border)
-    # Some triangles around other vertices are missing, so their copies are not used.
-    opened, origin = open_along(graph.F[near], graph.ends[cut], graph.n)
-    FT = graph.F.copy()
-    FT[near] = np.where(on_border[FT[near]], opened, FT[near])
-    copies = np.stack([FT.T, FT.T[(1, 2, 0), :]], axis=2)
-    tail, head = graph.F.T, graph.F.T[(1, 2, 0), :]
-    leads_up = tail < head
-    left, right = np.full(graph.ends.shape, -1), np.full(graph.ends.shape, -1)
-    left[graph.side[leads_up]] = copies[leads_up]
-    right[graph.side[~leads_up]] = copies[~leads_up][:, ::-1]
-    return left, right, origin
-
-
-def _label(pairs: IntArray, m: int) -> IntArray:
-    """Component labels of ``m`` elements connected by pairs."""
-    ones = np.ones(len(pairs), dtype=np.int8)
-    return connected_components(csr_array((ones, pairs.T), shape=(m, m)), directed=False)[1].astype(np.int64)
+def _corner_at(graph: EdgeGraph, edge: int, end: int) -> int:
+    """A corner at one end of an edge, in a triangle that has this edge; numbered as in `find_path_across`."""
+    k, t = np.argwhere(graph.side == edge)[0]
+    return int(3 * t + (k if graph.F[t, k] == end else (k + 1) % 3))

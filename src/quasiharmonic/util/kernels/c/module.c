@@ -17,6 +17,7 @@
     with(reference) \
     with(reweighted) \
     with(removal) \
+    with(ring) \
     with(topology) \
     with(triangles) \
     with(vector_adam)

@@ -1,0 +1,237 @@
+/* Kernel of `targets/cuts/ring.py`. */
+#include "arguments.h"
+
+#include <math.h>
+#include <stdlib.h>
+
+/* A surface opened at borders. Half-edge and corner 3 t + k of triangle t are those from and at its corner k. */
+typedef struct {
+    const int64_t *opposite, *side;
+    const char *border;
+    const double *cost;
+    /* The node of each corner: the smallest corner of its part of a vertex. */
+    int64_t *node, *loop;
+    double *distance;
+} Ring;
+
+typedef struct {
+    double distance;
+    int64_t node;
+} Entry;
+
+static int64_t next_of(int64_t half)
+{
+    return half % 3 == 2 ? half - 2 : half + 1;
+}
+
+static int64_t previous_of(int64_t half)
+{
+    return half % 3 == 0 ? half + 2 : half - 1;
+}
+
+static int64_t root(int64_t *label, int64_t item)
+{
+    while (label[item] != item)
+        item = label[item] = label[label[item]];
+    return item;
+}
+
+static void join_labels(int64_t *label, int64_t one, int64_t other)
+{
+    one = root(label, one);
+    other = root(label, other);
+    if (one < other)
+        label[other] = one;
+    else
+        label[one] = other;
+}
+
+/* Number the nodes, and the loops of border edges; a loop is -1 away from borders. */
+static void label_nodes(const Ring *ring, int64_t halves)
+{
+    for (int64_t h = 0; h < halves; h++)
+        ring->node[h] = h;
+    for (int64_t h = 0; h < halves; h++) {
+        const int64_t across = ring->opposite[h];
+        if (across < 0 || ring->border[ring->side[h]])
+            continue;
+        join_labels(ring->node, h, next_of(across));
+    }
+    for (int64_t h = 0; h < halves; h++)
+        ring->node[h] = root(ring->node, h);
+    for (int64_t h = 0; h < halves; h++)
+        ring->loop[h] = -1;
+    for (int64_t h = 0; h < halves; h++)
+        if (ring->border[ring->side[h]]) {
+            const int64_t tail = ring->node[h], head = ring->node[next_of(h)];
+            ring->loop[tail] = tail;
+            ring->loop[head] = head;
+        }
+    for (int64_t h = 0; h < halves; h++)
+        if (ring->border[ring->side[h]])
+            join_labels(ring->loop, ring->node[h], ring->node[next_of(h)]);
+    for (int64_t h = 0; h < halves; h++)
+        if (ring->loop[h] >= 0)
+            ring->loop[h] = root(ring->loop, h);
+}
+
+static int comes_before(Entry one, Entry other)
+{
+    return one.distance < other.distance || (one.distance == other.distance && one.node < other.node);
+}
+
+static void push(Entry *heap, int64_t *size, Entry entry)
+{
+    int64_t at = (*size)++;
+    for (; at > 0 && comes_before(entry, heap[(at - 1) / 2]); at = (at - 1) / 2)
+        heap[at] = heap[(at - 1) / 2];
+    heap[at] = entry;
+}
+
+static Entry pop(Entry *heap, int64_t *size)
+{
+    const Entry first = heap[0], last = heap[--*size];
+    int64_t at = 0;
+    for (;;) {
+        int64_t child = 2 * at + 1;
+        if (child >= *size)
+            break;
+        if (child + 1 < *size && comes_before(heap[child + 1], heap[child]))
+            child++;
+        if (!comes_before(heap[child], last))
+            break;
+        heap[at] = heap[child];
+        at = child;
+    }
+    heap[at] = last;
+    return first;
+}
+
+typedef struct {
+    int64_t corner, begun;
+    int turned;
+} Fan;
+
+/* The corner after one in a fan; -1 after the last. Fans are followed in one direction, then in the other. */
+static int64_t next_corner(const Ring *ring, Fan *fan)
+{
+    if (!fan->turned) {
+        const int64_t across = ring->opposite[fan->corner];
+        if (across >= 0 && !ring->border[ring->side[fan->corner]]) {
+            fan->corner = next_of(across);
+            return fan->corner == fan->begun ? -1 : fan->corner;
+        }
+        fan->turned = 1;
+        fan->corner = fan->begun;
+    }
+    const int64_t before = previous_of(fan->corner), across = ring->opposite[before];
+    if (across < 0 || ring->border[ring->side[before]])
+        return -1;
+    return fan->corner = across;
+}
+
+/* Shorten the distances of the neighbours of a node. */
+static void relax(const Ring *ring, Entry here, int64_t far, int64_t near, double limit, Entry *heap, int64_t *size)
+{
+    Fan fan = {here.node, here.node, 0};
+    for (int64_t corner = here.node; corner >= 0; corner = next_corner(ring, &fan)) {
+        const int64_t before = previous_of(corner);
+        const int64_t halves[2] = {corner, before}, others[2] = {next_of(corner), before};
+        for (int k = 0; k < 2; k++) {
+            const int64_t edge = ring->side[halves[k]], other = ring->node[others[k]], loop = ring->loop[other];
+            if (ring->border[edge] || (loop >= 0 && loop != far && loop != near))
+                continue;
+            const double longer = here.distance + ring->cost[edge];
+            if (longer <= limit && longer < ring->distance[other]) {
+                ring->distance[other] = longer;
+                push(heap, size, (Entry){longer, other});
+            }
+        }
+    }
+}
+
+/* Write the edges of the cheapest path from a loop to another; their number. */
+static int64_t search(const Ring *ring, int64_t halves, int64_t near, int64_t far, double limit, Entry *heap,
+                      int64_t *path)
+{
+    int64_t size = 0, end = -1, length = 0;
+    for (int64_t h = 0; h < halves; h++) {
+        const int source = ring->node[h] == h && ring->loop[h] == near;
+        ring->distance[h] = source ? 0 : INFINITY;
+        if (source)
+            push(heap, &size, (Entry){0, h});
+    }
+    while (size > 0) {
+        const Entry here = pop(heap, &size);
+        if (here.distance > ring->distance[here.node])
+            continue;
+        if (end >= 0 && here.distance > ring->distance[end])
+            break;
+        if (ring->loop[here.node] == far) {
+            if (end < 0)
+                end = here.node;
+            continue;
+        }
+        relax(ring, here, far, near, limit, heap, &size);
+    }
+    while (end >= 0 && ring->distance[end] > 0 && length < halves) {
+        int64_t edge = -1, from = -1;
+        Fan fan = {end, end, 0};
+        for (int64_t corner = end; corner >= 0; corner = next_corner(ring, &fan)) {
+            const int64_t before = previous_of(corner);
+            const int64_t sides[2] = {corner, before}, others[2] = {next_of(corner), before};
+            for (int k = 0; k < 2; k++) {
+                const int64_t number = ring->side[sides[k]], other = ring->node[others[k]];
+                if (!ring->border[number] && ring->distance[other] < ring->distance[end]
+                    && ring->loop[other] != far && ring->distance[other] + ring->cost[number] == ring->distance[end]
+                    && (edge < 0 || number < edge)) {
+                    edge = number;
+                    from = other;
+                }
+            }
+        }
+        if (edge < 0)
+            return 0;
+        path[length++] = edge;
+        end = from;
+    }
+    return length;
+}
+
+/* (opposite, side, border, cost, start, goal, limit, path): the cheapest path across a ring; its number of edges. */
+static PyObject *cross_ring(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[8];
+    if (!take("cross_ring", given, count, "qqbdnnxQ", a))
+        return NULL;
+    const Py_ssize_t halves = a[0].size, start = a[4].integer, goal = a[5].integer;
+    if (!fit("cross_ring", a, LENGTH(a),
+             halves % 3 == 0 && a[1].size == halves && a[2].size == a[3].size && a[7].size == halves && 0 <= start
+                 && start < halves && 0 <= goal && goal < halves))
+        return NULL;
+    int64_t *labels = malloc((size_t)halves * 2 * sizeof(*labels));
+    double *distance = malloc((size_t)halves * sizeof(*distance));
+    /* Every node is a source at most once, and every edge improves each of its ends at most once. */
+    Entry *heap = malloc((size_t)halves * 3 * sizeof(*heap));
+    if (!labels || !distance || !heap) {
+        free(labels);
+        free(distance);
+        free(heap);
+        return out_of_memory(a, LENGTH(a));
+    }
+    int64_t length = 0;
+    Py_BEGIN_ALLOW_THREADS
+    const Ring ring = {a[0].data, a[1].data, a[2].data, a[3].data, labels, labels + halves, distance};
+    label_nodes(&ring, halves);
+    const int64_t near = ring.loop[ring.node[start]], far = ring.loop[ring.node[goal]];
+    if (near >= 0 && far >= 0 && near != far)
+        length = search(&ring, halves, near, far, a[6].number, heap, a[7].data);
+    Py_END_ALLOW_THREADS
+    free(labels);
+    free(distance);
+    free(heap);
+    return done_with_integer(a, LENGTH(a), length);
+}
+
+PyMethodDef ring_kernels[] = {KERNEL(cross_ring), END_OF_KERNELS};
