@@ -124,6 +124,7 @@ _ANY_LENGTH = {
     "fill_rings": {0, 1, 2},
     "add_up": {9},
     "sure_signs": {1},
+    "find_contact": {0},
 }
 
 

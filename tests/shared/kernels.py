@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic import boundary_loops
+from quasiharmonic.apps.atlas.packing.contact import list_runs
 from quasiharmonic.geometry.coarsening.removal import allocate_round, remove_vertices
 from quasiharmonic.surfaces import annulus, disk
 from quasiharmonic.targets.cuts.graph import edge_graph
@@ -645,3 +646,30 @@ def _(rng):
     opposite, side = graph.half_edges
     start = int(np.flatnonzero(~graph.rim_vertices[F.ravel()])[0])
     return opposite, side, graph.rim, graph.cost, start, int(np.flatnonzero(graph.rim[side])[0]), 9.0, 0 * side
+
+
+@arguments_of("find_contact")
+def _(rng, shape=(40, 150), density=0.02, sizes=((9, 30), (30, 9), (2, 3))):
+    """Random bitmaps on a random board with a frame; some do not fit."""
+    occupied = rng.random(shape) < density
+    occupied[[0, -1]] = occupied[:, [0, -1]] = True
+    bitmaps = [rng.random(size) < 0.3 for size in sizes]
+    return occupied, len(occupied), *list_runs(bitmaps), np.zeros(3, dtype=np.int64)
+
+
+for shape, density, sizes in (
+    ((30, 64), 0.0, [(1, 1), (9, 62), (28, 62), (29, 3)]),
+    ((70, 65), 0.001, [(20, 20), (20, 22), (21, 21)]),
+    ((70, 129), 0.1, [(3, 4), (2, 70)]),
+    ((20, 20), 1.0, [(1, 2)]),
+    ((3, 3), 0.0, [(1, 1)]),
+    ((2, 5), 0.0, [(1, 1)]),
+):
+    arguments_of("find_contact")(partial(ARGUMENTS["find_contact"][0], shape=shape, density=density, sizes=sizes))
+
+
+@arguments_of("find_contact")
+def _(rng):
+    """A board without occupied cells and an empty bitmap."""
+    runs = list_runs([np.zeros((2, 2), dtype=bool), np.ones((2, 3), dtype=bool)])
+    return np.zeros((8, 8), dtype=bool), 8, *runs, np.zeros(3, dtype=np.int64)

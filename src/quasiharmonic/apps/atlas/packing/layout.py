@@ -9,7 +9,7 @@ from math import ceil, pi, sqrt
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw
-from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board, frame_of
+from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board
 from quasiharmonic.apps.atlas.packing.shapes import Shape, find_smallest_box
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
@@ -205,7 +205,7 @@ class _Search:
         # Length of a cell's side.
         self._cell = max(size) / self.cells / scale
         radius = _MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
-        self._frame = frame_of(int(_MORE_CELLS * self.cells)) if few else None
+        self._windows = not few
         self._areas = np.array([shape.area for shape in shapes])
         self._order = np.argsort(-self._areas, kind="stable")
         self._few = bitmaps
@@ -276,7 +276,7 @@ class _Search:
         """Place the bitmaps on boards with a number of cells along the longer side; None if one does not fit."""
         texels = max(self._size) / cells
         columns, rows = (int(side / texels * (1 + 1e-12)) for side in self._size)
-        boards = [Board(rows, columns, self._frame) for _ in range(self._tiles)]
+        boards = [Board(rows, columns, windows=self._windows) for _ in range(self._tiles)]
         n = len(self._areas)
         directions, centres, tiles = np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64)
         for i in (self._order[: self._few] if order is None else order).tolist():

@@ -2,6 +2,7 @@
 #include "arguments.h"
 
 #define FILES(with) \
+    with(contact) \
     with(deformation) \
     with(field) \
     with(guard) \
