@@ -640,6 +640,16 @@ for costs in ("equal", "few", "own"):
 
 @arguments_of("cross_ring")
 def _(rng):
+    """Both ends at the same border."""
+    opposite, side, border, cost, start, _, limit, path = open_ring(rng, "own", np.inf, 0.01)
+    _, F = annulus(8)
+    (loop,) = (loop for loop in boundary_loops(F, F.max() + 1) if F.ravel()[start] in loop)
+    goal = int(np.flatnonzero(np.isin(F.ravel(), loop[loop != F.ravel()[start]]))[rng.integers(9)])
+    return opposite, side, border, cost, start, goal, limit, path
+
+
+@arguments_of("cross_ring")
+def _(rng):
     """A start away from all borders."""
     V, F = disk(3)
     graph = edge_graph(V, F)

@@ -21,6 +21,7 @@ from quasiharmonic.targets.cuts.graph import EdgeGraph
 from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches
 from quasiharmonic.targets.cuts.shrinking import Shrinking
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat
 
 # A loose end costs as much as a cut of this length, in units in which the surface has area 1.
 _END = 0.1
@@ -82,6 +83,7 @@ class _Balance:
 
     def _weigh(self, cut: BoolArray) -> FloatArray:
         """Return the scale w under given cuts, and store their price."""
+        heartbeat()
         w = self.shrinking.of(self._rim | self.graph.mark_vertices(cut))
         length = float(self.graph.length[cut].sum()) + _END * int(self._loose(cut).sum())
         self._prices[np.packbits(cut).tobytes()] = self.shrinking.energy(w) + self.min_gain * length

@@ -1,4 +1,7 @@
-"""The cheapest path across a ring, which is what remains of a cut surface when one stretch of its cuts is closed."""
+"""The cheapest path that opens a cut surface again after one stretch of its cuts was closed.
+
+If the stretch was inside a chart, the chart becomes a ring; if it was between two charts, they become one disk.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,8 @@ def find_path_across(
 ) -> IntArray:
     """Edges of the cheapest path between two borders of a surface, from the second border to the first.
 
+    If both corners are at the same border, the path connects these two corners themselves.
+
     Half-edges and corners are numbered alike: number ``3 t + k`` is the half-edge of triangle ``t`` from its corner
     ``k`` to the next one, and this corner.
 
@@ -29,7 +34,7 @@ def find_path_across(
         Edges at which the surface is open.
     cost : (e,) float64
     start, goal : int
-        Corners at two borders, which the path connects. It does not touch other borders.
+        Corners at two borders, which the path connects. It does not touch borders elsewhere.
     limit : float
         Maximum cost of the path.
 
@@ -67,7 +72,11 @@ def cross_ring(
     on_border = np.zeros(halves.size, dtype=bool)
     on_border[tail[~inner]] = on_border[head[~inner]] = True
     loop = np.where(on_border, label_components(tail[~inner], head[~inner], halves.size), -1)
-    near, far = loop[node[start]], loop[node[goal]]
+    first, last = node[start], node[goal]
+    if loop[first] == loop[last] >= 0 and first != last:
+        # On one border, the path connects these two nodes.
+        loop[first], loop[last] = halves.size, halves.size + 1
+    near, far = loop[first], loop[last]
     if near < 0 or far < 0 or near == far:
         return 0
     blocked = on_border & (loop != near) & (loop != far)
@@ -84,8 +93,8 @@ def cross_ring(
     while distance[end] > 0:
         at = np.flatnonzero((tail == end) | (head == end))
         other = tail[at] + head[at] - end
-        last = (distance[other] + cost[number[at]] == distance[end]) & (distance[other] < distance[end])
-        step = int(np.argmin(np.where(last, number[at], cost.size)))
+        shortest = (distance[other] + cost[number[at]] == distance[end]) & (distance[other] < distance[end])
+        step = int(np.argmin(np.where(shortest, number[at], cost.size)))
         path[length] = number[at[step]]
         end, length = int(other[step]), length + 1
     return length

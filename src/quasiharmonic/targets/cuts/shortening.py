@@ -18,6 +18,7 @@ import numpy as np
 from quasiharmonic.targets.cuts.graph import EdgeGraph, distinct
 from quasiharmonic.targets.cuts.ring import find_path_across
 from quasiharmonic.util.arrays import BoolArray, IntArray
+from quasiharmonic.util.progress import heartbeat
 
 # Minimum relative saving for which a stretch is exchanged.
 _SAVES = 1e-6
@@ -54,6 +55,7 @@ def shorten_cuts(
         changed = False
         # Costliest first.
         for way in sorted(stretches(graph, cut), key=lambda way: (-graph.cost[way].sum(), way[0])):
+            heartbeat()
             if way.tobytes() in optimal or not _is_stretch(graph, cut, degree, way):
                 continue
             instead = _cheapest(graph, cut, way) if rings is None else _cheapest_near(graph, cut, way, rings)

@@ -94,7 +94,7 @@ class Board:
         padded = np.ones((h * step, w * step), dtype=bool)
         padded[: self._cells.shape[0] - 1, : self._cells.shape[1] - 1] = self._cells[1:, 1:]
         coarse = Board(self.rows // step, self.columns // step, windows=False)
-        pooled = padded.reshape(h, step, w, step).any(axis=(1, 3))
+        pooled = np.asarray(padded.reshape(h, step, w, step).any(axis=(1, 3)))
         coarse._cells[1 : 1 + coarse.rows, 1 : 1 + coarse.columns] = pooled[: coarse.rows, : coarse.columns]
         found = coarse.find(Bitmaps(bitmaps.directions, [_enlarge_cells(bitmap, step) for bitmap in bitmaps.cells]))
         return None if found is None else Spot(found.direction, found.row * step, found.column * step)
