@@ -1,7 +1,4 @@
-"""The cheapest path that opens a cut surface again after one stretch of its cuts was closed.
-
-If the stretch was inside a chart, the chart becomes a ring; if it was between two charts, they become one disk.
-"""
+"""The cheapest path across a ring, which is what remains of a cut surface when one stretch of its cuts is closed."""
 
 from __future__ import annotations
 
@@ -19,8 +16,6 @@ def find_path_across(
 ) -> IntArray:
     """Edges of the cheapest path between two borders of a surface, from the second border to the first.
 
-    If both corners are at the same border, the path connects these two corners themselves.
-
     Half-edges and corners are numbered alike: number ``3 t + k`` is the half-edge of triangle ``t`` from its corner
     ``k`` to the next one, and this corner.
 
@@ -34,7 +29,7 @@ def find_path_across(
         Edges at which the surface is open.
     cost : (e,) float64
     start, goal : int
-        Corners at two borders, which the path connects. It does not touch borders elsewhere.
+        Corners at two borders, which the path connects. It does not touch other borders.
     limit : float
         Maximum cost of the path.
 
@@ -72,11 +67,7 @@ def cross_ring(
     on_border = np.zeros(halves.size, dtype=bool)
     on_border[tail[~inner]] = on_border[head[~inner]] = True
     loop = np.where(on_border, label_components(tail[~inner], head[~inner], halves.size), -1)
-    first, last = node[start], node[goal]
-    if loop[first] == loop[last] >= 0 and first != last:
-        # On one border, the path connects these two nodes.
-        loop[first], loop[last] = halves.size, halves.size + 1
-    near, far = loop[first], loop[last]
+    near, far = loop[node[start]], loop[node[goal]]
     if near < 0 or far < 0 or near == far:
         return 0
     blocked = on_border & (loop != near) & (loop != far)

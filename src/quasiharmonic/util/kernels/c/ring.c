@@ -224,13 +224,7 @@ static PyObject *cross_ring(PyObject *module, PyObject *const *given, Py_ssize_t
     Py_BEGIN_ALLOW_THREADS
     const Ring ring = {a[0].data, a[1].data, a[2].data, a[3].data, labels, labels + halves, distance};
     label_nodes(&ring, halves);
-    const int64_t first = ring.node[start], last = ring.node[goal];
-    int64_t near = ring.loop[first], far = ring.loop[last];
-    if (near == far && first != last) {
-        /* On one border, the path connects these two nodes. */
-        ring.loop[first] = near = near < 0 ? near : halves;
-        ring.loop[last] = far = far < 0 ? far : halves + 1;
-    }
+    const int64_t near = ring.loop[ring.node[start]], far = ring.loop[ring.node[goal]];
     if (near >= 0 && far >= 0 && near != far)
         length = search(&ring, halves, near, far, a[6].number, heap, a[7].data);
     Py_END_ALLOW_THREADS
