@@ -33,6 +33,17 @@ def pytest_addoption(parser):
     parser.addoption("--nightly", action="store_true", help="run the tests that .ci/nightly runs, too")
 
 
+def pytest_configure(config):
+    """Let Hypothesis generate the same examples in every run, and new ones only with `--nightly`."""
+    try:
+        from hypothesis import settings
+    except ImportError:  # the tests of a wheel and of the Blender extension install little
+        return
+    settings.register_profile("repeatable", derandomize=True, database=None, deadline=None)
+    settings.register_profile("exploring", print_blob=True, deadline=None)
+    settings.load_profile("exploring" if config.getoption("nightly") else "repeatable")
+
+
 def pytest_collection_modifyitems(config, items):
     if not config.getoption("nightly"):
         left = [item for item in items if item.get_closest_marker("nightly")]

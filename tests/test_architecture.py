@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ PLAN = {
 FACADE = {"__init__", "__main__", "atlas", "batch", "jax", "plot", "results", "surfaces", "torch"}
 
 
+@cache
 def is_module(parts):
     """Whether a module or package has this dotted name, given as parts after the library's name."""
     path = ROOT.joinpath(*parts)
@@ -48,7 +50,7 @@ def imported(tree):
             dotted = [((node.module or "").split("."), alias.name) for alias in node.names]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documentation:
             parts = node.value.split(".")
-            dotted = [(parts, None)] if parts[0] == "quasiharmonic" and is_module(parts[1:]) else []
+            dotted = [(parts, None)] if parts[0] == "quasiharmonic" and is_module(tuple(parts[1:])) else []
         else:
             continue
         for (package, *of), name in dotted:
@@ -61,17 +63,26 @@ def imported(tree):
                 yield whole
 
 
+@cache
+def imports_of_files():
+    """A dictionary from every file, relative to the library's folder, to the list of modules that it imports."""
+    return {
+        path.relative_to(ROOT): list(imported(ast.parse(path.read_text(encoding="utf-8"), path)))
+        for path in sorted(ROOT.rglob("*.py"))
+        if path.relative_to(ROOT).with_suffix("").parts[0] not in FACADE
+    }
+
+
 def imports():
     """(package, other package, file) for every import across packages, at any position in a file."""
-    for path in sorted(ROOT.rglob("*.py")):
-        package = path.relative_to(ROOT).with_suffix("").parts[0]
-        if package not in FACADE:
-            for whole in imported(ast.parse(path.read_text(encoding="utf-8"), path)):
-                if whole[0] != package:
-                    yield package, whole[0], str(path.relative_to(ROOT))
+    for file, modules in imports_of_files().items():
+        for whole in modules:
+            if whole[0] != file.parts[0]:
+                yield file.parts[0], whole[0], str(file)
 
 
-ARROWS = {(one, other) for one, other, _ in imports()}
+def arrows():
+    return {(one, other) for one, other, _ in imports()}
 
 
 def test_the_plan_names_every_package():
@@ -92,21 +103,21 @@ def test_no_import_outside_the_plan():
 
 
 def test_the_plan_names_no_missing_import():
-    assert {(one, other) for one, others in PLAN.items() for other in others} - ARROWS == set()
+    assert {(one, other) for one, others in PLAN.items() for other in others} - arrows() == set()
 
 
 def test_packages_import_only_from_packages_above_them():
     order = list(PLAN)
-    assert [(one, other) for one, other in ARROWS if order.index(other) >= order.index(one)] == []
+    assert [(one, other) for one, other in arrows() if order.index(other) >= order.index(one)] == []
 
 
 def test_no_cycle_between_subpackages():
     """Subpackages of one package import each other in one direction only."""
     graph = {}
-    for path in sorted(ROOT.rglob("*.py")):
-        parts = path.relative_to(ROOT).with_suffix("").parts
+    for file, modules in imports_of_files().items():
+        parts = file.with_suffix("").parts
         if len(parts) > 2:
-            for whole in imported(ast.parse(path.read_text(encoding="utf-8"), path)):
+            for whole in modules:
                 if whole[0] == parts[0] and whole[1:2] != parts[1:2] and (ROOT / "/".join(whole[:2])).is_dir():
                     graph.setdefault(parts[:2], set()).add(whole[:2])
     while graph:

@@ -196,7 +196,7 @@ def test_nothing_to_pack():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("count", "seconds"), [(5, 0.5), pytest.param(1000, 8, marks=pytest.mark.nightly), (10_000, 20)]
+    ("count", "seconds"), [(5, 0.5), (1000, 8), pytest.param(10_000, 20, marks=pytest.mark.nightly)]
 )
 def test_time(count, seconds):
     charts = grids(count)

@@ -169,7 +169,7 @@ def crossing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [4, pytest.param(12, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("seconds", [1.5, pytest.param(12, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     "run",
     [

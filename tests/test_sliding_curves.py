@@ -182,10 +182,10 @@ def test_outlines_lie_on_their_curves(text):
         assert curve.nearest(middle)[1].max() < 1.01e-6 * max(1, np.ptp(contour))
 
 
-LONG_WORDS = "LOVE", "mesh", "R8", "OOO", "LEEL", "SCAF", "&@", "Wgy"
+LONG_WORDS = "LOVE", "mesh", "OOO", "LEEL", "SCAF", "&@", "Wgy"
 
 
-@pytest.mark.parametrize("text", ["QH", "G", *(pytest.param(text, marks=pytest.mark.slow) for text in LONG_WORDS)])
+@pytest.mark.parametrize("text", ["QH", "G", "R8", *(pytest.param(text, marks=pytest.mark.nightly) for text in LONG_WORDS)])
 def test_a_word_follows_the_curves_of_its_letters(text):
     pytest.importorskip("shapely")
     contours, curves = outline(f"word:{text}"), outline_curves(f"word:{text}")
@@ -197,7 +197,7 @@ def test_a_word_follows_the_curves_of_its_letters(text):
         sides = np.hypot(*np.diff(contour, axis=0, append=contour[:1]).T)
         assert curve.length == pytest.approx(sides.sum(), rel=1e-4)
     # Curves of a letter are unchanged: the first letter has the same position as alone.
-    s = np.concatenate([np.linspace(0, curve.length, 5000) for curve in curves])
+    s = np.concatenate([np.linspace(0, curve.length, 2000) for curve in curves])
     points = np.concatenate([c.position(part) for c, part in zip(curves, np.split(s, len(curves)), strict=True)])
     first = outline_curves(f"letter:{text[0]}")
     away = np.min([one.nearest(points)[1] for one in first], axis=0)
