@@ -570,7 +570,7 @@ class TestRun:
         began = time.monotonic()
         with pytest.raises(KeyboardInterrupt):
             batch.run(stars, tmp_path / "out", jobs=2, callback=interrupt)
-        assert time.monotonic() - began < 20
+        assert time.monotonic() - began < 120
         assert not (tmp_path / "out/results/y_sleep/record.json").exists()
         assert record_of(tmp_path / "out", "a")["certified"]
 

@@ -133,9 +133,12 @@ def test_no_scheduler(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("address", ["nonsense", "tcp://host", "http://host:1", "tcp://host:port"])
 def test_invalid_addresses_are_rejected_at_once(tmp_path, capfd, address):
     source = write_stars(tmp_path / "set", ["a"])
+    import dask
+
     began = time.monotonic()
-    assert main(["batch", str(source), "-o", str(tmp_path / "out"), "--scheduler", address]) == 2
+    with dask.config.set({"distributed.comm.timeouts.connect": "600s"}):
+        assert main(["batch", str(source), "-o", str(tmp_path / "out"), "--scheduler", address]) == 2
     error = capfd.readouterr().err
     assert f"'{address}' is not the address of a Dask scheduler, such as tcp://HOST:8786" in error
     assert "Traceback" not in error
-    assert time.monotonic() - began < 20
+    assert time.monotonic() - began < 300

@@ -44,12 +44,12 @@ class TestTroubles:
         source = write_stars(tmp_path / "set", [name for kind in kinds for name in (kind, f"{kind[:2]}~")])
         (source / "broken").mkdir()
         (source / "broken" / "input.obj").write_text("v 0 0 0\nf 1 2 3\n")
-        progress = batch.run(source, tmp_path / "out", jobs=2, time_limit=2.5)
+        progress = batch.run(source, tmp_path / "out", jobs=2, time_limit=6)
         found = {record["problem"]: record for record in batch.read_table(tmp_path / "out" / "records.csv")}
         assert len(found) == progress.total == progress.done
         expected = {
-            "sleep": ("timeout", "not finished within 2.5 s"),
-            "spin": ("timeout", "not finished within 2.5 s"),
+            "sleep": ("timeout", "not finished within 6 s"),
+            "spin": ("timeout", "not finished within 6 s"),
             "refused": ("memory", ""),
             "late": ("memory", "out of memory"),
             "segfault": ("crash", "ended by SIGSEGV.*Segmentation fault"),
@@ -64,7 +64,7 @@ class TestTroubles:
             assert record["certified"] == (outcome == "injective")
             assert re.search(words, record["error"] or "")
             if outcome == "timeout":
-                assert record["seconds"] == pytest.approx(2.5, abs=2)
+                assert 6 <= record["seconds"] < 60
         assert progress.failed == len(expected)
 
     @linux
@@ -78,15 +78,16 @@ class TestTroubles:
 
     def test_real_limits(self, tmp_path):
         """Real limits: a mesh exceeds the time limit, and then the memory limit."""
-        source = tmp_path / "set"
-        write_problem(source / "large", *star_of(230))
+        source, out = tmp_path / "set", tmp_path / "out"
         write_problem(source / "small", *star_of(4))
-        out = tmp_path / "out"
-        assert batch.run(source, out, jobs=1, time_limit=0.8).outcomes == {"timeout": 1, "injective": 1}
+        assert batch.run(source, out, jobs=1).outcomes == {"injective": 1}
+        write_problem(source / "large", *star_of(110))
+        limited = batch.run(source, out, jobs=1, time_limit=0.1)
+        assert (limited.outcomes, limited.resumed) == ({"timeout": 1, "injective": 1}, 1)
         # With the same limit or a lower one the problem is not solved again.
-        assert batch.run(source, out, jobs=1, time_limit=0.4).resumed == 2
+        assert batch.run(source, out, jobs=1, time_limit=0.05).resumed == 2
         if Path("/proc/self/statm").exists():
-            limited = batch.run(source, out, jobs=1, memory_limit=60 << 20)
+            limited = batch.run(source, out, jobs=1, memory_limit=40 << 20)
             assert (limited.outcomes, limited.resumed) == ({"memory": 1, "injective": 1}, 1)
         assert batch.run(source, out, jobs=1).outcomes == {"injective": 2}
 
@@ -107,7 +108,7 @@ class TestTroubles:
         began = time.monotonic()
         with pytest.raises(OSError, match=r"cannot write .*b_full.*[Nn]o space left"):
             batch.run(source, tmp_path / "out", jobs=2)
-        assert time.monotonic() - began < 20
+        assert time.monotonic() - began < 120
         assert record_of(tmp_path / "out", "a")["certified"]
         assert not (tmp_path / "out/results/b_full/record.json").exists()
         assert not list((tmp_path / "out").rglob("*.tmp"))
@@ -178,7 +179,7 @@ def test_a_killed_driver_loses_only_the_problems_in_progress(tmp_path):
     children = children_of(driver)
     driver.kill()
     driver.wait()
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while any(runs(child) for child in children):
         assert time.monotonic() < deadline, "processes were left behind"
         time.sleep(0.02)
@@ -220,7 +221,7 @@ def test_an_orphaned_process_that_hangs_is_ended(tmp_path, monkeypatch):
     driver.kill()
     driver.wait()
     assert len(children) == 1
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while runs(children[0]):
         assert time.monotonic() < deadline
         time.sleep(0.05)

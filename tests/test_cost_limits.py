@@ -196,6 +196,10 @@ class TestImports:
         assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.solver.search.solving"}
         assert len(found - self.modules("pass")) < 140
 
+    def test_workers_of_a_data_set_start_without_slow_imports(self):
+        found = self.modules("import quasiharmonic.ui.batch.worker")
+        assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.fft", "shapely", "pyarrow"}
+
     def test_a_solve_imports_only_what_it_needs(self):
         found = self.modules("from quasiharmonic import injective_map")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}

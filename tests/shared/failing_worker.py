@@ -19,8 +19,17 @@ fill_record, ready = worker.fill_record, groups.read_problem
 def use_all_memory():
     blocks = []
     while True:
+        # Slowly, so that a busy machine notices before it is far above the limit.
         blocks.append(b"\1" * (1 << 22))
-        time.sleep(0.001)
+        time.sleep(0.01)
+
+
+def hang():
+    """Hold the interpreter's lock within C, so that no other thread of the process can run."""
+    if os.name == "posix":
+        ctypes.PyDLL(None).sleep(600)
+    else:
+        re.match(r"(a+)+$", "a" * 60 + "b")
 
 
 def raise_disk_full(*arguments):
@@ -39,8 +48,7 @@ def print_text():
 
 FAILURES = {
     "sleep": lambda: time.sleep(600),
-    # Runs in C and holds the interpreter's lock, so no other thread of the process can run.
-    "spin": lambda: re.match(r"(a+)+$", "a" * 60 + "b"),
+    "spin": hang,
     "hog": use_all_memory,
     "refused": lambda: bytearray(1 << 62),
     "segfault": lambda: ctypes.string_at(0),

@@ -18,7 +18,6 @@ from quasiharmonic.apps.atlas.mapped_atlas import (
     name_island,
     orient_islands,
 )
-from quasiharmonic.apps.atlas.packing.pack import pack_charts
 from quasiharmonic.apps.flattening import free_boundary
 from quasiharmonic.apps.flattening.layout import fit_unit_square, place_in_row
 from quasiharmonic.energies.deformation import positive_weights
@@ -275,6 +274,9 @@ def pack(
         If an island has no positions or the islands do not fit; if an island has triangles so thin that rounding to
         positions in the square would invert them.
     """
+    # Packing needs scipy.spatial, which loads longer than most maps take.
+    from quasiharmonic.apps.atlas.packing.pack import pack_charts
+
     mesh = seamed_mesh(mesh)
     islands = mesh.islands
     charts = _scale_to_surface(islands, _surface_areas(mesh))
