@@ -123,7 +123,8 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("seconds", [pytest.param(0.15, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.15, pytest.param(1, marks=pytest.mark.nightly)])
 def test_triangles_that_another_thread_overwrites(seconds):
     text = REWRITTEN.format(calls=CALLS, seconds=seconds)
     ran = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)

@@ -58,7 +58,8 @@ def test_refining_the_named_edges_leaves_only_obstructions_that_no_refinement_re
         refined_problems += len(diagnosis.split) > 0
         rounds = 0
         while len(diagnosis.split):
-            assert (rounds := rounds + 1) < 6, name
+            rounds += 1
+            assert rounds < 6, name
             refined = refine(problem.V, problem.F, diagnosis.split)
             problem = Problem(refined.V, refined.F, problem.fixed, problem.target, reference="equilateral")
             diagnosis = diagnose(problem)

@@ -26,7 +26,6 @@ from shared.meshes import boundary_of
 from shared.polygons import U, circle, random_polygon, spiral
 from shared.small_meshes import loose_wheel, wheel
 
-
 POLYGONS = 43
 
 
@@ -253,7 +252,7 @@ def test_hubs_with_thousands_of_neighbours_are_placed(mesh):
     began = time.process_time()
     diagnosis = diagnose(problem)
     # It takes a second or less on an idle machine.
-    assert time.process_time() - began < 10
+    assert time.process_time() - began < 30
     assert diagnosis.obstructions == ()
     assert not any("sees" in words for words in diagnosis.unchecked)
 
@@ -294,13 +293,13 @@ def test_ten_thousand_boundary_vertices(kind):
     began = time.process_time()
     assert diagnose(problem).obstructions == ()
     # It takes less than a second on an idle machine.
-    assert time.process_time() - began < 10
+    assert time.process_time() - began < 30
 
 
 def test_every_vertex_of_a_ring_sees_too_little():
     problem = turned_ring(84, 2)
     began = time.process_time()
     diagnosis = diagnose(problem)
-    assert time.process_time() - began < 10
+    assert time.process_time() - began < 30
     assert {o.kind for o in diagnosis.obstructions} == {Kind.HIDDEN}
     assert {int(o.vertices[0]) for o in diagnosis.obstructions} == set(range(problem.n)) - set(problem.fixed.tolist())

@@ -6,12 +6,14 @@ import json
 import re
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
 from quasiharmonic import distortion, flatten, surfaces
+from quasiharmonic.apps.flattening import free_boundary, piece
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.distances.distance_descent import DistancePairs, keep_distances, lower_distance_error
 from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy
@@ -459,7 +461,7 @@ def test_a_coarse_mesh_helps_the_fine_one(folded, asked):
     plain = flatten(folded.V, folded.F)
     found = lower_coarse_distance_error(folded, 16, asked, least=900)
     whole = lower_distance_error(folded, plain.uv, 16, asked)
-    sample = surface_distances(folded.V, folded.F, rings=16, sources=400)
+    sample = surface_distances(folded.V, folded.F, rings=16, sources=150)
     errors = [sample.error(uv) for uv in (plain.uv, whole.uv, found.uv)]
     assert found.status is Status.POLISHED
     assert certify(folded.F, found.uv).bijective
@@ -502,9 +504,15 @@ def test_ctrl_c_on_the_coarse_mesh_returns_a_map_of_the_surface(folded, asked):
 
 
 @pytest.mark.slow
-def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh():
-    V, F = surfaces.cat(120)
-    assert len(F) > 50_000
+@pytest.mark.parametrize("rings", [48, pytest.param(120, marks=pytest.mark.nightly)])
+def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh(rings, monkeypatch):
+    if rings < 120:
+        for module in (piece, free_boundary):
+            monkeypatch.setattr(module, "COARSE_FROM", 8_000)
+        coarse = partial(lower_coarse_distance_error, least=1_500)
+        monkeypatch.setattr(free_boundary, "lower_coarse_distance_error", coarse)
+    V, F = surfaces.cat(rings)
+    assert len(F) >= piece.COARSE_FROM
     plain, found = (flatten(V, F, **options) for options in ({}, {"energy": "distances"}))
     sample = surface_distances(V, F, sources=300, targets=150)
     assert found.stages[-1].name == "guarded descent, distances, coarse"

@@ -441,4 +441,4 @@ class TestHarmonise:
         assert not result.injective
         assert result.status is Status.IMPOSSIBLE
         assert result.diagnosis.forbids_injective
-        assert result.to_dict()["diagnosis"] is not None
+        assert result.to_dict()["diagnosis"]["forbids_injective"] is True

@@ -37,7 +37,10 @@ ENTRY = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text()
 def interrupted(at, *arguments):
     """Run the command as its console script does, with Ctrl-C when a given module is imported."""
     return subprocess.run(
-        [sys.executable, "-c", INTERRUPTED, at, ENTRY, *map(str, arguments)], capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", INTERRUPTED, at, ENTRY, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
 
 
@@ -72,13 +75,13 @@ def test_in_a_finaliser(monkeypatch, capsys):
     def run(options):
         closing = Closing()
         del closing
-        time.sleep(10)
+        time.sleep(120)
         return 0
 
     monkeypatch.setattr(measure, "run", run)
     began = time.monotonic()
     assert main(["measure", "map.obj"]) == 2
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 60
     assert capsys.readouterr().err == "qhm measure: interrupted, nothing was written\n"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -112,7 +115,7 @@ def test_in_generated_code(tmp_path):
         env=os.environ | {"PYTHONPATH": path},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
     )
     assert (done.returncode, done.stderr) == (2, "qhm check: interrupted, nothing was written\n")
 
@@ -132,6 +135,6 @@ def test_after_the_last_output():
     # Too late to undo anything: the printed report stays true.
     late = "import signal; atexit.register(signal.raise_signal, signal.SIGINT)"
     code = f"import atexit, sys; {late}; sys.argv[1:] = ['--version']; from quasiharmonic.__main__ import main; main()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("qhm ")

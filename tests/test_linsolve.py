@@ -792,7 +792,7 @@ one_by_one(*[solve] * 30)
 def finished(code):
     """Return what a process prints that runs this code."""
     command = [sys.executable, "-W", "ignore", "-c", code]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout.split()
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=600).stdout.split()
 
 
 @needs_rslab
@@ -849,7 +849,7 @@ assert os.waitpid(child, 0)[1] == 0
 @needs_rslab
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
 def test_a_forked_process_does_not_wait_for_threads_of_its_parent():
-    subprocess.run([sys.executable, "-W", "ignore", "-c", _FORK], check=True, timeout=120)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", _FORK], check=True, timeout=600)
 
 
 # ---- MKL ----------------------------------------------------------------------------------------------------------
@@ -1011,7 +1011,7 @@ print(laplacian.solver.handle.threads)
 def test_pardiso_does_not_wait_for_threads_that_openmp_refuses(name, value, threads):
     environment = UNLIMITED | {"MKL_NUM_THREADS": "2", "MKL_DYNAMIC": "FALSE", name: value}
     run = subprocess.run(
-        [sys.executable, "-c", _TEAM], env=environment, capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", _TEAM], env=environment, capture_output=True, text=True, check=True, timeout=600
     )
     assert run.stdout.split() == [threads]
 

@@ -202,8 +202,8 @@ def test_time(count, seconds):
     charts = grids(count)
     began = time.process_time()
     packing = pack_charts(charts, resolution=1024 if count < 10_000 else 2048, padding=4)
-    # Twice the time on an idle machine.
-    assert time.process_time() - began < 2 * seconds
+    # Several times the time on an idle machine, as a busy one takes longer, also in CPU time.
+    assert time.process_time() - began < 4 * seconds
     check(charts, packing, [1024 if count < 10_000 else 2048] * 2, 4)
 
 

@@ -102,7 +102,7 @@ def test_a_data_set_is_solved_on_a_system_without_unix_features(tmp_path):
     command = [sys.executable, "-m", "quasiharmonic", "batch", str(stars), "-o", str(tmp_path / "out"), "--jobs", "1"]
     seen = [sys.executable, "-c", "import os, fcntl"]
     assert b"fcntl" in subprocess.run(seen, env=surroundings, capture_output=True).stderr, "this test changes nothing"
-    done = subprocess.run(command, env=surroundings, capture_output=True, timeout=120)
+    done = subprocess.run(command, env=surroundings, capture_output=True, timeout=600)
     assert done.returncode == 0, done.stderr.decode("cp1252", "replace")
     record = record_of(tmp_path / "out", "Größe")
     assert record["outcome"] == "injective"

@@ -72,7 +72,6 @@ def test_curves_and_their_smooth_continuations():
     assert all(np.array_equal(a, b) for a, b in zip(pieces, relative, strict=True))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0, 30, -75])
 @pytest.mark.parametrize(("large", "sweep"), [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_arcs_lie_on_their_ellipse(turn, large, sweep):
@@ -85,7 +84,7 @@ def test_arcs_lie_on_their_ellipse(turn, large, sweep):
     # The centre of the circle through the first, middle and last point.
     a, b, d = circle[0], circle[len(circle) // 2], circle[-1]
     centre = np.linalg.solve(2 * np.stack([b - a, d - a]), [b @ b - a @ a, d @ d - a @ a])
-    assert np.linalg.norm(circle - centre, axis=1) == pytest.approx(np.ones(len(circle)), abs=2e-7)
+    np.testing.assert_allclose(np.linalg.norm(circle - centre, axis=1), 1, rtol=0, atol=2e-7)
     angle = np.unwrap(np.arctan2(*(circle - centre).T[::-1]))
     assert (angle[-1] - angle[0] > 0) == bool(sweep)
     assert (abs(angle[-1] - angle[0]) > np.pi) == bool(large)
@@ -285,8 +284,8 @@ def test_excessive_sizes_are_rejected_quickly(read, text, message):
     began = time.process_time()
     with pytest.raises(ValueError, match=message):
         read(text)
-    # At most two seconds on an idle machine.
-    assert time.process_time() - began < 6
+    # At most two seconds on an idle machine; without the limits, minutes.
+    assert time.process_time() - began < 20
 
 
 SAMPLE = drawing(
