@@ -274,7 +274,7 @@ def pack(
         If an island has no positions or the islands do not fit; if an island has triangles so thin that rounding to
         positions in the square would invert them.
     """
-    # Packing needs scipy.spatial, which loads longer than most maps take.
+    # Packing needs scipy.spatial, which takes longer to load than most maps take.
     from quasiharmonic.apps.atlas.packing.pack import pack_charts
 
     mesh = seamed_mesh(mesh)
