@@ -24,6 +24,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from blender_objects import all_faces_edited, mesh_object, read_corners
 from quasiharmonic import boundary_loops, certify, flatten, io, surfaces
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -35,30 +36,20 @@ WAYS = {"ANGLE_BASED": {}, "CONFORMAL": {}, "MINIMUM_STRETCH": {"iterations": 10
 
 def unwrapped(V: FloatArray, F: IntArray, method: str, pins: dict[int, tuple[float, float]]) -> FloatArray:
     """Return the vertex positions (n, 2) of Blender's unwrap."""
-    data = bpy.data.meshes.new("surface")
-    data.from_pydata(V.tolist(), [], F.tolist())
-    thing = bpy.data.objects.new("surface", data)
-    bpy.context.collection.objects.link(thing)
-    bpy.context.view_layer.objects.active = thing
-    data.uv_layers.new()
     corner = F.ravel()
-    if pins:
-        uv = np.zeros((len(corner), 2), dtype=np.float32)
-        for vertex, place in pins.items():
-            uv[corner == vertex] = place
-        data.attributes[data.uv_layers[0].name].data.foreach_set("vector", uv.ravel())
-        data.uv_layers[0].pin_ensure()
-        data.uv_layers[0].pin.foreach_set("value", np.isin(corner, list(pins)))
-    bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.mesh.select_all(action="SELECT")
-    bpy.ops.uv.unwrap(method=method, **WAYS[method])
-    bpy.ops.object.mode_set(mode="OBJECT")
-    places = np.empty(2 * len(corner), dtype=np.float32)
-    data.uv_layers[0].uv.foreach_get("vector", places)
-    uv = np.zeros((len(V), 2))
-    uv[corner] = places.reshape(-1, 2)
-    bpy.data.objects.remove(thing)
-    bpy.data.meshes.remove(data)
+    with mesh_object(V, F) as thing:
+        data = thing.data
+        if pins:
+            places = np.zeros((len(corner), 2), dtype=np.float32)
+            for vertex, place in pins.items():
+                places[corner == vertex] = place
+            data.attributes[data.uv_layers[0].name].data.foreach_set("vector", places.ravel())
+            data.uv_layers[0].pin_ensure()
+            data.uv_layers[0].pin.foreach_set("value", np.isin(corner, list(pins)))
+        with all_faces_edited():
+            bpy.ops.uv.unwrap(method=method, **WAYS[method])
+        uv = np.zeros((len(V), 2))
+        uv[F] = read_corners(thing, F)
     return uv
 
 

@@ -27,6 +27,7 @@ from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,21 +66,12 @@ def by_blender(V: FloatArray, F: IntArray) -> Corners:
     """Blender's Smart UV Project."""
     import bpy
 
-    data = bpy.data.meshes.new("model")
-    data.from_pydata(V.tolist(), [], F.tolist())
-    thing = bpy.data.objects.new("model", data)
-    bpy.context.collection.objects.link(thing)
-    bpy.context.view_layer.objects.active = thing
-    data.uv_layers.new()
-    bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.mesh.select_all(action="SELECT")
-    bpy.ops.uv.smart_project(island_margin=PADDING / RESOLUTION, margin_method="FRACTION")
-    bpy.ops.object.mode_set(mode="OBJECT")
-    places = np.empty(6 * len(F), dtype=np.float32)
-    data.uv_layers[0].uv.foreach_get("vector", places)
-    bpy.data.objects.remove(thing)
-    bpy.data.meshes.remove(data)
-    return RESOLUTION * places.astype(np.float64).reshape(-1, 3, 2)
+    from blender_objects import all_faces_edited, mesh_object, read_corners
+
+    with mesh_object(V, F) as thing:
+        with all_faces_edited():
+            bpy.ops.uv.smart_project(island_margin=PADDING / RESOLUTION, margin_method="FRACTION")
+        return RESOLUTION * read_corners(thing, F)
 
 
 def cpu_seconds() -> float:
@@ -88,8 +80,35 @@ def cpu_seconds() -> float:
     return time.process_time() + child.ru_utime + child.ru_stime
 
 
-def row(name: str, way: str, V: FloatArray, F: IntArray, corners: Corners, seconds: float) -> str:
-    """Return a row of the table."""
+class Figures(NamedTuple):
+    """Figures of texture coordinates; degenerate and repeated triangles of the model are left out.
+
+    Attributes
+    ----------
+    charts : int
+    seams : float
+        Length of the seams, relative to the square root of the surface's area.
+    used : float
+        Area of all charts divided by that of the smallest square around them.
+    at_99, worst : float
+        Stretch of 99 % of the surface, and the largest.
+    wrong : int
+        Triangles without area, or with an orientation other than their chart's.
+    certified : bool
+        Whether every chart is bijective and no two charts overlap.
+    """
+
+    charts: int
+    seams: float
+    used: float
+    at_99: float
+    worst: float
+    wrong: int
+    certified: bool
+
+
+def measure(V: FloatArray, F: IntArray, corners: Corners) -> Figures:
+    """Return the figures of texture coordinates in texels."""
     cleaned = clean(V, F)
     # Reversing a triangle exchanges its last two corners.
     corners = corners[cleaned.triangles]
@@ -105,10 +124,24 @@ def row(name: str, way: str, V: FloatArray, F: IntArray, corners: Corners, secon
     length = np.linalg.norm(np.diff(mapped.V[mapped.seams], axis=1), axis=2).sum()
     sides = cleaned.V[cleaned.F[:, 1:]] - cleaned.V[cleaned.F[:, :1]]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
-    certified = "yes" if verdict.bijective and not len(verdict.overlapping) else "no"
+    return Figures(
+        charts=len(mapped.islands),
+        seams=float(length / np.sqrt(area)),
+        used=float(used),
+        at_99=float(measured.isometric[at_99]),
+        worst=float(measured.isometric[order[-1]]),
+        wrong=len(verdict.inverted),
+        certified=verdict.bijective and not len(verdict.overlapping),
+    )
+
+
+def row(name: str, way: str, V: FloatArray, F: IntArray, corners: Corners, seconds: float) -> str:
+    """Return a row of the table."""
+    found = measure(V, F, corners)
+    certified = "yes" if found.certified else "no"
     return (
-        f"| {name} | {len(F):,} | {way} | {len(mapped.islands)} | {length / np.sqrt(area):.1f} | {used:.2f} | "
-        f"{measured.isometric[at_99]:.2f} | {measured.isometric[order[-1]]:.1f} | {certified} | {seconds:.2f} |"
+        f"| {name} | {len(F):,} | {way} | {found.charts} | {found.seams:.1f} | {found.used:.2f} | "
+        f"{found.at_99:.2f} | {found.worst:.1f} | {certified} | {seconds:.2f} |"
     ).replace("| inf |", "| ∞ |")
 
 

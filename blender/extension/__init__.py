@@ -1,12 +1,12 @@
-"""Blender extension for UV maps without inverted faces: check, repair, flatten, reduce stretch, fit to an outline."""
+"""Blender extension for UV maps without inverted faces: check, repair, unwrap, flatten, reduce stretch, fit to an outline."""
 
 from __future__ import annotations
 
 import bpy
 
-from . import operators, panel
+from . import operators, panel, unwrap_operator
 
-_CLASSES = (*operators.CLASSES, *panel.CLASSES)
+_CLASSES = (*operators.CLASSES, unwrap_operator.QHM_OT_unwrap, *panel.CLASSES)
 
 
 def register() -> None:

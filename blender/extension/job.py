@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import bpy
-
-from quasiharmonic.results import Step
 
 from .surface import Refused
 
 # Seconds between two checks of a thread.
 _LOOK = 0.05
+# Steps after which the indicator of a search of unknown length is full once.
+_TURN = 20
 
-Work = Callable[[Callable[[Step], None]], Any]
+# A function whose argument is a callback for its steps: `Step` of a search, or `UnwrapStep`.
+Work = Callable[[Callable[[Any], None]], Any]
 
 
 class Job:
@@ -28,7 +31,7 @@ class Job:
     """
 
     def __init__(self, work: Work) -> None:
-        self.step: Step | None = None
+        self.step: Any = None
         self.steps = 0
         self.error: BaseException | None = None
         self.result: Any = None
@@ -64,11 +67,21 @@ class Job:
         except BaseException as error:
             self.error = error
 
-    def _heard(self, step: Step) -> None:
+    def _heard(self, step: Any) -> None:
         self.step = step
         self.steps += 1
         if self.stopped:
             raise KeyboardInterrupt
+
+
+def describe_progress(job: Job) -> tuple[str, float | None]:
+    """Return what a job is doing, and the finished share of its phase; None if its length is unknown."""
+    step = job.step
+    if step is None:
+        return "starting", None
+    if hasattr(step, "phase"):
+        return f"{step.phase} {step.done} of {step.total}", step.done / max(step.total, 1)
+    return f"step {job.steps}, energy {step.energy:.4g}", None
 
 
 class Working(bpy.types.Operator):
@@ -108,9 +121,16 @@ class Working(bpy.types.Operator):
             return {"RUNNING_MODAL"}
         manager = context.window_manager
         manager.progress_update(self._job.steps % 100)
-        if self._job.step is not None:
-            state = f"{self.bl_label}: step {self._job.steps}, energy {self._job.step.energy:.4g} (Esc cancels)"
-            context.workspace.status_text_set(state)
+        text, share = describe_progress(self._job)
+
+        def draw(header: Any, _: bpy.types.Context) -> None:
+            label = f"{self.bl_label}: {text} (Esc cancels)"
+            if share is None:
+                header.layout.progress(text=label, factor=self._job.steps % _TURN / _TURN, type="RING")
+            else:
+                header.layout.progress(text=label, factor=share, type="BAR")
+
+        context.workspace.status_text_set(draw)
         if self._job.running:
             return {"RUNNING_MODAL"}
         manager.event_timer_remove(self._timer)
@@ -144,14 +164,34 @@ class Working(bpy.types.Operator):
 
     def _guarded(self, context: bpy.types.Context, act: Callable[[bpy.types.Context], set[str]]) -> set[str]:
         """Call ``act`` in object mode, where mesh data is up to date, and report errors to the user."""
-        self.mode = mode = context.active_object.mode
-        if mode != "OBJECT":
-            bpy.ops.object.mode_set(mode="OBJECT")
-        try:
-            return act(context)
-        except (Refused, ValueError, ImportError) as error:
-            self.report({"ERROR"}, f"{self.bl_label}: {' '.join(str(error).split())}")
+        with _object_mode(context) as (self.mode, self.edited):
+            try:
+                return act(context)
+            except (Refused, ValueError, ImportError) as error:
+                self.report({"ERROR"}, f"{self.bl_label}: {' '.join(str(error).split())}")
+            except Exception as error:
+                # An error of the extension. The traceback goes to the console.
+                traceback.print_exc()
+                name = type(error).__name__
+                self.report({"ERROR"}, f"{self.bl_label}: internal error, nothing has changed. {name}: {error}")
             return {"CANCELLED"}
-        finally:
-            if mode != "OBJECT":
-                bpy.ops.object.mode_set(mode=mode)
+
+
+@contextmanager
+def _object_mode(context: bpy.types.Context) -> Iterator[tuple[str, list[bpy.types.Object]]]:
+    """Leave the current mode, and enter it again with the same objects; yields the mode and these objects."""
+    mode, objects = context.active_object.mode, list(context.objects_in_mode)
+    if mode == "OBJECT":
+        yield mode, []
+        return
+    bpy.ops.object.mode_set(mode="OBJECT")
+    try:
+        yield mode, objects
+    finally:
+        # Edit mode is entered by all selected objects.
+        selected = list(context.selected_objects)
+        for thing in {*selected, *objects}:
+            thing.select_set(thing in objects)
+        bpy.ops.object.mode_set(mode=mode)
+        for thing in {*selected, *objects}:
+            thing.select_set(thing in selected)

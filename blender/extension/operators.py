@@ -23,7 +23,7 @@ from quasiharmonic.solver.mapping import solve
 from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 from quasiharmonic.util.arrays import IntArray, count_of
 
-from . import outline, surface
+from . import outline, pins, surface
 from .job import Work, Working
 from .surface import Refused
 
@@ -39,8 +39,9 @@ class UvWorking(Working):
 
     def read(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
         """Return the active object's mesh; in edit mode, only islands with selected faces unless ``whole`` is true."""
-        chosen_only = not whole and self.mode == "EDIT"
-        self.surface = surface.read(context.active_object.data, chosen_only=chosen_only)
+        self.surface = surface.read(
+            context.active_object.data, edited=self.mode == "EDIT", chosen_only=not whole and self.mode == "EDIT"
+        )
         return self.surface.mesh
 
     def read_map(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
@@ -51,14 +52,15 @@ class UvWorking(Working):
 
     def take(self, context: bpy.types.Context, mapped: SeamedMesh, remark: str = "") -> None:
         """Write a map to Blender and report the verdict of the map as stored there."""
-        verdict = atlas.certify(surface.write(context.active_object.data, self.surface, mapped))
+        stored = surface.write(context.active_object.data, self.surface, mapped)
+        verdict = atlas.certify(stored)
         lost = np.setdiff1d(verdict.inverted, atlas.certify(mapped).inverted)
         if lost.size:
             remark = (
                 f"{count_of('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
             )
         kind = "INFO" if verdict.injective else "WARNING"
-        self.report({kind}, f"{self.bl_label}: {remark}{_told(verdict)}")
+        self.report({kind}, f"{self.bl_label}: {remark}{_told(verdict)}{_describe_others(self.surface, stored)}")
 
 
 class ChosenWorking(UvWorking):
@@ -125,7 +127,7 @@ class QHM_OT_repair(ChosenWorking):
         self.take(context, SeamedMesh(mesh.V, mesh.F, result.FT, result.uv), f"{reasons} " if reasons else "")
 
 
-class QHM_OT_flatten(UvWorking):
+class QHM_OT_flatten(ChosenWorking):
     """Flatten the mesh with free borders, without inversion or overlap; cut at marked seams or along UV borders."""
 
     bl_idname = "uv.qhm_flatten"
@@ -141,20 +143,24 @@ class QHM_OT_flatten(UvWorking):
     def prepare(self, context: bpy.types.Context) -> Work:
         """Return the work that cuts and flattens the mesh."""
         mesh, polygons = self.read(context), self.surface.polygons
+        here = self.surface
         seams = surface.marked_seams(context.active_object.data)
-        cut, pack, energy = self.cut, self.pack, self.energy
+        cut, pack, energy, whole = self.cut, self.pack, self.energy, self.whole or self.mode != "EDIT"
 
         def work(reports_progress: Callable[[Step], None]) -> SeamedMesh:
-            here = mesh
+            opened = mesh
             if len(seams):
-                here = seam_cuts.cut_along(mesh, seams, polygons=polygons)
+                opened = seam_cuts.cut_along(mesh, seams, polygons=polygons)
             elif 1 < len(polygons) == len(mesh.islands):
                 # A new UV layer of Blender looks the same: every face fills the square.
-                here = SeamedMesh(mesh.V, mesh.F)
+                opened = SeamedMesh(mesh.V, mesh.F)
+            opened = surface.restrict(opened, here.shown) if whole else here.choose(opened)
             if cut:
-                here = seam_cuts.cut_apart(here, polygons=polygons)
-            _require_borders(here)
-            mapped = atlas.flatten(here, energy=energy, callback=reports_progress)
+                opened = seam_cuts.cut_apart(opened, polygons=polygons)
+            _require_borders(opened)
+            if any(pins.find_pins(here, island)[0].size for island in opened.islands):
+                return pins.flatten_with_pins(here, opened, energy, reports_progress)
+            mapped = atlas.flatten(opened, energy=energy, callback=reports_progress)
             if mapped.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             return atlas.pack(mapped.mesh) if pack else mapped.mesh
@@ -178,16 +184,11 @@ class QHM_OT_reduce(ChosenWorking):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         """Return the work that reduces the distortion."""
-        mesh = self.read_map(context, whole=self.whole)
+        mesh, here = self.read_map(context, whole=self.whole), self.surface
         free, energy = self.free, self.energy
-
-        def work(reports_progress: Callable[[Step], None]) -> SeamedMesh:
-            mapped = atlas.polish(mesh, free=free, energy=energy, callback=reports_progress)
-            if mapped.status is Status.INTERRUPTED:
-                raise KeyboardInterrupt
-            return mapped.mesh
-
-        return work
+        return lambda reports_progress: pins.reduce_stretch(
+            here, mesh, free=free, energy=energy, reports_progress=reports_progress
+        )
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
         """Write the map and report the result."""
@@ -216,13 +217,14 @@ class QHM_OT_fit(ChosenWorking):
         """Return the work that fits the boundary to the outline, with corners detected, and computes the map."""
         mesh = self.read(context, whole=self.whole)
         if len(mesh.islands) != 1:
-            raise Refused(f"there are {len(mesh.islands)} islands: in edit mode, select a face of the one to fit")
+            raise Refused(f"there are {len(mesh.islands)} islands: in edit mode, select faces of the one to fit only")
         _require_borders(mesh)
-        contours = self._contours(context)
+        here, contours = self.surface, self._contours(context)
         corners = CornerSpec("auto") if self.to == "RECTANGLE" else None
 
         def find(island: Island, reports_progress: Callable[[Step], None]) -> MapResult:
             problem = fit_boundary(island.V, island.F, contours, corners=corners).problem
+            problem = pins.hold_pins(problem, *pins.find_pins(here, island))
             result = solve(problem, callback=reports_progress)
             if result.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
@@ -261,6 +263,22 @@ def _require_borders(mesh: SeamedMesh) -> None:
 def _told(verdict: AtlasVerdict) -> str:
     """Return the first lines of a verdict, joined into one line."""
     return " ".join(verdict.summary().splitlines()[:3])
+
+
+def _describe_others(here: surface.Surface, stored: SeamedMesh) -> str:
+    """Return a sentence on the islands that were left unchanged, and on those of them that overlap new ones."""
+    changed = np.zeros(len(stored.F), dtype=np.bool_)
+    changed[stored.mapped] = True
+    if changed.all():
+        return ""
+    verdict = atlas.certify(here.with_all(stored.uv))
+    new = np.array([changed[island.triangles].any() for island in verdict.islands])
+    if new.all():
+        return ""
+    pairs = verdict.overlapping[new[verdict.overlapping].sum(axis=1) == 1]
+    others = pairs[~new[pairs]] if len(pairs) else pairs
+    said = f" {count_of('other island', 'other islands', np.count_nonzero(~new))} unchanged"
+    return f"{said}, of which {len(np.unique(others))} overlap the new ones." if others.size else f"{said}."
 
 
 def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:

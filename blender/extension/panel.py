@@ -23,6 +23,8 @@ class _Buttons:
         column.operator("uv.qhm_check")
         column.operator("uv.qhm_repair")
         column.separator()
+        column.operator("uv.qhm_unwrap")
+        column.separator()
         column.operator("uv.qhm_flatten").cut = False
         column.operator("uv.qhm_flatten", text="Cut and Flatten").cut = True
         column.separator()

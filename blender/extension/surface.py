@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import bpy
@@ -31,32 +31,61 @@ class Surface:
     ----------
     mesh : SeamedMesh
         Its triangles, in Blender's own triangulation. Each corner refers to the row of the first loop at the same
-        position; triangles that are not chosen have rows of -1. Positions are those of all loops.
+        position; triangles that are not shown or not chosen have rows of -1. Positions are those of all loops.
     polygons : Polygons
         The mesh's faces, as rings of the triangles' corners.
     loops : (f, 3) int64
         The loop of each corner of each triangle.
+    pinned : (l,) bool
+        Whether the UV of each loop is pinned.
+    shown, selected : (f,) bool
+        Whether the face of each triangle is visible, and whether it is visible and selected. Outside of edit mode all
+        faces are visible, and all are selected.
     """
 
     mesh: SeamedMesh
     polygons: Polygons
     loops: IntArray
+    pinned: BoolArray
+    shown: BoolArray
+    selected: BoolArray
+
+    def choose(self, mesh: SeamedMesh) -> SeamedMesh:
+        """Return a mesh of the same triangles with the visible islands that have a selected triangle.
+
+        If no triangle is selected, all visible islands are chosen.
+        """
+        mesh = restrict(mesh, self.shown)
+        if not self.selected.any() or self.selected.all():
+            return mesh
+        chosen = np.zeros(len(mesh.F), dtype=np.bool_)
+        for island in mesh.islands:
+            chosen[island.triangles] = self.selected[island.triangles].any()
+        return restrict(mesh, chosen)
+
+    def with_all(self, uv: FloatArray) -> SeamedMesh:
+        """Return the mesh with positions (l, 2) of all loops, also of those that are hidden or not chosen."""
+        vertex = np.empty(len(uv), dtype=np.int64)
+        vertex[self.loops] = self.mesh.F
+        return SeamedMesh(self.mesh.V, self.mesh.F, _welded(vertex, uv.astype(np.float32))[self.loops], uv)
 
 
-def read(data: bpy.types.Mesh, *, chosen_only: bool) -> Surface:
-    """Read a mesh, its active UV layer and the selected faces.
+def read(data: bpy.types.Mesh, *, edited: bool, chosen_only: bool) -> Surface:
+    """Read a mesh, its active UV layer and pins, and which faces are visible and selected.
 
     Parameters
     ----------
     data : bpy.types.Mesh
         In object mode.
+    edited : bool
+        Leave out hidden faces, as in edit mode.
     chosen_only : bool
         If any face is selected, leave out islands without selected faces.
 
     Raises
     ------
     Refused
-        If the mesh has no faces.
+        If the mesh has no faces, or all faces are hidden.
     """
     if not len(data.polygons):
         raise Refused("the mesh has no faces")
@@ -67,15 +96,30 @@ def read(data: bpy.types.Mesh, *, chosen_only: bool) -> Surface:
     T = numbers(data.loop_triangles, "loops", 3, np.int32).astype(np.int64)
     # Every corner of a face is a corner of one of its triangles.
     polygons = Polygons(np.unique(T, return_index=True)[1], starts)
-    layer = data.uv_layers.active
+    shown = selected = np.ones(len(T), dtype=np.bool_)
+    if edited:
+        face = polygons.of_triangle
+        shown = ~numbers(data.polygons, "hide", 1, np.bool_).ravel()[face]
+        selected = shown & numbers(data.polygons, "select", 1, np.bool_).ravel()[face]
+    if not shown.any():
+        raise Refused("all faces are hidden")
+    layer, pinned = data.uv_layers.active, np.zeros(len(vertex), dtype=np.bool_)
     if layer is None:
         mesh = SeamedMesh(V, vertex[T])
     else:
         places = numbers(layer.uv, "vector", 2, np.float32)
         mesh = SeamedMesh(V, vertex[T], _welded(vertex, places)[T], places.astype(np.float64))
-    if chosen_only:
-        mesh = _chosen(mesh, numbers(data.polygons, "select", 1, np.bool_).ravel()[polygons.of_triangle])
-    return Surface(mesh, polygons, T)
+        if len(layer.pin):
+            pinned = numbers(layer.pin, "value", 1, np.bool_).ravel()
+    surface = Surface(mesh, polygons, T, pinned, shown, selected)
+    return replace(surface, mesh=surface.choose(mesh) if chosen_only else restrict(mesh, shown))
+
+
+def restrict(mesh: SeamedMesh, chosen: BoolArray) -> SeamedMesh:
+    """Return a mesh without the positions of the triangles outside of a mask (f,)."""
+    if chosen.all():
+        return mesh
+    return SeamedMesh(mesh.V, mesh.F, np.where(chosen[:, None], mesh.FT, -1), mesh.uv)
 
 
 def require_map(surface: Surface) -> None:
@@ -103,16 +147,27 @@ def write(data: bpy.types.Mesh, surface: Surface, mapped: SeamedMesh) -> SeamedM
     Refused
         If the mesh has the maximum number of UV layers and none is active.
     """
-    layer = data.uv_layers.active or data.uv_layers.new(name="UVMap")
-    if layer is None:
-        raise Refused("the mesh has no room for another UV map")
+    layer = require_layer(data)
     rounded = in_single_precision(mapped)
     places = numbers(layer.uv, "vector", 2, np.float32)
     places[surface.loops[rounded.mapped]] = rounded.uv[rounded.FT[rounded.mapped]]
-    # Undo shares the array of layer.uv, so writing there could not be undone.
-    data.attributes[layer.name].data.foreach_set("vector", places.ravel())
-    data.update()
+    set_places(data, layer, places)
     return SeamedMesh(mapped.V, mapped.F, np.where(mapped.FT >= 0, surface.loops, -1), places.astype(np.float64))
+
+
+def require_layer(data: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer:
+    """Return the active UV layer; create one if there is none. Raise `Refused` if there is no room for it."""
+    layer = data.uv_layers.active or data.uv_layers.new(name="UVMap")
+    if layer is None:
+        raise Refused("the mesh has no room for another UV map")
+    return layer
+
+
+def set_places(data: bpy.types.Mesh, layer: bpy.types.MeshUVLoopLayer, places: FloatArray) -> None:
+    """Write the positions of all loops (l, 2) into a UV layer."""
+    # Undo shares the array of layer.uv, so writing there could not be undone.
+    data.attributes[layer.name].data.foreach_set("vector", places.astype(np.float32).ravel())
+    data.update()
 
 
 def select_faces(context: bpy.types.Context, surface: Surface, faces: IntArray) -> None:
@@ -151,14 +206,3 @@ def _welded(vertex: IntArray, places: FloatArray) -> IntArray:
     graph = coo_array((np.ones(ends.shape[1], dtype=np.int8), tuple(ends)), shape=(len(vertex), len(vertex)))
     label = connected_components(graph, directed=False)[1]
     return np.unique(label, return_index=True)[1][label]
-
-
-def _chosen(mesh: SeamedMesh, selected: BoolArray) -> SeamedMesh:
-    """Return the islands that contain a selected triangle, or all islands if no triangle is selected."""
-    if not selected.any() or selected.all():
-        return mesh
-    FT = np.full_like(mesh.FT, -1)
-    for island in mesh.islands:
-        if selected[island.triangles].any():
-            FT[island.triangles] = mesh.FT[island.triangles]
-    return SeamedMesh(mesh.V, mesh.F, FT, mesh.uv)

@@ -1,0 +1,111 @@
+"""The operator that unwraps any model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import numpy as np
+
+from quasiharmonic.apps.unwrapping.result import UnwrapResult
+from quasiharmonic.util.arrays import count_of
+
+from . import unwrapping
+from .job import Work, Working
+
+
+class QHM_OT_unwrap(Working):
+    """Unwrap any model: cut it into few parts with little stretch, mark the seams and pack one texture.
+
+    In object mode all selected objects are unwrapped, in edit mode the selected faces.
+    """
+
+    bl_idname = "uv.qhm_unwrap"
+    bl_label = "Unwrap Model"
+    max_stretch: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Max Stretch",
+        description="99 % of the surface are stretched or shrunk by at most this factor. Lower values need more seams",
+        default=1.5,
+        min=1.0,
+        soft_min=1.05,
+        soft_max=3.0,
+    )
+    max_charts: bpy.props.IntProperty(  # type: ignore[valid-type]
+        name="Max Islands", description="Maximum number of islands; 0 for no limit", default=0, min=0
+    )
+    resolution: bpy.props.IntProperty(  # type: ignore[valid-type]
+        name="Resolution",
+        description="Side of the texture in texels, for the padding",
+        default=2048,
+        min=16,
+        max=65536,
+    )
+    padding: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Padding", description="Minimum distance of two islands in texels", default=4.0, min=0.0, soft_max=64.0
+    )
+    rotate: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Rotate", description="Rotate islands to fit better", default=True
+    )
+    stack: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Stack", description="Identical and mirrored parts share their place in the texture", default=False
+    )
+    keep_seams: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Keep Seams",
+        description="Cut at the marked seams, or without any along the borders of the UVs, and further where needed",
+        default=False,
+    )
+    mark_seams: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Mark Seams", description="Mark the new seams, and unmark other edges of these faces", default=True
+    )
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        """Return the work that unwraps the objects."""
+        self._objects = self._find_objects(context)
+        self._parts = parts = unwrapping.read_parts(self._objects, edited=self.mode == "EDIT")
+        options = {
+            "max_stretch": self.max_stretch,
+            "max_charts": self.max_charts or None,
+            "resolution": self.resolution,
+            "padding": self.padding,
+            "rotate": self.rotate,
+            "stack": self.stack,
+            "keep_seams": self.keep_seams,
+        }
+        return lambda reports_progress: unwrapping.unwrap_parts(parts, callback=reports_progress, **options)
+
+    def finish(self, context: bpy.types.Context, result: Any) -> None:
+        """Write the texture coordinates and report them."""
+        crossed = unwrapping.write_parts(self._parts, result, mark_seams=self.mark_seams)
+        sound = result.success and not result.misses and not crossed
+        self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {describe_unwrap(result, crossed)}")
+        changes = ", ".join(f"{name}: {len(found)}" for name, found in result.cleaned.changes.items() if len(found))
+        if changes:
+            self.report({"INFO"}, f"{self.bl_label}: the mesh is unchanged, but was treated as if cleaned. {changes}")
+        inward = int(np.count_nonzero(result.cleaned.facing < 0))
+        if inward:
+            said = f"{count_of('closed part is', 'closed parts are', inward)} inside out: use Recalculate Outside"
+            self.report({"WARNING"}, f"{self.bl_label}: {said}")
+        changed = [thing.name for thing in self._objects if thing.modifiers]
+        if changed:
+            names = ", ".join(changed[:3]) + (", …" if len(changed) > 3 else "")
+            self.report({"INFO"}, f"{self.bl_label}: the modifiers of {names} are ignored, the base mesh was unwrapped")
+
+    def _find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        """Return the mesh objects to unwrap, the active one first."""
+        active, things = context.active_object, self.edited
+        if self.mode != "EDIT":
+            things = context.selected_objects if active.select_get() else []
+        return [active, *(thing for thing in things if thing.type == "MESH" and thing != active)]
+
+
+def describe_unwrap(result: UnwrapResult, crossed: int) -> str:
+    """Return islands, stretch, use of the texture and the verdict in one line."""
+    stretch = result.stretch
+    said = (
+        f"{count_of('island', 'islands', result.n_charts)}, stretch {stretch.p99:.2f} at 99 % of the surface and "
+        f"{stretch.worst:.2f} at most, {100 * result.utilisation:.0f} % of the texture used. {result.message}"
+    )
+    if crossed:
+        faces = count_of("face is", "faces are", crossed)
+        said += f" But {faces} crossed by seams, so their UVs may overlap: triangulate them."
+    return said

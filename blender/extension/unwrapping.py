@@ -1,0 +1,208 @@
+"""Several objects as one model for `quasiharmonic.unwrap`, and its result in their UV layers and seams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+
+from quasiharmonic import unwrap
+from quasiharmonic.apps.unwrapping.result import UnwrapResult
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+from . import surface
+from .surface import Refused, Surface, numbers
+
+# Factor on the cost of a seam inside a face, which Blender cannot store.
+_INSIDE_FACE = 1e3
+# Objects whose scales along the axes differ by a smaller share are scaled uniformly.
+_UNIFORM = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The faces of one object that are unwrapped.
+
+    Attributes
+    ----------
+    data : bpy.types.Mesh
+    surface : Surface
+        The whole mesh.
+    chosen : (f,) bool
+        Whether each triangle is unwrapped.
+    V : (n, 3) float64
+        Positions at the object's scale.
+    seams : (s, 2) int64
+        The marked seams.
+    """
+
+    data: bpy.types.Mesh
+    surface: Surface
+    chosen: BoolArray
+    V: FloatArray
+    seams: IntArray
+
+    @property
+    def F(self) -> IntArray:
+        """The chosen triangles (k, 3)."""
+        return self.surface.mesh.F[self.chosen]
+
+
+def read_parts(objects: Sequence[bpy.types.Object], *, edited: bool) -> list[Part]:
+    """Read the faces to unwrap: in edit mode the selected ones, or all visible ones if none is selected.
+
+    A mesh that several objects share is read once, at the scale of the first of them. Objects without such faces are
+    left out.
+
+    Raises
+    ------
+    Refused
+        If there are no such faces, or a mesh is linked from another file.
+    """
+    parts: list[Part] = []
+    for thing in objects:
+        data = thing.data
+        if any(part.data == data for part in parts) or not len(data.polygons):
+            continue
+        if data.library is not None:
+            raise Refused(f"{thing.name} is linked from another file, so its UVs cannot be changed")
+        if edited and numbers(data.polygons, "hide", 1, np.bool_).all():
+            continue
+        here = surface.read(data, edited=edited, chosen_only=False)
+        V = here.mesh.V @ _stretch_of(np.array(thing.matrix_world)[:3, :3])
+        parts.append(Part(data, here, here.selected, V, surface.marked_seams(data)))
+    if not parts:
+        raise Refused("all faces are hidden" if edited and any(len(o.data.polygons) for o in objects) else "no faces")
+    if not any(part.chosen.any() for part in parts):
+        return [Part(part.data, part.surface, part.surface.shown, part.V, part.seams) for part in parts]
+    return [part for part in parts if part.chosen.any()]
+
+
+def unwrap_parts(
+    parts: Sequence[Part], *, keep_seams: bool, callback: Callable[[Any], None], **options: Any
+) -> UnwrapResult:
+    """Unwrap all parts as one model, into one texture.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+    keep_seams : bool
+        Cut at the marked seams of each part, or without any at the seams of its UVs.
+    callback : callable
+    **options
+        Options of `quasiharmonic.unwrap`.
+    """
+    V, F, costs, uv = [], [], [], []
+    first, right = 0, 0.0
+    # Parts stand apart, because equal positions are joined. A power of two keeps the shifts exact.
+    size = max(float(np.ptp(part.V, axis=0).max()) for part in parts) or 1.0
+    step = 2.0 ** np.ceil(np.log2(2 * size)) if len(parts) > 1 else 0.0
+    for part in parts:
+        V.append(part.V + ([right - np.round(part.V[:, 0].min() / step) * step, 0, 0] if step else 0))
+        F.append(part.F + first)
+        costs.append(_edge_costs(part))
+        if keep_seams:
+            uv.append(_seam_positions(part))
+        first, right = first + len(part.V), right + 2 * step
+    return unwrap(
+        np.concatenate(V),
+        np.concatenate(F),
+        edge_costs=np.concatenate(costs),
+        uv=np.concatenate(uv) if keep_seams else None,
+        callback=callback,
+        **options,
+    )
+
+
+def write_parts(parts: Sequence[Part], result: UnwrapResult, *, mark_seams: bool) -> int:
+    """Write the texture coordinates of all parts; mark their seams and unmark other edges.
+
+    Returns
+    -------
+    int
+        Number of faces that seams cross: Blender has only one position for each of their corners.
+    """
+    layers = [surface.require_layer(part.data) for part in parts]
+    excluded = np.zeros(len(result.indices), dtype=np.bool_)
+    excluded[result.cleaned.excluded] = True
+    ends = np.cumsum([np.count_nonzero(part.chosen) for part in parts])[:-1]
+    corners = np.split(result.uvs[result.indices].astype(np.float32), ends)
+    crossed = 0
+    for part, layer, uv, without in zip(parts, layers, corners, np.split(excluded, ends), strict=True):
+        loops = part.surface.loops[part.chosen]
+        places = numbers(layer.uv, "vector", 2, np.float32)
+        # A corner of several triangles takes the position of one that is not degenerate.
+        places[loops[without]] = uv[without]
+        places[loops[~without]] = uv[~without]
+        differs = (places[loops[~without]] != uv[~without]).any(axis=(1, 2))
+        face = part.surface.polygons.of_triangle[part.chosen]
+        crossed += np.unique(face[~without][differs]).size
+        surface.set_places(part.data, layer, places)
+        if mark_seams:
+            _mark_seams(part, places, np.unique(face))
+    return crossed
+
+
+def _stretch_of(matrix: FloatArray) -> FloatArray:
+    """Return the scale and shear (3, 3) of an object's matrix, without rotation and reflection."""
+    _, scale, axes = np.linalg.svd(matrix)
+    if not scale[-1] > 0:
+        # An object that is flat has no area in some directions.
+        return np.eye(3)
+    if scale[0] - scale[-1] <= _UNIFORM * scale[0]:
+        # An object without scale keeps its positions exactly.
+        return np.eye(3) if abs(scale[0] - 1) <= _UNIFORM else scale[0] * np.eye(3)
+    return np.asarray(axes.T @ np.diag(scale) @ axes)
+
+
+def _edge_costs(part: Part) -> FloatArray:
+    """Return the factors (k, 3) on the costs of seams: large inside faces."""
+    mesh, n = part.surface.mesh, len(part.V)
+    inside = part.surface.polygons.diagonals(mesh.F)
+    at = np.isin(edge_keys(part.F, part.F[:, (1, 2, 0)], n), edge_keys(inside[:, 0], inside[:, 1], n))
+    return np.where(at, _INSIDE_FACE, 1.0)
+
+
+def _seam_positions(part: Part) -> FloatArray:
+    """Return positions (k, 3, 2) that differ at the marked seams; without any, those of the UV layer."""
+    mesh, n = part.surface.mesh, len(part.V)
+    own = edge_keys(part.F, part.F[:, (1, 2, 0)], n)
+    seams = part.seams[np.isin(edge_keys(part.seams[:, 0], part.seams[:, 1], n), own)]
+    if len(seams):
+        row = SeamedMesh(mesh.V, part.F).cut(seams).FT
+        return np.stack([row, np.zeros_like(row)], axis=2).astype(np.float64)
+    if mesh.uv is None or len(part.surface.polygons) == len(mesh.islands) > 1:
+        # In a new UV layer of Blender, every face fills the square.
+        return np.zeros((len(part.F), 3, 2))
+    return mesh.uv[mesh.FT[part.chosen]]
+
+
+def _mark_seams(part: Part, places: FloatArray, faces: IntArray) -> None:
+    """Mark the edges of these faces whose sides have different positions; unmark their other edges inside the mesh."""
+    data = part.data
+    edge = numbers(data.loops, "edge_index", 1, np.int32).ravel().astype(np.int64)
+    vertex = numbers(data.loops, "vertex_index", 1, np.int32).ravel()
+    starts = part.surface.polygons.starts
+    ahead = np.arange(len(edge)) + 1
+    ahead[starts[1:] - 1] = starts[:-1]
+    # Each side of an edge as the positions at its ends, smaller vertex first.
+    swap = (vertex > vertex[ahead])[:, None]
+    here, there = places, places[ahead]
+    sides = np.concatenate([np.where(swap, there, here), np.where(swap, here, there)], axis=1)
+    order = np.argsort(edge, kind="stable")
+    same = np.flatnonzero(np.diff(edge[order]) == 0)
+    first, second = order[same], order[same + 1]
+    apart = np.zeros(len(data.edges), dtype=np.bool_)
+    apart[edge[first][(sides[first] != sides[second]).any(axis=1)]] = True
+    chosen = np.zeros(len(part.surface.polygons), dtype=np.bool_)
+    chosen[faces] = True
+    mine = np.zeros(len(data.edges), dtype=np.bool_)
+    mine[edge[np.repeat(chosen, np.diff(starts))]] = True
+    mine &= np.bincount(edge, minlength=len(data.edges)) > 1
+    seam = numbers(data.edges, "use_seam", 1, np.bool_).ravel()
+    data.edges.foreach_set("use_seam", np.where(mine, apart, seam))
