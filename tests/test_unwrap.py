@@ -306,3 +306,42 @@ def test_rounding_keeps_triangles_positive_where_it_can():
     assert len(inverted_triangles(triangles, rounded)) < 5
     assert np.abs(rounded - uv).max() < 4 * 2.0**-24
     np.testing.assert_array_equal(rounded * 2**24, np.rint(rounded * 2**24))
+
+
+def quads(columns, rows):
+    """A sheet of quads as triangles, and a mask (f, 3) of the sides inside quads."""
+    flat, triangles = grid(columns, rows)
+    tail, head = flat[triangles], flat[np.roll(triangles, -1, axis=1)]
+    return flat, triangles, np.all(np.abs(head - tail) > 1e-9, axis=2)
+
+
+@pytest.mark.parametrize("shape", ["hills", "strip", "closed"])
+def test_sides_with_large_costs_are_not_cut(shape):
+    if shape == "hills":
+        flat, triangles, inside = quads(8, 8)
+        points = np.column_stack([flat, 0.5 * np.sin(9 * flat[:, 0]) * np.cos(8 * flat[:, 1])])
+    elif shape == "strip":
+        # Its chart is too long for the texture, so it is divided.
+        flat, triangles, inside = quads(3, 2)
+        points = flat * [20.0, 1.0]
+    else:
+        # A closed box with strongly bent faces, which is unfolded.
+        points = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+        points[[0, 3, 5, 6]] *= 0.2
+        faces = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+        triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+        inside = np.zeros(triangles.shape, dtype=bool)
+        inside[:6, 2] = inside[6:, 0] = True
+    found = unwrap(points, triangles, max_stretch=1.2, resolution=512, edge_costs=np.where(inside, 1000.0, 1.0))
+    sides = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2), axis=2)
+    spared = {tuple(side) for side in sides[inside].tolist()}
+    assert len(found.seams)
+    assert spared.isdisjoint(map(tuple, found.seams.tolist()))
+    assert found.success
+
+
+def test_a_single_long_polygon_is_not_divided():
+    points, triangles = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 1.0], [0.0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    inside = np.array([[False, False, True], [True, False, False]])
+    assert unwrap(points, triangles, resolution=512).n_charts == 2
+    assert unwrap(points, triangles, resolution=512, edge_costs=np.where(inside, 1000.0, 1.0)).n_charts == 1

@@ -1,4 +1,4 @@
-"""Blender extension for UV maps without inverted faces: check, repair, unwrap, flatten, reduce stretch, fit to an outline."""
+"""Blender extension for UV maps without inverted faces: check, repair, unwrap, flatten, reduce stretch, fit."""
 
 from __future__ import annotations
 

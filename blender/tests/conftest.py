@@ -18,6 +18,17 @@ BUILD = Path(__file__).parents[1] / "build.py"
 MODULE = "bl_ext.user_default.quasiharmonic"
 
 
+def pytest_addoption(parser):
+    parser.addoption("--nightly", action="store_true", help="run the long tests, too")
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("nightly"):
+        left = [item for item in items if item.get_closest_marker("nightly")]
+        config.hook.pytest_deselected(items=left)
+        items[:] = [item for item in items if item not in left]
+
+
 @pytest.fixture(scope="session")
 def archive(tmp_path_factory):
     """The zip, built by the one command."""

@@ -70,6 +70,15 @@ def add_quads(n=6):
     return add_mesh(V, faces, flat)
 
 
+def two_squares(shift, *, mirror=False):
+    """Two squares of 4 by 4 quads, apart in space; the UVs of the second moved, or turned over."""
+    V, flat, faces = quads(4)
+    other = flat * [-1, 1] + [1, 0] if mirror else flat
+    beside = V + np.array([2, 0, 0])
+    both = np.concatenate([faces, faces + len(V)])
+    return add_mesh(np.concatenate([V, beside]), both, np.concatenate([flat, other + shift]))
+
+
 def vertices_of_loops(thing):
     found = np.empty(len(thing.data.loops), dtype=np.int32)
     thing.data.loops.foreach_get("vertex_index", found)

@@ -144,17 +144,8 @@ def test_check_selects_the_flipped_faces(said):
     assert np.array_equal(scenes.places(thing), before)
 
 
-def two_squares(shift, *, mirror=False):
-    """Two squares of 4 by 4 quads, apart in space; the UVs of the second moved, or turned over."""
-    V, flat, faces = scenes.quads(4)
-    other = flat * [-1, 1] + [1, 0] if mirror else flat
-    beside = V + np.array([2, 0, 0])
-    both = np.concatenate([faces, faces + len(V)])
-    return scenes.add_mesh(np.concatenate([V, beside]), both, np.concatenate([flat, other + shift]))
-
-
 def test_check_selects_the_faces_that_lie_on_others(said):
-    thing = two_squares([0.625, 0])
+    thing = scenes.two_squares([0.625, 0])
     bpy.ops.uv.qhm_check()
     column = np.arange(32) % 4
     expected = np.flatnonzero(np.where(np.arange(32) < 16, column >= 2, column <= 1))
@@ -163,7 +154,7 @@ def test_check_selects_the_faces_that_lie_on_others(said):
 
 
 def test_check_tells_of_mirrored_islands_and_selects_none_of_them(said):
-    thing = two_squares([1.5, 0], mirror=True)
+    thing = scenes.two_squares([1.5, 0], mirror=True)
     bpy.ops.uv.qhm_check()
     assert scenes.selected(thing) == set()
     text = said()
@@ -193,7 +184,7 @@ def test_repair(thing):
 
 
 def test_repair_leaves_mirrored_islands_unless_asked():
-    thing = two_squares([1.5, 0], mirror=True)
+    thing = scenes.two_squares([1.5, 0], mirror=True)
     before = scenes.places(thing)
     bpy.ops.uv.qhm_repair()
     assert np.array_equal(scenes.places(thing), before)
@@ -295,7 +286,7 @@ def test_a_text_object_and_a_flat_mesh_are_outlines_too():
 
 
 def test_in_edit_mode_islands_that_are_not_selected_stay():
-    thing = two_squares([1.5, 0])
+    thing = scenes.two_squares([1.5, 0])
     scenes.move_vertex(thing, 7, [0.5, 0.35])
     scenes.move_vertex(thing, 32, [2.0, 0.35])
     bpy.ops.object.mode_set(mode="EDIT")

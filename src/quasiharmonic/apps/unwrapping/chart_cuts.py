@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
@@ -30,6 +31,8 @@ _MAX_BAND = 30_000
 # Number of boundary positions between which a dividing line is sought, and what a balanced line is worth.
 _SAMPLES = 256
 _BALANCE = 0.2
+#: Triangles on the two sides of an edge with at least this cost factor stay together, such as those of a polygon.
+UNDIVIDED_COST = 1e3
 # A part with a smaller share of the triangles is a mere corner.
 _LEAST_PART = 0.004
 # Cost factor of boundary edges for a dividing line, and what a line costs at least, relative to the boundary's length.
@@ -98,6 +101,11 @@ def _excess(chart: WorkingChart, bound: float) -> FloatArray:
     # A single triangle must not be lost by the averages.
     np.maximum.at(at, chart.F[chart.too_long].ravel(), np.log(_MAX_PEAK))
     return np.maximum(at, 0)
+
+
+def is_undivided(chart: WorkingChart) -> bool:
+    """Return whether all triangles of a chart should stay together, such as those of one polygon."""
+    return not _group_undivided(chart.cost, _graph(chart)).any()
 
 
 def _graph(chart: WorkingChart) -> EdgeGraph:
@@ -173,21 +181,26 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     with np.errstate(all="ignore"):
         t = np.nan_to_num(near / (near + far), nan=0.5)[chart.F].mean(axis=1)
     k, lowest, highest = len(chart.F), *_BAND
+    group = _group_undivided(chart.cost, graph)
+    if not group.any():
+        # The chart is a single polygon, which can only be divided between its triangles.
+        group = np.arange(k)
+    t = _mean_of_groups(t, group)
     inside = np.abs(t - 0.5)
     half = 0.5 * (highest - lowest)
     if np.count_nonzero(inside < half) > _MAX_BAND:
         half = float(np.partition(inside, _MAX_BAND)[_MAX_BAND])
     # Around the ends, triangles belong to the nearer one, so that no part is tiny.
-    near, far = near[chart.F].mean(axis=1), far[chart.F].mean(axis=1)
+    near, far = (_mean_of_groups(distance[chart.F].mean(axis=1), group) for distance in (near, far))
     source = (t <= 0.5 - half) | ((near < _REACH) & (near < far))
     sink = (t >= 0.5 + half) | ((far < _REACH) & (far <= near))
     if not source.any() or not sink.any():
         # The chart is so small that no triangle is close to an end.
-        order = np.argsort(t, kind="stable")
-        source[order[0]], sink[order[-1]] = True, True
-        sink[order[0]] = source[order[-1]] = False
-    # Triangles in the band are nodes; all others are the source, k, or the sink, k + 1.
-    node = np.where(source, k, np.where(sink, k + 1, np.arange(k)))
+        order = group[np.argsort(t, kind="stable")]
+        first, last = group == order[0], group == order[order != order[0]][-1]
+        source, sink = (source & ~last) | first, (sink & ~first) | last
+    # Groups in the band are nodes; all others are the source, k, or the sink, k + 1.
+    node = np.where(source, k, np.where(sink, k + 1, group))
     numbers, node = np.unique(np.concatenate([node, [k, k + 1]]), return_inverse=True)
     first, second, edge = _pairs(graph)
     capacity = np.clip(graph.cost[edge] / np.mean(graph.cost) * _UNIT, 1, _MOST / (len(edge) + 1)).astype(np.int32)
@@ -211,6 +224,25 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     line = np.zeros(len(graph.ends), dtype=bool)
     line[edge[side[first] != side[second]]] = True
     return line
+
+
+def _group_undivided(cost: FloatArray, graph: EdgeGraph) -> IntArray:
+    """Label (k,) of the group of triangles that should stay together: its first triangle.
+
+    ``cost`` (k, 3) are the factors of the sides.
+    """
+    first, second, edge = _pairs(graph)
+    dear = np.zeros(len(graph.ends), dtype=bool)
+    dear[graph.side.T[cost >= UNDIVIDED_COST]] = True
+    joined = dear[edge]
+    return label_components(first[joined], second[joined], len(cost))
+
+
+def _mean_of_groups(values: FloatArray, group: IntArray) -> FloatArray:
+    """Return for each triangle the mean of its group."""
+    size = np.bincount(group, minlength=len(values))
+    total = np.bincount(group, values, minlength=len(values))
+    return total[group] / size[group]
 
 
 def _pairs(graph: EdgeGraph) -> tuple[IntArray, IntArray, IntArray]:

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.unwrapping.chart_cuts import UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
@@ -86,7 +87,8 @@ def find_charts(
     max_charts : int, optional
         Maximum number of charts. It is exceeded only by components, and by parts without an injective map.
     edge_costs : (f, 3) float64, optional
-        Positive factor on the cost of cutting each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
+        Positive factor on the cost of cutting each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0. Two
+        triangles stay together at factors of at least `UNDIVIDED_COST`, where possible.
     uv_cuts : (l, 2) array of int, optional
         Edges that are cut in any case, such as the seams of existing texture coordinates.
     seed : int
@@ -105,7 +107,7 @@ def find_charts(
     cost = np.ones(F.shape) if edge_costs is None else np.asarray(edge_costs, dtype=np.float64)
     given = np.empty((0, 2), dtype=np.int64) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
     flat, charts = _lay_flat(V, F, given)
-    small, unfolded = _unfold_small(V, F, np.flatnonzero(~flat), given)
+    small, unfolded = _unfold_small(V, F, np.flatnonzero(~flat), given, cost >= UNDIVIDED_COST)
     charts += unfolded
     rest = np.flatnonzero(~flat & ~small)
     cut = partial(_cut, V, F, given=given, cost=cost)
@@ -135,7 +137,9 @@ def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, lis
     return mask, charts
 
 
-def _unfold_small(V: FloatArray, F: IntArray, rows: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:
+def _unfold_small(
+    V: FloatArray, F: IntArray, rows: IntArray, cut: IntArray, undivided: BoolArray
+) -> tuple[BoolArray, list[Chart]]:
     """Unfold small closed components without cuts; return a mask (f,) of their triangles, and their charts."""
     mask, charts = np.zeros(len(F), dtype=bool), list[Chart]()
     if not rows.size:
@@ -149,7 +153,7 @@ def _unfold_small(V: FloatArray, F: IntArray, rows: IntArray, cut: IntArray) -> 
     rows = rows[chosen[component]]
     if not rows.size:
         return mask, charts
-    split, component, uv, good = unfold(V, F[rows])
+    split, component, uv, good = unfold(V, F[rows], undivided[rows])
     order = np.argsort(component, kind="stable")
     for k, some in enumerate(np.split(order, np.flatnonzero(np.diff(component[order])) + 1)):
         if good[k]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import find_smallest_box, make_shape
-from quasiharmonic.apps.unwrapping.chart_cuts import divide
+from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.charts import Chart
 from quasiharmonic.util.arrays import FloatArray
@@ -63,8 +63,12 @@ def divide_long_charts(
         full = max_charts is not None and len(done) + len(waiting) + 1 >= max_charts
         if full or len(chart.F) < 2 or not _is_too_long(chart, side):
             done.append(chart)
+            continue
+        working = WorkingChart(chart.triangles, chart.vertices, V[chart.vertices], chart.F, cost[chart.triangles])
+        if is_undivided(working):
+            done.append(chart)
         else:
-            waiting += _divide(chart, V, cost, bound)
+            waiting += _divide(chart, working, bound)
     return sorted(done, key=lambda chart: int(chart.triangles[0]))
 
 
@@ -80,9 +84,8 @@ def _is_too_long(chart: Chart, side: float) -> bool:
     return max(width, height) > side * (_LONGEST_LOOSE if loose else _LONGEST)
 
 
-def _divide(chart: Chart, V: FloatArray, cost: FloatArray, bound: float) -> list[Chart]:
+def _divide(chart: Chart, working: WorkingChart, bound: float) -> list[Chart]:
     """Divide a chart across its middle."""
-    working = WorkingChart(chart.triangles, chart.vertices, V[chart.vertices], chart.F, cost[chart.triangles])
     working.uv, working.stretch = np.ldexp(chart.uv, -working.piece.exponent), chart.stretch
     parts = []
     for part in divide(working, bound):

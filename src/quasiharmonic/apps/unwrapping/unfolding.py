@@ -16,7 +16,7 @@ from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 
-def unfold(V: FloatArray, F: IntArray) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+def unfold(V: FloatArray, F: IntArray, undivided: BoolArray) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
     """Unfold closed surfaces.
 
     Parameters
@@ -24,6 +24,8 @@ def unfold(V: FloatArray, F: IntArray) -> tuple[IntArray, IntArray, FloatArray, 
     V : (n, 3) float64
     F : (f, 3) int64
         Triangles of closed surfaces.
+    undivided : (f, 3) bool
+        Sides across which triangles are joined first, such as those inside polygons.
 
     Returns
     -------
@@ -43,6 +45,7 @@ def unfold(V: FloatArray, F: IntArray) -> tuple[IntArray, IntArray, FloatArray, 
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = normal / np.linalg.norm(normal, axis=1)[:, None]
     bend = 1 - (normal[first] * normal[second]).sum(axis=1)
+    bend[undivided[first, side] | undivided[second, opposite]] = -1.0
     rank = np.empty(bend.size)
     rank[np.argsort(bend, kind="stable")] = np.arange(1, bend.size + 1)
     size = len(F)
