@@ -56,3 +56,33 @@ def test_order_of_the_methods_of_mesh_motion(scene):
     assert (first, second) == (("MovingMesh", "last"), ("elasticity", "last"))
     assert steps[first] > steps[second]
     assert (steps[first] == end) == (scene not in ("turning disk", "sliding walls"))
+
+
+def test_unwraps_beside_those_of_blender():
+    text = (DOCS / "speed" / "unwrapping_blender.md").read_text(encoding="utf-8")
+    described, _, table = text.partition("\n\n")
+    assert "Blender 5.0" in described
+    head, _, *lines = ([cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines())
+    models = {}
+    for line in lines:
+        row = dict(zip(head, line, strict=True))
+        models.setdefault(row["model"], {})[row["program"]] = row
+    assert len(models) == 11
+    seams = "Minimum Stretch, seams of "
+    slower, fuller, less = [], 0, 0
+    for rows in models.values():
+        mine, smart = rows["`unwrap`"], rows["Smart UV Project"]
+        most, same = rows[seams + "Smart UV Project"], rows[seams + "`unwrap`"]
+        assert (mine["certified"], mine["wrong"]) == ("yes", "0")
+        assert int(mine["charts"]) <= int(smart["charts"]) / 5
+        assert float(mine["seams"]) <= 0.6 * float(smart["seams"])
+        assert float(smart["seconds"]) < 0.5
+        assert float(most["worst"]) > float(mine["worst"])
+        assert float(same["stretch, 99 %"]) > float(mine["stretch, 99 %"])
+        assert float(same["used"]) < float(mine["used"])
+        less += float(most["stretch, 99 %"]) < float(mine["stretch, 99 %"])
+        fuller += float(most["used"]) > float(mine["used"])
+        slower.append(float(most["seconds"]) / float(mine["seconds"]))
+    assert min(slower) > 4.5
+    assert max(slower) < 31
+    assert (less, fuller) == (8, 2)
