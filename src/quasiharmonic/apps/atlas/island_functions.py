@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -47,6 +47,7 @@ def polish(
     free: bool = False,
     fixed: ArrayLike | None = None,
     weights: ArrayLike | None = None,
+    islands: Collection[int] | None = None,
     **rest: Any,
 ) -> MappedAtlas:
     """Lower the distortion of every island of an injective map.
@@ -61,6 +62,8 @@ def polish(
         Fixed vertices of the mesh, on all islands that contain them; the boundaries by default. Not with ``free``.
     weights : (f,) array, optional
         Weight of each triangle's distortion.
+    islands : collection of int, optional
+        Indices of the islands that change, in the order of ``mesh.islands``; all by default.
     **rest
         Options of `quasiharmonic.polish`, or with ``free`` of `quasiharmonic.flatten`: ``energy``,
         ``max_iterations``, ``tol``, ``linear_solver``, ``callback``; without ``free`` also ``slide``.
@@ -88,7 +91,7 @@ def polish(
             return replace(result, uv=fit_in_place(island, result.uv))
         return polish_map(_domain(island, checked), island.uv, PolishOptions(**own, **rest))
 
-    return each_island(mesh, lower)
+    return each_island(mesh, lower, only=islands)
 
 
 def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **rest: Any) -> MappedAtlas:
@@ -149,6 +152,7 @@ def flatten(
     weights: ArrayLike | None = None,
     unit_square: bool = False,
     gap: float = 0.0,
+    islands: Collection[int] | None = None,
     **rest: Any,
 ) -> MappedAtlas:
     """Flatten every island with a free boundary. Islands stand side by side and are not mirrored.
@@ -166,6 +170,9 @@ def flatten(
         Weight of each triangle's distortion.
     unit_square, gap, **rest
         Options of `quasiharmonic.flatten`.
+    islands : collection of int, optional
+        Indices of the islands that are flattened, in the order of ``mesh.islands``; all by default. With a choice, each
+        keeps its centre, direction and area, and the other islands keep their positions. Islands may then overlap.
 
     Returns
     -------
@@ -178,6 +185,8 @@ def flatten(
     check_non_negative("gap", gap)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     checked = _check_fixed(mesh, fixed)
+    if islands is not None and unit_square:
+        raise ValueError("some islands cannot be scaled to the unit square alone: omit unit_square or islands")
     if checked is not None and unit_square:
         raise ValueError("fixed vertices determine the size of the map: omit unit_square")
     if checked is not None and mesh.uv is None:
@@ -190,8 +199,14 @@ def flatten(
         pins = _select_fixed(island, checked) if checked is not None else np.empty(0, dtype=np.int64)
         if pins.size:
             own |= {"fixed": pins, "target": island.uv[pins]}
-        return free_boundary.flatten(island.V, island.F, **own, **rest)
+        result = free_boundary.flatten(island.V, island.F, **own, **rest)
+        if islands is None or pins.size or np.isnan(island.uv).any():
+            return result
+        uv = fit_in_place(island, result.uv)
+        return replace(result, uv=uv, certificate=certify(island.F, uv))
 
+    if islands is not None:
+        return each_island(mesh, lay, reflect=start, only=islands)
     faces = orient_islands(mesh, reflect=start)
     if checked is not None and checked.size and len(faces) > 1 and not any(mirrored for _, mirrored in faces):
         return _flatten_together(mesh, checked, weights, start, {"gap": gap, **rest})

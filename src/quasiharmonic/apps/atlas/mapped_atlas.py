@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,13 +11,14 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, AtlasVerdict, certify, mirrored_islands
 from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.refinement import Refined
 from quasiharmonic.geometry.mesh.surface_checks import manifold_edges
 from quasiharmonic.io import MeshData, refined_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
 from quasiharmonic.util.outcome import Outcome
 
 # The status of an atlas is the first of these that one of its islands has; without any, that of the first island.
@@ -124,16 +125,24 @@ class MappedAtlas(Outcome):
         }
 
 
-def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, reflect: bool = True) -> MappedAtlas:
+def each_island(
+    mesh: SeamedMesh,
+    lower: Callable[[Island], MapResult],
+    *,
+    reflect: bool = True,
+    only: Collection[int] | None = None,
+) -> MappedAtlas:
     """Apply an operation to each island of a mesh; without seams it must be a manifold surface.
 
     ``lower`` maps an island to a result with a position for every vertex of it, and perhaps further vertices at the
     end. With ``reflect``, mirrored ones of several islands are passed as their reflection and stay mirrored. A single
-    mirrored island is treated as inverted. After Ctrl-C the remaining islands keep their positions; KeyboardInterrupt
-    is raised if they have none. ValueError as `orient_islands`, or if ``lower`` rejects an island; the message names
+    mirrored island is treated as inverted. Islands whose indices are not in ``only`` keep their positions. After Ctrl-C
+    the remaining islands keep their positions; KeyboardInterrupt is raised if they have none. ValueError as
+    `orient_islands`, if there is no island of an index in ``only``, or if ``lower`` rejects an island; the message names
     it.
     """
     islands = orient_islands(mesh, reflect=reflect)
+    chosen = check_island_choice(mesh, only)
     done: list[MappedIsland] = []
     places = [island.uv for island in mesh.islands]
     for k, (island, mirrored) in enumerate(islands):
@@ -141,12 +150,38 @@ def each_island(mesh: SeamedMesh, lower: Callable[[Island], MapResult], *, refle
             if np.isnan(island.uv).any():
                 raise KeyboardInterrupt
             continue
-        with name_island(island, len(islands)):
-            result = lower(island)
+        if k in chosen:
+            with name_island(island, len(islands)):
+                result = lower(island)
+        else:
+            result = _keep(island)
         # A refined island has further vertices at the end.
         places[k] = (result.uv * MIRROR if mirrored else result.uv)[: len(island.vertices)]
         done.append(MappedIsland(island.triangles, mirrored, result))
     return MappedAtlas(mesh.with_places(places), tuple(done))
+
+
+def check_island_choice(mesh: SeamedMesh, only: Collection[int] | None) -> Collection[int]:
+    """Return the indices of the chosen islands, by default of all; ValueError if one does not exist or is not mapped.
+
+    Islands that are not chosen need positions.
+    """
+    count = len(mesh.islands)
+    if only is None:
+        return range(count)
+    absent = sorted(set(only) - set(range(count)))
+    if absent or not only:
+        raise ValueError(f"there is no {names_of('island', 'islands', absent or [-1])}: the mesh has {count}, from 0")
+    bare = [k for k, island in enumerate(mesh.islands) if k not in only and np.isnan(island.uv).any()]
+    if bare:
+        raise ValueError(f"{names_of('island', 'islands', bare)} without texture coordinates: choose them, too")
+    return frozenset(only)
+
+
+def _keep(island: Island) -> MapResult:
+    """Return the current map of an island as a result."""
+    found = certificate.certify(island.F, island.uv)
+    return MapResult(uv=island.uv, status=Status.INJECTIVE if found.injective else Status.STALLED, certificate=found)
 
 
 def orient_islands(mesh: SeamedMesh, *, reflect: bool = True) -> list[tuple[Island, bool]]:

@@ -43,6 +43,24 @@ def add_options(parser: argparse._ActionsContainer) -> None:
     )
 
 
+def add_islands(parser: argparse._ActionsContainer) -> None:
+    """Add ``--islands``."""
+    parser.add_argument(
+        "--islands",
+        type=_island_list,
+        metavar="K,K,…",
+        help="change only these islands, from 0 in the order of their first triangles; the others keep their positions",
+    )
+
+
+def _island_list(text: str) -> list[int]:
+    """Convert a list of indices separated by commas; for argparse."""
+    words = text.split(",")
+    if not all(word.isascii() and word.isdigit() and len(word) < 10 for word in words):
+        raise argparse.ArgumentTypeError(f"{text} is not a list of islands such as 0,2")
+    return sorted({int(word) for word in words})
+
+
 def add_packing(parser: argparse._ActionsContainer) -> None:
     """Add ``--pack``, ``--resolution`` and ``--padding``."""
     parser.add_argument(

@@ -59,6 +59,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--unit-square", action="store_true", help="scale the map evenly into the unit square")
     seam_options.add_options(parser)
+    seam_options.add_islands(parser)
     seam_options.add_packing(parser)
     parser.add_argument(
         "--pattern", type=Path, metavar="FILE", help="also draw the outline true to scale, as .svg or .dxf"
@@ -129,6 +130,7 @@ def run(options: argparse.Namespace) -> int:
             unit_square=options.unit_square,
             rings=options.rings,
             gap=_PIECE_GAP * options.allowance,
+            islands=options.islands,
             max_iterations=options.max_iterations,
             linear_solver=options.linear_solver,
             callback=show,

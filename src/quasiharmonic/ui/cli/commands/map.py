@@ -54,6 +54,7 @@ def add_parser(commands: Commands) -> None:
         choices=("map", "distortion"),
         help="for --plot: draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂) with its histogram",
     )
+    seam_options.add_islands(parser)
     seam_options.add_packing(parser)
     material.add_options(parser)
     arguments.add_report(parser)
@@ -118,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
         return result
 
     with report.about(mesh_path):
-        mapped = each_island(found.mesh, solve_island, reflect=options.to is None)
+        mapped = each_island(found.mesh, solve_island, reflect=options.to is None, only=options.islands)
     refined = [one.result.refined for one in mapped.islands]
     refined += [None] * (len(islands) - len(refined))
     written = mesh.with_places(mapped.mesh)

@@ -62,6 +62,7 @@ def add_parser(commands: Commands) -> None:
         metavar="OUTLINE",
         help="the outline of the boundary, as for qhm map (default: the polygon of the boundary)",
     )
+    seam_options.add_islands(parser)
     seam_options.add_packing(parser)
     arguments.add_linear_solver(parser)
     material.add_options(parser)
@@ -90,6 +91,7 @@ def run(options: argparse.Namespace) -> int:
             "max_iterations": options.max_iterations,
             "linear_solver": options.linear_solver,
             "callback": show,
+            "islands": options.islands,
         }
         if options.free:
             return atlas.polish(mesh, free=True, **given)

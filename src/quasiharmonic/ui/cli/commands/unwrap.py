@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
     from quasiharmonic.ui.cli.arguments import Commands
 
-# Factor on the cost of a seam inside a polygon, which the file cannot store.
-_INSIDE_POLYGON = 1e3
-
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
@@ -101,6 +98,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, unwrap, write, read back, compare, report."""
     from quasiharmonic import io
+    from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.ui.cli import material, progress_line, report, written_map
     from quasiharmonic.util.arrays import count_of
@@ -123,12 +121,12 @@ def run(options: argparse.Namespace) -> int:
             stack=options.stack,
             outward=options.outward,
             edge_costs=_edge_costs(mesh, options.edge_costs),
-            uv=_corner_uv(mesh) if options.keep_seams else None,
+            uv=corner_positions(mesh) if options.keep_seams else None,
             seed=options.seed,
             callback=_bound_memory(show, options.memory),
             jobs=options.jobs,
         )
-    unwrapped, divided = _with_map(mesh, result)
+    unwrapped, divided = add_map(mesh, result)
     written_map.tell_losses(options.output, unwrapped)
     io.write_mapped(options.output, unwrapped)
     with report.after_writing(options.output):
@@ -170,37 +168,25 @@ def _edge_costs(mesh: MeshData, path: Path | None) -> Any:
     """Return the cost factors (f, 3) of a file of edges, and a large cost inside polygons; None if all are 1."""
     import numpy as np
 
+    from quasiharmonic.apps.unwrapping.model_files import polygon_costs
     from quasiharmonic.geometry.mesh.topology import edge_keys
     from quasiharmonic.io.lowlevel.textual import read_rows
     from quasiharmonic.util.arrays import edge_names
 
-    if path is None and mesh.polygons is None:
-        return None
+    if path is None:
+        return polygon_costs(mesh)
     n = len(mesh.V)
     keys, costs = edge_keys(mesh.F, mesh.F[:, (1, 2, 0)], n), np.ones(mesh.F.shape)
-    if path is not None:
-        table = np.array([row for _, row in read_rows(path, 3)]).reshape(-1, 3)
-        pairs = table[:, :2].astype(np.int64)
-        wanted = edge_keys(pairs[:, 0], pairs[:, 1], n)
-        absent = (pairs != table[:, :2]).any(axis=1) | ~np.isin(wanted, keys)
-        if absent.any():
-            raise ValueError(f"{path}: {edge_names(pairs[absent])}: not an edge of the mesh")
-        order = np.argsort(wanted, kind="stable")
-        given = np.isin(keys, wanted)
-        costs[given] = table[order, 2][np.searchsorted(wanted[order], keys[given])]
-    if mesh.polygons is not None:
-        diagonals = mesh.polygons.diagonals(mesh.F)
-        costs[np.isin(keys, edge_keys(diagonals[:, 0], diagonals[:, 1], n))] = _INSIDE_POLYGON
-    return costs
-
-
-def _corner_uv(mesh: MeshData) -> Any:
-    """Return the texture coordinates of every corner (f, 3, 2); NaN where there are none."""
-    import numpy as np
-
-    if mesh.vt is None or mesh.FT is None:
-        raise ValueError("the file has no texture coordinates (vt) whose seams could be used: omit --keep-seams")
-    return np.where(mesh.FT[:, :, None] >= 0, mesh.vt[mesh.FT], np.nan)
+    table = np.array([row for _, row in read_rows(path, 3)]).reshape(-1, 3)
+    pairs = table[:, :2].astype(np.int64)
+    wanted = edge_keys(pairs[:, 0], pairs[:, 1], n)
+    absent = (pairs != table[:, :2]).any(axis=1) | ~np.isin(wanted, keys)
+    if absent.any():
+        raise ValueError(f"{path}: {edge_names(pairs[absent])}: not an edge of the mesh")
+    order = np.argsort(wanted, kind="stable")
+    given = np.isin(keys, wanted)
+    costs[given] = table[order, 2][np.searchsorted(wanted[order], keys[given])]
+    return polygon_costs(mesh, costs)
 
 
 def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) -> Callable[[UnwrapStep], None] | None:
@@ -220,29 +206,6 @@ def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) 
             show(step)
 
     return check
-
-
-def _with_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:
-    """Return the mesh with its map, and the number of polygons that are divided into triangles along seams."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    mapped = replace(mesh, vt=result.uvs, FT=result.indices)
-    polygons = mesh.polygons
-    if polygons is None:
-        return mapped, 0
-    # A polygon that is not divided has one row of texture coordinates at each vertex.
-    key = (polygons.of_triangle[:, None] * len(mesh.V) + mesh.F).ravel()
-    order = np.argsort(key, kind="stable")
-    rows, same = result.indices.ravel()[order], np.diff(key[order]) == 0
-    divided = np.zeros(len(polygons), dtype=np.bool_)
-    divided[key[order][1:][same & (np.diff(rows) != 0)] // len(mesh.V)] = True
-    if not divided.any():
-        return mapped, 0
-    before = np.concatenate([[0], np.cumsum(np.where(divided, polygons.sizes - 2, 1))])
-    at = np.where(mesh.statement_faces < 0, -1, before[mesh.statement_faces])
-    return replace(mapped, polygons=polygons.divide(divided), statement_faces=at), int(divided.sum())
 
 
 def _is_written(output: Path, result: UnwrapResult) -> bool:

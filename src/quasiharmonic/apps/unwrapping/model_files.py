@@ -1,0 +1,63 @@
+"""Texture coordinates of `unwrap` and the data of a model's file: polygons, seams of the file, and the map to write."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from quasiharmonic.apps.unwrapping.result import UnwrapResult
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.util.arrays import FloatArray
+
+# Factor on the cost of a seam inside a polygon, which the file cannot store.
+_INSIDE_POLYGON = 1e3
+
+
+def polygon_costs(mesh: MeshData, costs: FloatArray | None = None) -> FloatArray | None:
+    """Return ``edge_costs`` (f, 3) of `unwrap` with large values inside polygons.
+
+    ``costs`` (f, 3) are the costs of the other sides; 1 by default. Without polygons, ``costs`` is returned.
+    """
+    if mesh.polygons is None:
+        return costs
+    found = np.ones(mesh.F.shape) if costs is None else costs.copy()
+    diagonals, n = mesh.polygons.diagonals(mesh.F), len(mesh.V)
+    keys = edge_keys(mesh.F, mesh.F[:, (1, 2, 0)], n)
+    found[np.isin(keys, edge_keys(diagonals[:, 0], diagonals[:, 1], n))] = _INSIDE_POLYGON
+    return found
+
+
+def corner_positions(mesh: MeshData) -> FloatArray:
+    """Return the texture coordinates (f, 3, 2) of every corner; NaN where there are none.
+
+    Raises ValueError if the file has none.
+    """
+    if mesh.vt is None or mesh.FT is None:
+        raise ValueError("the file has no texture coordinates (vt) whose seams could be used: omit --keep-seams")
+    return np.where(mesh.FT[:, :, None] >= 0, mesh.vt[mesh.FT], np.nan)
+
+
+def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:
+    """Return the mesh with its map, and the number of polygons that are divided into triangles along seams."""
+    mapped = replace(mesh, vt=result.uvs, FT=result.indices)
+    return divide_polygons(mapped)
+
+
+def divide_polygons(mesh: MeshData) -> tuple[MeshData, int]:
+    """Divide polygons that seams of the map cross into triangles; return the mesh and the number of these polygons."""
+    polygons = mesh.polygons
+    if polygons is None or mesh.FT is None:
+        return mesh, 0
+    # A polygon that is not divided has one row of texture coordinates at each vertex.
+    key = (polygons.of_triangle[:, None] * len(mesh.V) + mesh.F).ravel()
+    order = np.argsort(key, kind="stable")
+    rows, same = mesh.FT.ravel()[order], np.diff(key[order]) == 0
+    divided = np.zeros(len(polygons), dtype=np.bool_)
+    divided[key[order][1:][same & (np.diff(rows) != 0)] // len(mesh.V)] = True
+    if not divided.any():
+        return mesh, 0
+    before = np.concatenate([[0], np.cumsum(np.where(divided, polygons.sizes - 2, 1))])
+    at = np.where(mesh.statement_faces < 0, -1, before[mesh.statement_faces])
+    return replace(mesh, polygons=polygons.divide(divided), statement_faces=at), int(divided.sum())
