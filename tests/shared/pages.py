@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,21 @@ from quasiharmonic import io
 from quasiharmonic.surfaces import cat
 from quasiharmonic.ui.studio.protocol import Frame, decode, encode
 from quasiharmonic.ui.studio.session.session import Session
-from quasiharmonic.ui.studio.session.surface import make_sheet
+from quasiharmonic.ui.studio.session.surface import make_sheet, read_sheet
 
 
 class Visitor:
-    """A client with a session, which records every frame that the session sends."""
+    """A client with a session, which records every frame that the session sends.
+
+    Its model is a file, or an array of positions and one of triangles.
+    """
 
     def __init__(self, V=None, F=None, name="surface.obj", waiting=lambda: False):
         self.frames: list[Frame] = []
         self.session = Session(self._hear, waiting)
+        if isinstance(V, Path):
+            self.session.open(read_sheet(V))
+            return
         V, F = cat(10) if V is None else (V, F)
         self.session.open(make_sheet(io.MeshData(V, F, source=name), name))
 

@@ -117,7 +117,12 @@ def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **
 
 
 def injective_map(
-    mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, reference: Any = None, **rest: Any
+    mesh: SeamedMesh | MeshLike,
+    *,
+    fixed: ArrayLike | None = None,
+    reference: Any = None,
+    islands: Collection[int] | None = None,
+    **rest: Any,
 ) -> MappedAtlas:
     """Map every island again with a fixed boundary; see `quasiharmonic.injective_map`.
 
@@ -125,6 +130,7 @@ def injective_map(
     ----------
     mesh : SeamedMesh, or a mesh or path that stands for one
     fixed : (k,) array of int, optional
+    islands : collection of int, optional
         As for `polish`.
     reference, **rest
         Options of `quasiharmonic.injective_map`.
@@ -141,7 +147,7 @@ def injective_map(
         own = _select_fixed(island, checked)
         return solve(Problem(island.V, island.F, own, island.uv[own], reference=reference), **rest)
 
-    return each_island(mesh, find)
+    return each_island(mesh, find, only=islands)
 
 
 def flatten(

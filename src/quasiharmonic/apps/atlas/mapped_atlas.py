@@ -138,8 +138,7 @@ def each_island(
     end. With ``reflect``, mirrored ones of several islands are passed as their reflection and stay mirrored. A single
     mirrored island is treated as inverted. Islands whose indices are not in ``only`` keep their positions. After Ctrl-C
     the remaining islands keep their positions; KeyboardInterrupt is raised if they have none. ValueError as
-    `orient_islands`, if there is no island of an index in ``only``, or if ``lower`` rejects an island; the message names
-    it.
+    `orient_islands`, if an index in ``only`` has no island, or if ``lower`` rejects an island; the message names it.
     """
     islands = orient_islands(mesh, reflect=reflect)
     chosen = check_island_choice(mesh, only)
@@ -169,11 +168,13 @@ def check_island_choice(mesh: SeamedMesh, only: Collection[int] | None) -> Colle
     count = len(mesh.islands)
     if only is None:
         return range(count)
-    absent = sorted(set(only) - set(range(count)))
-    if absent or not only:
-        raise ValueError(f"there is no {names_of('island', 'islands', absent or [-1])}: the mesh has {count}, from 0")
-    bare = [k for k, island in enumerate(mesh.islands) if k not in only and np.isnan(island.uv).any()]
-    if bare:
+    absent = np.setdiff1d(list(only), np.arange(count))
+    if not only:
+        raise ValueError("no island is chosen")
+    if absent.size:
+        raise ValueError(f"there is no {names_of('island', 'islands', absent)}: the mesh has {count}, from 0")
+    bare = np.array([k for k, island in enumerate(mesh.islands) if k not in only and np.isnan(island.uv).any()])
+    if bare.size:
         raise ValueError(f"{names_of('island', 'islands', bare)} without texture coordinates: choose them, too")
     return frozenset(only)
 

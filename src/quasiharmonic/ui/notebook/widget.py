@@ -71,7 +71,6 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         self._sent: dict[str, bytes] = {}
         self._note = ""
         sheet = _sheet(surface, F)
-        self.vertices: IntArray = sheet.island.vertices
         self._session = Session(self._tell)
         self._session.open(sheet)
         self.on_msg(self._receive)
@@ -80,6 +79,10 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
     def result(self) -> MapResult:
         state = self._session.state
         return replace(state.result, V=state.problem.V)
+
+    @property
+    def vertices(self) -> IntArray:
+        return self._session.state.active.island.vertices
 
     @property
     def problem(self) -> Problem:

@@ -17,16 +17,22 @@ from typing import Any, BinaryIO
 
 from quasiharmonic.ui.studio.protocol import Array, Frame, decode, encode
 from quasiharmonic.ui.studio.session.session import Session
+from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import read_sheet
 
 #: Maximum total size of waiting messages, bytes.
 MAX_WAITING = 256 << 20
+# Messages that do not interrupt a computation.
+_HARMLESS = {"save", "image", "select"}
 # Memory of a message besides its contents, bytes.
 _OVERHEAD = 1024
 
 
-def serve(source: str) -> None:
-    """Handle messages from standard input until it is closed; open ``source``, or a built-in surface if it is empty."""
+def serve(source: str, folder: str = "") -> None:
+    """Handle messages from standard input until it is closed; open ``source``, or a built-in surface if it is empty.
+
+    The session is stored in ``folder``. If a stored session is there, it continues.
+    """
     # Ctrl-C reaches the whole process group; the server decides when this process ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
@@ -44,9 +50,12 @@ def serve(source: str) -> None:
             os._exit(0)
 
     inbox = Inbox(os.fdopen(os.dup(0), "rb"))
-    session = Session(tell, inbox.waiting)
+    session = Session(tell, inbox.waiting, Storage(Path(folder)) if folder else None)
     try:
-        session.open(read_sheet(Path(source)) if source else None)
+        if session.restore():
+            tell({"kind": "restored"}, {})
+        else:
+            session.open(read_sheet(Path(source)) if source else None)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         tell({"kind": "note", "level": "error", "text": str(error)}, {})
         session.open()
@@ -97,5 +106,5 @@ class Inbox:
             return frame
 
     def waiting(self) -> bool:
-        """Whether a waiting message makes the current computation unnecessary; "save" does not."""
-        return any(frame.header.get("do") != "save" for frame, _ in self._messages.copy())
+        """Whether a waiting message makes the current computation unnecessary; `_HARMLESS` ones do not."""
+        return any(frame.header.get("do") not in _HARMLESS for frame, _ in self._messages.copy())

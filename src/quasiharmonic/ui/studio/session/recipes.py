@@ -1,134 +1,136 @@
-"""Commands and Python scripts that reproduce a map of the page."""
+"""Commands and Python scripts that reproduce the map of a page from the file, or from a start that the page saves."""
 
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS
-from quasiharmonic.ui.studio.session.outlines import Outline
-from quasiharmonic.ui.studio.session.surface import Sheet
+from quasiharmonic.io import MeshData
 
-#: Name of the file that the page saves.
-MAP = "map.obj"
-#: Name of the file with the fixed vertices that the page saves.
-FIXED = "fixed.txt"
+#: Names of the files that the page saves: the map, the map from which the last step started, the fixed vertices, the
+#: seams that the user drew.
+MAP, START, FIXED, SEAMS = "map.obj", "start.obj", "fixed.txt", "seams.txt"
+#: Number of steps of `polish` as a step of its own.
+POLISHING_STEPS = 200
 
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """Description of how a map was computed."""
+    """How a map was computed: one call of the library, on the file as opened or on a start that the page saves."""
 
-    sheet: Sheet
-    # The outline of the boundary. None if the boundary was moved since, comes from the file, or is free.
-    outline: Outline | None = None
-    corners: str | None = None  # As for ``--corners`` of the command
-    pinned: bool = False  # Whether there are pins
-    free: bool = False  # Whether the boundary was free
-    energy: str | None = None  # The energy that was lowered until it converged
-    slide: bool = False  # Whether the boundary slid during that
+    command: str = ""  # The command line; empty if the map is that of the file
+    python: str = ""  # A script with the same result, as ``mesh``
+    start: MeshData | None = None  # Contents of `START`, if they read it
+    texts: dict[str, bytes] = field(default_factory=dict)  # Contents of further files that they read
+    outline: str | None = None  # The outline of the boundary
     anew: bool = True  # Whether the map was solved from scratch
 
     def files(self) -> list[str]:
-        """Return the names of the files that command and script need besides the surface's file, in saving order."""
-        if self.outline is None and not (self.free and not self.pinned):
-            return [MAP, FIXED] if self.pinned else [MAP]
-        return [self.outline.to] if self.outline is not None and self.outline.content is not None else []
+        """Return the names of the saved files that command and script read."""
+        return [*([START] if self.start is not None else []), *self.texts]
 
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The file from which a step starts."""
+
+    name: str
+    start: MeshData | None  # Contents, if the page saves the file
+
+    @property
     def command(self) -> str:
-        """Return the command line."""
-        words = ["qhm"]
-        if self.free:
-            words += ["flatten", MAP if self.pinned else self.sheet.name]
-            words += self._fixed() if self.pinned else list(self.sheet.flags)
-            return shlex.join([*words, "-o", "flat.obj"])
-        if self.outline is not None:
-            words += ["map", self.sheet.name, *self.sheet.flags, "--to", self.outline.to]
-            words += [] if self.corners is None else ["--corners", self.corners]
-        elif self.anew:
-            words += ["map", MAP, *self._fixed()]
-        else:
-            return shlex.join(["qhm", "polish", MAP, *self._fixed(), "--energy", "blend", "-o", "again.obj"])
-        words += [] if self.energy is None else ["--polish", self.energy]
-        words += ["--slide"] if self.slide else []
-        return shlex.join([*words, "-o", "again.obj"])
+        """The name as a word of a command line."""
+        return self.name if not self.name.startswith("-") else f"./{self.name}"
 
-    def _fixed(self) -> list[str]:
-        return ["--fixed", FIXED] if self.pinned else []
 
-    def python(self) -> str:
-        """Return a script that computes ``result``."""
-        names, lines = {"io"}, []
-        if self.outline is not None and not self.sheet.flags and self.sheet.seamed.seamless:
-            lines += [
-                f"mesh = io.read_mesh({self.sheet.name!r})",
-                "V, F = mesh.V, mesh.F",
-                f"contours = {self._contours()}",
-                f"fixed, target = boundary_to(V, F, contours{self._corners()})",
-            ]
-        elif self.free and not self.pinned:
-            lines += [f"mesh = io.read_mesh({self.sheet.name!r})", "V, F = mesh.V, mesh.F"]
-        else:
-            lines += [f"mesh = io.read_mesh({MAP!r})", "V, F, uv = io.cut_at_seams(mesh)"]
-            lines += [
-                f"fixed = io.read_handles({FIXED!r}, len(V))"
-                if self.pinned
-                else "fixed = np.unique(np.concatenate(boundary_loops(F, len(V))))"
-            ]
-            lines += ["target = uv[fixed]"]
-        solved, more = self._solve_lines()
-        names |= more
-        text = "\n".join([*lines, *solved])
-        head = ["import numpy as np", ""] if "np." in text else []
-        head += [f"from quasiharmonic import {', '.join(sorted(names))}"]
-        if "boundary_loops" in text:
-            head += ["from quasiharmonic.geometry.mesh.topology import boundary_loops"]
-        if "boundary_to" in text:
-            used = [name for name in ("boundary_to", "filled", "outline") if f"{name}(" in text]
-            head += [f"from quasiharmonic.targets import {', '.join(used)}"]
-        if "BoundaryCurves(" in text:
-            head += ["from quasiharmonic.targets import outline_curves"]
-        return "\n".join([*head, "", text, "print(result.certificate.summary())", ""])
+def write_command(words: Sequence[str], output: str, source: Source) -> str:
+    """Return a command line that writes ``output``, or another name if the input has this one."""
+    return shlex.join(["qhm", *words, "-o", output if source.name != output else f"new_{output}"])
 
-    def _contours(self) -> str:
-        assert self.outline is not None
-        text = f"outline({self.outline.to!r})"
-        # The surface has no holes, so those of the outline are filled.
-        return f"filled({text})" if len(self.outline.contours) > 1 and not self._holes() else text
 
-    def _holes(self) -> bool:
-        from quasiharmonic.geometry.mesh.topology import boundary_loops
+def option_words(**options: object) -> list[str]:
+    """Return the words of options; None and False are left out."""
+    words = []
+    for name, value in options.items():
+        if value is None or value is False:
+            continue
+        words.append(f"--{name.replace('_', '-')}")
+        words += [] if value is True else [str(value)]
+    return words
 
-        island = self.sheet.island
-        return len(boundary_loops(island.F, len(island.V))) > 1
 
-    def _corners(self) -> str:
-        if self.corners is None:
-            return ""
-        if self.corners == "auto":
-            return ', corners="auto"'
-        return f", corners={{{', '.join(part.replace(':', ': ') for part in self.corners.split(','))}}}"
+def island_words(only: Sequence[int] | None) -> list[str]:
+    """Return the option that chooses islands."""
+    return [] if only is None else ["--islands", ",".join(map(str, only))]
 
-    def _solve_lines(self) -> tuple[list[str], set[str]]:
-        """Return the lines that solve, and the public names that they use."""
-        if self.free:
-            held = ", fixed=inside, target=uv[inside]" if self.pinned else ""
-            pins = ["edge = np.concatenate(boundary_loops(F, len(V)))", "inside = np.setdiff1d(fixed, edge)"]
-            return [*(pins if self.pinned else []), f"result = flatten(V, F{held})"], {"flatten"}
-        options = "" if self.energy is None else f", polish={self.energy!r}"
-        if self.slide and self.outline is not None:
-            options += f", slide=BoundaryCurves(outline_curves({self.outline.to!r}){self._fixed_corners()})"
-        elif self.slide:
-            options += ", slide=True"
-        start = "" if self.anew else ", start=uv"
-        lines = [f"result = injective_map(V, F, fixed, target{options}{start})"]
-        names = {"injective_map"} | ({"BoundaryCurves"} if self.slide and self.outline is not None else set())
-        if self.energy is None and len(self.sheet.island.F) <= LARGEST_SMOOTHED:
-            polished = f'polish(V, F, result.uv, fixed=fixed, energy="blend", max_iterations={SMOOTHING_STEPS})'
-            return [*lines, f"result = {polished}"], names | {"polish"}
-        return lines, names
 
-    def _fixed_corners(self) -> str:
-        if self.corners is None or self.corners == "auto":
-            return ""
-        return f", fixed=[{', '.join(part.partition(':')[0] for part in self.corners.split(','))}]"
+def arguments(**options: object) -> str:
+    """Return further arguments of a Python call; None and False are left out."""
+    return "".join(
+        f", {name}={value if isinstance(value, Code) else repr(value)}"
+        for name, value in options.items()
+        if value is not None and value is not False
+    )
+
+
+class Code(str):
+    """Python code, as opposed to a text."""
+
+    __slots__ = ()
+
+
+def write_script(lines: Sequence[str], *, names: Sequence[str] = (), modules: Sequence[str] = ()) -> str:
+    """Return a script with its imports: ``names`` of the library, and further ``modules`` lines."""
+    text = "\n".join(lines)
+    head = ["import numpy as np", ""] if "np." in text else []
+    head += [f"from quasiharmonic import {', '.join(sorted(set(names)))}"]
+    return "\n".join([*head, *modules, "", text, ""])
+
+
+def map_script(source: Source, only: Sequence[int] | None, count: int, fixed: str | None) -> str:
+    """Return a script that maps islands again with their fixed vertices in place; ``count`` is that of triangles."""
+    given = arguments(fixed=read_indices(fixed), islands=only)
+    lines = [f"result = atlas.injective_map({source.name!r}{given})"]
+    if count <= LARGEST_SMOOTHED:
+        more = arguments(energy="blend", max_iterations=SMOOTHING_STEPS)
+        lines.append(f"result = atlas.polish(result.mesh{given}{more})")
+    return write_script([*lines, "mesh = result.mesh"], names=["atlas"])
+
+
+def outline_script(
+    source: Source, to: str, filled: bool, corners: object, islands: Sequence[int], smoothed: bool
+) -> str:
+    """Return a script that maps islands to an outline; several of them to copies side by side."""
+    contours = f"outline({to!r})"
+    lines = [
+        f"mesh = atlas.SeamedMesh({source.name!r})",
+        f"contours = {f'filled({contours})' if filled else contours}",
+        "places = [island.uv for island in mesh.islands]",
+    ]
+    if len(islands) > 1:
+        lines += [
+            "width = (1 + 0.05) * np.ptp(np.concatenate(contours)[:, 0])",
+            f"for i, k in enumerate({list(islands)}):",
+            "    island = mesh.islands[k]",
+            "    copy = [contour + np.array([i * width, 0.0]) for contour in contours]",
+        ]
+    else:
+        lines += [f"for k in {list(islands)}:", "    island = mesh.islands[k]", "    copy = contours"]
+    lines += [
+        f"    fixed, target = boundary_to(island.V, island.F, copy{arguments(corners=corners or None)})",
+        "    result = injective_map(island.V, island.F, fixed, target)",
+    ]
+    if smoothed:
+        more = arguments(fixed=Code("fixed"), energy="blend", max_iterations=SMOOTHING_STEPS)
+        lines.append(f"    result = polish(island.V, island.F, result.uv{more})")
+    lines += ["    places[k] = result.uv", "mesh = mesh.with_places(places)"]
+    used = [name for name in ("boundary_to", "filled", "outline") if any(f"{name}(" in line for line in lines)]
+    names = ["atlas", "injective_map", *(["polish"] if smoothed else [])]
+    return write_script(lines, names=names, modules=[f"from quasiharmonic.targets import {', '.join(used)}"])
+
+
+def read_indices(name: str | None) -> Code | None:
+    """Return the code that reads a list of vertices."""
+    return None if name is None else Code(f"np.loadtxt({name!r}, dtype=int)")

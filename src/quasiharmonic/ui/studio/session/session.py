@@ -11,38 +11,33 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.energies.newton.sliding_boundary import move_onto
-from quasiharmonic.geometry.curves import BoundaryCurves
-from quasiharmonic.geometry.exact.certificate import Certificate
-from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.io.models.textures import texture_of
 from quasiharmonic.ui.studio.protocol import Array, Frame
-from quasiharmonic.ui.studio.session import validation
+from quasiharmonic.ui.studio.session import frames, operations, validation
 from quasiharmonic.ui.studio.session.drag import DragMap, Follower
+from quasiharmonic.ui.studio.session.exports import list_files
 from quasiharmonic.ui.studio.session.falloff import drag_weights
-from quasiharmonic.ui.studio.session.finalize import compute_final_map
-from quasiharmonic.ui.studio.session.outlines import make_outline, make_polygon, read_drawing
-from quasiharmonic.ui.studio.session.recipes import FIXED, MAP
+from quasiharmonic.ui.studio.session.history import History
+from quasiharmonic.ui.studio.session.islands import Numbering
+from quasiharmonic.ui.studio.session.outlines import Outline, make_outline, make_polygon, read_drawing
+from quasiharmonic.ui.studio.session.seams import add_edges, erase_chain, find_seams, shortest_path
 from quasiharmonic.ui.studio.session.setup import (
-    fit_to_outline,
-    free_boundary,
     make_first_state,
+    open_without_map,
     pin_vertices,
+    turn_over,
     with_corner,
+    with_start,
 )
-from quasiharmonic.ui.studio.session.state import (
-    DistortionMonitor,
-    SessionState,
-    bad_triangles,
-    describe_obstructions,
-    verdict,
-)
+from quasiharmonic.ui.studio.session.state import DistortionMonitor, SessionState, describe_obstructions
+from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import Sheet, make_first_sheet, read_upload
+from quasiharmonic.ui.studio.session.unwrapping import UnwrapOptions, unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
 
-#: Maximum number of states for undo.
-MAX_STATES = 40
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
+_LARGEST_TEXTURE = 16_384
 
 Tell = Callable[[Mapping[str, Any], Mapping[str, Array]], None]
 
@@ -51,6 +46,7 @@ Tell = Callable[[Mapping[str, Any], Mapping[str, Array]], None]
 class _DragState:
     """State of a drag."""
 
+    island: int
     place: FloatArray  # (2,): position where the drag started
     share: FloatArray  # (k,): share of the motion for each fixed vertex
     follower: Follower | None  # Computes the maps, if the drag starts from an injective map
@@ -62,52 +58,47 @@ class Session:
     """Session of one page.
 
     ``tell`` sends a header and arrays to the page. ``waiting`` returns whether a newer message makes the current
-    computation unnecessary.
+    computation unnecessary. With a ``storage``, each state at rest is stored.
     """
 
-    def __init__(self, tell: Tell, waiting: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, tell: Tell, waiting: Callable[[], bool] = lambda: False, storage: Storage | None = None) -> None:
         self._tell, self._waiting = tell, waiting
-        self._sheet: Sheet
-        self._states: list[SessionState] = []
-        self._at = -1
+        self._history = History(storage)
+        self._numbering: Numbering | None = None
         self._drag_state: _DragState | None = None
         self._after = -1
+        self._origin = np.zeros(2)
 
     @property
     def state(self) -> SessionState:
         """The state that the page shows."""
-        return self._states[self._at]
+        return self._history.state
 
     def open(self, sheet: Sheet | None = None) -> None:
-        """Open a surface, by default a built-in one.
+        """Open a model, by default a built-in one; its surface is shown before there is a map.
 
-        ValueError if the surface cannot be mapped; the page then keeps its previous surface.
+        ValueError if the model cannot be opened; the page then keeps its previous one.
         """
         sheet = make_first_sheet() if sheet is None else sheet
-        first = make_first_state(sheet)
-        self._sheet, self._drag_state, self._after = sheet, None, -1
-        self._origin = first.problem.target.mean(axis=0)
-        V = np.zeros((first.problem.n, 3), dtype=np.float64)
-        V[:, : first.problem.V.shape[1]] = first.problem.V
-        self._measured = DistortionMonitor(first.problem.V, first.problem.F)
-        header = {
-            "kind": "surface",
-            "name": sheet.name,
-            "vertices": first.problem.n,
-            "triangles": len(first.problem.F),
-            "loops": [len(loop) for loop in first.problem.domain.loops],
-        }
-        arrays = {
-            "positions": (V - V.mean(axis=0)).astype(np.float32),
-            "triangles": first.problem.F.astype(np.uint32),
-            "boundary": np.concatenate(first.problem.domain.loops).astype(np.int32),
-        }
-        self._tell(header, arrays)
-        self._states.clear()
-        if first.result.injective:
-            self._keep(first, fit=True)
-        else:
-            self._finalize(first, fit=True)
+        bare = open_without_map(sheet)
+        self._drag_state, self._after = None, -1
+        self._send_surface(bare)
+        self._busy("finding the first map")
+        try:
+            first = make_first_state(sheet, self._step)
+        except KeyboardInterrupt:
+            first = bare
+        self._history.clear(sheet.texture)
+        self._keep(first, fit=True)
+        self._send_image()
+
+    def restore(self) -> bool:
+        """Continue the stored session; return whether there is one."""
+        if not self._history.restore():
+            return False
+        self._show(fit=True)
+        self._send_image()
+        return True
 
     def handle(self, frame: Frame) -> None:
         """Execute the command of a message; errors are sent to the page."""
@@ -122,64 +113,142 @@ class Session:
         except (ValueError, OSError, ArithmeticError, RuntimeError, ImportError) as error:
             self._drag_state = None
             self._tell({"kind": "note", "level": "error", "text": str(error)}, {})
-            if self._states and not isinstance(error, RequestError):
+            if self._history and not isinstance(error, RequestError):
                 self._show()
 
-    # --- surfaces and outlines ---------------------------------------------------------------------------------------
+    # --- models, selection and seams ---------------------------------------------------------------------------------
 
     def _load(self, frame: Frame) -> None:
         self.open(read_upload(validation.text(frame, "name"), validation.content(frame)))
 
+    def _image(self, frame: Frame) -> None:
+        texture = texture_of(validation.content(frame))
+        if texture is None:
+            raise RequestError("this file is not a PNG or JPEG image")
+        self._history.texture = texture
+        self._history.write()
+        self._send_image()
+
+    def _select(self, frame: Frame) -> None:
+        chosen = validation.indices(frame, "islands", len(self.state.islands))
+        self._history.change(replace(self.state, selected=tuple(chosen or range(len(self.state.islands)))))
+        self._show()
+
+    def _seam(self, frame: Frame) -> None:
+        """Add the shortest path between two vertices to the seams."""
+        state, mesh = self.state, self.state.mesh
+        ends = [int(state.numbering.origin[validation.number_below(frame, n, len(state.numbering.origin))])
+                for n in ("start", "vertex")]  # fmt: skip
+        if ends[0] == ends[1]:
+            return
+        path = shortest_path(mesh.V, mesh.F, *ends)
+        self._keep(replace(state, drawn=add_edges(find_seams(state), path)))
+
+    def _erase(self, frame: Frame) -> None:
+        """Remove the chain of seams nearest to a vertex."""
+        state = self.state
+        vertex = int(state.numbering.origin[validation.vertex(frame, len(state.numbering.origin))])
+        self._keep(replace(state, drawn=erase_chain(find_seams(state), state.mesh.V, vertex)))
+
+    def _turn(self, frame: Frame) -> None:
+        self._keep(turn_over(self.state), fit=True)
+
+    # --- new maps ----------------------------------------------------------------------------------------------------
+
     def _outline(self, frame: Frame) -> None:
-        self._finalize(fit_to_outline(self._sheet, make_outline(frame.header.get("to"))), fit=True)
+        self._map_to(make_outline(frame.header.get("to")))
 
     def _drawing(self, frame: Frame) -> None:
-        self._finalize(
-            fit_to_outline(self._sheet, read_drawing(validation.text(frame, "name"), validation.content(frame))),
-            fit=True,
-        )
+        self._map_to(read_drawing(validation.text(frame, "name"), validation.content(frame)))
 
     def _polygon(self, frame: Frame) -> None:
-        self._finalize(fit_to_outline(self._sheet, make_polygon(validation.points(frame))), fit=True)
+        self._map_to(make_polygon(validation.points(frame)))
+
+    def _map_to(self, outline: Outline, corners: Any = ()) -> None:
+        self._refuse_drawn()
+        self._busy("finding the map")
+        self._keep(operations.map_to_outline(self.state, outline, corners, self._step), fit=True)
 
     def _corner(self, frame: Frame) -> None:
-        self._finalize(with_corner(self.state, validation.vertex(frame, self.state.problem.n)))
+        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+        self._busy("finding the map")
+        self._keep(with_corner(self.state, k, vertex, self._step))
 
     def _corners(self, frame: Frame) -> None:
-        outline = self.state.recipe.outline
+        outline = self.state.active.outline
         if outline is None:
-            raise RequestError("corners need an outline: choose one first")
-        self._finalize(fit_to_outline(self._sheet, outline, "auto"))
+            raise RequestError("corners need an outline: choose one under Boundary first")
+        self._map_to(outline, "auto")
 
     def _flatten(self, frame: Frame) -> None:
-        state = self.state
         self._busy("flattening")
-        self._keep(free_boundary(state.problem, state.recipe, state.pins, self._step), fit=True)
+        self._keep(operations.flatten_islands(self.state, self._step), fit=True)
 
-    # --- drags and edits ---------------------------------------------------------------------------------------------
+    def _unwrap(self, frame: Frame) -> None:
+        options = UnwrapOptions(
+            float(validation.amount(frame, "max_stretch", 1, 10, 1.5)),
+            int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, 2048)),
+            float(validation.amount(frame, "padding", 0, 64, 4)),
+            frame.header.get("keep_seams") is True,
+        )
+        self._busy("unwrapping")
+        self._keep(unwrap_model(self.state, options, self._step), fit=True)
+
+    def _pack(self, frame: Frame) -> None:
+        self._refuse_drawn()
+        operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
+        resolution = int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, 1024))
+        self._busy("packing")
+        padding = float(validation.amount(frame, "padding", 0, 64, 4))
+        self._keep(operations.pack_all(self.state, resolution, padding), fit=True)
+
+    def _polish(self, frame: Frame) -> None:
+        energy, slide = validation.text(frame, "energy"), frame.header.get("slide") is True
+        if energy not in ENERGIES:
+            raise RequestError(f"unknown energy {energy[:40]!r}: use {', '.join(ENERGIES)}")
+        self._refuse_drawn()
+        operations.require_map(self.state)
+        self._busy("lowering the distortion")
+        self._keep(operations.polish_islands(self.state, energy, slide, self._step))
+
+    def _refuse_drawn(self) -> None:
+        if self.state.drawn is not None:
+            raise RequestError("the seams have changed: press Unwrap or Flatten, which cut the surface along them")
+
+    # --- drags and pins ----------------------------------------------------------------------------------------------
 
     def _pin(self, frame: Frame) -> None:
-        state, vertex = self.state, validation.vertex(frame, self.state.problem.n)
-        if vertex in np.concatenate(state.problem.domain.loops):
+        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+        one = self.state.islands[k]
+        if any(vertex in loop for loop in one.loops):
             raise RequestError("that vertex is on the boundary, which is already fixed: drag it in the map")
-        if not state.result.injective:
+        if not one.injective:
             raise RequestError("pins need a map without inverted triangles, but none was found")
-        if vertex not in state.pins:
-            self._keep(pin_vertices(state, [*state.pins, vertex]))
+        if vertex not in one.pins:
+            self._keep(pin_vertices(self.state, k, [*one.pins, vertex]))
 
     def _unpin(self, frame: Frame) -> None:
-        vertex = validation.vertex(frame, self.state.problem.n)
-        self._keep(pin_vertices(self.state, [v for v in self.state.pins if v != vertex]))
+        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+        self._keep(pin_vertices(self.state, k, [v for v in self.state.islands[k].pins if v != vertex]))
 
     def _grab(self, frame: Frame) -> None:
-        state, vertex = self.state, validation.vertex(frame, self.state.problem.n)
-        problem, result = state.problem, state.result
-        share = drag_weights(vertex, problem.fixed, problem.target, problem.domain.loops, state.corners)
+        vertex = validation.vertex(frame, len(self.state.numbering.origin))
+        self._refuse_drawn()
+        k, vertex = self.state.numbering.find(vertex)
+        one = self.state.islands[k]
+        if one.result is None or one.fixed is None or one.target is None:
+            raise RequestError("there is no map to drag yet: press Unwrap or Flatten first")
+        if self.state.selected != (k,):
+            self._history.change(replace(self.state, selected=(k,)))
+            one = self.state.islands[k]
+        problem = one.problem
+        share = drag_weights(vertex, problem.fixed, problem.target, problem.domain.loops, one.corners)
         # Without an injective map the drag only moves the boundary; a search follows at its end.
-        follows = result.injective and state.in_place
-        follower = Follower(problem, result.uv, result.certificate) if follows else None
+        follower = None
+        if one.result is not None and one.injective and one.in_place:
+            follower = Follower(problem, one.result.uv, one.result.certificate)
         place = problem.target[np.flatnonzero(problem.fixed == vertex)[0]]
-        self._drag_state = _DragState(place, share, follower)
+        self._drag_state = _DragState(k, place, share, follower)
 
     def _drag(self, frame: Frame) -> None:
         to, seq = validation.place(frame), validation.number(frame, "seq")
@@ -188,35 +257,34 @@ class Session:
             # The vertex could not be grabbed, but the page still waits for an answer.
             return self._tell_map({}, seq=seq)
         self._after = seq
-        drag.goal = self.state.problem.target + drag.share[:, None] * (to - drag.place)
+        one = self.state.islands[drag.island]
+        assert one.target is not None
+        drag.goal = one.target + drag.share[:, None] * (to * one.sign - drag.place)
         if drag.follower is None:
             return self._tell_map({}, seq=seq, asked=drag.goal)
         drag.shown = shown = drag.follower.to(drag.goal, self._waiting)
         asked = None if shown.reached else drag.goal
         fields = {"state": "following", "reached": shown.reached}
-        self._tell_map(fields, seq=seq, shown=(shown.uv, shown.certificate), asked=asked)
+        self._tell_map(fields, seq=seq, shown=shown, asked=asked)
 
     def _drop(self, frame: Frame) -> None:
         drag, self._drag_state = self._drag_state, None
         if drag is None or drag.goal is None:
             return
-        state = self.state.with_target(drag.goal)
-        if drag.shown is not None and drag.shown.reached:
-            result = MapResult(uv=drag.shown.uv, status=Status.INJECTIVE, certificate=drag.shown.certificate)
-            state = replace(state, result=result)
-        self._finalize(state)
+        self._busy("finding the map")
+        reached = drag.shown is not None and drag.shown.reached
+        uv = drag.shown.uv if drag.shown is not None and reached else None
+        state, start = with_start(self.state, drag.island, drag.goal, uv)
+        try:
+            self._keep(operations.map_in_place(state, start, operations.choose(state), self._step, follows=reached))
+        except KeyboardInterrupt:
+            # The next message came before the final map. If the drag has a map, it is kept.
+            if reached:
+                self._keep(operations.as_it_is(state, start, operations.saved_start(start), keep=True))
+            else:
+                self._show()
 
-    def _polish(self, frame: Frame) -> None:
-        energy, slide = validation.text(frame, "energy"), frame.header.get("slide") is True
-        if energy not in ENERGIES:
-            raise RequestError(f"unknown energy {energy[:40]!r}: use {', '.join(ENERGIES)}")
-        state = self.state
-        curves: bool | BoundaryCurves = False
-        if slide:
-            outline = state.recipe.outline
-            curves = True if outline is None else BoundaryCurves(outline.curves(), fixed=state.held)
-            state = replace(state, problem=move_onto(curves, state.problem))
-        self._finalize(state, energy=energy, slide=curves)
+    # --- history and files -------------------------------------------------------------------------------------------
 
     def _undo(self, frame: Frame) -> None:
         self._go(-1)
@@ -226,7 +294,7 @@ class Session:
 
     def _go(self, step: int) -> None:
         self._drag_state = None
-        self._at = min(max(self._at + step, 0), len(self._states) - 1)
+        self._history.go(step)
         self._show(fit=True)
 
     def _stop(self, frame: Frame) -> None:
@@ -234,98 +302,90 @@ class Session:
         self._show()
 
     def _save(self, frame: Frame) -> None:
-        state, recipe = self.state, self.state.recipe
-        self._send(MAP, self._sheet.written(state.result.uv))
-        if recipe.pinned:
-            held = self._sheet.numbers(state.problem.fixed.tolist())
-            self._send(FIXED, "".join(f"{v}\n" for v in held).encode())
-        if recipe.outline is not None and recipe.outline.content is not None:
-            self._send(recipe.outline.to, recipe.outline.content)
+        form = frame.header.get("format", "obj")
+        files = list_files(self.state, form if isinstance(form, str) else "", self._history.texture)
+        for name, content in files.items():
+            self._tell({"kind": "file", "name": name}, {"content": np.frombuffer(content, dtype=np.uint8)})
+        self._history.mark_saved()
+        self._tell({"kind": "saved"}, {})
 
-    def _send(self, name: str, content: bytes) -> None:
-        self._tell({"kind": "file", "name": name}, {"content": np.frombuffer(content, dtype=np.uint8)})
+    # --- updates of the page -----------------------------------------------------------------------------------------
 
-    # --- final maps and updates of the page --------------------------------------------------------------------------
-
-    def _finalize(self, state: SessionState, *, fit: bool = False, energy: str | None = None,
-                slide: bool | BoundaryCurves = False) -> None:  # fmt: skip
-        """Compute the map of a state, and add the state."""
-        self._busy("polishing" if energy else "finding the map")
-        before = state.result if state.result.injective and state.in_place else None
-        done = compute_final_map(state.problem, before, energy=energy, slide=slide, callback=self._step)
-        recipe = replace(state.recipe, energy=energy, slide=slide is not False, anew=done.anew)
-        problem = state.problem
-        if slide is not False and done.result.injective:
-            problem = problem.with_target(done.result.uv[problem.fixed])
-        kept = replace(state, problem=problem, result=done.result, recipe=recipe)
-        self._keep(kept, fit=fit)
-
-    def _step(self, step: Step) -> None:
+    def _step(self, step: Any) -> None:
+        """Report progress of a computation; KeyboardInterrupt if it is no longer needed."""
         if self._waiting():
             raise KeyboardInterrupt
-        self._tell({"kind": "progress", "flips": step.inverted, "energy": _finite(step.energy)}, {})
+        if hasattr(step, "phase"):
+            self._tell({"kind": "progress", "phase": step.phase, "done": step.done, "total": step.total}, {})
+        else:
+            self._tell({"kind": "progress", "flips": step.inverted, "energy": _finite(step.energy)}, {})
 
     def _keep(self, state: SessionState, *, fit: bool = False) -> None:
         """Add a state as the last one, and show it."""
-        del self._states[self._at + 1 :]
-        self._states.append(state)
-        del self._states[:-MAX_STATES]
-        self._at = len(self._states) - 1
+        self._history.add(state)
         self._show(fit=fit)
+
+    def _send_surface(self, state: SessionState) -> None:
+        self._numbering = state.numbering
+        self._measured = DistortionMonitor(state.numbering.V, state.numbering.F)
+        self._tell(*frames.surface_message(state))
+
+    def _send_image(self) -> None:
+        texture = self._history.texture
+        content = b"" if texture is None else texture.data
+        kind = "" if texture is None else texture.media_type
+        self._tell({"kind": "image", "type": kind}, {"content": np.frombuffer(content, dtype=np.uint8)})
 
     def _show(self, *, fit: bool = False) -> None:
         """Send the current state to the page."""
         state = self.state
-        result, problem = state.result, state.problem
-        there = state.in_place
-        # A state without a map is solved from scratch.
-        recipe = state.recipe if result.injective and there else replace(state.recipe, anew=True)
-        fields = {
-            "state": "settled",
-            "reached": there,
-            "fit": fit,
-            "status": result.status.value,
-            "undo": self._at > 0,
-            "redo": self._at < len(self._states) - 1,
-            "command": recipe.command(),
-            "python": recipe.python(),
-            "needs": recipe.files(),
-            "anew": recipe.anew,
-            "outline": None if state.recipe.outline is None else state.recipe.outline.to,
-        }
-        self._tell_map(fields, shown=(result.uv, result.certificate), asked=None if there else problem.target)
+        if not state.numbering.same(self._numbering):
+            self._send_surface(state)
+            fit = True
+        if fit and state.mapped:
+            uv = state.uv
+            self._origin = (uv.min(axis=0) + uv.max(axis=0)) / 2
+        fields = frames.state_fields(state) | self._history.fields() | {"fit": fit}
+        self._tell(*frames.seams_message(state))
+        self._tell_map(fields, everything=state.mapped)
         self._tell({"kind": "obstructions", "obstructions": describe_obstructions(state)}, {})
+        self._history.write()
 
     def _tell_map(
         self,
         fields: Mapping[str, Any],
         *,
         seq: int = -1,
-        shown: tuple[FloatArray, Certificate] | None = None,
+        everything: bool = False,
+        shown: DragMap | None = None,
         asked: FloatArray | None = None,
     ) -> None:
-        """Send the map and its certificate; without ``shown`` send only the target of the boundary."""
-        state = self.state
-        header = {
+        """Send the whole map, or that of the dragged island, with its certificate; otherwise only the target."""
+        state, drag = self.state, self._drag_state
+        header: dict[str, Any] = {
             "kind": "map",
             "seq": seq,
             "after": self._after,
             "fit": False,
             "origin": self._origin.tolist(),
-            "corners": list(state.corners),
-            "numbers": list(range(len(state.corners))),
-            "pins": state.pins,
-            **fields,
         }
+        header |= {**frames.handle_fields(state), **fields}
         arrays: dict[str, Array] = {}
-        if shown is not None:
-            uv, certificate = shown
-            header |= verdict(certificate) | self._measured.look(uv, now=seq < 0) | {"scale": self._measured.scale}
-            arrays["places"] = (uv - self._origin).astype(np.float32)
-            arrays["bad"] = bad_triangles(certificate)
-        if asked is not None:
-            edge = sum(map(len, state.problem.domain.loops))
-            arrays["asked"] = (asked[:edge] - self._origin).astype(np.float32)
+        if everything or shown is not None:
+            changed = None
+            uv = state.uv
+            if shown is not None and drag is not None:
+                start = int(state.numbering.starts[drag.island])
+                moved = shown.uv * state.islands[drag.island].sign
+                uv[start : start + len(moved)] = moved
+                changed = drag.island, moved, shown.certificate
+            more, found = frames.map_arrays(state, self._origin, changed=changed)
+            header |= more
+            arrays |= found
+            header |= self._measured.look(uv, now=seq < 0) | {"scale": self._measured.scale}
+        targets = {} if asked is None or drag is None else {drag.island: asked}
+        if targets or (everything and not state.in_place):
+            arrays["asked"] = frames.asked_boundary(state, targets, self._origin)
         self._tell(header, arrays)
 
     def _busy(self, what: str) -> None:
@@ -333,12 +393,19 @@ class Session:
 
     _HANDLERS: dict[str, Callable[[Session, Frame], None]] = {  # noqa: RUF012
         "load": _load,
+        "image": _image,
+        "select": _select,
+        "seam": _seam,
+        "erase": _erase,
+        "turn": _turn,
         "outline": _outline,
         "drawing": _drawing,
         "polygon": _polygon,
         "corner": _corner,
         "corners": _corners,
         "flatten": _flatten,
+        "unwrap": _unwrap,
+        "pack": _pack,
         "pin": _pin,
         "unpin": _unpin,
         "grab": _grab,

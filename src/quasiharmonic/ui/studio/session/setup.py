@@ -1,114 +1,143 @@
-"""Set up the problems of a page: target of the boundary, and pins."""
+"""The first state of a model, and changes of its constraints: corners and pins."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.free_boundary import flatten
-from quasiharmonic.apps.repair.fitting import find_corner_vertices, fit_boundary, fix_in_place
-from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.problem import Problem
-from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.targets import filled, nearest_on_boundary
-from quasiharmonic.targets.boundary.corner_spec import CornerSpec
-from quasiharmonic.ui.studio.session.outlines import Outline, make_outline
+from quasiharmonic.geometry.mesh.topology import edges
+from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.targets import nearest_on_boundary
+from quasiharmonic.ui.studio.session.islands import IslandState
+from quasiharmonic.ui.studio.session.operations import (
+    as_it_is,
+    fix_where_it_is,
+    fixed_positions,
+    flatten_islands,
+    map_in_place,
+    map_to_outline,
+    saved_start,
+)
+from quasiharmonic.ui.studio.session.outlines import make_outline
 from quasiharmonic.ui.studio.session.recipes import Recipe
 from quasiharmonic.ui.studio.session.state import SessionState
-from quasiharmonic.ui.studio.session.surface import Sheet
+from quasiharmonic.ui.studio.session.surface import Sheet, has_complete_map
+from quasiharmonic.ui.studio.session.unwrapping import UnwrapOptions, unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.util.arrays import FloatArray
 
 _FIRST_OUTLINE = "rect:1x1"
+#: Larger models are not cut and mapped before the user asks, because this takes longer than some seconds.
+MAX_AUTOMATIC = 40_000
 
 
-def make_first_state(sheet: Sheet) -> SessionState:
-    """Return the initial state of a surface: the boundary of its own map, or a square.
+def open_without_map(sheet: Sheet) -> SessionState:
+    """Return the state of a model before it has a map."""
+    mesh = sheet.initial_map()
+    if mesh.uv is not None:
+        mesh = SeamedMesh(mesh.V, mesh.F)
+    islands = tuple(IslandState(island) for island in mesh.islands)
+    return SessionState(sheet, mesh, islands, Recipe(), tuple(range(len(islands))))
 
-    If a surface without a map has holes or was cut open, its boundary is free. ValueError if the surface cannot be
-    mapped.
+
+def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = None) -> SessionState:
+    """Return the initial state of a model: with the map of the file; otherwise a square, a flat map, or charts.
+
+    A disk is mapped to a square. Another connected surface is flattened, and cut before if necessary. Any other model
+    is unwrapped. Large models that must be cut have no map.
     """
-    island = sheet.island
-    if np.isnan(island.uv).any():
-        loops = boundary_loops(island.F, len(island.V))
-        # At the end of a cut two boundary edges belong to one triangle, which a straight side would make degenerate.
-        if len(loops) > 1 or "--cut" in sheet.flags:
-            V, F, fixed = island.V, island.F, np.concatenate(loops)
-            return free_boundary(Problem(V, F, fixed, np.zeros((len(fixed), 2))), Recipe(sheet))
-        return fit_to_outline(sheet, make_outline(_FIRST_OUTLINE))
-    problem = fix_in_place(island, None).problem
-    edge = np.concatenate(problem.domain.loops)
-    pins = np.empty(0, dtype=np.int64) if sheet.fixed is None else np.setdiff1d(sheet.fixed, edge)
-    fixed = np.concatenate([edge, pins])
-    posed = Problem(island.V, island.F, fixed, island.uv[fixed])
-    return SessionState(posed, _make_placeholder(posed), Recipe(sheet, pinned=len(pins) > 0))
+    bare = open_without_map(sheet)
+    if has_complete_map(sheet.mesh) or (sheet.fixed is not None and sheet.is_file and sheet.mesh.FT is not None):
+        return _take_map(sheet, bare, callback)
+    if len(bare.islands) == 1 and sheet.is_file:
+        if _is_disk(bare.islands[0]):
+            return map_to_outline(bare, make_outline(_FIRST_OUTLINE), callback=callback)
+        if len(sheet.surface.F) <= MAX_AUTOMATIC:
+            try:
+                return flatten_islands(bare, callback)
+            except (ValueError, RuntimeError):
+                pass
+    return bare if len(sheet.surface.F) > MAX_AUTOMATIC else unwrap_model(bare, UnwrapOptions(), callback)
 
 
-def fit_to_outline(
-    sheet: Sheet, outline: Outline, corners: Sequence[tuple[int, int]] | Literal["auto"] = ()
-) -> SessionState:
-    """Map a surface's boundary to an outline; errors as `boundary_to`.
-
-    ``corners`` are boundary vertices and the outline's corners that they go to. "auto" chooses vertices by angle;
-    without corners arc length decides.
-    """
-    island = sheet.island
-    spec = CornerSpec(corners if corners == "auto" else tuple(corners)) if corners else None
-    fitted = fit_boundary(island.V, island.F, outline.contours, corners=spec)
-    contours = filled(outline.contours) if fitted.filled_holes else outline.contours
-    problem = fitted.problem
-    at = tuple(find_corner_vertices(problem.fixed, problem.target, contours))
-    option = corners if corners == "auto" else ",".join(f"{sheet.numbers([v])[0]}:{k}" for v, k in corners)
-    chosen = () if corners == "auto" else tuple(corners)
-    return SessionState(problem, _make_placeholder(problem), Recipe(sheet, outline, option or None), at, chosen)
+def _take_map(sheet: Sheet, bare: SessionState, callback: Callable[[Any], object] | None) -> SessionState:
+    """Return the state with the map of the file; if it has inverted triangles, with a map of the same boundary."""
+    mesh = sheet.initial_map()
+    state = replace(bare, mesh=mesh, selected=tuple(range(len(mesh.islands))))
+    pins = [] if sheet.fixed is None else sheet.fixed.tolist()
+    islands = tuple(_with_file_pins(IslandState(island), pins) for island in mesh.islands)
+    state = replace(state, islands=islands)
+    if sheet.fixed is None or not pins:
+        state = as_it_is(state, mesh, Recipe())
+        if state.injective:
+            return state
+    try:
+        return map_in_place(replace(state, islands=islands), mesh, None, callback)
+    except ValueError:
+        return as_it_is(state, mesh, Recipe())
 
 
-def with_corner(state: SessionState, vertex: int) -> SessionState:
-    """Assign the boundary vertex nearest to ``vertex`` to the next corner of the outline.
+def _with_file_pins(one: IslandState, pins: Sequence[int]) -> IslandState:
+    """Return an island with those of its interior vertices pinned that are in a list of the surface's vertices."""
+    if not pins:
+        return one
+    edge = np.concatenate([np.empty(0, dtype=np.int64), *one.loops])
+    own = np.setdiff1d(np.flatnonzero(np.isin(one.island.vertices, pins)), edge)
+    return replace(one, pins=tuple(own.tolist()))
+
+
+def _is_disk(one: IslandState) -> bool:
+    found, n = edges(one.island.F, len(one.island.vertices)), len(one.island.vertices)
+    return len(one.loops) == 1 and n - len(found.interior) - len(found.boundary) + len(one.island.F) == 1
+
+
+def with_corner(state: SessionState, k: int, vertex: int, callback: Callable[[Any], object] | None) -> SessionState:
+    """Assign the boundary vertex of island ``k`` nearest to ``vertex`` to the next corner of its outline.
 
     ValueError if there is no outline, or the order of the corners differs from that of the vertices.
     """
-    recipe, problem = state.recipe, state.problem
-    if recipe.outline is None:
-        raise RequestError("corners need an outline: choose one first")
-    near = int(nearest_on_boundary(problem.V, problem.F, problem.V[vertex][None])[0])
-    before = tuple((v, k) for v, k in state.chosen if v != near)
-    count = max(len(state.corners), 1)
-    if len(before) >= count:
+    one = state.islands[k]
+    if one.outline is None:
+        raise RequestError("corners need an outline: choose one under Boundary first")
+    near = int(nearest_on_boundary(one.island.V, one.island.F, one.island.V[vertex][None])[0])
+    before = tuple((v, c) for v, c in one.chosen if v != near)
+    if len(before) >= max(len(one.corners), 1):
         before = ()
-    return fit_to_outline(recipe.sheet, recipe.outline, (*before, (near, len(before))))
+    chosen = (*before, (near, len(before)))
+    return map_to_outline(replace(state, selected=(k,)), one.outline, chosen, callback)
 
 
-def pin_vertices(state: SessionState, pins: Sequence[int]) -> SessionState:
-    """Return a state with these pins at their positions in the map, and the boundary unchanged."""
-    problem = state.problem
-    fixed = np.concatenate([*problem.domain.loops, np.array(pins, dtype=np.int64)])
-    held = Problem(problem.V, problem.F, fixed, state.result.uv[fixed])
-    other = replace(state, problem=held).with_target(held.target)
-    return replace(other, recipe=replace(other.recipe, pinned=bool(pins), anew=False))
+def pin_vertices(state: SessionState, k: int, pins: Sequence[int]) -> SessionState:
+    """Return a state with these pins of island ``k`` at their positions; the map stays the same."""
+    one = state.islands[k]
+    assert one.result is not None
+    held = fix_where_it_is(replace(one, pins=tuple(pins)))
+    return replace(state.with_island(k, held), selected=(k,))
 
 
-def free_boundary(
-    problem: Problem, recipe: Recipe, pins: Sequence[int] = (), callback: Callable[[Step], object] | None = None
-) -> SessionState:
-    """Flatten a surface with free boundary; pins keep their target positions.
+def turn_over(state: SessionState) -> SessionState:
+    """Return the state with the triangles reversed; the map is mirrored, so that it stays injective."""
+    sheet, mesh = state.sheet.turn_over(), state.mesh
+    if mesh.uv is None:
+        return replace(open_without_map(sheet), from_file=False)
+    middle = float(mesh.uv[:, 0].max()) + float(mesh.uv[:, 0].min())
+    uv = np.stack([middle - mesh.uv[:, 0], mesh.uv[:, 1]], axis=1)
+    turned = SeamedMesh(sheet.surface.V, sheet.surface.F, mesh.FT[:, (0, 2, 1)], uv)
+    return as_it_is(replace(state, sheet=sheet, from_file=False), turned, saved_start(turned))
 
-    ValueError if no injective map was found; the message names the cause.
+
+def with_start(
+    state: SessionState, k: int, target: FloatArray, uv: FloatArray | None
+) -> tuple[SessionState, SeamedMesh]:
+    """Return the state with one island selected and moved to ``target`` (k, 2), and its mesh with these positions.
+
+    ``uv`` (m, 2) is an injective map with this target, if there is one.
     """
-    held = np.array(pins, dtype=np.int64)
-    edge = len(problem.fixed) - len(held)
-    given: dict[str, Any] = {"fixed": held, "target": problem.target[edge:]} if len(held) else {}
-    result = flatten(problem.V, problem.F, callback=callback, **given)
-    if not result.injective:
-        raise RequestError(result.status.value)
-    recipe = Recipe(recipe.sheet, pinned=len(held) > 0, free=True)
-    return SessionState(problem.with_target(result.uv[problem.fixed]), result, recipe)
-
-
-def _make_placeholder(problem: Problem) -> MapResult:
-    """Return a placeholder result with all vertices at the centre of the target; it is never shown."""
-    uv = np.broadcast_to(problem.target.mean(axis=0), (problem.n, 2)).copy()
-    return MapResult(uv=uv, status=Status.INTERRUPTED, certificate=certify(problem.F, uv, boundary=False))
+    one = state.islands[k]
+    places = [island.uv for island in state.mesh.islands]
+    places[k] = fixed_positions(one, target, uv)
+    moved = replace(state.with_island(k, one.with_target(target)), selected=(k,))
+    return moved, state.mesh.with_places(places)

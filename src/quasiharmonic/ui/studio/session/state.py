@@ -1,57 +1,122 @@
-"""State of a page: a problem, its map, and how it was computed. Undo and redo switch between states."""
+"""State of a page: a model, its seams, the map, and how it was computed. Undo and redo switch between states."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from quasiharmonic.apps.atlas.atlas_verdict import certify as certify_islands
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.exact.certificate import Certificate
+from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.studio.protocol import Array
+from quasiharmonic.ui.studio.session.islands import IslandState, Numbering
 from quasiharmonic.ui.studio.session.recipes import Recipe
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.ui.studio.session.surface import Sheet
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 #: Maximum numbers of obstructions and of elements per obstruction that are sent to the page.
 _MAX_OBSTRUCTIONS = 20
 _MAX_ELEMENTS = 2000
+# Islands above this number are not checked for overlaps with each other after each change.
+_MAX_CHECKED = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class SessionState:
     """State of a page."""
 
-    problem: Problem  # Its fixed vertices are the boundary loops, one after another, and then the pins
-    result: MapResult  # Its map
-    recipe: Recipe
-    corners: tuple[int, ...] = ()  # Boundary vertices at which sides end, in the order of the outline's corners
-    # Vertices that the user assigned to a corner, and the numbers of the corners
-    chosen: tuple[tuple[int, int], ...] = ()
+    sheet: Sheet
+    mesh: SeamedMesh  # The surface with its seams and its map
+    islands: tuple[IslandState, ...]  # Those of the mesh, in its order
+    recipe: Recipe  # How the map was computed
+    selected: tuple[int, ...] = (0,)  # Indices of the selected islands, ascending, at least one
+    from_file: bool = True  # Whether the seams are those of the file
+    drawn: IntArray | None = field(default=None)  # (k, 2): edges of the seams that the user drew, if they changed
+
+    @cached_property
+    def numbering(self) -> Numbering:
+        """Numbers of vertices and triangles on the page."""
+        return Numbering(self.mesh, self.islands)
 
     @property
-    def pins(self) -> list[int]:
-        """Fixed interior vertices, in the order in which they were pinned."""
-        edge = sum(map(len, self.problem.domain.loops))
-        return [int(v) for v in self.problem.fixed[edge:]]
+    def active(self) -> IslandState:
+        """The first selected island."""
+        return self.islands[self.selected[0]]
 
     @property
-    def held(self) -> list[int]:
-        """Boundary vertices at chosen or detected corners, which do not slide."""
-        return list(self.corners) if self.recipe.corners == "auto" else [v for v, _ in self.chosen]
+    def mapped(self) -> bool:
+        """Whether every island has a map."""
+        return all(one.result is not None for one in self.islands)
+
+    @property
+    def injective(self) -> bool:
+        """Whether every island has a map without inverted triangles."""
+        return all(one.injective for one in self.islands)
 
     @property
     def in_place(self) -> bool:
         """Whether the fixed vertices of the map are at their target positions."""
-        return np.array_equal(self.result.uv[self.problem.fixed], self.problem.target)
+        return all(one.in_place for one in self.islands)
 
-    def with_target(self, target: FloatArray) -> SessionState:
-        """Return the state with other target positions, as after a drag."""
-        recipe = replace(self.recipe, outline=None, corners=None, free=False, energy=None, slide=False)
-        return replace(self, problem=self.problem.with_target(target), recipe=recipe, chosen=())
+    @cached_property
+    def overlapping(self) -> IntArray:
+        """Pairs (p, 2) of islands that share points of the plane."""
+        if not self.injective or len(self.islands) == 1 or len(self.islands) > _MAX_CHECKED:
+            return np.empty((0, 2), dtype=np.int64)
+        return certify_islands(self.mesh).overlapping
+
+    @property
+    def uv(self) -> FloatArray:
+        """The map of all islands (n, 2), in the numbering of the page."""
+        return np.concatenate([place(one) for one in self.islands])
+
+    # --- the first selected island ------------------------------------------------------------------------------------
+
+    @property
+    def result(self) -> MapResult:
+        """The result of the active island."""
+        assert self.active.result is not None
+        return self.active.result
+
+    @property
+    def problem(self) -> Problem:
+        """The problem of the active island."""
+        return self.active.problem
+
+    @property
+    def pins(self) -> list[int]:
+        """Fixed interior vertices, in the numbering of the page."""
+        starts = self.numbering.starts
+        return [int(v + start) for one, start in zip(self.islands, starts, strict=False) for v in one.pins]
+
+    @property
+    def corners(self) -> list[int]:
+        """Corners of all islands, in the numbering of the page."""
+        starts = self.numbering.starts
+        return [int(v + start) for one, start in zip(self.islands, starts, strict=False) for v in one.corners]
+
+    def with_island(self, k: int, island: IslandState) -> SessionState:
+        """Return the state with another island of index ``k``; the mesh is unchanged."""
+        islands = (*self.islands[:k], island, *self.islands[k + 1 :])
+        other = replace(self, islands=islands)
+        other.__dict__["numbering"] = self.numbering
+        return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the contents for a snapshot; what can be computed again is left out."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("numbering", "overlapping")}
+
+
+def place(one: IslandState) -> FloatArray:
+    """Return the map (m, 2) of an island on the page; NaN if it has none."""
+    return one.island.uv if one.result is None else one.result.uv * one.sign
 
 
 class DistortionMonitor:
@@ -64,7 +129,7 @@ class DistortionMonitor:
         self.scale = 1.0
 
     def look(self, uv: FloatArray, *, now: bool) -> dict[str, Any]:
-        """Return energy and worst stretch of a map; recent values unless ``now`` is True."""
+        """Return energy, worst stretch and used space of a map; recent values unless ``now`` is True."""
         began = time.perf_counter()
         if now or began - self._when > max(0.15, 8 * self._cost):
             measured = distortion(self._V, self._F, uv)
@@ -75,6 +140,7 @@ class DistortionMonitor:
             self.numbers = {
                 "energy": energy if np.isfinite(energy) else None,
                 "worst": worst if np.isfinite(worst) else None,
+                "used": _find_used_space(self._F, uv),
             }
             self.scale = measured.scale if np.isfinite(measured.scale) else 1.0
             self._when = time.perf_counter()
@@ -82,41 +148,66 @@ class DistortionMonitor:
         return self.numbers
 
 
-def verdict(certificate: Certificate) -> dict[str, Any]:
-    """Return the certificate as entries of a message."""
-    bad = len(certificate.inverted) + len(certificate.degenerate) + len(certificate.nonfinite)
+def _find_used_space(F: Array, uv: FloatArray) -> float | None:
+    """Return the share of the unit square that the map covers; if the map leaves the square, that of its box."""
+    a, b, c = (uv[F[:, k]] for k in range(3))
+    area = float(np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).sum() / 2)
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    box = 1.0 if low.min() >= 0 and high.max() <= 1 else float(np.prod(high - low))
+    return area / box if box > 0 and np.isfinite(area / box) else None
+
+
+def verdict(certificates: list[Certificate], overlapping: int) -> dict[str, Any]:
+    """Return the certificates of all islands as entries of a message."""
+    bad = sum(len(one.inverted) + len(one.degenerate) + len(one.nonfinite) for one in certificates)
+    bijective = [bool(one.bijective) for one in certificates]
+    if len(certificates) == 1:
+        words = certificates[0].summary()
+    else:
+        words = f"{len(bijective)} islands: {sum(one.injective for one in certificates)} injective, {sum(bijective)} "
+        words += f"bijective. {'No two overlap.' if not overlapping else f'{overlapping} pairs overlap.'}"
     return {
-        "injective": certificate.injective,
-        "bijective": bool(certificate.bijective),
+        "injective": all(one.injective for one in certificates),
+        "bijective": all(bijective) and not overlapping,
+        "overlapping": overlapping,
         "flips": bad,
-        "verdict": certificate.summary(),
+        "verdict": words,
     }
 
 
-def bad_triangles(certificate: Certificate) -> Array:
-    """Return the triangles that are not positive, (k,) uint32."""
-    some = np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
-    return np.sort(some).astype(np.uint32)
+def bad_triangles(certificates: list[Certificate]) -> Array:
+    """Return the triangles that are not positive, (k,) uint32, in the numbering of the page."""
+    start, found = 0, [np.empty(0, dtype=np.int64)]
+    for one in certificates:
+        found += [one.inverted + start, one.degenerate + start, one.nonfinite + start]
+        start += one.triangles
+    return np.sort(np.concatenate(found)).astype(np.uint32)
 
 
 def describe_obstructions(state: SessionState) -> list[dict[str, Any]]:
     """Return the obstructions to a map, or to a bijective map, as the page marks them."""
-    diagnosis, loops = state.result.diagnosis, state.problem.domain.loops
-    if diagnosis is None:
-        return []
-    # Obstructions with vertices or edges are more specific than those of whole loops.
-    found = sorted(diagnosis.obstructions, key=lambda one: not (one.vertices.size or one.edges.size))
-    return [
-        {
-            "message": one.message,
-            "advice": one.advice,
-            "forbids": one.forbids.value,
-            "vertices": one.vertices.tolist()[:_MAX_ELEMENTS],
-            "edges": (one.edges.tolist() or _around([loops[k] for k in one.loops]))[:_MAX_ELEMENTS],
-            "triangles": one.triangles.tolist()[:_MAX_ELEMENTS],
-        }
-        for one in found[:_MAX_OBSTRUCTIONS]
-    ]
+    found = []
+    for one, start, first in zip(
+        state.islands, state.numbering.starts.tolist(), state.numbering.first_triangles.tolist(), strict=False
+    ):
+        diagnosis = None if one.result is None else one.result.diagnosis
+        if diagnosis is None:
+            continue
+        loops = one.problem.domain.loops
+        # Obstructions with vertices or edges are more specific than those of whole loops.
+        for each in sorted(diagnosis.obstructions, key=lambda one: not (one.vertices.size or one.edges.size)):
+            edges = each.edges if each.edges.size else np.array(_around([loops[k] for k in each.loops]), dtype=np.int64)
+            found.append(
+                {
+                    "message": each.message,
+                    "advice": each.advice,
+                    "forbids": each.forbids.value,
+                    "vertices": (each.vertices + start).tolist()[:_MAX_ELEMENTS],
+                    "edges": (edges.reshape(-1, 2) + start).tolist()[:_MAX_ELEMENTS],
+                    "triangles": (each.triangles + first).tolist()[:_MAX_ELEMENTS],
+                }
+            )
+    return found[:_MAX_OBSTRUCTIONS]
 
 
 def _around(loops: list[Array]) -> list[list[int]]:

@@ -1,45 +1,87 @@
-"""The surface of a page: from a file, from an upload, or built in."""
+"""The model of a page: from a file, from an upload, or built in; and the surface in it that is mapped."""
 
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from quasiharmonic import io
-from quasiharmonic.apps.atlas import seam_cuts
+from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
+from quasiharmonic.apps.unwrapping.model_files import divide_polygons
 from quasiharmonic.geometry.surfaces import cat
-from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.io.models.meshdata import vertex_places
+from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.problem.inspection import MeshReport, inspect_mesh
+from quasiharmonic.util.arrays import IntArray
 
 #: Maximum number of triangles; larger meshes are too slow to draw and drag.
 MAX_TRIANGLES = 1_000_000
+# Defects that do not prevent a model from being mapped as it is in the file.
+_HARMLESS = {"vertices without triangle", "vertices where surfaces touch"}
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """Connected surface with a boundary, and its file."""
+    """Model of a page.
+
+    The functions that map accept only surfaces. So a model with defects is cleaned first, and the cleaned surface is
+    mapped. Files that are written have the model's own vertices and faces.
+    """
 
     name: str  # File name without folder
-    mesh: io.MeshData  # The mesh as read; written files contain it with its map
-    seamed: SeamedMesh  # The mesh, cut open if it is closed
-    island: Island  # The single island, which is mapped
-    flags: tuple[str, ...] = ()  # Options of ``qhm map`` that produce the same surface
-    fixed: np.ndarray | None = field(default=None)  # (k,): fixed vertices of the island, if the file comes with a list
+    mesh: io.MeshData  # The mesh as read
+    surface: io.MeshData  # The mesh that is mapped
+    report: MeshReport  # Topology and defects of the model
+    cleaned: CleanedMesh | None = None  # How the surface was made from the model; None if they are the same
+    turned: bool = False  # Whether the triangles of the surface are reversed
+    fixed: IntArray | None = None  # (k,): fixed vertices, if the file comes with a list
+    texture: io.Texture | None = None  # The model's own texture
 
-    def written(self, uv: FloatArray) -> bytes:
-        """Return an OBJ file with a map (n, 2) of the island as texture coordinates, without rounding."""
-        mesh = self.mesh.with_places(self.seamed.with_places([uv]))
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "map.obj"
-            io.write_mapped(path, mesh)
-            return path.read_bytes()
+    @property
+    def is_file(self) -> bool:
+        """Whether the surface has the vertices and triangles of the file."""
+        return self.cleaned is None and not self.turned
 
-    def numbers(self, vertices: list[int]) -> list[int]:
-        """Return the file's indices of vertices of the island."""
-        return [int(self.island.vertices[v]) for v in vertices]
+    @cached_property
+    def inward(self) -> int:
+        """Number of closed components that are inside out."""
+        if self.cleaned is not None:
+            found = int(np.count_nonzero(self.cleaned.facing < 0))
+            return int(np.count_nonzero(self.cleaned.facing > 0)) if self.turned else found
+        return inspect_mesh(self.surface.V, self.surface.F).inward if self.turned else self.report.inward
+
+    def initial_map(self) -> SeamedMesh:
+        """Return the surface with the seams and the map of the file, without map if the file has none."""
+        if self.mesh.FT is None or self.mesh.vt is None:
+            return SeamedMesh(self.surface.V, self.surface.F)
+        if self.cleaned is None and not self.turned:
+            return io.seamed(self.mesh)
+        if (self.mesh.FT < 0).any():
+            return SeamedMesh(self.surface.V, self.surface.F)
+        return SeamedMesh(self.surface.V, self.surface.F, self.from_file(self.mesh.FT), self.mesh.vt)
+
+    def from_file(self, corners: IntArray) -> IntArray:
+        """Return values at the corners of the file's triangles (f, 3) at those of the surface."""
+        if self.cleaned is not None:
+            corners = corners[self.cleaned.triangles]
+            corners = np.where(self.cleaned.flipped[:, None], corners[:, (0, 2, 1)], corners)
+        return corners[:, (0, 2, 1)] if self.turned else corners
+
+    def mapped_file(self, mesh: SeamedMesh) -> io.MeshData:
+        """Return the file's mesh with a map of the surface; polygons that seams cross become triangles."""
+        FT = mesh.FT[:, (0, 2, 1)] if self.turned else mesh.FT
+        if self.cleaned is not None:
+            FT = self.cleaned.restore_corners(FT)
+        return divide_polygons(replace(self.mesh, vt=mesh.uv, FT=FT))[0]
+
+    def turn_over(self) -> Sheet:
+        """Return the model with the triangles of its surface reversed."""
+        surface = io.MeshData(self.surface.V, self.surface.F[:, (0, 2, 1)], source=self.mesh.source)
+        return replace(self, surface=surface, turned=not self.turned)
 
 
 def make_first_sheet() -> Sheet:
@@ -48,9 +90,9 @@ def make_first_sheet() -> Sheet:
 
 
 def read_sheet(path: Path) -> Sheet:
-    """Read the surface given to the command: a file, or a folder with ``input.obj`` and perhaps ``handles.txt``.
+    """Read the model given to the command: a file, or a folder with ``input.obj`` and perhaps ``handles.txt``.
 
-    ValueError or OSError if the file is not a surface with one component and a boundary.
+    ValueError or OSError if the file is not a model.
     """
     mesh_path, fixed_path = io.problem_files(path)
     mesh = io.read_mesh(mesh_path)
@@ -59,9 +101,9 @@ def read_sheet(path: Path) -> Sheet:
 
 
 def read_upload(name: str, content: bytes) -> Sheet:
-    """Read an uploaded surface; of its name on the user's side only the suffix matters.
+    """Read an uploaded model; of its name on the user's side only the suffix matters.
 
-    ValueError if the file is not a valid surface. The message names the user's file, not a path of this machine.
+    ValueError if the file is not a valid model. The message names the user's file, not a path of this machine.
     """
     shown = PurePosixPath(name.replace("\\", "/")).name[:100]
     # A page uploads one file, without further files that it may refer to.
@@ -71,43 +113,34 @@ def read_upload(name: str, content: bytes) -> Sheet:
         path.write_bytes(content)
         try:
             mesh = io.read_mesh(path)
+            sheet = make_sheet(mesh, shown)
         except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
             raise ValueError(str(error).replace(str(path), shown)) from None
-    return make_sheet(mesh, shown)
+    return replace(sheet, mesh=replace(sheet.mesh, source=shown))
 
 
-def make_sheet(mesh: io.MeshData, name: str, fixed: np.ndarray | None = None) -> Sheet:
-    """Return the sheet of a mesh, cut open if it is closed.
-
-    ValueError if it has no triangles, too many triangles, or several components.
-    """
+def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> Sheet:
+    """Return the sheet of a mesh; ValueError if it has no triangles, too many, or only degenerate ones."""
     if len(mesh.F) > MAX_TRIANGLES:
         raise ValueError(
             f"{name} has {len(mesh.F):,} triangles, but the page shows at most {MAX_TRIANGLES:,}: "
-            "use the command qhm map, or coarsen the mesh first"
+            "use the command qhm unwrap, or coarsen the mesh first"
         )
     if not len(mesh.F):
         raise ValueError(f"{name} has no triangles")
-    seamed, flags = io.seamed(mesh), []
-    if len(seamed.islands) > 1 and not seamed.seamless:
-        # An atlas of several islands: use the surface without its seams.
-        seamed, flags = SeamedMesh(mesh.V, mesh.F), ["--seams", "none"]
-    if len(seamed.islands) == 1 and not _has_boundary(seamed.islands[0]):
-        seamed = seam_cuts.cut_apart(seamed, polygons=mesh.polygons, disks_too=False, reach=False)
-        flags.append("--cut")
-    islands = seamed.islands
-    if len(islands) != 1:
-        sizes = ", ".join(f"{len(island.F):,}" for island in islands[:5])
-        raise ValueError(
-            f"{name} has {len(islands)} connected parts (of {sizes}{' …' if len(islands) > 5 else ''} triangles), but "
-            "the page supports only one: use the command qhm map or qhm flatten"
-        )
-    (island,) = islands
-    own = None if fixed is None else np.flatnonzero(np.isin(island.vertices, fixed))
-    return Sheet(name, mesh, seamed, island, tuple(flags), own)
+    report = inspect_mesh(mesh.V, mesh.F)
+    sound = not any(found.size for what, found in report.defects.items() if what not in _HARMLESS)
+    texture = io.own_texture(mesh) if mesh.source else None
+    if sound:
+        return Sheet(name, mesh, mesh, report, fixed=fixed, texture=texture)
+    cleaned = clean(mesh.V, mesh.F)
+    surface = io.MeshData(cleaned.V, cleaned.F, source=mesh.source)
+    own = None if fixed is None else np.flatnonzero(np.isin(cleaned.vertices, fixed))
+    return Sheet(name, mesh, surface, report, cleaned, fixed=own, texture=texture)
 
 
-def _has_boundary(island: Island) -> bool:
-    from quasiharmonic.geometry.mesh.topology import boundary_edges
-
-    return bool(len(boundary_edges(island.F, len(island.V))))
+def has_complete_map(mesh: io.MeshData) -> bool:
+    """Return whether every triangle of a file has texture coordinates."""
+    if mesh.FT is None or mesh.vt is None:
+        return False
+    return bool((mesh.FT >= 0).all()) and not np.isnan(vertex_places(mesh)[0][mesh.F]).any()

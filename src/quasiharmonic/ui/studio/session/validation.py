@@ -16,7 +16,12 @@ class RequestError(ValueError):
 
 def vertex(frame: Frame, n: int) -> int:
     """Return the vertex index, below ``n``."""
-    value = number(frame, "vertex")
+    return number_below(frame, "vertex", n)
+
+
+def number_below(frame: Frame, name: str, n: int) -> int:
+    """Return a vertex index of another name, below ``n``."""
+    value = number(frame, name)
     if not 0 <= value < n:
         raise RequestError(f"there is no vertex {value}: the surface has {n}, counted from 0")
     return value
@@ -63,3 +68,19 @@ def points(frame: Frame) -> FloatArray:
     if array is None or array.dtype != np.float64 or array.size % 2:
         raise RequestError("the message lacks the points")
     return array.reshape(-1, 2)
+
+
+def amount(frame: Frame, name: str, low: float, high: float, default: float) -> float:
+    """Return a number between two bounds, ``default`` if there is none."""
+    value = frame.header.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise RequestError(f"{name} must be a number from {low:g} to {high:g}")
+    return value
+
+
+def indices(frame: Frame, name: str, n: int) -> list[int]:
+    """Return a list of different indices below ``n``, ascending."""
+    values = frame.header.get(name)
+    if not isinstance(values, list) or not all(type(value) is int and 0 <= value < n for value in values):
+        raise RequestError(f"the message lacks {name}, a list of numbers below {n}")
+    return sorted(set(values))

@@ -1,0 +1,49 @@
+"""Files that the page saves: the map on the model, with an image if there is one, and what its recipe reads."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from quasiharmonic import io
+from quasiharmonic.ui.studio.session.recipes import MAP, START
+from quasiharmonic.ui.studio.session.state import SessionState
+from quasiharmonic.ui.studio.session.validation import RequestError
+
+#: Formats in which the page saves the map.
+FORMATS = "obj", "glb", "ply"
+
+
+def list_files(state: SessionState, form: str, texture: io.Texture | None) -> dict[str, bytes]:
+    """Return the files of a map by name: the model with its map, and its image.
+
+    In OBJ, also those that the command and the script read. RequestError if there is no map.
+    """
+    if state.mesh.uv is None:
+        raise RequestError("there is no map to save yet: press Unwrap or Flatten first")
+    if form not in FORMATS:
+        raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
+    mesh = state.sheet.mapped_file(state.mesh)
+    if texture is not None and form != "ply":
+        mesh = replace(mesh, texture=texture)
+    files = _write(mesh, MAP if form == "obj" else f"map.{form}")
+    return files | (list_recipe_files(state) if form == "obj" else {})
+
+
+def list_recipe_files(state: SessionState) -> dict[str, bytes]:
+    """Return the files that command and script of a state read, besides the user's file."""
+    recipe = state.recipe
+    start = {} if recipe.start is None else _write(recipe.start, START)
+    return start | recipe.texts
+
+
+def _write(mesh: io.MeshData, name: str) -> dict[str, bytes]:
+    """Return a mesh as a file, with the files that belong to it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        if mesh.FT is None:
+            io.write_obj(path, mesh)
+        else:
+            io.write_mapped(path, mesh)
+        return {each.name: each.read_bytes() for each in sorted(Path(folder).iterdir())}

@@ -1,0 +1,129 @@
+"""Contents of the messages to a page: the surface, the map, the seams."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.geometry.exact.certificate import Certificate
+from quasiharmonic.ui.studio.protocol import Array
+from quasiharmonic.ui.studio.session.seams import find_seam_sides, sides_of
+from quasiharmonic.ui.studio.session.state import SessionState, bad_triangles, verdict
+from quasiharmonic.util.arrays import FloatArray
+
+Message = tuple[Mapping[str, Any], Mapping[str, Array]]
+# Maximum number of islands with an entry of their own in the list of the page.
+_MAX_LISTED = 400
+
+
+def surface_message(state: SessionState) -> Message:
+    """Return the surface in the numbering of the page."""
+    numbering, sheet = state.numbering, state.sheet
+    V = np.zeros((len(numbering.V), 3), dtype=np.float64)
+    V[:, : numbering.V.shape[1]] = numbering.V
+    starts = numbering.starts[:-1].tolist()
+    loops = [loop + start for one, start in zip(state.islands, starts, strict=True) for loop in one.loops]
+    header = {
+        "kind": "surface",
+        "name": sheet.name,
+        "vertices": len(V),
+        "triangles": len(numbering.F),
+        "loops": [len(loop) for loop in loops],
+        "starts": starts,
+        "first_triangles": numbering.first_triangles[:-1].tolist(),
+        "components": sheet.report.components,
+        "closed": sheet.report.closed,
+        "defects": [f"{found.size:,} {what}" for what, found in sheet.report.defects.items() if found.size],
+    }
+    arrays = {
+        "positions": (V - V.mean(axis=0)).astype(np.float32),
+        "triangles": numbering.F.astype(np.uint32),
+        "boundary": np.concatenate([np.empty(0, dtype=np.int64), *loops]).astype(np.int32),
+    }
+    return header, arrays
+
+
+def state_fields(state: SessionState) -> dict[str, Any]:
+    """Return what the controls of a page show about a state at rest."""
+    recipe = state.recipe
+    return {
+        "state": "settled",
+        "mapped": state.mapped,
+        "reached": state.in_place,
+        "command": recipe.command,
+        "python": recipe.python,
+        "needs": recipe.files(),
+        "anew": recipe.anew,
+        "outline": None if state.active.outline is None else state.active.outline.to,
+        "drawn": state.drawn is not None,
+        "inward": state.sheet.inward,
+        "turned": state.sheet.turned,
+        "islands": [
+            {
+                "triangles": len(one.island.F),
+                "good": one.injective and bool(one.result and one.result.certificate.bijective),
+            }
+            for one in state.islands[:_MAX_LISTED]
+        ],
+        "count": len(state.islands),
+    }
+
+
+def handle_fields(state: SessionState) -> dict[str, Any]:
+    """Return the handles of a state: corners with their numbers, pins, and the selection."""
+    return {
+        "corners": state.corners,
+        "numbers": [i for one in state.islands for i in range(len(one.corners))],
+        "pins": state.pins,
+        "selected": list(state.selected),
+    }
+
+
+def certificates_of(state: SessionState) -> list[Certificate]:
+    """Return the certificates of all islands; each must have a map."""
+    return [one.result.certificate for one in state.islands if one.result is not None]
+
+
+def map_arrays(
+    state: SessionState, origin: FloatArray, *, changed: tuple[int, FloatArray, Certificate] | None = None
+) -> Message:
+    """Return verdict and positions of a map; with ``changed`` those of one island, which moves."""
+    certificates = certificates_of(state)
+    if changed is None:
+        header = verdict(certificates, len(state.overlapping))
+        return header, {
+            "places": (state.uv - origin).astype(np.float32),
+            "bad": bad_triangles(certificates),
+        }
+    k, uv, certificate = changed
+    certificates[k] = certificate
+    # Overlaps between islands are checked when the drag ends.
+    header = verdict(certificates, 0) | {"start": int(state.numbering.starts[k])}
+    return header, {"places": (uv - origin).astype(np.float32), "bad": bad_triangles(certificates)}
+
+
+def asked_boundary(state: SessionState, targets: Mapping[int, FloatArray], origin: FloatArray) -> Array:
+    """Return the requested positions (b, 2) of all boundary loops; ``targets`` are those of islands that move."""
+    rows = [np.empty((0, 2))]
+    for k, one in enumerate(state.islands):
+        if not one.loops:
+            continue
+        uv = one.result.uv if one.result is not None else np.zeros((len(one.island.vertices), 2))
+        target = targets.get(k, one.target)
+        if target is not None and one.fixed is not None:
+            uv = uv.copy()
+            uv[one.fixed] = target
+        rows.append(uv[np.concatenate(one.loops)] * one.sign)
+    return (np.concatenate(rows) - origin).astype(np.float32)
+
+
+def seams_message(state: SessionState) -> Message:
+    """Return the seams, each side with the number of its chain; or those that the user drew."""
+    if state.drawn is None:
+        sides = find_seam_sides(state)
+    else:
+        sides = sides_of(state, state.drawn)
+    header = {"kind": "seams", "drawn": state.drawn is not None, "chains": int(sides.chains.max(initial=-1)) + 1}
+    return header, {"edges": sides.edges.astype(np.uint32), "chain": sides.chains.astype(np.uint32)}

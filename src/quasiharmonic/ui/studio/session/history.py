@@ -1,0 +1,96 @@
+"""The states of a session for undo and redo, its image, and which state was saved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from quasiharmonic.io.models.textures import Texture
+from quasiharmonic.ui.studio.session.state import SessionState
+from quasiharmonic.ui.studio.session.storage import Snapshot, Storage
+
+#: Maximum number of states for undo.
+MAX_STATES = 40
+# Maximum number of triangles in all stored states together; fewer states of large models are stored.
+_MAX_STORED = 4_000_000
+
+
+class History:
+    """States of a session; with a storage, they are stored after each change."""
+
+    def __init__(self, storage: Storage | None = None) -> None:
+        self._storage = storage
+        self._states: list[SessionState] = []
+        self._numbers: list[int] = []
+        self._at = -1
+        self._next = 0
+        self._saved = 0
+        self.texture: Texture | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self._states)
+
+    @property
+    def state(self) -> SessionState:
+        """The state that the page shows."""
+        return self._states[self._at]
+
+    def clear(self, texture: Texture | None) -> None:
+        """Forget all states, for another model with its own image; the next state counts as saved."""
+        self._states, self._numbers, self._at = [], [], -1
+        self.texture, self._saved = texture, self._next
+
+    def add(self, state: SessionState) -> None:
+        """Add a state after the current one; later ones are forgotten."""
+        del self._states[self._at + 1 :], self._numbers[self._at + 1 :]
+        self._states.append(state)
+        self._numbers.append(self._next)
+        self._next += 1
+        del self._states[:-MAX_STATES], self._numbers[:-MAX_STATES]
+        self._at = len(self._states) - 1
+
+    def change(self, state: SessionState) -> None:
+        """Replace the current state by one with the same map."""
+        self._states[self._at] = state
+
+    def go(self, step: int) -> None:
+        """Undo (-1) or redo (1) one step, if there is one."""
+        selected = self.state.selected
+        self._at = min(max(self._at + step, 0), len(self._states) - 1)
+        if max(selected) < len(self.state.islands):
+            self.change(replace(self.state, selected=selected))
+
+    def mark_saved(self) -> None:
+        """Remember that the current state was saved."""
+        self._saved = self._numbers[self._at]
+        self.write()
+
+    def fields(self) -> dict[str, Any]:
+        """Return what the controls of a page show about the history."""
+        return {
+            "undo": self._at > 0,
+            "redo": self._at < len(self._states) - 1,
+            "unsaved": self._numbers[self._at] != self._saved,
+        }
+
+    def write(self) -> None:
+        """Store all states; of large models only those around the current one."""
+        if self._storage is None or not self._states:
+            return
+        count = max(2, _MAX_STORED // max(len(self.state.mesh.F), 1))
+        low = max(0, self._at + 1 - count)
+        high = min(len(self._states), low + count)
+        some = slice(low, high)
+        self._storage.write(
+            Snapshot(self._states[some], self._at - low, self.texture, self._saved, self._numbers[some])
+        )
+
+    def restore(self) -> bool:
+        """Take over the stored states; return whether there are any."""
+        found = None if self._storage is None else self._storage.read()
+        if found is None or not found.states:
+            return False
+        self._states, self._numbers, self._at = list(found.states), list(found.numbers), found.at
+        self.texture, self._saved = found.texture, found.saved
+        self._next = max(self._numbers) + 1
+        return True

@@ -1,0 +1,390 @@
+"""The steps that change a map. Each calls the library as the command does, and returns that command and a script.
+
+A step depends on the model, on its options and, if it starts from a map, on that map, which the page saves as
+`recipes.START`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from quasiharmonic.apps.atlas import island_functions as atlas
+from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, mirrored_islands
+from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, each_island
+from quasiharmonic.apps.atlas.seam_cuts import cut_along, cut_apart
+from quasiharmonic.apps.repair.fitting import find_corner_vertices, fit_boundary, fix_in_place
+from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
+from quasiharmonic.geometry.curves import BoundaryCurves
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops, edges
+from quasiharmonic.io import MeshData
+from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis import diagnose
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.targets import filled
+from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+from quasiharmonic.ui.studio.session import recipes
+from quasiharmonic.ui.studio.session.islands import IslandState
+from quasiharmonic.ui.studio.session.outlines import Outline
+from quasiharmonic.ui.studio.session.recipes import FIXED, POLISHING_STEPS, SEAMS, START, Recipe, Source
+from quasiharmonic.ui.studio.session.state import SessionState
+from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+Callback = Callable[[Step], object] | None
+
+
+def find_source(state: SessionState, *, with_map: bool) -> Source:
+    """Return the file from which a step starts; ``with_map`` if the step depends on the current map."""
+    unchanged = not state.recipe.command and not state.recipe.start
+    if state.sheet.is_file and state.from_file and (unchanged or not with_map):
+        return Source(state.sheet.name, None)
+    return make_start(state.mesh)
+
+
+def make_start(mesh: SeamedMesh) -> Source:
+    """Return a file with a map that the page saves."""
+    return Source(START, MeshData(mesh.V, mesh.F, vt=mesh.uv, FT=None if mesh.uv is None else mesh.FT))
+
+
+def saved_start(mesh: SeamedMesh) -> Recipe:
+    """Return the recipe of a map that no step makes: the file with it."""
+    source = make_start(mesh)
+    python = recipes.write_script([f"mesh = atlas.SeamedMesh({source.name!r})"], names=["atlas"])
+    return Recipe(f"qhm check {source.name}", python, source.start)
+
+
+def choose(state: SessionState) -> list[int] | None:
+    """Return the selected islands; None if these are all."""
+    return None if len(state.selected) == len(state.islands) else list(state.selected)
+
+
+def map_to_outline(
+    state: SessionState,
+    outline: Outline,
+    corners: Sequence[tuple[int, int]] | Literal["auto"] = (),
+    callback: Callback = None,
+) -> SessionState:
+    """Map the boundaries of the selected islands to an outline.
+
+    ``corners`` are boundary vertices of the first selected island and the outline's corners that they go to. "auto"
+    chooses vertices by angle; without corners arc length decides.
+    """
+    only, posed = choose(state), list[Problem]()
+    source = find_source(state, with_map=only is not None)
+    own = state.active.island.vertices
+    named = () if isinstance(corners, str) else tuple((int(own[v]), k) for v, k in corners)
+    spec = CornerSpec("auto" if isinstance(corners, str) else named) if corners else None
+    fills: list[bool] = []
+
+    def lower(island: Island) -> MapResult:
+        asked = None if spec is None else spec.within(island.vertices)
+        fitted = fit_boundary(island.V, island.F, outline.contours, corners=asked, beside=len(posed))
+        posed.append(fitted.problem)
+        fills.append(bool(fitted.filled_holes))
+        return solve_smoothly(fitted.problem, callback)
+
+    mapped = each_island(state.mesh, lower, reflect=False, only=only)
+    word = corners if corners == "auto" else ",".join(f"{v}:{k}" for v, k in named) or None
+    options = recipes.option_words(to=outline.to, corners=word)
+    command = recipes.write_command(["map", source.command, *options, *recipes.island_words(only)], "again.obj", source)
+    small = all(len(state.islands[k].island.F) <= LARGEST_SMOOTHED for k in state.selected)
+    python = recipes.outline_script(
+        source, outline.to, any(fills), corners if corners == "auto" else dict(corners), state.selected, small
+    )
+    texts = {} if outline.content is None else {outline.to: outline.content}
+    recipe = Recipe(command, python, source.start, texts, outline.to)
+    after = rebuild(state, mapped, recipe)
+    for i, k in enumerate(state.selected):
+        right = i * 1.05 * np.ptp(np.concatenate(outline.contours)[:, 0])
+        contours = filled(outline.contours) if fills[i] else outline.contours
+        copies = [contour + np.array([right, 0.0]) for contour in contours] if i else contours
+        one = after.islands[k]
+        found = find_corner_vertices(posed[i].fixed, posed[i].target, copies)
+        one = replace(
+            one,
+            outline=outline,
+            corners=tuple(found),
+            chosen=() if isinstance(corners, str) or i else tuple(corners),
+            by_angle=corners == "auto",
+            pins=(),
+        )
+        after = after.with_island(k, one.with_problem(posed[i]))
+    return after
+
+
+def map_in_place(
+    state: SessionState, start: SeamedMesh, only: list[int] | None, callback: Callback = None, follows: bool = False
+) -> SessionState:
+    """Map islands with their fixed vertices at the positions that they have in ``start``.
+
+    With ``follows``, ``start`` is injective. It is then improved if the search from scratch finds no map.
+    """
+    source = find_source(state, with_map=True) if start is state.mesh else make_start(start)
+    fixed = _list_fixed(state, only)
+    numbers = None if fixed is None else np.array(fixed)
+
+    def lower(island: Island) -> MapResult:
+        return solve_smoothly(fix_in_place(island, numbers).problem, callback)
+
+    mapped = each_island(start, lower, only=only)
+    done = mapped.islands if only is None else [mapped.islands[k] for k in only]
+    anew = all(one.result.injective for one in done)
+    options = [*recipes.option_words(fixed=None if fixed is None else FIXED), *recipes.island_words(only)]
+    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in fixed).encode()}
+    if anew or not follows:
+        command = recipes.write_command(["map", source.command, *options], "again.obj", source)
+        name = None if fixed is None else FIXED
+        python = recipes.map_script(source, only, max(len(one.triangles) for one in done), name)
+    else:
+        given: dict[str, Any] = {"energy": "blend", "max_iterations": SMOOTHING_STEPS}
+        mapped = atlas.polish(start, fixed=numbers, islands=only, callback=callback, **given)
+        words = ["polish", source.command, *recipes.option_words(**given), *options]
+        command = recipes.write_command(words, "again.obj", source)
+        read = recipes.read_indices(None if fixed is None else FIXED)
+        more = recipes.arguments(**given, fixed=read, islands=only)
+        python = recipes.write_script(
+            [f"result = atlas.polish({source.name!r}{more})", "mesh = result.mesh"], names=["atlas"]
+        )
+    recipe = Recipe(command, python, source.start, texts, anew=anew)
+    return rebuild(state, mapped, recipe, keep=True, corners=True)
+
+
+def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
+    """Lower an energy of the selected islands until it converges."""
+    only, source = choose(state), find_source(state, with_map=True)
+    fixed = _list_fixed(state, only)
+    outline = state.active.outline if slide and len(state.islands) == 1 else None
+    curves: bool | BoundaryCurves = slide if outline is None else BoundaryCurves(outline.curves())
+    given: dict[str, Any] = {"energy": energy, "max_iterations": POLISHING_STEPS}
+    numbers = None if fixed is None else np.array(fixed)
+    mapped = atlas.polish(state.mesh, fixed=numbers, slide=curves, islands=only, callback=callback, **given)
+    to = None if outline is None else outline.to
+    options = recipes.option_words(energy=energy, slide=slide, to=to, fixed=None if fixed is None else FIXED)
+    words = ["polish", source.command, *options, *recipes.island_words(only)]
+    command = recipes.write_command(words, "again.obj", source)
+    track = recipes.Code(f"BoundaryCurves(outline_curves({to!r}))") if outline is not None else slide
+    read = recipes.read_indices(None if fixed is None else FIXED)
+    more = recipes.arguments(**given, fixed=read, slide=track, islands=only)
+    python = recipes.write_script(
+        [f"result = atlas.polish({source.name!r}{more})", "mesh = result.mesh"],
+        names=["atlas", *(["BoundaryCurves"] if outline is not None else [])],
+        modules=["from quasiharmonic.targets import outline_curves"] if outline is not None else [],
+    )
+    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in fixed).encode()}
+    if outline is not None and outline.content is not None:
+        texts[outline.to] = outline.content
+    recipe = Recipe(command, python, source.start, texts, to)
+    return rebuild(state, mapped, recipe, keep=True, outlines=True)
+
+
+def flatten_islands(state: SessionState, callback: Callback = None) -> SessionState:
+    """Flatten the selected islands with free boundaries; all of them along new seams if the user drew some."""
+    if state.drawn is not None:
+        return _flatten_along(state, state.drawn, callback)
+    mesh, only = state.mesh, choose(state)
+    pins = [int(one.island.vertices[v]) for k, one in enumerate(state.islands) for v in one.pins if k in state.selected]
+    source = find_source(state, with_map=only is not None or bool(pins))
+    cut = only is None and not all(is_flattenable(one.island) for one in state.islands)
+    if cut:
+        mesh = cut_apart(mesh, polygons=_polygons(state, source), disks_too=True)
+    fixed = np.array(pins) if pins and not cut else None
+    mapped = atlas.flatten(mesh, fixed=fixed, islands=only, callback=callback)
+    options = recipes.option_words(cut=cut, fixed=None if fixed is None else FIXED)
+    command = recipes.write_command(
+        ["flatten", source.command, *options, *recipes.island_words(only)], "flat.obj", source
+    )
+    read = recipes.read_indices(None if fixed is None else FIXED)
+    more = recipes.arguments(fixed=read, islands=only)
+    lines, names = [f"result = atlas.flatten({source.name!r}{more})", "mesh = result.mesh"], ["atlas"]
+    if cut:
+        lines, names = _cut_lines(source, state), ["atlas", "find_cuts"]
+        lines += [f"result = atlas.flatten(mesh{more})", "mesh = result.mesh"]
+        if "io.read_mesh" in lines[0]:
+            names.append("io")
+    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in pins).encode()}
+    recipe = Recipe(command, recipes.write_script(lines, names=names), source.start, texts)
+    after = rebuild(state, mapped, recipe, keep=not cut)
+    return replace(after, from_file=state.from_file and not cut)
+
+
+def pack_all(state: SessionState, resolution: int, padding: float) -> SessionState:
+    """Pack all islands into the unit square, at one texel density."""
+    source = find_source(state, with_map=True)
+    laid = atlas.flatten(state.mesh, start=True, max_iterations=0)
+    mesh = atlas.pack(laid.mesh, resolution=resolution, padding=padding)
+    size = {"resolution": resolution, "padding": padding}
+    words = ["flatten", source.command, "--start", "--max-iterations", "0", "--pack", *recipes.option_words(**size)]
+    command = recipes.write_command(words, "packed.obj", source)
+    lines = [
+        f"flat = atlas.flatten({source.name!r}, start=True, max_iterations=0).mesh",
+        f"mesh = atlas.pack(flat{recipes.arguments(**size)})",
+    ]
+    recipe = Recipe(command, recipes.write_script(lines, names=["atlas"]), source.start)
+    return as_it_is(state, mesh, recipe, keep=True)
+
+
+def is_flattenable(island: Island) -> bool:
+    """Whether an island has a boundary and no handle."""
+    found, n = edges(island.F, len(island.vertices)), len(island.vertices)
+    if not len(found.boundary):
+        return False
+    euler = n - len(found.interior) - len(found.boundary) + len(island.F)
+    return euler == 2 - len(boundary_loops(island.F, n))
+
+
+def solve_smoothly(problem: Problem, callback: Callback) -> MapResult:
+    """Solve a problem as ``qhm map`` does; the result has a diagnosis if no bijective map was found."""
+    result = solve(problem, max_iterations=2000, callback=callback)
+    if result.status is Status.INJECTIVE:
+        result = smooth(problem, result, callback=callback)
+    if result.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    if not result.certificate.bijective and result.diagnosis is None:
+        result = replace(result, diagnosis=diagnose(problem))
+    return result
+
+
+def rebuild(
+    state: SessionState,
+    mapped: MappedAtlas,
+    recipe: Recipe,
+    *,
+    keep: bool = False,
+    corners: bool = False,
+    outlines: bool = False,
+) -> SessionState:
+    """Return the state after a step; with ``keep`` pins stay, with ``corners`` and ``outlines`` these, too."""
+    changed = set(range(len(mapped.islands))) if len(mapped.islands) != len(state.islands) else set(state.selected)
+    if any(one.result.status is Status.INTERRUPTED for one in mapped.islands):
+        raise KeyboardInterrupt
+    islands = []
+    for k, (island, one) in enumerate(zip(mapped.mesh.islands, mapped.islands, strict=True)):
+        before = state.islands[k] if k < len(state.islands) else None
+        if before is not None and k not in changed and np.array_equal(island.uv, before.island.uv):
+            islands.append(before)
+            continue
+        # The atlas may have shifted an island after it was mapped.
+        result = one.result
+        uv = island.uv * MIRROR if one.mirrored else island.uv
+        if not np.array_equal(uv, result.uv):
+            result = replace(result, uv=uv, certificate=certify(island.F, uv))
+        new = IslandState(island, one.mirrored, result)
+        if before is not None and keep and np.array_equal(before.island.F, island.F):
+            new = replace(new, pins=before.pins, corners=before.corners if corners else ())
+            if outlines:
+                new = replace(
+                    new,
+                    outline=before.outline,
+                    corners=before.corners,
+                    chosen=before.chosen,
+                    by_angle=before.by_angle,
+                )
+        islands.append(fix_where_it_is(new))
+    return replace(
+        state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=_still(state, islands), drawn=None
+    )
+
+
+def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, *, keep: bool = False) -> SessionState:
+    """Return the state with the map of a mesh; with ``keep`` the islands are the same, and their pins stay."""
+    islands = []
+    for k, (island, mirrored) in enumerate(zip(mesh.islands, mirrored_islands(mesh), strict=True)):
+        uv = island.uv * MIRROR if mirrored else island.uv
+        if np.isnan(uv).any():
+            islands.append(IslandState(island))
+            continue
+        found = certify(island.F, uv)
+        result = MapResult(uv=uv, status=Status.INJECTIVE if found.injective else Status.STALLED, certificate=found)
+        pins = state.islands[k].pins if keep and k < len(state.islands) else ()
+        islands.append(fix_where_it_is(IslandState(island, mirrored, result, pins=pins)))
+    return replace(state, mesh=mesh, islands=tuple(islands), recipe=recipe, selected=_still(state, islands), drawn=None)
+
+
+def fix_where_it_is(one: IslandState) -> IslandState:
+    """Return an island whose boundary and pins are fixed at their positions in its map."""
+    assert one.result is not None
+    edge = np.unique(boundary_edges(one.island.F, len(one.island.vertices)))
+    fixed = np.union1d(edge, np.array(one.pins, dtype=np.int64))
+    return replace(one, fixed=fixed, target=one.result.uv[fixed])
+
+
+def _still(state: SessionState, islands: Sequence[IslandState]) -> tuple[int, ...]:
+    """Return the selection if the islands are still the same; otherwise all of them."""
+    return state.selected if len(islands) == len(state.islands) else tuple(range(len(islands)))
+
+
+def _list_fixed(state: SessionState, only: Sequence[int] | None) -> list[int] | None:
+    """Return the fixed vertices of the selected islands, in the surface's numbering; None if these are the boundary."""
+    chosen = state.islands if only is None else [state.islands[k] for k in only]
+    if not any(one.pins for one in chosen):
+        return None
+    rows = [
+        one.island.vertices[np.union1d(boundary_edges(one.island.F, len(one.island.vertices)), np.array(one.pins, int))]
+        for one in chosen
+    ]
+    return np.unique(np.concatenate(rows)).tolist()
+
+
+def _polygons(state: SessionState, source: Source) -> Any:
+    return state.sheet.mesh.polygons if source.start is None else None
+
+
+def _cut_lines(source: Source, state: SessionState) -> list[str]:
+    """Return the lines that cut a surface as ``--cut`` does."""
+    if _polygons(state, source) is None:
+        return [
+            f"mesh = atlas.SeamedMesh({source.name!r})",
+            "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))",
+        ]
+    return [
+        f"model = io.read_mesh({source.name!r})",
+        "mesh, inside = atlas.SeamedMesh(model), model.polygons.diagonals(model.F)",
+        "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams, forbidden_edges=inside))",
+    ]
+
+
+def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> SessionState:
+    """Flatten the whole surface, cut along the seams that the user drew, and where this is not enough."""
+    surface = state.sheet.surface
+    source = Source(state.sheet.name, None) if state.sheet.is_file else make_start(SeamedMesh(surface.V, surface.F))
+    polygons = _polygons(state, source)
+    mesh = cut_along(SeamedMesh(surface.V, surface.F), drawn, polygons=polygons)
+    cut = not all(is_flattenable(island) for island in mesh.islands)
+    if cut:
+        mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
+    mapped = atlas.flatten(mesh, callback=callback)
+    words = ["flatten", source.command, "--seams", SEAMS, *recipes.option_words(cut=cut)]
+    lines = [
+        f"mesh = atlas.SeamedMesh({source.name!r})",
+        f"seams = np.loadtxt({SEAMS!r}, dtype=int).reshape(-1, 2)",
+        "mesh = atlas.SeamedMesh(mesh.V, mesh.F).cut(seams)",
+        *(["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"] if cut else []),
+        "result = atlas.flatten(mesh)",
+        "mesh = result.mesh",
+    ]
+    texts = {SEAMS: "".join(f"{a} {b}\n" for a, b in drawn.tolist()).encode()}
+    python = recipes.write_script(lines, names=["atlas", *(["find_cuts"] if cut else [])])
+    recipe = Recipe(recipes.write_command(words, "flat.obj", source), python, source.start, texts)
+    return replace(rebuild(state, mapped, recipe), from_file=False, selected=tuple(range(len(mapped.islands))))
+
+
+def require_map(state: SessionState) -> None:
+    """Raise RequestError unless the selected islands have maps."""
+    if any(state.islands[k].result is None for k in state.selected):
+        raise RequestError("there is no map yet: press Unwrap or Flatten first")
+
+
+def fixed_positions(one: IslandState, target: FloatArray, uv: FloatArray | None) -> FloatArray:
+    """Return positions (m, 2) of an island with its fixed vertices at a target; ``uv`` are those of the others."""
+    assert one.result is not None
+    assert one.fixed is not None
+    positions = (one.result.uv if uv is None else uv).copy()
+    positions[one.fixed] = target
+    return positions * one.sign

@@ -1,0 +1,104 @@
+"""Seams of a map, in chains with one colour on both sides; and seams that a user draws."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
+from quasiharmonic.ui.studio.session.state import SessionState
+from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+
+class SeamSides(NamedTuple):
+    """Sides of seams, by vertices of the page."""
+
+    edges: IntArray  # (k, 2): every seam edge twice, once for each side
+    chains: IntArray  # (k,): the chain of each, the same on both sides; a chain ends where seams meet
+
+
+def find_seam_sides(state: SessionState) -> SeamSides:
+    """Return the sides of all seams of a state: edges at which triangles meet on the surface but not in the map."""
+    numbering = state.numbering
+    F = numbering.F
+    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
+    n = int(F.max()) + 1
+    key = edge_keys(tail, head, n)
+    _, first, times = np.unique(key, return_index=True, return_counts=True)
+    rim = first[times == 1]
+    tail, head = tail[rim], head[rim]
+    model = np.sort(np.stack([numbering.origin[tail], numbering.origin[head]], axis=1), axis=1)
+    _, of, count = np.unique(model, axis=0, return_inverse=True, return_counts=True)
+    seam = count[of.ravel()] > 1
+    pairs, which = np.unique(model[seam], axis=0, return_inverse=True)
+    return SeamSides(np.stack([tail[seam], head[seam]], axis=1), _label_chains(pairs)[which.ravel()])
+
+
+def find_seams(state: SessionState) -> IntArray:
+    """Return the edges (k, 2) of the surface that the seams use, or those that the user drew."""
+    return state.mesh.seams if state.drawn is None else state.drawn
+
+
+def sides_of(state: SessionState, pairs: IntArray) -> SeamSides:
+    """Return edges (k, 2) of the surface by vertices of the page, every copy of them."""
+    numbering = state.numbering
+    tail, head = numbering.F.ravel(), numbering.F[:, (1, 2, 0)].ravel()
+    n = len(state.mesh.V)
+    key = edge_keys(numbering.origin[tail], numbering.origin[head], n)
+    wanted = edge_keys(pairs[:, 0], pairs[:, 1], n)
+    order = np.argsort(wanted, kind="stable")
+    at = np.flatnonzero(np.isin(key, wanted))
+    row = order[np.searchsorted(wanted[order], key[at])]
+    return SeamSides(np.stack([tail[at], head[at]], axis=1), _label_chains(pairs)[row])
+
+
+def _label_chains(pairs: IntArray) -> IntArray:
+    """Return the chain (k,) of each edge: edges are joined at vertices where exactly two of them meet."""
+    if not len(pairs):
+        return np.empty(0, dtype=np.int64)
+    ends = pairs.ravel()
+    edge = np.repeat(np.arange(len(pairs)), 2)
+    order = np.argsort(ends, kind="stable")
+    _, first, times = np.unique(ends[order], return_index=True, return_counts=True)
+    joints = first[times == 2]
+    labels = label_components(edge[order[joints]], edge[order[joints + 1]], len(pairs))
+    return np.unique(labels, return_inverse=True)[1]
+
+
+def shortest_path(V: FloatArray, F: IntArray, start: int, end: int) -> IntArray:
+    """Return the edges (k, 2) of the shortest path along edges between two vertices.
+
+    RequestError if no path joins them.
+    """
+    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
+    low, high = np.minimum(tail, head), np.maximum(tail, head)
+    _, once = np.unique(edge_keys(low, high, len(V)), return_index=True)
+    low, high = low[once], high[once]
+    lengths = np.maximum(np.linalg.norm(V[high] - V[low], axis=1), np.finfo(np.float64).tiny)
+    graph = csr_array((lengths, (low, high)), shape=(len(V), len(V)))
+    _, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
+    path = [end]
+    while path[-1] != start:
+        if before[path[-1]] < 0:
+            raise RequestError("no edges join these two vertices, which are on different parts of the model")
+        path.append(int(before[path[-1]]))
+    return np.stack([path[:-1], path[1:]], axis=1).astype(np.int64)
+
+
+def add_edges(seams: IntArray, more: IntArray) -> IntArray:
+    """Return seams with further edges, ascending."""
+    return np.unique(np.sort(np.concatenate([seams, more.reshape(-1, 2)]), axis=1), axis=0)
+
+
+def erase_chain(seams: IntArray, V: FloatArray, vertex: int) -> IntArray:
+    """Return seams without the chain that is nearest to a vertex; RequestError if there are none."""
+    if not len(seams):
+        raise RequestError("there are no seams to erase")
+    middle = (V[seams[:, 0]] + V[seams[:, 1]]) / 2
+    nearest = int(np.argmin(((middle - V[vertex]) ** 2).sum(axis=1)))
+    chains = _label_chains(seams)
+    return seams[chains != chains[nearest]]

@@ -1,0 +1,82 @@
+"""Unwrap the model of a page with `unwrap`, and the seams that are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from quasiharmonic.apps.unwrapping.model_files import polygon_costs
+from quasiharmonic.apps.unwrapping.result import UnwrapStep
+from quasiharmonic.apps.unwrapping.unwrap import unwrap
+from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.ui.studio.session import recipes
+from quasiharmonic.ui.studio.session.operations import as_it_is, make_start
+from quasiharmonic.ui.studio.session.recipes import Code, Recipe, Source
+from quasiharmonic.ui.studio.session.state import SessionState
+
+
+@dataclass(frozen=True)
+class UnwrapOptions:
+    """Options of `unwrap` that the page offers."""
+
+    max_stretch: float = 1.5
+    resolution: int = 2048
+    padding: float = 4.0
+    keep_seams: bool = False
+
+
+def unwrap_model(
+    state: SessionState, options: UnwrapOptions, callback: Callable[[UnwrapStep], object] | None = None
+) -> SessionState:
+    """Unwrap the whole model; with ``keep_seams``, or after seams were drawn, along the current seams at least."""
+    sheet = state.sheet
+    kept: SeamedMesh | None = None
+    if state.drawn is not None:
+        kept = _with_any_positions(SeamedMesh(sheet.surface.V, sheet.surface.F).cut(state.drawn))
+    elif options.keep_seams and state.mapped:
+        kept = state.mesh
+    if kept is None and not sheet.turned:
+        source, V, F = Source(sheet.name, None), sheet.mesh.V, sheet.mesh.F
+        costs = polygon_costs(sheet.mesh)
+    else:
+        bare = SeamedMesh(sheet.surface.V, sheet.surface.F)
+        source, V, F, costs = make_start(bare if kept is None else kept), sheet.surface.V, sheet.surface.F, None
+    uv = None if kept is None or kept.uv is None else kept.uv[kept.FT]
+    size = {"max_stretch": options.max_stretch, "resolution": options.resolution, "padding": options.padding}
+    result = unwrap(
+        V,
+        F,
+        max_stretch=options.max_stretch,
+        resolution=options.resolution,
+        padding=options.padding,
+        edge_costs=costs,
+        uv=uv,
+        callback=callback,
+    )
+    FT = sheet.from_file(result.indices) if source.start is None else result.indices
+    words = ["unwrap", source.command, *recipes.option_words(**size, keep_seams=uv is not None)]
+    more = recipes.arguments(
+        **size,
+        edge_costs=None if costs is None else Code("polygon_costs(model)"),
+        uv=None if uv is None else Code("model.vt[model.FT]"),
+    )
+    lines = [
+        f"model = io.read_mesh({source.name!r})",
+        f"result = unwrap(model.V, model.F{more})",
+        "mesh = atlas.SeamedMesh(model.V, model.F, result.indices, result.uvs)",
+    ]
+    module = "from quasiharmonic.apps.unwrapping.model_files import polygon_costs"
+    python = recipes.write_script(lines, names=["atlas", "io", "unwrap"], modules=[] if costs is None else [module])
+    recipe = Recipe(recipes.write_command(words, "unwrapped.obj", source), python, source.start)
+    mesh = SeamedMesh(sheet.surface.V, sheet.surface.F, FT, result.uvs)
+    after = as_it_is(state, mesh, recipe)
+    return replace(after, from_file=False, selected=tuple(range(len(after.islands))))
+
+
+def _with_any_positions(mesh: SeamedMesh) -> SeamedMesh:
+    """Return a cut mesh with a separate position for each of its rows, so that a file keeps the seams."""
+    rows = int(mesh.FT.max()) + 1
+    number = np.arange(rows)
+    return SeamedMesh(mesh.V, mesh.F, mesh.FT, np.stack([number % 1024, number // 1024], axis=1).astype(np.float64))
