@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
-import io as text_io
 import tracemalloc
 
 import numpy as np
@@ -15,12 +13,13 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.certification import is_injective
 from quasiharmonic.solver.mapping import quasi_harmonic_map
 from quasiharmonic.surfaces import annulus, cat, grid, starfish
-from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
 from quasiharmonic.ui.studio.session.drag import Follower
 from quasiharmonic.ui.studio.session.falloff import drag_weights
 from quasiharmonic.ui.studio.session.outlines import make_outline, make_polygon, read_drawing
+from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.setup import make_first_state
+from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import MAX_TRIANGLES, make_sheet
 from shared.pages import Visitor
 
@@ -181,73 +180,18 @@ def boundary(V, F):
     return loop
 
 
-def made_again(one, folder, monkeypatch):
-    """Return the maps that the page's command and Python code make of the files that it saves."""
-    for name, content in one.files().items():
-        (folder / name).write_bytes(content)
-    sheet = one.session.state.recipe.sheet
-    if not (folder / sheet.name).exists():
-        io.write_obj(folder / sheet.name, sheet.mesh.with_map(sheet.mesh.V[:, :2]))
-    monkeypatch.chdir(folder)
-    shown = one.last("map").header
-    words = shown["command"].split()
-    with contextlib.redirect_stdout(text_io.StringIO()):
-        assert main(words[1:]) == 0
-        names = {}
-        exec(shown["python"], names)
-    return io.map_of(io.read_mesh(words[-1])), names["result"].uv
-
-
-@pytest.mark.parametrize(
-    "deed",
-    [
-        lambda one: one.does("outline", to="letter:L"),
-        lambda one: None,
-        lambda one: one.does("corner", vertex=300),
-        lambda one: one.does("corners"),
-        lambda one: one.does("drawing", {"content": np.frombuffer(SVG, np.uint8)}, name="an l.svg"),
-        lambda one: one.does("polygon", {"points": np.array([[0, 0], [2, 0], [2, 1], [1, 0.4], [0, 1.0]]).ravel()}),
-        lambda one: one.does("polish", energy="symmetric-dirichlet", slide=False),
-        lambda one: one.does("polish", energy="mips", slide=True),
-        lambda one: one.does("flatten"),
-    ],
-    ids=["letter", "as it is", "corner", "by angle", "svg", "polygon", "polish", "slide", "flatten"],
-)
-def test_the_command_and_the_python_code_make_the_same_map(deed, tmp_path, monkeypatch):
-    one = Visitor(*cat(8))
-    deed(one)
-    shown = one.last("map").header
-    assert shown["injective"]
-    assert shown["anew"]
-    uv = one.session.state.result.uv
-    by_command, by_python = made_again(one, tmp_path, monkeypatch)
-    assert np.allclose(by_command, uv, atol=1e-12)
-    assert np.allclose(by_python, uv, atol=1e-12)
-
-
-def test_dragged_vertices_are_reproduced(tmp_path, monkeypatch):
-    one = Visitor(*cat(8))
-    one.does("pin", vertex=3)
-    one.drags(one.session.state.corners[2], (1.1, 0.8))
-    by_command, by_python = made_again(one, tmp_path, monkeypatch)
-    uv = one.session.state.result.uv
-    assert np.allclose(by_command, uv, atol=1e-9)
-    assert np.allclose(by_python, uv, atol=1e-9)
-
-
 def test_holes_closed_surfaces_and_planes_are_accepted():
     ring = Visitor(*annulus(8))
     assert ring.last("map").header["bijective"]
     assert ring.last("surface").header["loops"] == [32, 16]
     ring.does("outline", to="ring:0.5")
     assert ring.last("map").header["bijective"]
-    assert ring.session.state.recipe.outline.to == "ring:0.5"
-    star = make_sheet(io.MeshData(*starfish(3, 8), source="star.obj"), "star.obj")
-    assert star.flags == ("--cut",)
-    assert len(star.island.F) == 12 * 64
-    first = make_first_state(star)
-    assert first.result.certificate.bijective
-    assert first.recipe.command() == "qhm flatten star.obj --cut -o flat.obj"
+    assert ring.session.state.active.outline.to == "ring:0.5"
+    star = make_first_state(make_sheet(io.MeshData(*starfish(3, 8), source="star.obj"), "star.obj"))
+    assert len(star.islands) == 1
+    assert len(star.active.island.F) == 12 * 64
+    assert star.result.certificate.bijective
+    assert star.recipe.command == "qhm flatten star.obj --cut -o flat.obj"
 
 
 @pytest.mark.parametrize(
@@ -271,15 +215,151 @@ def test_invalid_meshes_are_rejected_with_a_message_about_the_users_file(name, c
     assert visitor.session.state is before
 
 
-def test_too_many_triangles_and_pieces_are_rejected():
+def test_too_many_triangles_are_rejected():
     V, F = grid(4, 4)
     many = np.broadcast_to(F[:1], (MAX_TRIANGLES + 1, 3))
     with pytest.raises(ValueError, match=r"1,000,001 triangles, but the page shows at most 1,000,000"):
         make_sheet(io.MeshData(V, many, source="big.obj"), "big.obj")
-    with pytest.raises(ValueError, match="2 connected parts"):
-        make_sheet(
-            io.MeshData(np.concatenate([V, V + 2]), np.concatenate([F, F + len(V)]), source="two.obj"), "two.obj"
-        )
+
+
+def test_several_parts_are_shown_together_and_changed_one_by_one():
+    (V, F), (W, G) = cat(6), cat(5)
+    one = Visitor(np.concatenate([V, W + 3]), np.concatenate([F, G + len(V)]))
+    surface, shown = one.last("surface"), one.last("map").header
+    assert surface.header["triangles"] == len(F) + len(G)
+    assert surface.header["first_triangles"] == [0, len(F)]
+    assert shown["count"] == 2
+    assert shown["bijective"]
+    before = one.session.state.uv
+    one.does("select", islands=[1])
+    assert one.last("map").header["selected"] == [1]
+    one.does("outline", to="rect:1x1")
+    after = one.session.state.uv
+    assert np.array_equal(before[: len(V)], after[: len(V)])
+    assert not np.array_equal(before[len(V) :], after[len(V) :])
+    assert "--islands 1" in one.last("map").header["command"]
+    # A drag sends the positions of its island alone.
+    corner = one.session.state.corners[0]
+    moved = one.drags(corner, (after[corner] + 0.01).tolist())[0]
+    assert moved.header["start"] == len(V)
+    assert len(moved.arrays["places"]) == len(W)
+    one.does("pack")
+    assert one.last("map").header["overlapping"] == 0
+    assert one.last("map").header["bijective"]
+    assert 0.3 < one.last("map").header["used"] < 1
+
+
+def test_overlapping_islands_are_reported():
+    (V, F), (W, G) = cat(6), cat(5)
+    one = Visitor(np.concatenate([V, W + 3]), np.concatenate([F, G + len(V)]))
+    one.does("select", islands=[0])
+    one.does("outline", to="disk")
+    one.does("select", islands=[1])
+    one.does("outline", to="disk")
+    shown = one.last("map").header
+    assert (shown["injective"], shown["bijective"], shown["overlapping"]) == (True, False, 1)
+    assert "1 pair overlaps" in shown["verdict"]
+
+
+def test_seams_have_one_number_on_both_sides():
+    one = Visitor(*starfish(3, 8))
+    seams = one.last("seams")
+    edges, chain = seams.arrays["edges"], seams.arrays["chain"]
+    origin = one.session.state.numbering.origin
+    pairs = np.sort(origin[edges], axis=1)
+    found, times = np.unique(pairs, axis=0, return_counts=True)
+    assert np.array_equal(found, one.session.state.mesh.seams)
+    assert (times == 2).all()
+    for pair in found:
+        assert len(set(chain[(pairs == pair).all(axis=1)].tolist())) == 1
+    assert seams.header["chains"] > 1
+
+
+def test_seams_are_drawn_along_the_shortest_path_and_erased():
+    one = Visitor(*cat(8))
+    V = one.session.state.numbering.V
+    start, end = int(np.argmin(V[:, 0])), int(np.argmax(V[:, 0]))
+    one.does("seam", start=start, vertex=end)
+    drawn = one.session.state.drawn
+    length = np.linalg.norm(V[drawn[:, 0]] - V[drawn[:, 1]], axis=1).sum()
+    assert np.linalg.norm(V[start] - V[end]) <= length < 1.5 * np.linalg.norm(V[start] - V[end])
+    assert one.last("map").header["drawn"]
+    (note,) = [frame for frame in one.does("polish", energy="mips", slide=False) if frame.header["kind"] == "note"]
+    assert "press Unwrap or Flatten" in note.header["text"]
+    one.does("flatten")
+    assert one.last("map").header["count"] == 2
+    assert one.last("map").header["bijective"]
+    one.does("erase", vertex=start)
+    one.does("flatten")
+    assert one.last("map").header["count"] == 1
+
+
+def test_a_model_that_is_inside_out_is_recognised_and_turned():
+    V, F = starfish(3, 8)
+    one = Visitor(V, F[:, ::-1])
+    shown = one.last("map").header
+    assert (shown["inward"], shown["injective"]) == (1, True)
+    one.does("turn")
+    shown = one.last("map").header
+    assert (shown["inward"], shown["turned"], shown["bijective"]) == (0, True, True)
+    one.does("undo")
+    assert one.last("map").header["inward"] == 1
+
+
+def test_an_image_is_shown_and_saved_with_the_map(tmp_path):
+    one = Visitor(*cat(6))
+    (note,) = one.does("image", {"content": np.frombuffer(b"no image", np.uint8)})
+    assert "PNG or JPEG" in note.header["text"]
+    picture = io.checkerboard().data
+    (shown,) = one.does("image", {"content": np.frombuffer(picture, np.uint8)})
+    assert (shown.header["kind"], shown.header["type"]) == ("image", "image/png")
+    for form in ("glb", "obj"):
+        for frame in one.does("save", format=form):
+            if frame.header["kind"] == "file":
+                (tmp_path / frame.header["name"]).write_bytes(frame.arrays["content"].tobytes())
+    for name in ("map.glb", "map.obj"):
+        assert io.own_texture(io.read_mesh(tmp_path / name)).data == picture
+    # The model's own image is shown when it is opened.
+    assert Visitor(tmp_path / "map.glb").last("image").arrays["content"].tobytes() == picture
+
+
+def test_a_stored_session_continues_with_its_history(tmp_path):
+    one = Visitor(*cat(6), storage=Storage(tmp_path / "session"))
+    one.does("outline", to="disk")
+    one.drags(int(one.session.state.islands[0].loops[0][0]), (0.1, 0.1))
+    one.does("image", {"content": np.frombuffer(io.checkerboard().data, np.uint8)})
+    one.does("undo")
+    again = Visitor(storage=Storage(tmp_path / "session"), restore=True)
+    shown, before = again.last("map"), one.last("map")
+    assert np.array_equal(shown.arrays["places"], before.arrays["places"])
+    for name in ("command", "undo", "redo", "unsaved", "outline"):
+        assert shown.header[name] == before.header[name]
+    assert again.last("image").header["type"] == "image/png"
+    again.does("redo")
+    one.does("redo")
+    assert np.array_equal(again.last("map").arrays["places"], one.last("map").arrays["places"])
+    again.does("undo")
+    again.does("undo")
+    assert again.last("map").header["outline"] == "rect:1x1"
+    assert not again.last("map").header["undo"]
+    assert not again.last("map").header["unsaved"]
+
+
+def test_a_damaged_store_is_ignored(tmp_path):
+    one = Visitor(*cat(6), storage=Storage(tmp_path))
+    assert one.last("map").header["injective"]
+    (tmp_path / "index").write_bytes(b"damaged")
+    assert not Session(lambda header, arrays: None, storage=Storage(tmp_path)).restore()
+
+
+def test_only_unsaved_changes_are_reported():
+    one = Visitor(*cat(6))
+    assert not one.last("map").header["unsaved"]
+    one.does("outline", to="disk")
+    assert one.last("map").header["unsaved"]
+    one.does("save")
+    one.does("stop")
+    assert not one.last("map").header["unsaved"]
 
 
 @pytest.mark.parametrize(

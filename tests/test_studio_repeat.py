@@ -104,7 +104,10 @@ STEPS = {
     "pinned flat": lambda one: [pin(one), one.does("flatten")],
     "pinned polish": lambda one: [pin(one), one.does("polish", energy="blend", slide=False)],
     "one of two": lambda one: [one.does("select", islands=[1]), one.does("flatten")],
-    "one of two polished": lambda one: [one.does("select", islands=[0]), one.does("polish", energy="mips", slide=False)],
+    "one of two polished": lambda one: [
+        one.does("select", islands=[0]),
+        one.does("polish", energy="mips", slide=False),
+    ],
     "one of two to a disk": lambda one: [one.does("select", islands=[0]), one.does("outline", to="disk")],
     "both to squares": lambda one: [one.does("select", islands=[]), one.does("outline", to="rect:1x1")],
     "seams drawn, flat": lambda one: [draw(one), one.does("flatten")],

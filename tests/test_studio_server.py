@@ -259,7 +259,7 @@ class Stuck:
     ends: asyncio.Event
 
     @classmethod
-    async def start(cls, source, tell):
+    async def start(cls, source, tell, folder):
         cls.started += 1
         await cls.begins.wait()
         return cls()
@@ -315,7 +315,7 @@ def test_pages_opened_at_once_count_like_pages_opened_one_by_one(stuck):
 
 
 def test_a_page_whose_process_cannot_start_gets_the_reason(running, monkeypatch, capfd):
-    def start(source, tell):
+    def start(source, tell, folder):
         raise OSError(11, "no more processes")
 
     monkeypatch.setattr(served.Page, "start", start)
@@ -449,3 +449,54 @@ def test_an_internal_error_of_the_server_is_logged(running, monkeypatch, caplog)
     while "a defect" not in caplog.text and time.monotonic() < until:
         time.sleep(0.01)
     assert "a defect" in caplog.text
+
+
+def test_a_session_continues_after_a_reload_and_after_a_crash(running):
+    name = "0123456789abcdef" * 2
+    with session_page(running, name) as page:
+        hear(page, "map", state="settled")
+        page.send(encode({"do": "outline", "to": "disk"}))
+        shown = hear(page, "map", state="settled")
+        hear(page, "obstructions")
+        page.send(encode({"do": "stop"}))
+        hear(page, "obstructions")
+    with session_page(running, name) as page:
+        again = hear(page, "map", state="settled")
+        assert again.header["outline"] == "disk"
+        assert again.header["undo"]
+        assert np.array_equal(again.arrays["places"], shown.arrays["places"])
+        for pid in children():
+            os.kill(pid, signal.SIGKILL)
+        assert hear(page, "note").header["level"] == "gone"
+    with session_page(running, name) as page:
+        assert hear(page, "map", state="settled").header["outline"] == "disk"
+        page.send(encode({"do": "undo"}))
+        assert hear(page, "map", state="settled").header["outline"] == "rect:1x1"
+    nobody_is_left()
+
+
+def test_a_session_opened_elsewhere_ends_here(running):
+    name = "f" * 32
+    with session_page(running, name) as one:
+        hear(one, "map", state="settled")
+        with session_page(running, name) as other:
+            hear(other, "map", state="settled")
+            with pytest.raises(ConnectionClosed) as closed:
+                hear(one, "never")
+            assert closed.value.rcvd.code == served.ELSEWHERE
+
+
+@pytest.mark.parametrize("name", ["../../etc", "A" * 32, "0" * 31, "0" * 64, "%2e%2e"])
+def test_names_of_sessions_are_not_paths(running, name):
+    with session_page(running, name) as page:
+        assert hear(page, "map", state="settled").header["injective"]
+    assert not running.studio._session_of(
+        type("Socket", (), {"request": type("R", (), {"path": f"/x?session={name}"})})
+    )
+
+
+def session_page(running, name):
+    """Open a socket with the name of a session, as a page does after a reload."""
+    at = f"127.0.0.1:{running.studio.port}"
+    address = f"ws://{at}/{running.studio.token}/socket?session={name}"
+    return connect(address, compression=None, origin=f"http://{at}", max_size=None)

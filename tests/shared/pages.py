@@ -21,9 +21,12 @@ class Visitor:
     Its model is a file, or an array of positions and one of triangles.
     """
 
-    def __init__(self, V=None, F=None, name="surface.obj", waiting=lambda: False):
+    def __init__(self, V=None, F=None, name="surface.obj", waiting=lambda: False, storage=None, restore=False):
         self.frames: list[Frame] = []
-        self.session = Session(self._hear, waiting)
+        self.session = Session(self._hear, waiting, storage)
+        if restore:
+            assert self.session.restore()
+            return
         if isinstance(V, Path):
             self.session.open(read_sheet(V))
             return

@@ -10,7 +10,7 @@ from contextlib import suppress
 from quasiharmonic.ui.batch.supervisor import resident
 
 # Code of the worker process; -P prevents imports from the working directory.
-_CODE = "import sys; from quasiharmonic.ui.studio.server.page_worker import serve; serve(sys.argv[1])"
+_CODE = "import sys; from quasiharmonic.ui.studio.server.page_worker import serve; serve(*sys.argv[1:])"
 #: Memory limit of one page, bytes.
 MAX_MEMORY = 6 << 30
 # Seconds between two checks, and seconds until a process must react to "stop".
@@ -29,14 +29,18 @@ class Page:
         self._reason = ""
 
     @classmethod
-    async def start(cls, source: str, tell: Callable[[bytes], Awaitable[None]]) -> Page:
-        """Start a process for a page that opens ``source``, or a built-in surface if it is empty."""
+    async def start(cls, source: str, tell: Callable[[bytes], Awaitable[None]], folder: str = "") -> Page:
+        """Start a process for a page that opens ``source``, or a built-in surface if it is empty.
+
+        The process stores its session in ``folder``, and continues the one that is there.
+        """
         process = await asyncio.create_subprocess_exec(
             sys.executable,
             "-P",
             "-c",
             _CODE,
             source,
+            folder,
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             limit=1 << 20,

@@ -9,9 +9,12 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
+import re
 import secrets
+import tempfile
 from collections.abc import Callable
 from http import HTTPStatus
+from pathlib import Path
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
@@ -27,6 +30,10 @@ HOST = "127.0.0.1"
 MAX_BYTES = 128 << 20
 #: Maximum number of open pages.
 MAX_PAGES = 8
+#: Close code of a socket whose session was opened in another tab.
+ELSEWHERE = 4001
+# Name of a session, which a page chooses at random; it is the name of a folder.
+_SESSION = re.compile(r"[0-9a-f]{32}")
 #: Close code of a socket if too many pages are open.
 TRY_LATER = 1013
 # Load nothing from other sites, forbid framing, and never send the address with its token as a referrer.
@@ -51,6 +58,8 @@ class Studio:
         self.token = secrets.token_urlsafe(24) if token is None else token
         self.port = 0
         self._pages: set[Page] = set()
+        self._sessions: dict[str, tuple[ServerConnection, Page]] = {}
+        self._folder = ""
         self._open = 0
 
     @property
@@ -73,6 +82,10 @@ class Studio:
         OSError
             If the port is in use.
         """
+        with tempfile.TemporaryDirectory(prefix="qhm-studio-", ignore_cleanup_errors=True) as self._folder:
+            await self._serve(port, ready)
+
+    async def _serve(self, port: int, ready: Callable[[str], object]) -> None:
         async with serve(
             self._page,
             HOST,
@@ -143,14 +156,18 @@ class Studio:
             await connection.send(message)
 
         await tell(encode({"kind": "hello", "most_bytes": MAX_BYTES}))
+        session = self._session_of(connection)
+        await self._take_over(session)
         try:
-            page = await Page.start(self.source, tell)
+            page = await Page.start(self.source, tell, str(Path(self._folder, session)) if session else "")
         except OSError as error:
             reason = f"no process can be started for this page: {error.strerror or error}"
             await tell(encode({"kind": "note", "level": "error", "text": reason}))
             await connection.close(TRY_LATER, reason[:100])
             return
         self._pages.add(page)
+        if session:
+            self._sessions[session] = connection, page
         listening = asyncio.ensure_future(self._listen(connection, page))
         try:
             why = await page.run()
@@ -160,6 +177,21 @@ class Studio:
             listening.cancel()
             await page.ended()
             self._pages.discard(page)
+            if self._sessions.get(session, (None, None))[1] is page:
+                del self._sessions[session]
+
+    def _session_of(self, connection: ServerConnection) -> str:
+        """Return the name of the session that a page asks for; empty if there is none."""
+        assert connection.request is not None
+        name = connection.request.path.partition("?session=")[2]
+        return name if _SESSION.fullmatch(name) else ""
+
+    async def _take_over(self, session: str) -> None:
+        """End the page that has a session, as after a reload or in another tab."""
+        if session in self._sessions:
+            connection, page = self._sessions.pop(session)
+            await connection.close(ELSEWHERE, "this session was opened in another tab")
+            await page.ended()
 
     async def _listen(self, connection: ServerConnection, page: Page) -> None:
         """Forward the messages of the page to its process."""

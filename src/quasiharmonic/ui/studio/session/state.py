@@ -165,7 +165,8 @@ def verdict(certificates: list[Certificate], overlapping: int) -> dict[str, Any]
         words = certificates[0].summary()
     else:
         words = f"{len(bijective)} islands: {sum(one.injective for one in certificates)} injective, {sum(bijective)} "
-        words += f"bijective. {'No two overlap.' if not overlapping else f'{overlapping} pairs overlap.'}"
+        pairs = f"{overlapping} {'pairs overlap' if overlapping > 1 else 'pair overlaps'}"
+        words += f"bijective. {pairs if overlapping else 'No two overlap'}."
     return {
         "injective": all(one.injective for one in certificates),
         "bijective": all(bijective) and not overlapping,
