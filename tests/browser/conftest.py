@@ -94,3 +94,8 @@ def settled():
 @pytest.fixture
 def serving():
     return served
+
+
+@pytest.fixture(scope="module")
+def serving_of_module(browser):
+    return served

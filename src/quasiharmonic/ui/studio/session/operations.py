@@ -152,7 +152,7 @@ def map_in_place(
         python = recipes.write_script(
             [f"result = atlas.polish({source.name!r}{more})", "mesh = result.mesh"], names=["atlas"]
         )
-    recipe = Recipe(command, python, source.start, texts, anew=anew)
+    recipe = Recipe(command, python, source.start, texts, anew=anew, dragged=start is not state.mesh)
     return rebuild(state, mapped, recipe, keep=True, corners=True)
 
 

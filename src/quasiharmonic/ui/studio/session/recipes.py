@@ -26,6 +26,7 @@ class Recipe:
     texts: dict[str, bytes] = field(default_factory=dict)  # Contents of further files that they read
     outline: str | None = None  # The outline of the boundary
     anew: bool = True  # Whether the map was solved from scratch
+    dragged: bool = False  # Whether the map ended a drag
 
     def files(self) -> list[str]:
         """Return the names of the saved files that command and script read."""

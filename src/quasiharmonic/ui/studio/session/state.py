@@ -141,6 +141,7 @@ class DistortionMonitor:
                 "energy": energy if np.isfinite(energy) else None,
                 "worst": worst if np.isfinite(worst) else None,
                 "used": _find_used_space(self._F, uv),
+                "packed": bool(uv.min() >= 0 and uv.max() <= 1),
             }
             self.scale = measured.scale if np.isfinite(measured.scale) else 1.0
             self._when = time.perf_counter()
@@ -208,7 +209,16 @@ def describe_obstructions(state: SessionState) -> list[dict[str, Any]]:
                     "triangles": (each.triangles + first).tolist()[:_MAX_ELEMENTS],
                 }
             )
+    if found and state.recipe.dragged:
+        return [_describe_drag(found)]
     return found[:_MAX_OBSTRUCTIONS]
+
+
+def _describe_drag(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what a drag did, in place of the obstructions that follow from it."""
+    crossing = any(one["edges"] and "crosses itself" in one["message"] for one in found)
+    what = "across itself, so it crosses itself" if crossing else "across the opposite side, so it is turned over"
+    return {**found[0], "message": f"The boundary was dragged {what}.", "advice": "Drag it back.", "undo": True}
 
 
 def _around(loops: list[Array]) -> list[list[int]]:

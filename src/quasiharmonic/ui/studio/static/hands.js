@@ -1,4 +1,4 @@
-// Pointer and keyboard input: rotate the surface, pan the map, drag vertices, pin, choose corners, draw.
+// Pointer and keyboard input: rotate the surface, pan the map, drag vertices, select, pin, choose corners, seams, draw.
 
 const GRIP = 14; // distance in CSS pixels within which a handle is grabbed
 const CLICK = 4; // maximum motion of a click in CSS pixels
@@ -19,7 +19,7 @@ export class Hands {
       this.#pane(
         element,
         "map",
-        "The map. N and P select a handle, arrow keys move it, with Shift in small steps. Without a handle, arrow keys move the map.",
+        "The map. N and B select a handle, arrow keys move it, with Shift in small steps. Without a handle, arrow keys move the map.",
       ),
     ];
   }
@@ -32,13 +32,20 @@ export class Hands {
     pane.setAttribute("aria-label", label);
     Object.assign(pane.style, { position: "absolute", touchAction: "none" });
     const listener = (kind) => (event) => this[`${name}${kind}`](event, this.#at(event, element));
+    const pinch = new Pinch((factor, dx, dy, middle) => this.#pinch(name, factor, dx, dy, middle));
     pane.addEventListener("pointerdown", (event) => {
       pane.setPointerCapture(event.pointerId);
-      listener("Down")(event);
+      if (pinch.down(event.pointerId, this.#at(event, element))) this.#cancel();
+      else listener("Down")(event);
     });
-    pane.addEventListener("pointermove", listener("Move"));
-    pane.addEventListener("pointerup", listener("Up"));
-    pane.addEventListener("pointercancel", listener("Up"));
+    pane.addEventListener("pointermove", (event) => {
+      if (!pinch.move(event.pointerId, this.#at(event, element))) listener("Move")(event);
+    });
+    for (const kind of ["pointerup", "pointercancel"]) {
+      pane.addEventListener(kind, (event) => {
+        if (!pinch.up(event.pointerId)) listener("Up")(event);
+      });
+    }
     pane.addEventListener("wheel", (event) => {
       event.preventDefault();
       listener("Wheel")(event);
@@ -50,6 +57,25 @@ export class Hands {
     pane.addEventListener("blur", () => this.#letGo());
     element.append(pane);
     return pane;
+  }
+
+  /** Zoom and shift a pane with two fingers. */
+  #pinch(name, factor, dx, dy, middle) {
+    if (name === "map") {
+      this.plane.zoomBy(factor, middle);
+      this.plane.shiftBy(dx, dy);
+      this.redraw("plane");
+    } else if (this.space()) {
+      this.space().zoomBy(factor);
+      this.space().shiftBy(dx, dy);
+      this.redraw("space");
+    }
+  }
+
+  /** End a drag with one finger when a second one comes. */
+  #cancel() {
+    this.from = this.last = null;
+    this.#letGo();
   }
 
   #at(event, element) {
@@ -92,9 +118,32 @@ export class Hands {
   surfaceUp(event, point) {
     const clicked = this.from && Math.hypot(point[0] - this.from[0], point[1] - this.from[1]) < CLICK;
     this.last = null;
-    if (!clicked || event.type !== "pointerup" || !this.send || !["pin", "corner"].includes(this.tool)) return;
-    const hit = this.space()?.pick(point, this.scene.triangles);
-    if (hit) this.send({ do: this.tool === "pin" && this.scene.pins.includes(hit.vertex) ? "unpin" : this.tool, vertex: hit.vertex });
+    if (!clicked || event.type !== "pointerup" || !this.send) return;
+    const { scene, tool } = this;
+    const hit = this.space()?.pick(point, scene.triangles);
+    if (!hit) return;
+    if (tool === "pin") this.send({ do: scene.pins.includes(hit.vertex) ? "unpin" : "pin", vertex: hit.vertex });
+    else if (tool === "corner" || tool === "erase") this.send({ do: tool, vertex: hit.vertex });
+    else if (tool === "seam") this.#seamTo(hit.vertex);
+    else if (tool === "move") this.#select(scene.islandOfTriangle(hit.triangle), event.shiftKey);
+  }
+
+  /** Start a seam at a vertex, or continue it to there. */
+  #seamTo(vertex) {
+    const { scene } = this;
+    if (scene.seamStart >= 0 && scene.seamStart !== vertex) this.send({ do: "seam", start: scene.seamStart, vertex });
+    scene.seamStart = vertex;
+    this.redraw();
+  }
+
+  /** Select an island; with `more` add it to the selection, or remove it. */
+  #select(island, more) {
+    const { selected, starts } = this.scene;
+    if (starts.length < 2 || island < 0) return;
+    const chosen = new Set(more ? selected : []);
+    if (more && chosen.has(island)) chosen.delete(island);
+    else chosen.add(island);
+    this.send({ do: "select", islands: [...chosen].sort((a, b) => a - b) });
   }
 
   surfaceWheel(event) {
@@ -110,6 +159,7 @@ export class Hands {
     else if (event.key === "+" || event.key === "=") space.zoomBy(1.15);
     else if (event.key === "-") space.zoomBy(1 / 1.15);
     else if (event.key === "0") space.reset();
+    else if (event.key === "Escape") this.scene.seamStart = -1;
     else return false;
     this.redraw();
     return true;
@@ -158,7 +208,17 @@ export class Hands {
     const clicked = this.from && Math.hypot(point[0] - this.from[0], point[1] - this.from[1]) < CLICK;
     this.from = this.last = null;
     if (this.held >= 0) this.#letGo();
-    else if (clicked && this.tool === "draw" && event.type === "pointerup") this.#drawTo(point);
+    else if (clicked && event.type === "pointerup" && this.scene.places && this.send) {
+      if (this.tool === "draw") this.#drawTo(point);
+      else this.#select(this.#islandAt(point), event.shiftKey);
+    }
+  }
+
+  /** Return the island at a point of the map, or -1. */
+  #islandAt(point) {
+    const { scene, plane } = this;
+    const triangle = plane.pick(point, scene.places, scene.triangles);
+    return triangle < 0 ? -1 : scene.islandOfTriangle(triangle);
   }
 
   mapWheel(event, point) {
@@ -168,8 +228,9 @@ export class Hands {
 
   mapKey(event) {
     const { scene, plane } = this;
+    if (!scene.places) return false;
     const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
-    if (event.key === "n" || event.key === "p") this.#choose(event.key === "n" ? 1 : -1);
+    if (event.key === "n" || event.key === "b") this.#choose(event.key === "n" ? 1 : -1);
     else if (event.key === "Escape") [scene.chosen, scene.sketch] = [-1, []];
     else if (event.key === "Enter" && scene.sketch.length) this.closeSketch();
     else if (event.key === "Delete" && scene.pins.includes(scene.chosen)) this.send?.({ do: "unpin", vertex: scene.chosen });
@@ -266,5 +327,46 @@ export class Hands {
       this.send?.({ do: "polygon" }, { points });
     }
     this.redraw();
+  }
+}
+
+/** Two fingers on a pane: calls `changed(factor, dx, dy, middle)` when they move. */
+class Pinch {
+  constructor(changed) {
+    this.changed = changed;
+    this.fingers = new Map();
+  }
+
+  /** Return whether two fingers are down now. */
+  down(id, point) {
+    this.fingers.set(id, point);
+    return this.fingers.size === 2;
+  }
+
+  move(id, point) {
+    if (!this.fingers.has(id)) return false;
+    if (this.fingers.size !== 2) {
+      this.fingers.set(id, point);
+      return false;
+    }
+    const before = this.#pair();
+    this.fingers.set(id, point);
+    const after = this.#pair();
+    if (before.length > 0) {
+      this.changed(after.length / before.length, after.middle[0] - before.middle[0], after.middle[1] - before.middle[1], after.middle);
+    }
+    return true;
+  }
+
+  /** Return whether two fingers were down. */
+  up(id) {
+    const two = this.fingers.size === 2;
+    this.fingers.delete(id);
+    return two;
+  }
+
+  #pair() {
+    const [a, b] = [...this.fingers.values()];
+    return { middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], length: Math.hypot(a[0] - b[0], a[1] - b[1]) };
   }
 }

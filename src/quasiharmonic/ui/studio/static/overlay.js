@@ -1,4 +1,6 @@
-// Overlay of the panes: the outline, handles, obstructions, and the polygon being drawn.
+// Overlay of the panes: outline, handles, obstructions, and the polygon being drawn.
+
+import { drawScale } from "./grid.js";
 
 export const INK = "#0f1f4a";
 export const RED = "#c01030";
@@ -7,26 +9,37 @@ const PIN = "#7a1fa2";
 const PAPER = "#ffffff";
 // Maximum number of rings around triangles that are too small to see; more would hide the picture.
 const MAX_RINGS = 200;
+// Maximum number of tests of a handle against a triangle while the surface moves.
+const MAX_TESTS = 3e6;
 
-/** Draw on a 2D canvas whose unit is the CSS pixel. `scene` is the scene of `createView`. */
-export function drawOverlay(context, scene, space, plane) {
-  const { width, height } = scene.size;
-  context.clearRect(0, 0, width, height);
-  if (!scene.places) return;
+/**
+ * Draw on a 2D canvas whose unit is the CSS pixel. `scene` is the scene of `createView`; `style` has the colours of the
+ * page; `moving` says that a picture must be quick.
+ */
+export function drawOverlay(context, scene, space, plane, { moving = false, style }) {
+  const ink = style.getPropertyValue("--ink").trim() || INK;
   context.lineJoin = "round";
-  context.save();
-  clip(context, plane.box);
-  outline(context, scene, plane);
-  badTriangles(context, scene, plane);
-  obstructions(context, scene, (v) => plane.pointOf(...scene.placeOf(v)));
-  handles(context, scene, (v) => plane.pointOf(...scene.placeOf(v)), { numbered: true });
-  if (scene.sketch.length) sketch(context, scene, plane);
-  context.restore();
+  if (scene.places) {
+    context.save();
+    clip(context, plane.box);
+    outline(context, scene, plane, style);
+    badTriangles(context, scene, plane);
+    const point = (v) => plane.pointOf(...scene.placeOf(v));
+    obstructions(context, scene, point);
+    handles(context, scene, point, { numbered: true });
+    if (scene.sketch.length) sketch(context, scene, plane);
+    drawScale(context, plane.box, plane.pixels, ink);
+    context.restore();
+  }
   context.save();
   clip(context, space.box);
   obstructions(context, scene, (v) => space.project(v));
-  const faint = (v) => (space.looksAway(v, scene.triangles) ? 0.25 : 1);
-  handles(context, scene, (v) => space.project(v), { faint });
+  const shown = [...scene.corners, ...scene.pins, ...(scene.chosen >= 0 ? [scene.chosen] : [])];
+  const tests = (shown.length * scene.triangles.length) / 3;
+  const hidden = shown.length && (!moving || tests < MAX_TESTS) ? space.hidden(shown, scene.triangles) : null;
+  handles(context, scene, (v) => space.project(v), { faint: (v) => (hidden?.has(v) ? 0.25 : 1) });
+  if (scene.seamStart >= 0) disc(context, space.project(scene.seamStart), 6, RED);
+  drawScale(context, space.box, space.pixels, ink);
   context.restore();
 }
 
@@ -41,12 +54,19 @@ function path(context, loop, point) {
   context.closePath();
 }
 
-function outline(context, scene, plane) {
-  context.lineWidth = 1.5;
-  context.strokeStyle = INK;
-  context.beginPath();
-  for (const loop of scene.loops) path(context, loop, (v) => plane.pointOf(...scene.placeOf(v)));
-  context.stroke();
+function outline(context, scene, plane, style) {
+  const point = (v) => plane.pointOf(...scene.placeOf(v));
+  // Where all islands are selected, the outlines show the colours of the seams.
+  const several = scene.selected.size < scene.starts.length;
+  for (const chosen of [false, true]) {
+    context.lineWidth = chosen && several ? 3 : 1;
+    context.strokeStyle = style.getPropertyValue(chosen && several ? "--accent" : "--ink").trim() || INK;
+    context.beginPath();
+    scene.loops.forEach((loop, i) => {
+      if (scene.selected.has(scene.owners[i]) === chosen) path(context, loop, point);
+    });
+    context.stroke();
+  }
   if (!scene.asked) return;
   // The target of the boundary, while there is no certified map for it.
   context.strokeStyle = RED;

@@ -16,6 +16,7 @@ class Page {
     this.view = createView($("view"), {
       send: (message, arrays) => this.send(message, arrays),
       measured: new URLSearchParams(location.search).has("measured"),
+      pictured: (picture) => this.panel.image(picture),
     });
     this.panel = new Panel(this);
     this.connect();
@@ -24,30 +25,35 @@ class Page {
   connect() {
     const address = new URL("socket", location.href);
     address.protocol = "ws:";
-    address.search = "";
+    address.search = `session=${sessionName()}`;
     this.socket = new WebSocket(address);
     this.socket.binaryType = "arraybuffer";
     this.socket.onmessage = (event) => this.receive(decodeFrame(event.data));
     this.socket.onclose = (event) => {
       this.view.hands.forget();
-      if (event.code === 1009) this.panel.note("That file is too large. The page restarts.");
-      else if (event.code === 1013) this.panel.refused(event.reason);
-      else if (event.code === 1006) this.panel.disconnected();
-      if (event.code === 1009 || event.code === 1011) setTimeout(() => this.connect(), 1500);
+      const { status } = this.panel;
+      if (event.code === 1009) status.note("That file is too large. The page restarts.");
+      else if (event.code === 1013) status.refused(event.reason);
+      else if (event.code === 4001) status.elsewhere();
+      else if (event.code === 1006) status.disconnected();
+      if (event.code !== 1009 && event.code !== 1011) return;
+      document.body.dataset.state = "restarting";
+      setTimeout(() => this.connect(), 1500);
     };
   }
 
   send(message, arrays) {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(encodeFrame(message, arrays));
-    else if (document.body.dataset.state !== "gone") this.panel.disconnected();
+    else if (document.body.dataset.state !== "gone") this.panel.status.disconnected();
   }
 
   receive(frame) {
     const { header, arrays } = frame;
     if (header.kind === "hello") this.mostBytes = header.most_bytes;
-    else if (header.kind === "note") this.panel.note(header.text);
-    else if (header.kind === "busy") this.panel.busy(header.what);
-    else if (header.kind === "progress") this.panel.progress(header);
+    else if (header.kind === "note") this.panel.status.note(header.text);
+    else if (header.kind === "busy") this.panel.status.busy(header.what);
+    else if (header.kind === "progress") this.panel.status.progress(header);
+    else if (header.kind === "saved") this.panel.unsaved = false;
     else if (header.kind === "file") this.download(header.name, new Blob([arrays.content]));
     else this.view.receive(frame);
     if (header.kind === "surface") {
@@ -56,12 +62,12 @@ class Page {
     } else if (header.kind === "map") {
       if (arrays.places) {
         // A film contains only certified maps.
-        if (header.injective) this.film.add(arrays.places);
+        if (header.injective) this.film.add(header.start === undefined ? arrays.places : this.view.scene.places.slice());
         this.count();
       }
       this.panel.map(header, Boolean(arrays.places), this.arrivals.length);
     } else if (header.kind === "obstructions") {
-      this.panel.obstructions(header.obstructions);
+      this.panel.status.obstructions(header.obstructions);
     }
   }
 
@@ -71,16 +77,18 @@ class Page {
     while (this.arrivals[0] < now - RATE_OVER) this.arrivals.shift();
   }
 
-  /** Upload a file of the user: a surface, or a drawing of an outline. */
+  /** Upload a file of the user: a model, an image for it, or a drawing of an outline. */
   async take(file) {
     if (file.size > this.mostBytes) {
       const mega = (bytes) => `${Math.ceil(bytes / 2 ** 20).toLocaleString("en")} MB`;
-      this.panel.note(`${file.name} has ${mega(file.size)}, more than ${mega(this.mostBytes)}: map it with the command qhm map.`);
+      this.panel.status.note(`${file.name} has ${mega(file.size)}, more than ${mega(this.mostBytes)}: map it with the command qhm map.`);
       return;
     }
     const content = new Uint8Array(await file.arrayBuffer());
-    const drawing = file.name.toLowerCase().endsWith(".svg");
-    this.send({ do: drawing ? "drawing" : "load", name: file.name.slice(-150) }, { content });
+    const suffix = file.name.toLowerCase().split(".").pop();
+    const what = { svg: "drawing", png: "image", jpg: "image", jpeg: "image" }[suffix] ?? "load";
+    if (what === "load") this.panel.status.forget();
+    this.send({ do: what, name: file.name.slice(-150) }, { content });
   }
 
   download(name, blob) {
@@ -98,8 +106,18 @@ class Page {
   async saveFilm() {
     const blob = await this.film.record(this.view);
     if (blob) this.download("map.webm", blob);
-    else this.panel.note("This browser cannot record films.");
+    else this.panel.status.note("This browser cannot record films.");
   }
+}
+
+/** Return the name of this tab's session, with which it continues after a reload. */
+function sessionName() {
+  let name = sessionStorage.getItem("qhm-session");
+  if (!name) {
+    name = Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+    sessionStorage.setItem("qhm-session", name);
+  }
+  return name;
 }
 
 window.studio = new Page();

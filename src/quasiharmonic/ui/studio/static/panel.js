@@ -1,23 +1,17 @@
-// The controls beside the view, and their status texts.
+// The controls beside the view.
+
+import { Islands } from "./islands.js";
+import { listenForKeys } from "./keys.js";
+import { Status } from "./status.js";
 
 const $ = (id) => document.getElementById(id);
-
-const HINTS = {
-  move: "",
-  pin: "Click a vertex on the surface to pin it, then drag it in the map with Move. Click it again to remove the pin.",
-  corner: "Click on the surface: the nearest boundary vertex is assigned to the outline's next corner.",
-  draw: "Click the corners of a polygon in the map. To close it, click the first corner again or press Enter.",
-};
-const NUMBER = new Intl.NumberFormat("en", { maximumSignificantDigits: 4 });
-const shown = (value) => {
-  if (value === null || value === undefined) return "∞";
-  return Math.abs(value) < 1e6 ? NUMBER.format(value) : value.toExponential(2);
-};
 
 export class Panel {
   constructor(page) {
     this.page = page;
-    this.dragged = false;
+    this.status = new Status(page);
+    this.islands = new Islands((message) => page.send(message));
+    this.unsaved = false;
     const { view } = page;
     const send = (message) => page.send(message);
 
@@ -25,26 +19,29 @@ export class Panel {
       input.addEventListener("change", () => this.tool(input.value));
     }
     for (const input of document.querySelectorAll("input[name=colouring]")) {
-      input.addEventListener("change", () => {
-        view.set({ colouring: input.value });
-        $("legend").hidden = input.value !== "stretch";
-      });
+      input.addEventListener("change", () => this.colour(input.value));
     }
-    $("edges").addEventListener("change", () => view.set({ edges: $("edges").checked }));
+    for (const id of ["edges", "seams", "grid"]) $(id).addEventListener("change", () => view.set({ [id]: $(id).checked }));
     $("shape").addEventListener("change", () => ($("letter").hidden = $("shape").value !== "letter"));
     $("outline").addEventListener("submit", (event) => {
       event.preventDefault();
       const shape = $("shape").value;
       if (shape) send({ do: "outline", to: shape === "letter" ? `letter:${$("letter").value.trim()}` : shape });
     });
-    for (const id of ["undo", "redo", "flatten", "save", "stop"]) $(id).addEventListener("click", () => send({ do: id }));
+    for (const id of ["undo", "redo", "flatten", "save", "stop", "turn"]) $(id).addEventListener("click", () => send({ do: id }));
+    $("unwrap").addEventListener("click", () => this.unwrap());
+    $("pack").addEventListener("click", () => send({ do: "pack", ...this.#size() }));
+    $("glb").addEventListener("click", () => send({ do: "save", format: "glb" }));
+    $("select-all").addEventListener("click", () => send({ do: "select", islands: [] }));
     $("polish").addEventListener("click", () => send({ do: "polish", energy: $("polish-energy").value, slide: $("slide").checked }));
     $("by-angle").addEventListener("click", () => send({ do: "corners" }));
     $("fit").addEventListener("click", () => view.fit());
     $("png").addEventListener("click", () => page.savePicture());
     $("play").addEventListener("click", () => page.film.play(view));
     $("film").addEventListener("click", () => page.saveFilm());
-    for (const id of ["open", "svg"]) {
+    $("help").addEventListener("click", () => $("keys").showModal());
+    $("note-close").addEventListener("click", () => this.status.forget());
+    for (const id of ["open", "svg", "image"]) {
       $(id).addEventListener("change", () => {
         if ($(id).files.length) page.take($(id).files[0]);
         $(id).value = "";
@@ -54,14 +51,9 @@ export class Panel {
       button.addEventListener("click", () => navigator.clipboard.writeText($(button.dataset.of).textContent));
     }
     this.#drops();
-    document.addEventListener("keydown", (event) => {
-      if (!(event.ctrlKey || event.metaKey) || event.target.closest("input, select")) return;
-      const key = event.key.toLowerCase();
-      if (key === "z") send({ do: event.shiftKey ? "redo" : "undo" });
-      else if (key === "y") send({ do: "redo" });
-      else if (key === "s") send({ do: "save" });
-      else return;
-      event.preventDefault();
+    listenForKeys(this);
+    window.addEventListener("beforeunload", (event) => {
+      if (this.unsaved) event.preventDefault();
     });
   }
 
@@ -74,46 +66,67 @@ export class Panel {
     }
   }
 
+  #size() {
+    return { resolution: Number($("resolution").value), padding: Number($("padding").value) };
+  }
+
+  unwrap() {
+    const options = { max_stretch: Number($("max-stretch").value), keep_seams: $("keep-seams").checked };
+    this.page.send({ do: "unwrap", ...options, ...this.#size() });
+  }
+
+  /** Choose a tool by its name. */
   tool(name) {
-    this.page.view.hands.tool = name;
-    $("tool-hint").textContent = HINTS[name];
+    const { view } = this.page;
+    document.querySelector(`input[name=tool][value=${name}]`).checked = true;
+    view.hands.tool = name;
+    view.scene.seamStart = -1;
     $("corner-row").hidden = name !== "corner";
-    if (name !== "draw") this.page.view.scene.sketch = [];
-    this.page.view.set({});
+    if (name !== "draw") view.scene.sketch = [];
+    view.set({});
+    this.status.tool = name;
+    this.status.hint();
+  }
+
+  /** Choose a colouring by its name. */
+  colour(name) {
+    document.querySelector(`input[name=colouring][value=${name}]`).checked = true;
+    this.page.view.set({ colouring: name });
+    $("legend").hidden = name !== "stretch";
+    if (name === "image" && !this.pictured) $("image").click();
+  }
+
+  /** Show that there is an image on the surface, or none. */
+  image(picture) {
+    this.pictured = Boolean(picture);
+    if (picture) this.colour("image");
+    else if (this.page.view.look.colouring === "image") this.colour("checker");
   }
 
   surface(header) {
     $("name").textContent = `${header.name} — ${header.triangles.toLocaleString("en")} triangles`;
-    $("hint").hidden = this.dragged;
+    $("name").title = header.defects.length ? `Repaired for mapping: ${header.defects.join(", ")}` : "";
+    this.status.surface();
   }
 
   /** Show the certificate and the numbers of the displayed map. */
   map(header, moved, rate) {
-    if (header.seq > 2 && !this.dragged) {
-      this.dragged = true;
-      $("hint").hidden = true;
-    }
-    if (!moved) {
-      this.#verdict("open", "…", "No injective map yet", "Release the pointer to search for one, or undo.");
-      return;
-    }
-    if (!header.injective) this.#verdict("bad", "✗", "Not injective", header.verdict);
-    else if (!header.reached) {
-      this.#verdict("open", "…", "Target not reached", "The map is certified, but its boundary has not reached the dashed target.");
-    } else if (header.bijective) this.#verdict("good", "✓", "Certified: no inverted triangle, no overlap", header.verdict);
-    else this.#verdict("open", "✓", "Certified: no inverted triangle, but it overlaps itself", header.verdict);
-    $("flips").textContent = header.flips;
-    $("worst").textContent = header.worst === null ? "∞" : `${shown(header.worst)} ×`;
-    $("energy").textContent = shown(header.energy);
-    if (header.state === "following") $("rate").textContent = rate;
+    this.status.map(header, moved, rate);
+    this.islands.select(header.selected);
     if (header.state !== "settled") return;
+    this.unsaved = header.unsaved;
+    this.islands.show(header);
     this.#outline(header.outline);
     $("stop").disabled = true;
     $("undo").disabled = !header.undo;
     $("redo").disabled = !header.redo;
-    $("command").textContent = header.command;
-    $("python").textContent = header.python;
+    $("outward").hidden = !header.inward;
+    $("outward-words").textContent = `${header.inward === 1 ? "A closed part" : `${header.inward} closed parts`} of the model face inward.`;
+    $("repeat").hidden = !header.command && header.mapped === false;
+    $("command").textContent = header.command || "The map is the one in the file.";
+    $("python").textContent = header.python || "# The map is the one in the file.";
     $("needs").textContent = this.#needs(header);
+    for (const id of ["save", "glb", "pack", "polish"]) $(id).disabled = !header.mapped;
     $("play").disabled = $("film").disabled = this.page.film.maps.length < 2;
     document.body.dataset.state = "settled";
   }
@@ -128,61 +141,7 @@ export class Panel {
   }
 
   #needs(header) {
-    const files = header.needs.length ? `They read ${header.needs.join(" and ")}; Save OBJ writes what they read. ` : "";
+    const files = header.needs.length ? `They read ${header.needs.join(" and ")}, which Save OBJ writes, too. ` : "";
     return header.anew ? files : `${files}This map was computed from the previous one; a search from scratch did not find it.`;
-  }
-
-  #verdict(kind, sign, title, words) {
-    $("verdict").className = kind;
-    $("sign").textContent = sign;
-    if ($("title").textContent !== title) $("title").textContent = title;
-    $("words").textContent = words;
-  }
-
-  obstructions(all) {
-    $("why").hidden = !all.length;
-    $("obstructions").replaceChildren(
-      ...all.map((one) => {
-        const item = document.createElement("li");
-        const button = document.createElement("button");
-        button.textContent = `${one.message} ${one.advice}`;
-        button.title = `Show the place. Consequence: ${one.forbids}.`;
-        button.addEventListener("click", () => this.page.view.point(one));
-        item.append(button);
-        return item;
-      }),
-    );
-  }
-
-  busy(what) {
-    document.body.dataset.state = "busy";
-    $("stop").disabled = false;
-    this.#verdict("open", "…", `Working: ${what}`, "");
-    $("note").hidden = true;
-  }
-
-  progress(header) {
-    $("words").textContent = header.flips ? `${header.flips} triangles still inverted` : `energy ${shown(header.energy)}`;
-  }
-
-  note(text) {
-    $("note").textContent = text;
-    $("note").hidden = false;
-    clearTimeout(this.hiding);
-    this.hiding = setTimeout(() => ($("note").hidden = true), 12_000);
-  }
-
-  disconnected() {
-    this.#gone("Disconnected", "The server has stopped. Restart it, then reload the page.");
-  }
-
-  /** Report that the server has too many open pages. */
-  refused(why) {
-    this.#gone("Not opened", `${why}. Close another page, then reload this one.`);
-  }
-
-  #gone(title, words) {
-    document.body.dataset.state = "gone";
-    this.#verdict("bad", "✗", title, words);
   }
 }

@@ -76,6 +76,26 @@ export class PlaneView {
     return new Float32Array([sx, sy, -sx * this.centre[0], -sy * this.centre[1]]);
   }
 
+  /** Return the triangle that covers a point of the screen, the last one if several do; -1 if none does. */
+  pick(point, places, triangles) {
+    const [x, y] = this.placeOf(point);
+    for (let t = triangles.length - 3; t >= 0; t -= 3) {
+      const [i, j, k] = [2 * triangles[t], 2 * triangles[t + 1], 2 * triangles[t + 2]];
+      const [ax, ay, bx, by] = [places[i] - x, places[i + 1] - y, places[j] - x, places[j + 1] - y];
+      const [cx, cy] = [places[k] - x, places[k + 1] - y];
+      const [a, b, c] = [bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay];
+      if ((a >= 0 && b >= 0 && c >= 0) || (a <= 0 && b <= 0 && c <= 0)) return t / 3;
+    }
+    return -1;
+  }
+
+  /** Return a round length, 1, 2 or 5 times a power of ten, of at least so many pixels. */
+  roundLength(pixels) {
+    const least = pixels / this.pixels;
+    const power = 10 ** Math.floor(Math.log10(least));
+    return power * [1, 2, 5, 10].find((factor) => factor * power >= least);
+  }
+
   /** Return the vertex of a list nearest to a point of the screen, within so many pixels; else -1. */
   nearest(point, vertices, places, within) {
     let best = within;

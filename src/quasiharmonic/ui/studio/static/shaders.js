@@ -1,3 +1,5 @@
+import { LinePainter } from "./lines.js";
+
 // Shaders for a surface and its map. Both panes share the vertex buffers, so a new map needs only one upload.
 
 const VERTEX = `#version 300 es
@@ -25,6 +27,8 @@ uniform float scale;
 uniform float reach;
 uniform float squares;
 uniform vec4 flat_colour;
+uniform vec2 origin;
+uniform sampler2D image;
 in vec3 at;
 in vec2 uv;
 out vec4 colour;
@@ -64,12 +68,16 @@ void main() {
   vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
   float facing = dot(normal, toward);
   float light = flat_pane ? 0.82 + 0.18 * facing : 0.45 + 0.55 * abs(facing);
-  vec3 base = colouring == 0 ? checker() : ramp(log2(stretch()) / reach);
+  vec3 base = vec3(0.72, 0.74, 0.78);
+  if (colouring == 0) base = checker();
+  if (colouring == 1) base = ramp(log2(stretch()) / reach);
+  if (colouring == 3) base = texture(image, uv + origin).rgb;
   if (!flat_pane && !gl_FrontFacing) base *= 0.6;
   colour = vec4(base * light, 1.0);
 }`;
 
-export const COLOURINGS = ["checker", "stretch"];
+/** Numbers of the colourings in the shader; "plain" is that of a surface without a map. */
+const COLOURINGS = { checker: 0, stretch: 1, image: 3, plain: 4 };
 const FLAT = 2;
 
 function compiled(gl, kind, source) {
@@ -113,28 +121,69 @@ export class Painter {
     gl.linkProgram(this.program);
     if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program));
     this.at = {};
-    for (const name of ["flat_pane", "turn", "window", "colouring", "toward", "scale", "reach", "squares", "flat_colour"]) {
+    for (const name of ["flat_pane", "turn", "window", "colouring", "toward", "scale", "reach", "squares", "flat_colour", "origin", "image"]) {
       this.at[name] = gl.getUniformLocation(this.program, name);
     }
     this.buffers = {};
     for (const name of ["position", "place", "triangles", "edges", "bad"]) this.buffers[name] = gl.createBuffer();
+    this.lines = new LinePainter(gl, compiled);
+    this.texture = gl.createTexture();
+    if (this.picture) this.setImage(this.picture);
     if (this.surface) {
-      this.setSurface(this.surface.positions, this.surface.triangles, this.surface.edges);
-      this.setPlaces(this.surface.places);
-      this.setBad(this.surface.bad);
+      const { positions, triangles, places, bad, seams } = this.surface;
+      this.setSurface(positions, triangles);
+      if (seams) this.setSeams(...seams);
+      this.setPlaces(places);
+      this.setBad(bad);
     }
   }
 
-  /** Set positions (n × 3), triangles (f × 3) and edges (e × 2) of a surface. */
-  setSurface(positions, triangles, edges) {
+  /** Set positions (n × 3) and triangles (f × 3) of a surface. */
+  setSurface(positions, triangles) {
     const gl = this.gl;
-    this.surface = { positions, triangles, edges, places: new Float32Array((positions.length / 3) * 2), bad: new Uint32Array(0) };
+    this.surface = { positions, triangles, edges: null, seams: null, places: new Float32Array((positions.length / 3) * 2), bad: new Uint32Array(0) };
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers.position);
     gl.bufferData(gl.ARRAY_BUFFER, positions, gl.STATIC_DRAW);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.buffers.triangles);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.STATIC_DRAW);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.buffers.edges);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, edges, gl.STATIC_DRAW);
+    this.setSeams(new Uint32Array(0), new Uint32Array(0), false);
+  }
+
+  /** Upload the edges when they are first drawn. */
+  #edges() {
+    if (this.surface.edges) return this.surface.edges;
+    const { triangles } = this.surface;
+    const edges = new Uint32Array(2 * triangles.length);
+    let count = 0;
+    for (let t = 0; t < triangles.length; t += 3) {
+      for (let k = 0; k < 3; k++) {
+        const [i, j] = [triangles[t + k], triangles[t + ((k + 1) % 3)]];
+        // The second halfedge of an inner edge has the opposite direction; the overlay draws the boundary.
+        if (i < j) [edges[count++], edges[count++]] = [i, j];
+      }
+    }
+    this.surface.edges = edges.subarray(0, count);
+    this.gl.bindBuffer(this.gl.ELEMENT_ARRAY_BUFFER, this.buffers.edges);
+    this.gl.bufferData(this.gl.ELEMENT_ARRAY_BUFFER, this.surface.edges, this.gl.STATIC_DRAW);
+    return this.surface.edges;
+  }
+
+  /** Set the sides of the seams (k × 2), the chain of each, and whether the user drew them. */
+  setSeams(edges, chain, drawn) {
+    this.surface.seams = [edges, chain, drawn];
+    this.lines.setEdges(edges, chain, this.surface.positions, drawn);
+    this.lines.setPlaces(this.surface.places);
+  }
+
+  /** Set the image on the surface: an ImageBitmap with its last row first, or null. */
+  setImage(picture) {
+    const gl = this.gl;
+    this.picture = picture;
+    if (!picture) return;
+    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+    gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
   }
 
   /** Set the positions (n × 2) of the vertices in the map. */
@@ -143,6 +192,16 @@ export class Painter {
     this.surface.places = places;
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers.place);
     gl.bufferData(gl.ARRAY_BUFFER, places, gl.DYNAMIC_DRAW);
+    this.lines.setPlaces(places);
+  }
+
+  /** Set the positions of some vertices, from `start` on. */
+  setSomePlaces(places, start) {
+    const gl = this.gl;
+    this.surface.places.set(places, 2 * start);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers.place);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 8 * start, places);
+    this.lines.setPlaces(this.surface.places);
   }
 
   /** Set the indices of the triangles to paint red. */
@@ -172,13 +231,16 @@ export class Painter {
     gl.uniform1f(this.at.scale, look.scale);
     gl.uniform1f(this.at.reach, look.reach);
     gl.uniform1f(this.at.squares, look.squares);
+    gl.uniform2f(this.at.origin, ...look.origin);
+    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    gl.uniform1i(this.at.image, 0);
     this.#attribute(0, this.buffers.position, 3);
     this.#attribute(1, this.buffers.place, 2);
     gl[look.flat ? "disable" : "enable"](gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
     gl.enable(gl.POLYGON_OFFSET_FILL);
     gl.polygonOffset(1, 1);
-    gl.uniform1i(this.at.colouring, COLOURINGS.indexOf(look.colouring));
+    gl.uniform1i(this.at.colouring, COLOURINGS[look.colouring === "image" && !this.picture ? "checker" : look.colouring]);
     this.#draw(gl.TRIANGLES, this.buffers.triangles, this.surface.triangles.length);
     gl.disable(gl.POLYGON_OFFSET_FILL);
     gl.uniform1i(this.at.colouring, FLAT);
@@ -187,11 +249,22 @@ export class Painter {
       // Keep the canvas opaque, otherwise the page shines through.
       gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
       gl.uniform4f(this.at.flat_colour, 0.06, 0.12, 0.29, 0.35);
-      this.#draw(gl.LINES, this.buffers.edges, this.surface.edges.length);
+      const count = this.#edges().length;
+      this.#draw(gl.LINES, this.buffers.edges, count);
       gl.disable(gl.BLEND);
     }
     gl.uniform4f(this.at.flat_colour, 0.89, 0.07, 0.17, 1);
     this.#draw(gl.TRIANGLES, this.buffers.bad, this.surface.bad.length * 3);
+    if (look.seams) this.lines.draw(box, look, look.width);
+  }
+
+  /** Clear a pane: `box` in canvas pixels from the lower left. */
+  clearPane(box) {
+    const gl = this.gl;
+    gl.scissor(box.x, box.y, box.width, box.height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
   }
 
   /** Clear the canvas. */

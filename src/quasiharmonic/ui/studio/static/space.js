@@ -10,7 +10,6 @@ export class SpaceView {
       high[i % 3] = Math.max(high[i % 3], positions[i]);
     }
     this.positions = positions;
-    this.normals = new Map();
     this.centre = low.map((value, k) => (value + high[k]) / 2);
     this.radius = Math.hypot(...low.map((value, k) => (high[k] - value) / 2)) || 1;
     this.box = { x: 0, y: 0, width: 1, height: 1 };
@@ -22,6 +21,12 @@ export class SpaceView {
     this.pitch = 0;
     this.zoom = 1;
     this.shift = [0, 0];
+  }
+
+  /** Take over the direction of another view. */
+  turnLike(other) {
+    [this.yaw, this.pitch, this.zoom] = [other.yaw, other.pitch, other.zoom];
+    this.shift = [...other.shift];
   }
 
   /** Rotate by a pointer motion in CSS pixels. */
@@ -79,29 +84,36 @@ export class SpaceView {
     ];
   }
 
-  /** Whether the normal of a vertex points away from the viewer. */
-  looksAway(vertex, triangles) {
-    if (!this.normals.has(vertex)) this.normals.set(vertex, this.#normal(vertex, triangles));
-    const normal = this.normals.get(vertex);
-    return this.axes[2].reduce((sum, a, k) => sum + a * normal[k], 0) < 0;
-  }
-
-  #normal(vertex, triangles) {
-    const sum = [0, 0, 0];
-    for (let t = 0; t < triangles.length; t += 3) {
-      if (triangles[t] !== vertex && triangles[t + 1] !== vertex && triangles[t + 2] !== vertex) continue;
-      const [a, b, c] = [0, 1, 2].map((k) => this.positions.subarray(3 * triangles[t + k], 3 * triangles[t + k] + 3));
-      const [u, v] = [b, c].map((p) => [p[0] - a[0], p[1] - a[1], p[2] - a[2]]);
-      [0, 1, 2].forEach((k) => (sum[k] += u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3]));
+  /** Return the vertices of a list that triangles in front of them hide; the last answer is kept for the same direction. */
+  hidden(vertices, triangles) {
+    const key = `${this.yaw},${this.pitch},${vertices.join()}`;
+    if (this.hiddenKey !== key) {
+      this.hiddenKey = key;
+      const flat = this.#flatten(0, 0);
+      this.hiddenVertices = new Set(vertices.filter((vertex) => this.#isHidden(vertex, triangles, flat)));
     }
-    return sum;
+    return this.hiddenVertices;
   }
 
-  /** Return the nearest triangle under a point of the screen and its vertex nearest to that point, or null. */
-  pick(point, triangles) {
+  #isHidden(vertex, triangles, flat) {
+    const [x, y, z] = flat.subarray(3 * vertex, 3 * vertex + 3);
+    const margin = 1e-3 * this.radius;
+    for (let t = 0; t < triangles.length; t += 3) {
+      const [i, j, k] = [3 * triangles[t], 3 * triangles[t + 1], 3 * triangles[t + 2]];
+      if (Math.max(flat[i + 2], flat[j + 2], flat[k + 2]) < z + margin) continue;
+      const [ax, ay, bx, by] = [flat[i] - x, flat[i + 1] - y, flat[j] - x, flat[j + 1] - y];
+      const [cx, cy] = [flat[k] - x, flat[k + 1] - y];
+      const [a, b, c] = [bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay];
+      if ((a < 0 || b < 0 || c < 0) && (a > 0 || b > 0 || c > 0)) continue;
+      const whole = a + b + c;
+      if (whole && (a * flat[i + 2] + b * flat[j + 2] + c * flat[k + 2]) / whole > z + margin) return true;
+    }
+    return false;
+  }
+
+  /** Return the coordinates of all vertices along right, up and the direction toward the eye, less (x, y). */
+  #flatten(x, y) {
     const [right, up, eye] = this.axes;
-    const x = (point[0] - this.box.x - this.box.width / 2 - this.shift[0]) / this.pixels;
-    const y = -(point[1] - this.box.y - this.box.height / 2 - this.shift[1]) / this.pixels;
     const n = this.positions.length / 3;
     const flat = new Float64Array(3 * n);
     for (let i = 0; i < n; i++) {
@@ -112,6 +124,14 @@ export class SpaceView {
       flat[3 * i + 1] = up[0] * a + up[1] * b + up[2] * c - y;
       flat[3 * i + 2] = eye[0] * a + eye[1] * b + eye[2] * c;
     }
+    return flat;
+  }
+
+  /** Return the nearest triangle under a point of the screen and its vertex nearest to that point, or null. */
+  pick(point, triangles) {
+    const x = (point[0] - this.box.x - this.box.width / 2 - this.shift[0]) / this.pixels;
+    const y = -(point[1] - this.box.y - this.box.height / 2 - this.shift[1]) / this.pixels;
+    const flat = this.#flatten(x, y);
     let nearest = -Infinity;
     let found = null;
     for (let t = 0; t < triangles.length; t += 3) {

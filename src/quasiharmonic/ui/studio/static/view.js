@@ -1,14 +1,17 @@
 // View of a surface and its map. It is self-contained: pass `createView` an element and a function that sends messages,
 // and pass frames to `receive`.
 //
-// It handles the frames "surface", "map" and "obstructions", and sends {do: "grab" | "drag" | "drop" | "pin" | "unpin" |
-// "corner" | "polygon"}; docs/development/page_protocol.md describes them. Without `send` the view is read-only.
+// It handles the frames "surface", "map", "seams", "image" and "obstructions", and sends {do: "grab" | "drag" | "drop" |
+// "pin" | "unpin" | "corner" | "polygon" | "select" | "seam" | "erase"}; docs/development/page_protocol.md describes them.
+// Without `send` the view is read-only.
 
 import { decodeFrame } from "./frames.js";
+import { drawGrid } from "./grid.js";
 import { Hands } from "./hands.js";
 import { drawOverlay } from "./overlay.js";
 import { PlaneView } from "./plane.js";
 import { Painter } from "./shaders.js";
+import { Scene } from "./scene.js";
 import { SpaceView } from "./space.js";
 
 const STACKED_BELOW = 640; // CSS pixels of width
@@ -20,31 +23,9 @@ const COARSER = 3;
 const QUICK = 12;
 const SURFACE_EVERY = 4;
 const REST = 150;
-
-/** The scene according to the last frames; see `drawOverlay`. */
-class Scene {
-  constructor() {
-    this.size = { width: 1, height: 1 };
-    this.places = null;
-    this.loops = [];
-    this.boundary = [];
-    this.triangles = new Uint32Array(0);
-    this.asked = null;
-    this.bad = new Uint32Array(0);
-    this.origin = [0, 0];
-    this.corners = [];
-    this.numbers = [];
-    this.pins = [];
-    this.obstruction = null;
-    this.hovered = -1;
-    this.chosen = -1;
-    this.sketch = [];
-  }
-
-  placeOf(vertex) {
-    return [this.places[2 * vertex], this.places[2 * vertex + 1]];
-  }
-}
+// Width of seams in CSS pixels.
+const SEAM = 3;
+const SMOOTH = 220; // duration of a transition to another map, in milliseconds
 
 /** Latencies: milliseconds from a pointer motion to the picture of its map, for the last thousand. */
 class Clock {
@@ -80,7 +61,7 @@ export function createView(element, options = {}) {
   const scene = new Scene();
   const plane = new PlaneView();
   const clock = new Clock();
-  const look = { colouring: "checker", edges: false, squares: 16, reach: 3 };
+  const look = { colouring: "checker", edges: false, seams: true, grid: true, squares: 16, reach: 3 };
   let space = null;
   let scale = 1;
   let seq = -1;
@@ -89,18 +70,24 @@ export function createView(element, options = {}) {
   let moves = true; // whether all requests for the next picture come from motion
   let followed = 0; // maps since the surface was redrawn
   let resting = 0;
+  let transition = 0;
 
   element.classList.add("qhm-view");
   const canvas = document.createElement("canvas");
   const over = document.createElement("canvas");
-  for (const each of [canvas, over]) {
+  const under = document.createElement("canvas");
+  for (const each of [canvas, over, under]) {
     Object.assign(each.style, { position: "absolute", inset: "0", width: "100%", height: "100%" });
     each.setAttribute("aria-hidden", "true");
   }
   if (getComputedStyle(element).position === "static") element.style.position = "relative";
-  element.append(canvas, over);
+  // The grid lies behind the map.
+  under.style.zIndex = "-1";
+  element.style.isolation = "isolate";
+  element.append(canvas, over, under);
   const painter = new Painter(canvas);
   const context = over.getContext("2d");
+  const ground = under.getContext("2d");
 
   /** Request a picture: a full one, or one of a pane in motion, "space" or "plane". */
   function redraw(moving = null) {
@@ -135,25 +122,44 @@ export function createView(element, options = {}) {
     const ratio = density() / (coarse ? COARSER : 1);
     const resized = fill(canvas, ratio);
     const every = resized || !coarse;
-    if (space && scene.places) {
+    if (space) {
       const within = (box) => ({
         x: Math.round(box.x * ratio),
         y: Math.round((scene.size.height - box.y - box.height) * ratio),
         width: Math.round(box.width * ratio),
         height: Math.round(box.height * ratio),
       });
-      const shared = { ...look, scale, squares: look.squares / plane.extent, toward: space.axes[2], turn: space.matrix };
+      const shared = {
+        ...look,
+        colouring: scene.places ? look.colouring : "plain",
+        scale,
+        squares: look.squares / plane.extent,
+        toward: space.axes[2],
+        turn: space.matrix,
+        origin: scene.origin,
+        width: SEAM * ratio,
+      };
       for (const [name, pane] of [["space", space], ["plane", plane]]) {
         if (!every && !stale.has(name)) continue;
+        if (pane === plane && !scene.places) {
+          painter.clearPane(within(pane.box));
+          continue;
+        }
         painter.pane(within(pane.box), { ...shared, flat: pane === plane, window: plane.window });
       }
       if (every || stale.has("space")) followed = 0;
     } else painter.clear();
     stale.clear();
     moves = true;
-    fill(over, density());
-    context.setTransform(density(), 0, 0, density(), 0, 0);
-    if (space) drawOverlay(context, scene, space, plane);
+    for (const [some, drawing] of [[over, context], [under, ground]]) {
+      fill(some, density());
+      drawing.setTransform(density(), 0, 0, density(), 0, 0);
+      drawing.clearRect(0, 0, scene.size.width, scene.size.height);
+    }
+    if (!space) return;
+    const style = getComputedStyle(element);
+    if (look.grid && scene.places) drawGrid(ground, scene, plane, style);
+    drawOverlay(context, scene, space, plane, { moving: coarse, style });
   }
 
   function density() {
@@ -173,6 +179,7 @@ export function createView(element, options = {}) {
     const height = Math.max(1, element.clientHeight);
     scene.size = { width, height };
     const stacked = width < STACKED_BELOW;
+    element.classList.toggle("stacked", stacked);
     const half = stacked ? { width, height: height / 2 } : { width: width / 2, height };
     if (space) space.box = { x: 0, y: 0, ...half };
     plane.setBox(stacked ? { x: 0, y: height / 2, ...half } : { x: width / 2, y: 0, ...half });
@@ -190,21 +197,15 @@ export function createView(element, options = {}) {
   });
 
   function surface(header, arrays) {
-    const positions = arrays.positions;
-    const triangles = arrays.triangles;
-    const edges = [];
-    for (let t = 0; t < triangles.length; t += 3) {
-      for (let k = 0; k < 3; k++) {
-        const [i, j] = [triangles[t + k], triangles[t + ((k + 1) % 3)]];
-        // The second halfedge of an inner edge has the opposite direction; the overlay draws the boundary.
-        if (i < j) edges.push(i, j);
-      }
-    }
-    painter.setSurface(positions, triangles, new Uint32Array(edges));
+    const { positions, triangles } = arrays;
+    painter.setSurface(positions, triangles);
+    const turned = space;
     space = new SpaceView(positions);
-    Object.assign(scene, new Scene(), { size: scene.size, triangles, boundary: Array.from(arrays.boundary) });
-    let start = 0;
-    scene.loops = header.loops.map((length) => scene.boundary.slice(start, (start += length)));
+    // The same model with other seams keeps its direction.
+    if (turned && scene.name === header.name) space.turnLike(turned);
+    cancelAnimationFrame(transition);
+    Object.assign(scene, new Scene(), { size: scene.size, sizes: scene.sizes, name: header.name, triangles });
+    scene.setIslands(header, Array.from(arrays.boundary));
     hands.forget();
     resize();
   }
@@ -216,17 +217,24 @@ export function createView(element, options = {}) {
     scene.corners = header.corners;
     scene.numbers = header.numbers;
     scene.pins = header.pins;
+    scene.selected = new Set(header.selected);
+    cancelAnimationFrame(transition);
+    if (arrays.places && header.start !== undefined && scene.places) {
+      scene.places.set(arrays.places, 2 * header.start);
+      painter.setSomePlaces(arrays.places, header.start);
+    } else if (arrays.places) {
+      scene.places = arrays.places.slice();
+      painter.setPlaces(scene.places);
+    } else if (header.mapped === false) scene.places = null;
     if (arrays.places) {
-      scene.places = arrays.places;
       scene.bad = arrays.bad;
       scale = header.scale;
-      painter.setPlaces(arrays.places);
       painter.setBad(arrays.bad);
       clock.maps += 1;
     }
     if (header.fit) {
       scene.chosen = -1;
-      plane.fit(scene.places);
+      if (scene.places) glide();
     }
     seq = header.seq;
     hands.answered(header.seq, header.after);
@@ -237,6 +245,35 @@ export function createView(element, options = {}) {
     }
   }
 
+  /** Show an image on the surface; an empty one is none. */
+  async function image(header, arrays) {
+    const blob = new Blob([arrays.content], { type: header.type });
+    // The first row of a picture is the highest, that of a texture the lowest.
+    const picture = blob.size ? await createImageBitmap(blob, { imageOrientation: "flipY" }) : null;
+    painter.setImage(picture);
+    options.pictured?.(picture);
+    redraw();
+  }
+
+  /** Move the view of the map to its new fit smoothly, unless the user prefers less motion. */
+  function glide() {
+    const from = { centre: plane.centre, pixels: plane.pixels };
+    const first = !plane.size;
+    plane.fit(scene.places);
+    if (first || painter.software || matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+    const to = { centre: plane.centre, pixels: plane.pixels };
+    const began = performance.now();
+    const step = () => {
+      const t = Math.min((performance.now() - began) / SMOOTH, 1);
+      const s = t * t * (3 - 2 * t);
+      plane.centre = from.centre.map((c, k) => c + s * (to.centre[k] - c));
+      plane.pixels = from.pixels * (to.pixels / from.pixels) ** s;
+      redraw("plane");
+      if (t < 1) transition = requestAnimationFrame(step);
+    };
+    step();
+  }
+
   const observer = new ResizeObserver(resize);
   observer.observe(element);
   resize();
@@ -245,12 +282,17 @@ export function createView(element, options = {}) {
     scene,
     clock,
     hands,
+    look,
 
     /** Handle a frame: a buffer, or the result of `decodeFrame`. */
     receive(frame) {
       const { header, arrays } = frame.header ? frame : decodeFrame(frame);
       if (header.kind === "surface") surface(header, arrays);
       else if (header.kind === "map") map(header, arrays);
+      else if (header.kind === "seams" && space) {
+        painter.setSeams(arrays.edges, arrays.chain, header.drawn);
+        redraw();
+      } else if (header.kind === "image") image(header, arrays);
       else if (header.kind === "obstructions") {
         scene.obstruction = header.obstructions.length ? header.obstructions[0] : null;
         redraw();
@@ -263,7 +305,10 @@ export function createView(element, options = {}) {
       redraw();
     },
 
-    /** Change the look: `colouring` ("checker" or "stretch"), `edges`, `squares` across the map, `reach` in doublings. */
+    /**
+     * Change the look: `colouring` ("checker", "stretch" or "image"), `edges`, `seams`, `grid`, `squares` across the map,
+     * `reach` in doublings.
+     */
     set(changes) {
       Object.assign(look, changes);
       redraw();
@@ -278,6 +323,7 @@ export function createView(element, options = {}) {
 
     /** Show another map of the same surface, for example a stored one. */
     show(places, bad = new Uint32Array(0)) {
+      if (places.length !== scene.places?.length) return;
       scene.places = places;
       scene.bad = bad;
       painter.setPlaces(places);
@@ -292,8 +338,9 @@ export function createView(element, options = {}) {
       const whole = document.createElement("canvas");
       [whole.width, whole.height] = [canvas.width, canvas.height];
       const flat = whole.getContext("2d");
-      flat.fillStyle = "#ffffff";
+      flat.fillStyle = getComputedStyle(element).getPropertyValue("--paper").trim() || "#ffffff";
       flat.fillRect(0, 0, whole.width, whole.height);
+      flat.drawImage(under, 0, 0);
       flat.drawImage(canvas, 0, 0);
       flat.drawImage(over, 0, 0);
       return whole;
@@ -301,6 +348,7 @@ export function createView(element, options = {}) {
 
     dispose() {
       clearTimeout(resting);
+      cancelAnimationFrame(transition);
       observer.disconnect();
       painter.dispose();
       element.replaceChildren();
