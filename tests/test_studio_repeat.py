@@ -112,6 +112,7 @@ STEPS = {
     "both to squares": lambda one: [one.does("select", islands=[]), one.does("outline", to="rect:1x1")],
     "seams drawn, flat": lambda one: [draw(one), one.does("flatten")],
     "seams drawn, unwrapped": lambda one: [draw(one), one.does("unwrap", resolution=512)],
+    "seams erased": lambda one: [draw(one), one.does("erase", vertex=0), one.does("flatten")],
     "seams kept": lambda one: [one.does("flatten"), one.does("unwrap", resolution=512, keep_seams=True)],
     "turned": lambda one: one.does("turn"),
     "turned, unwrapped": lambda one: [one.does("turn"), one.does("unwrap", resolution=512)],
@@ -145,6 +146,7 @@ def draw(one):
     [
         *(("disk", step) for step in ("as it is", "letter", "corner", "by angle", "svg", "polygon", "polish", "slide")),
         *(("disk", step) for step in ("flatten", "unwrap", "drag", "pinned", "pinned flat", "pinned polish", "turned")),
+        ("disk", "seams erased"),
         *(("ring", step) for step in ("as it is", "drag", "polish")),
         *(("closed", step) for step in ("as it is", "unwrap", "letter", "drag", "seams drawn, flat", "pack")),
         *(("closed", step) for step in ("seams drawn, unwrapped", "seams kept", "turned, unwrapped")),

@@ -11,9 +11,10 @@ from quasiharmonic.ui.studio.assets import assets
 TEXT, SHAPE = 4.5, 3.0
 
 
-def declarations():
-    """Return (selector, property) -> value of every rule of the style sheet."""
-    css = re.sub(r"/\*.*?\*/", "", assets()["style.css"].content.decode(), flags=re.DOTALL)
+def declarations(*names):
+    """Return (selector, property) -> value of every rule of some style sheets; later ones precede."""
+    css = "".join(assets()[name].content.decode() for name in names)
+    css = re.sub(r"/\*.*?\*/", "", css, flags=re.DOTALL)
     return {
         (" ".join(selectors.split()), name.strip()): value.strip()
         for selectors, body in re.findall(r"([^{}]+)\{([^{}]*)\}", css)
@@ -21,12 +22,15 @@ def declarations():
     }
 
 
-SHEET = declarations()
+SHEETS = {
+    "light": declarations("style.css", "controls.css"),
+    "dark": declarations("style.css", "controls.css", "dark.css"),
+}
 
 
-def colour(value):
+def colour(sheet, value):
     """Return the only colour in a value, as six hexadecimal digits; None if there is none, or several."""
-    value = re.sub(r"var\((--\w+)\)", lambda found: SHEET[":root", found[1]], value)
+    value = re.sub(r"var\((--\w+(?:-\w+)*)\)", lambda found: sheet[":root", found[1]], value)
     found = re.findall(r"#([0-9a-f]{6})\b", value)
     return found[0] if len(found) == 1 else None
 
@@ -42,16 +46,23 @@ def contrast(one, other):
     return (high + 0.05) / (low + 0.05)
 
 
-INK, PAPER, GROUND = (colour(SHEET[":root", name]) for name in ("--ink", "--paper", "--ground"))
+def root(sheet, name):
+    return colour(sheet, sheet[":root", f"--{name}"])
+
+
+def grounds(sheet):
+    """Return the colours on which text without a background of its own stands."""
+    return [root(sheet, name) for name in ("paper", "ground", "raised")]
 
 
 def texts():
-    """Return every pair of text and background colours; a rule without a background has both of the page."""
-    for selector in dict.fromkeys(selector for selector, _ in SHEET):
-        own = colour(SHEET.get((selector, "color"), ""))
-        ground = colour(SHEET.get((selector, "background"), ""))
-        for behind in [ground] if ground else [PAPER, GROUND] if own else []:
-            yield pytest.param(own or INK, behind, id=selector)
+    """Return every pair of text and background colours."""
+    for scheme, sheet in SHEETS.items():
+        for selector in dict.fromkeys(selector for selector, _ in sheet):
+            own = colour(sheet, sheet.get((selector, "color"), ""))
+            ground = colour(sheet, sheet.get((selector, "background"), ""))
+            for behind in [ground] if ground else grounds(sheet) if own else []:
+                yield pytest.param(own or root(sheet, "ink"), behind, id=f"{scheme} {selector}")
 
 
 @pytest.mark.parametrize(("text", "ground"), list(texts()))
@@ -59,11 +70,16 @@ def test_text_has_enough_contrast(text, ground):
     assert contrast(text, ground) >= TEXT
 
 
-def test_edges_of_controls_and_the_focus_have_enough_contrast():
-    edge, focus = colour(SHEET[":root", "--edge"]), colour(SHEET[":focus-visible", "outline"])
-    for one in (edge, focus):
-        assert min(contrast(one, PAPER), contrast(one, GROUND)) >= SHAPE
-    assert contrast(colour(SHEET["header :focus-visible", "outline-color"]), INK) >= SHAPE
+@pytest.mark.parametrize("scheme", SHEETS)
+def test_edges_of_controls_and_the_focus_have_enough_contrast(scheme):
+    sheet = SHEETS[scheme]
+    assert min(contrast(root(sheet, name), ground) for name in ("edge", "accent") for ground in grounds(sheet)) >= SHAPE
+
+
+def test_both_themes_have_the_same_colours():
+    names = [{name for selector, name in declarations(file) if selector == ":root" and name.startswith("--")}
+             for file in ("style.css", "dark.css")]  # fmt: skip
+    assert names[0] == names[1]
 
 
 def test_drawings_on_the_map_have_enough_contrast():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io import MeshData
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
+from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.studio.assets import bundle
@@ -28,17 +29,19 @@ except ImportError as error:
     raise ImportError(f"the widget needs anywidget ({error}): pip install 'quasiharmonic[notebook]'") from error
 
 # Messages to repeat to a new view, in this order.
-_REPEATED = "surface", "map", "obstructions"
+_REPEATED = "surface", "seams", "map", "obstructions", "image"
 
 
 class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
-    """View of a surface and its map, as in ``qhm studio``: drag the outline, corners and pins, and the map follows.
+    """View of a model and its map, as in ``qhm studio``: drag the outline, corners and pins, and the map follows.
+
+    The buttons above the view unwrap and flatten, draw seams and undo. The attributes follow what is done there.
 
     Parameters
     ----------
     surface : Problem, MapResult, (n, 2) or (n, 3) array, mesh or path
         A problem, a result, or a surface. A result keeps its boundary. A surface without a map starts with its boundary
-        on a square; a file with a map keeps its boundary.
+        on a square; a file with a map keeps its boundary. A model of several parts, or with defects, is unwrapped.
     F : (f, 3) array of int, optional
         Triangles, if ``surface`` is an array of positions.
     height : int
@@ -46,12 +49,16 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
 
     Attributes
     ----------
+    mesh : SeamedMesh
+        The surface with its seams and the last final map of all islands; it does not change during a drag.
+    selected : list of int
+        Indices of the selected islands.
     result : MapResult
-        The last certified final map; it does not change during a drag.
+        The map of the first selected island.
     problem : Problem
         The problem of that map.
     vertices : (n,) int64
-        Indices of the problem's vertices in the surface. A closed surface is cut open, so some vertices have copies.
+        Indices of the problem's vertices in the surface. A surface that is cut has copies of vertices.
 
     Raises
     ------
@@ -87,6 +94,26 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
     @property
     def problem(self) -> Problem:
         return self._session.state.problem
+
+    @property
+    def mesh(self) -> SeamedMesh:
+        return self._session.state.mesh
+
+    @property
+    def selected(self) -> list[int]:
+        return list(self._session.state.selected)
+
+    def select(self, islands: Sequence[int]) -> None:
+        """Select islands, to which the other methods apply; raise ValueError if one does not exist."""
+        self._ask({"do": "select", "islands": [int(k) for k in islands]})
+
+    def unwrap(self, *, max_stretch: float = 1.5, resolution: int = 2048, padding: float = 4) -> None:
+        """Unwrap the whole model, as `quasiharmonic.unwrap` does; raise ValueError if that is not possible."""
+        self._ask({"do": "unwrap", "max_stretch": max_stretch, "resolution": resolution, "padding": padding})
+
+    def flatten(self) -> None:
+        """Map with a free boundary, as `quasiharmonic.flatten` does; raise ValueError if that is not possible."""
+        self._ask({"do": "flatten"})
 
     def outline(self, to: str) -> None:
         """Map the boundary to a named outline, such as ``"letter:R"``; raise ValueError if that is not possible."""
@@ -147,7 +174,7 @@ def _sheet(surface: Any, F: ArrayLike | None) -> Sheet:
         # Only the positions of fixed vertices are used.
         uv = np.zeros((surface.n, 2))
         uv[surface.fixed] = surface.target
-        return make_sheet(MeshData(surface.V, surface.F).with_map(uv), "problem", surface.fixed)
+        return make_sheet(MeshData(surface.V, surface.F, source="").with_map(uv), "problem", surface.fixed)
     if isinstance(surface, MapResult):
         if surface.V is None:
             raise ValueError("the result has no surface: pass its Problem, or V and F")

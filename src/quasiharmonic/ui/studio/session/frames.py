@@ -121,9 +121,6 @@ def asked_boundary(state: SessionState, targets: Mapping[int, FloatArray], origi
 
 def seams_message(state: SessionState) -> Message:
     """Return the seams, each side with the number of its chain; or those that the user drew."""
-    if state.drawn is None:
-        sides = find_seam_sides(state)
-    else:
-        sides = sides_of(state, state.drawn)
+    sides = find_seam_sides(state) if state.drawn is None else sides_of(state, state.drawn)
     header = {"kind": "seams", "drawn": state.drawn is not None, "chains": int(sides.chains.max(initial=-1)) + 1}
     return header, {"edges": sides.edges.astype(np.uint32), "chain": sides.chains.astype(np.uint32)}

@@ -355,21 +355,23 @@ def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> 
     surface = state.sheet.surface
     source = Source(state.sheet.name, None) if state.sheet.is_file else make_start(SeamedMesh(surface.V, surface.F))
     polygons = _polygons(state, source)
-    mesh = cut_along(SeamedMesh(surface.V, surface.F), drawn, polygons=polygons)
+    mesh = SeamedMesh(surface.V, surface.F)
+    if len(drawn):
+        mesh = cut_along(mesh, drawn, polygons=polygons)
     cut = not all(is_flattenable(island) for island in mesh.islands)
     if cut:
         mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
     mapped = atlas.flatten(mesh, callback=callback)
-    words = ["flatten", source.command, "--seams", SEAMS, *recipes.option_words(cut=cut)]
+    words = ["flatten", source.command, "--seams", SEAMS if len(drawn) else "none", *recipes.option_words(cut=cut)]
     lines = [
         f"mesh = atlas.SeamedMesh({source.name!r})",
-        f"seams = np.loadtxt({SEAMS!r}, dtype=int).reshape(-1, 2)",
-        "mesh = atlas.SeamedMesh(mesh.V, mesh.F).cut(seams)",
+        "mesh = atlas.SeamedMesh(mesh.V, mesh.F)",
+        *([f"mesh = mesh.cut(np.loadtxt({SEAMS!r}, dtype=int).reshape(-1, 2))"] if len(drawn) else []),
         *(["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"] if cut else []),
         "result = atlas.flatten(mesh)",
         "mesh = result.mesh",
     ]
-    texts = {SEAMS: "".join(f"{a} {b}\n" for a, b in drawn.tolist()).encode()}
+    texts = {SEAMS: "".join(f"{a} {b}\n" for a, b in drawn.tolist()).encode()} if len(drawn) else {}
     python = recipes.write_script(lines, names=["atlas", *(["find_cuts"] if cut else [])])
     recipe = Recipe(recipes.write_command(words, "flat.obj", source), python, source.start, texts)
     return replace(rebuild(state, mapped, recipe), from_file=False, selected=tuple(range(len(mapped.islands))))
