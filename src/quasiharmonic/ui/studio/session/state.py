@@ -217,8 +217,10 @@ def describe_obstructions(state: SessionState) -> list[dict[str, Any]]:
 def _describe_drag(found: list[dict[str, Any]]) -> dict[str, Any]:
     """Return what a drag did, in place of the obstructions that follow from it."""
     crossing = any(one["edges"] and "crosses itself" in one["message"] for one in found)
-    what = "across itself, so it crosses itself" if crossing else "across the opposite side, so it is turned over"
-    return {**found[0], "message": f"The boundary was dragged {what}.", "advice": "Drag it back.", "undo": True}
+    what = (
+        "another side, so the boundary crosses itself" if crossing else "the opposite side, so the map is turned over"
+    )
+    return {**found[0], "message": f"It was dragged across {what}.", "advice": "Drag it back.", "undo": True}
 
 
 def _around(loops: list[Array]) -> list[list[int]]:
