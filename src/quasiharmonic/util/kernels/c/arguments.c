@@ -13,11 +13,12 @@ static int fits(char kind, const char *format, Py_ssize_t itemsize)
         format++;
     switch (kind) {
     case 'd':
-        return !strcmp(format, "d") && itemsize == 8;
+        /* A long double ('g') has 8 bytes on Windows and on Apple Arm. */
+        return (!strcmp(format, "d") || !strcmp(format, "g")) && itemsize == 8;
     case 'z':
-        return !strcmp(format, "Zd") && itemsize == 16;
+        return (!strcmp(format, "Zd") || !strcmp(format, "Zg")) && itemsize == 16;
     case 'q':
-        return (*format == 'q' || *format == 'l') && !format[1] && itemsize == 8;
+        return (*format == 'q' || *format == 'l' || *format == 'i') && !format[1] && (itemsize == 8 || itemsize == 4);
     case 'i':
         return (*format == 'i' || *format == 'l') && !format[1] && itemsize == 4;
     case 'u':
@@ -29,11 +30,47 @@ static int fits(char kind, const char *format, Py_ssize_t itemsize)
     }
 }
 
+/* The item of an array of int32 at a row and a column of `Argument`, as the buffer has it. */
+static int32_t *narrow(const Argument *array, Py_ssize_t row, Py_ssize_t column)
+{
+    const Py_buffer *view = &array->view;
+    Py_ssize_t stride = view->ndim > 0 && view->strides ? view->strides[view->ndim - 1] : view->itemsize;
+    Py_ssize_t row_stride = view->ndim > 1 && view->strides ? view->strides[view->ndim - 2] : array->columns * view->itemsize;
+    return (int32_t *)((char *)view->buf + row * row_stride + column * stride);
+}
+
+/* Make a contiguous copy of an array of int32 as int64: default integers have 32 bits on Windows with NumPy 1. */
+static int widen(Argument *array)
+{
+    Py_ssize_t size = array->size > 0 ? array->size : 1;
+    array->wide = PyMem_Malloc((size_t)size * sizeof(int64_t));
+    if (!array->wide) {
+        PyErr_NoMemory();
+        return 0;
+    }
+    for (Py_ssize_t row = 0; row < array->rows; row++)
+        for (Py_ssize_t column = 0; column < array->columns; column++)
+            array->wide[row * array->columns + column] = *narrow(array, row, column);
+    array->data = array->wide;
+    array->row_stride = array->columns;
+    array->stride = 1;
+    return 1;
+}
+
+/* Let the arrays go, and write copies back: kernels write indices and counts, which fit into the caller's 32 bits. */
 static void release(Argument *arguments, Py_ssize_t count)
 {
-    for (Py_ssize_t i = 0; i < count; i++)
-        if (arguments[i].held)
-            PyBuffer_Release(&arguments[i].view);
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const Argument *array = &arguments[i];
+        if (!array->held)
+            continue;
+        if (array->wide && array->written)
+            for (Py_ssize_t row = 0; row < array->rows; row++)
+                for (Py_ssize_t column = 0; column < array->columns; column++)
+                    *narrow(array, row, column) = (int32_t)array->wide[row * array->columns + column];
+        PyMem_Free(array->wide);
+        PyBuffer_Release(&arguments[i].view);
+    }
 }
 
 /* An array's data and shape. */
@@ -45,6 +82,8 @@ static int take_array(PyObject *given, char letter, int strided, Argument *to)
     if (PyObject_GetBuffer(given, &to->view, flags) < 0)
         return 0;
     to->held = 1;
+    to->wide = NULL;
+    to->written = flags & PyBUF_WRITABLE;
     const Py_buffer *view = &to->view;
     char kind = (char)tolower((unsigned char)letter);
     if (!fits(kind, view->format ? view->format : "B", view->itemsize)) {
@@ -79,7 +118,7 @@ static int take_array(PyObject *given, char letter, int strided, Argument *to)
             to->row_stride = last ? view->strides[0] / view->itemsize : 0;
         }
     }
-    return 1;
+    return kind == 'q' && view->itemsize == 4 ? widen(to) : 1;
 }
 
 int take(const char *kernel, PyObject *const *given, Py_ssize_t count, const char *kinds, Argument *arguments)

@@ -18,12 +18,15 @@ typedef struct {
     Py_ssize_t integer;
     double number;
     Py_buffer view;
-    int held;
+    int held, written;
+    /* The copy of an array of int32 that stands for int64; written back at the end if the kernel writes to it. */
+    int64_t *wide;
 } Argument;
 
 /* Read the arguments of a kernel, a letter each:
  *
  *     d float64   z complex128   q int64   i int32   u uint32   b bool, int8 or uint8     arrays, contiguous in C's order
+ *     q may also be int32, which is copied
  *     the same in upper case                                                              arrays that are written to
  *     ~ before a letter                                                                   with any strides, of two axes at most
  *     n integer   x float                                                                 numbers

@@ -46,7 +46,14 @@ static int fill(PyObject *module)
     return failed;
 }
 
-static PyModuleDef_Slot slots[] = {{Py_mod_exec, (void *)fill}, {0, NULL}};
+static PyModuleDef_Slot slots[] = {
+    {Py_mod_exec, (void *)fill},
+#ifdef Py_GIL_DISABLED
+    /* Kernels share no data but constants. */
+    {Py_mod_gil, Py_MOD_GIL_NOT_USED},
+#endif
+    {0, NULL},
+};
 
 static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT, "_compiled", "Loops of quasiharmonic, compiled.", 0, NULL, slots, NULL, NULL, NULL,
