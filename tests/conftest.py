@@ -14,6 +14,9 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYO
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# These scripts limit the resources of processes, which Windows cannot.
+collect_ignore = ["test_benchmarks.py", "test_damaged_files.py"] if os.name == "nt" else []
+
 # Beyond this number, a worker's start and its memory (half a gigabyte) cost more than it saves.
 MOST_WORKERS = 8
 

@@ -67,6 +67,17 @@ class TestTroubles:
                 assert 6 <= record["seconds"] < 60
         assert progress.failed == len(expected)
 
+    def test_a_record_that_another_program_has_open_fails_alone(self, tmp_path, failing_worker, monkeypatch):
+        """As on Windows; the next run tries the problem again."""
+        source = write_stars(tmp_path / "set", ["a", "z_in_use"])
+        progress = batch.run(source, tmp_path / "out", jobs=1)
+        assert progress.outcomes == {"injective": 1, "error": 1}
+        assert [row["problem"] for row in batch.read_table(tmp_path / "out" / "records.csv")] == ["a"]
+        monkeypatch.undo()
+        again = batch.run(source, tmp_path / "out", jobs=1)
+        assert again.resumed == 1
+        assert again.outcomes == {"injective": 2}
+
     @linux
     def test_memory_hog(self, tmp_path, failing_worker):
         source = write_stars(tmp_path / "set", ["a", "hog", "z"])

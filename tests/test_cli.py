@@ -265,7 +265,13 @@ class TestReportFailures:
 
     def test_ascii_console(self, star, tmp_path):
         command = [sys.executable, "-m", "quasiharmonic", "check", str(star)]
-        plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+        plain = {
+            **os.environ,
+            "LC_ALL": "C",
+            "PYTHONUTF8": "0",
+            "PYTHONCOERCECLOCALE": "0",
+            "PYTHONIOENCODING": "ascii",
+        }
         done = subprocess.run(command, capture_output=True, env=plain)
         assert done.returncode == 1
         assert done.stdout.isascii()
@@ -520,7 +526,7 @@ def test_progress_on_a_terminal_only(star, tmp_path):
     assert done.returncode == 0
     assert "iteration" in shown
     assert "inverted 0" in shown
-    assert shown.endswith("\r\x1b[K")
+    assert re.search(r"\r +\r$", shown)
 
 
 # One problem of every family that is feasible by construction and that Tutte's embedding does not solve.

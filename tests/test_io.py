@@ -18,8 +18,10 @@ from hypothesis.extra.numpy import arrays
 
 from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError, OutputError
+from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.formats.obj import read_regular
 from quasiharmonic.io.formats.objlines import read_obj_lines
+from quasiharmonic.io.lowlevel import atomic
 from quasiharmonic.io.lowlevel.textual import read_rows, read_text
 from quasiharmonic.io.models.meshdata import is_planar
 from shared.datasets import write_problem
@@ -674,6 +676,34 @@ def test_write_whole(tmp_path):
     assert path.read_bytes() == b"one"
     io.write_whole(str(path), lambda file: file.write(b"two"))
     assert path.read_bytes() == b"two"
+    assert left_in(tmp_path) == ["file"]
+
+
+def in_use(attempts):
+    """Return a function that replaces a file after some attempts while another program has it open."""
+    error = PermissionError(13, "Access is denied")
+    error.winerror = 5
+    errors = [error] * attempts
+
+    def replace(old, new, move=os.replace):
+        if errors:
+            raise errors.pop()
+        move(old, new)
+
+    return replace
+
+
+def test_a_file_that_another_program_has_open_is_tried_again(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+    monkeypatch.setattr(os, "replace", in_use(3))
+    io.write_whole(path, b"new")
+    assert path.read_bytes() == b"new"
+    monkeypatch.setattr(atomic, "PATIENCE", 0.1)
+    monkeypatch.setattr(os, "replace", in_use(1000))
+    with pytest.raises(FileInUseError, match="another program has it open"):
+        io.write_whole(path, b"newer")
+    assert path.read_bytes() == b"new"
     assert left_in(tmp_path) == ["file"]
 
 

@@ -13,6 +13,7 @@ import time
 from quasiharmonic.io.lowlevel import atomic
 from quasiharmonic.ui.batch import groups, metadata, worker
 
+replace = os.replace
 fill_record, ready = worker.fill_record, groups.read_problem
 
 
@@ -36,6 +37,14 @@ def raise_disk_full(*arguments):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+def raise_in_use(old, new):
+    if "record.json" in str(new):
+        error = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        error.winerror = 32  # as on Windows
+        raise error
+    replace(old, new)
+
+
 def raise_memory_error(V, F, uv):
     raise MemoryError
 
@@ -57,6 +66,7 @@ FAILURES = {
     "bug": lambda: {}["lost"],
     "noise": print_text,
     "late": lambda: setattr(metadata, "distortion", raise_memory_error),
+    "in_use": lambda: setattr(atomic.os, "replace", raise_in_use),
     "full": lambda: setattr(atomic.os, "replace", raise_disk_full),
 }
 

@@ -55,3 +55,7 @@ class MeshFileError(ValueError):
 
 class OutputError(OSError):
     """A file could not be written; an existing file at its path is unchanged."""
+
+
+class FileInUseError(OutputError):
+    """A file could not be replaced because another program has it open (Windows)."""

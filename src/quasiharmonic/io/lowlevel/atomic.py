@@ -5,11 +5,17 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from quasiharmonic.io.errors import OutputError, check_path, printable
+from quasiharmonic.io.errors import FileInUseError, OutputError, check_path, printable
+
+# Windows refuses to replace or delete a file that another program has open, for example a virus scanner, with one of
+# these errors (access denied, sharing violation, lock violation). Seconds to try again, and between attempts.
+_IN_USE = 5, 32, 33
+PATIENCE, _PAUSE = 2.0, 0.05
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
@@ -76,6 +82,8 @@ def write_whole(
     ------
     OutputError
         If the file cannot be written: no such directory, no permission, disk full.
+    FileInUseError
+        If another program keeps the old file open for two seconds (Windows).
     """
     target = check_writable(path)
     part = target.with_name(f".qhm-{os.urandom(8).hex()}.tmp")
@@ -91,13 +99,38 @@ def write_whole(
         mode = _mode(target)
         if mode is not None:
             os.chmod(part, stat.S_IMODE(mode))
-        os.replace(part, target)
+        retry_in_use(os.replace, part, target)
     except BaseException as error:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
+        if isinstance(error, FileInUseError):
+            raise FileInUseError(f"cannot write {path}: another program has it open") from error
         if isinstance(error, OSError):
             raise OutputError(f"cannot write {path}: {_reason(error)}") from error
         raise
+
+
+def retry_in_use(action: Callable[..., object], *paths: Path) -> None:
+    """Replace or delete a file; while another program has it open (Windows), try again for two seconds.
+
+    Raises
+    ------
+    FileInUseError
+        If the file is still open then.
+    OSError
+        Other errors of ``action``, at once.
+    """
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            action(*paths)
+            return
+        except PermissionError as error:
+            if getattr(error, "winerror", None) not in _IN_USE:
+                raise
+            if time.monotonic() > end:
+                raise FileInUseError(f"another program has {paths[-1]} open") from error
+            time.sleep(_PAUSE)
 
 
 @contextlib.contextmanager

@@ -20,6 +20,7 @@ import numpy as np
 
 from quasiharmonic import io
 from quasiharmonic.geometry.exact.batched_loops import certify_each
+from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Problem
@@ -89,11 +90,14 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
         record = read[k].record
         record |= metadata.sizes([posed[k].problem]) | metadata.describe_search([result], result.status)
         record |= {"flips_before": result.history[0].inverted, "seconds_map": result.seconds}
-        records.clear(folders[k])
-        with metadata.time_phase(record, "write"):
-            path = records.map_path(folders[k])
-            io.write_obj(path, posed[k].mapped(result.uv), durable=False)
-            found = _read_map(io.read_mesh(path))
+        try:
+            records.clear(folders[k])
+            with metadata.time_phase(record, "write"):
+                path = records.map_path(folders[k])
+                io.write_obj(path, posed[k].mapped(result.uv), durable=False)
+                found = _read_map(io.read_mesh(path))
+        except FileInUseError:
+            continue  # tried again when the problem is solved individually
         if np.array_equal(found.F, posed[k].problem.F) and len(found.V) == posed[k].problem.n:
             written[k] = found
     with _time_shared([read[k].record for k in written], "write"):
@@ -114,7 +118,10 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
             record |= metadata.measure(*found)
         record["peak_memory"] = metadata.peak()
         record["seconds"] = sum(value for name, value in record.items() if name.startswith("seconds_"))
-        records.write_record(folders[k], record)
+        try:
+            records.write_record(folders[k], record)
+        except FileInUseError:
+            continue
         tell({"done": k, "outcome": "injective", "seconds": record["seconds"]})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,25 +17,32 @@ FILE = "qhm-batch.lock"
 def lock_folder(folder: Path) -> Iterator[None]:
     """Lock a folder against other runs; the system releases the lock when this process ends for any reason.
 
-    If the system (Windows) or the file system has no such locks, the folder is not locked. OutputError if another run
-    has locked the folder, or the folder cannot be written to.
+    If the file system has no such locks, the folder is not locked. OutputError if another run has locked the folder, or
+    the folder cannot be written to.
     """
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
     try:
         file = open(folder / FILE, "ab")  # noqa: SIM115
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+            _lock(file.fileno())
+        except (BlockingIOError, PermissionError):
             raise OutputError(
                 f"another run is writing to {folder}: wait for its end, or choose another folder"
             ) from None
         except OSError:
             pass  # a file system without locks
         yield
+
+
+def _lock(descriptor: int) -> None:
+    """Lock an open file; BlockingIOError (POSIX) or PermissionError (Windows) if another process has locked it."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -81,9 +81,13 @@ def peak() -> int | None:
     """Return the peak resident memory in bytes: since `forget_peak` on Linux, of the process elsewhere; else None."""
     with suppress(OSError, IndexError):
         return 1024 * int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmHWM:")[1].split()[0])
-    try:
-        import resource
-    except ImportError:
+    if sys.platform == "win32":
+        with suppress(ImportError):
+            import psutil
+
+            return int(psutil.Process().memory_info().peak_wset)
         return None
+    import resource
+
     max_rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return max_rss if sys.platform == "darwin" else 1024 * max_rss

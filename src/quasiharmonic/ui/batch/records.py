@@ -14,8 +14,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.io.errors import MeshFileError, OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path
+from quasiharmonic.io.lowlevel.atomic import retry_in_use, write_whole
 
 Record = dict[str, Any]
 
@@ -132,12 +132,14 @@ def _is_whole(record: Record) -> bool:
 def clear(folder: Path) -> None:
     """Create the folder of a problem's results, and delete results of an earlier attempt, the record first.
 
-    OutputError if the folder cannot be created or emptied.
+    OutputError if the folder cannot be created or emptied, FileInUseError if another program has one of its files open.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for path in (folder / FILE, folder / _MAP, *folder.glob(".qhm-*.tmp")):
-            path.unlink(missing_ok=True)
+            retry_in_use(lambda old: old.unlink(missing_ok=True), path)
+    except FileInUseError:
+        raise
     except OSError as error:
         raise OutputError(f"cannot write results to {folder}: {error.strerror or error}") from error
 

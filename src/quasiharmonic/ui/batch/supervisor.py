@@ -17,7 +17,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, BinaryIO, NamedTuple
 
-from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.errors import FileInUseError, OutputError
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.ui.batch.records import Record
@@ -211,8 +211,9 @@ def _start_record(files: ProblemFiles, orders: Orders) -> Record:
 
 def _conclude(folder: Path, record: Record, seconds: float) -> Finished:
     """Write the record of a problem whose process could not write it."""
-    records.clear(folder)
-    records.write_record(folder, record | {"seconds": seconds})
+    with suppress(FileInUseError):  # without a record the next run tries this problem again
+        records.clear(folder)
+        records.write_record(folder, record | {"seconds": seconds})
     return Finished(record["problem"], record["outcome"], seconds)
 
 

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from math import isfinite
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +32,14 @@ from quasiharmonic.apps.repair.fitting import FittedProblem
 from quasiharmonic.energies.polishing import PolishOptions, polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refine.attempts import on_refinement
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.ui.cli.streams import detach_input
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"
@@ -63,11 +65,12 @@ def serve() -> None:
             os._exit(0)
 
     jobs: SimpleQueue[bytes] = SimpleQueue()
-    threading.Thread(target=_listen, args=(jobs,), daemon=True).start()
+    threading.Thread(target=_listen, args=(detach_input(), jobs), daemon=True).start()
     tell({READY: True})
     while True:
         job = json.loads(jobs.get())
         _alarm(job["time_limit"])
+        began = time.perf_counter()
         try:
             if "together" in job:
                 groups.solve_some(job["together"], tell)
@@ -75,17 +78,18 @@ def serve() -> None:
             else:
                 record = solve_files(job, tell)
                 answer = {"outcome": record["outcome"], "seconds": record["seconds"]}
+        except FileInUseError:
+            # No record can be written, so the next run tries this problem again.
+            answer = {"outcome": "error", "seconds": time.perf_counter() - began}
         except io.OutputError as error:
             answer = {"stop": str(error)}
         tell(answer)
         _alarm(None)
 
 
-def _listen(jobs: SimpleQueue[bytes]) -> None:
-    # Not sys.stdin, because the interpreter cannot close it at exit while a thread reads it.
-    with os.fdopen(os.dup(0), "rb") as source:
-        for line in source:
-            jobs.put(line)
+def _listen(source: BinaryIO, jobs: SimpleQueue[bytes]) -> None:
+    for line in source:
+        jobs.put(line)
     # The supervisor is gone, so the current job is not needed.
     os._exit(0)
 
@@ -110,6 +114,8 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     record: Record = {**job["record"], "versions": metadata.versions()}
     try:
         fill_record(job, folder, record, tell)
+    except FileInUseError as error:
+        record |= _describe_error(error)
     except io.OutputError:
         raise
     except MemoryError as error:

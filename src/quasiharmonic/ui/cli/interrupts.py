@@ -6,7 +6,6 @@ During the initialisation of an extension module it can turn into another except
 
 from __future__ import annotations
 
-import _thread
 import signal
 import sys
 import threading
@@ -64,8 +63,8 @@ class Interrupts:
 
 
 def _interrupt_main() -> None:
-    """Interrupt the main thread; where the system supports it, also while it waits."""
+    """Interrupt the main thread, also while it waits."""
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-    else:
-        _thread.interrupt_main()
+    else:  # Windows, where `_thread.interrupt_main` does not wake a thread that sleeps
+        signal.raise_signal(signal.SIGINT)

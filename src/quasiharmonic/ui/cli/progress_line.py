@@ -19,6 +19,13 @@ def _of_search(step: Step) -> str:
     return f"iteration {step.iteration}   inverted {step.inverted}   energy/area {step.energy:.3g}"
 
 
+def overwrite(text: str) -> None:
+    """Write text over the terminal's current line, and blanks after it: old Windows consoles print escape codes."""
+    width = max(shutil.get_terminal_size().columns - 1, 1)
+    sys.stderr.write("\r" + text[:width].ljust(width) + ("" if text else "\r"))
+    sys.stderr.flush()
+
+
 @contextmanager
 def line(words: Callable[[Any], str] = _of_search) -> Iterator[Callable[[Any], None] | None]:
     """Yield a callback that shows steps, or None if standard error is not a terminal."""
@@ -33,11 +40,9 @@ def line(words: Callable[[Any], str] = _of_search) -> Iterator[Callable[[Any], N
         if now - shown < _INTERVAL:
             return
         shown = now
-        sys.stderr.write("\r\x1b[K" + words(step)[: shutil.get_terminal_size().columns - 1])
-        sys.stderr.flush()
+        overwrite(words(step))
 
     try:
         yield show
     finally:
-        sys.stderr.write("\r\x1b[K")
-        sys.stderr.flush()
+        overwrite("")

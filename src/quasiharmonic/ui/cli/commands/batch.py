@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from quasiharmonic.ui.cli.progress_line import overwrite
 from quasiharmonic.ui.cli.streams import tell
 
 if TYPE_CHECKING:
@@ -257,16 +257,14 @@ class _Display:
         if progress.seconds_left is not None:
             text += f"   {_duration(progress.seconds_left)} left"
         if self._terminal:
-            sys.stderr.write("\r\x1b[K" + text[: shutil.get_terminal_size().columns - 1])
-            sys.stderr.flush()
+            overwrite(text)
         else:
             tell(text)
 
     def clear(self) -> None:
         """Erase the progress line."""
         if self._terminal:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
+            overwrite("")
 
 
 def _duration(seconds: float) -> str:

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from quasiharmonic.ui.cli.streams import detach_input
 from quasiharmonic.ui.studio.protocol import Array, Frame, decode, encode
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.storage import Storage
@@ -49,7 +50,7 @@ def serve(source: str, folder: str = "") -> None:
             # The server is gone.
             os._exit(0)
 
-    inbox = Inbox(os.fdopen(os.dup(0), "rb"))
+    inbox = Inbox(detach_input())
     session = Session(tell, inbox.waiting, Storage(Path(folder)) if folder else None)
     try:
         if session.restore():
