@@ -106,8 +106,11 @@ REPRESENTATIONS = "Path(", "Error(", "errno", "Errno", "object at 0x", "np.float
 
 
 def test_outputs_with_unusable_names(folder, capsys):
-    os.symlink("loop.obj", folder / "loop.obj")
-    for name in ("loop.obj", "a\0b.obj"):
+    names = ["a\0b.obj"]
+    if os.name == "posix":
+        os.symlink("loop.obj", folder / "loop.obj")
+        names.append("loop.obj")
+    for name in names:
         with pytest.raises(OutputError) as raised:
             io.check_writable(folder / name)
         said = str(raised.value)

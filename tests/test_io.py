@@ -250,7 +250,8 @@ def test_files_that_cannot_be_opened(tmp_path):
         io.read_mesh(tmp_path / "folder.obj")
     with pytest.raises(MeshFileError, match="is not a file name"):
         io.read_mesh("a\0b.obj")
-    with pytest.raises(MeshFileError, match="cannot be read"):
+    # Windows says of such a name that there is no such file.
+    with pytest.raises(MeshFileError, match=r"cannot be read|there is no such file"):
         io.read_mesh("x" * 5000 + ".obj")
 
 
@@ -732,7 +733,7 @@ def test_paths_that_cannot_be_written(tmp_path):
         (tmp_path / "none" / "a.obj", "there is no directory"),
         (tmp_path / "file" / "a.obj", "there is no directory|Not a directory"),
         (tmp_path / "folder.obj", "it is a directory"),
-        (tmp_path / ("x" * 5000 + ".obj"), "cannot write"),
+        *([(tmp_path / ("x" * 5000 + ".obj"), "cannot write")] if os.name == "posix" else []),
         ("a\0b.obj", "cannot write"),
     ):
         with pytest.raises(OutputError, match=message):

@@ -73,8 +73,8 @@ def triangulate_air(
     others = np.empty((0, 2)) if around is None else np.ldexp(np.asarray(around, dtype=np.float64), -exponent)
     outline = np.ldexp(positions[boundary], -exponent)
     start = np.cumsum([0, *(len(loop) for loop in loops)])
-    heads = np.concatenate([np.roll(np.arange(*ends), -1) for ends in pairwise(start.tolist())])
-    segments = np.stack([np.arange(len(boundary)), heads], axis=1)
+    heads = np.concatenate([np.roll(np.arange(*ends, dtype=np.int64), -1) for ends in pairwise(start.tolist())])
+    segments = np.stack([np.arange(len(boundary), dtype=np.int64), heads], axis=1)
 
     corner, side, shape = _squares(np.concatenate([outline, others]), margin)
     frame = _frame(corner, side, shape)

@@ -53,7 +53,7 @@ class Quadtree:
 
     def leaves(self) -> tuple[IntArray, IntArray, IntArray]:
         """Return level and integer position along x and y of every square that is not split; each (k,) int64."""
-        x, y = (axis.ravel() for axis in np.meshgrid(*map(np.arange, self.shape)))
+        x, y = (axis.ravel() for axis in np.indices(self.shape[::-1], dtype=np.int64)[::-1])
         there = (y << _BITS) + x
         levels, kept = [], []
         for depth, split in enumerate([*self.split, np.empty(0, dtype=np.int64)]):
