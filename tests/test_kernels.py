@@ -245,12 +245,6 @@ def test_the_environment_switches_kernels_off(value, switched):
     assert (done.stdout.strip() == "True") >= switched
 
 
-def test_kernels_are_not_used_where_default_integers_have_32_bits():
-    code = "import numpy; numpy.int_ = numpy.int32; from quasiharmonic.util import kernels; print(kernels.extension)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "None"
-
-
 @needs_extension
 @pytest.mark.skipif(sys.platform == "win32", reason="symbols are hidden there by default")
 def test_the_extension_exports_its_entry_point_alone():

@@ -14,9 +14,26 @@ import sys
 from pathlib import Path
 
 OBJDUMP = "x86_64-w64-mingw32-objdump"
-ONE_ARGUMENT = "acos acosh asin asinh atan atanh cos cosh exp log proj sin sinh sqrt tan tanh".split()
+ONE_ARGUMENT = [
+    "acos",
+    "acosh",
+    "asin",
+    "asinh",
+    "atan",
+    "atanh",
+    "cos",
+    "cosh",
+    "exp",
+    "log",
+    "proj",
+    "sin",
+    "sinh",
+    "sqrt",
+    "tan",
+    "tanh",
+]
 
-# Structures, because Windows passes and returns complex numbers as it does structures.
+# Windows passes and returns complex numbers as it does structures.
 HEAD = """#include <complex.h>
 #include <math.h>
 

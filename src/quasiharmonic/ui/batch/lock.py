@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +16,8 @@ FILE = "qhm-batch.lock"
 def lock_folder(folder: Path) -> Iterator[None]:
     """Lock a folder against other runs; the system releases the lock when this process ends for any reason.
 
-    If the file system has no such locks, the folder is not locked. OutputError if another run has locked the folder, or
-    the folder cannot be written to.
+    If the system or the file system has no such locks, the folder is not locked. OutputError if another run has locked
+    the folder, or the folder cannot be written to.
     """
     try:
         file = open(folder / FILE, "ab")  # noqa: SIM115
@@ -38,11 +37,17 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 def _lock(descriptor: int) -> None:
     """Lock an open file; BlockingIOError (POSIX) or PermissionError (Windows) if another process has locked it."""
-    if sys.platform == "win32":
-        import msvcrt
-
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    else:
+    try:
         import fcntl
-
+    except ImportError:
+        _lock_on_windows(descriptor)
+    else:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _lock_on_windows(descriptor: int) -> None:
+    try:
+        import msvcrt
+    except ImportError:
+        return  # a system without locks
+    msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]

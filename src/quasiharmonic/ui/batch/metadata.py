@@ -81,13 +81,17 @@ def peak() -> int | None:
     """Return the peak resident memory in bytes: since `forget_peak` on Linux, of the process elsewhere; else None."""
     with suppress(OSError, IndexError):
         return 1024 * int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmHWM:")[1].split()[0])
-    if sys.platform == "win32":
-        with suppress(ImportError):
-            import psutil
-
-            return int(psutil.Process().memory_info().peak_wset)
-        return None
-    import resource
-
+    try:
+        import resource
+    except ImportError:
+        return _peak_on_windows()
     max_rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return max_rss if sys.platform == "darwin" else 1024 * max_rss
+
+
+def _peak_on_windows() -> int | None:
+    try:
+        import psutil
+    except ImportError:
+        return None
+    return getattr(psutil.Process().memory_info(), "peak_wset", None)

@@ -39,7 +39,7 @@ from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refine.attempts import on_refinement
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
-from quasiharmonic.ui.cli.streams import detach_input
+from quasiharmonic.util.standard_input import detach_input
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import suppress
-from typing import BinaryIO
 
 #: Exit status of a process that wrote to a pipe without a reader: 128 plus the number of SIGPIPE.
 NO_READER = 141
@@ -16,18 +15,6 @@ def tell(text: str) -> None:
     if sys.stderr is not None:
         with suppress(OSError):
             print(text, file=sys.stderr, flush=True)
-
-
-def detach_input() -> BinaryIO:
-    """Return the process's standard input as a binary file, and leave the null device in its place.
-
-    A thread may then read the file while other threads work: on Windows, a library's start-up code waits for standard
-    input while a thread reads it, and the interpreter cannot close `sys.stdin` at exit.
-    """
-    source = os.fdopen(os.dup(0), "rb")
-    with open(os.devnull, "rb") as nothing:
-        os.dup2(nothing.fileno(), 0)
-    return source
 
 
 def finish(status: int) -> int:

@@ -17,9 +17,10 @@ passes only these on. `index_array`, `triangle_array`, `vertex_array` and simila
 such as the triangles of a `Domain` or a `Certificate`. A read-only array may be a view of a writeable one, so it is
 copied.
 
-Set ``QUASIHARMONIC_PURE=1`` in the environment to run the NumPy versions. They also run where NumPy's default integers
-have 32 bits (NumPy 1 on Windows, as in Blender), because kernels take arrays of 64-bit integers. Both versions give the
-same results up to rounding, and identical results in the package `exact`.
+Kernels copy arrays of 32-bit integers, which NumPy 1 makes by default on Windows, as in Blender.
+
+Set ``QUASIHARMONIC_PURE=1`` in the environment to run the NumPy versions. Both versions give the same results up to
+rounding, and identical results in the package `exact`.
 
 Constants that both versions use are assigned in Python; `constants` writes them into a C header during the build.
 
@@ -32,13 +33,9 @@ import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import numpy as np
-
 try:
     if os.environ.get("QUASIHARMONIC_PURE", "0") not in ("", "0"):
         raise ImportError("switched off")
-    if np.dtype(np.int_).itemsize < 8:
-        raise ImportError("default integers have 32 bits")
     from quasiharmonic.util.kernels import _compiled as extension
 except ImportError:
     extension = None  # type: ignore[assignment]

@@ -15,11 +15,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.ui.cli.streams import detach_input
 from quasiharmonic.ui.studio.protocol import Array, Frame, decode, encode
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import read_sheet
+from quasiharmonic.util.standard_input import detach_input
 
 #: Maximum total size of waiting messages, bytes.
 MAX_WAITING = 256 << 20
