@@ -366,7 +366,7 @@ def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> 
     lines = [
         f"mesh = atlas.SeamedMesh({source.name!r})",
         "mesh = atlas.SeamedMesh(mesh.V, mesh.F)",
-        *([f"mesh = mesh.cut(np.loadtxt({SEAMS!r}, dtype=int).reshape(-1, 2))"] if len(drawn) else []),
+        *([f"mesh = mesh.cut(np.loadtxt({SEAMS!r}, dtype=np.int64).reshape(-1, 2))"] if len(drawn) else []),
         *(["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"] if cut else []),
         "result = atlas.flatten(mesh)",
         "mesh = result.mesh",

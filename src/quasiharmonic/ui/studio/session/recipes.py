@@ -134,4 +134,4 @@ def outline_script(
 
 def read_indices(name: str | None) -> Code | None:
     """Return the code that reads a list of vertices."""
-    return None if name is None else Code(f"np.loadtxt({name!r}, dtype=int)")
+    return None if name is None else Code(f"np.loadtxt({name!r}, dtype=np.int64)")
