@@ -77,7 +77,8 @@ def read_parts(objects: Sequence[bpy.types.Object], *, edited: bool) -> list[Par
         V = here.mesh.V @ _stretch_of(np.array(thing.matrix_world)[:3, :3])
         parts.append(Part(data, here, here.selected, V, surface.marked_seams(data)))
     if not parts:
-        raise Refused("all faces are hidden" if edited and any(len(o.data.polygons) for o in objects) else "no faces")
+        hidden = edited and any(len(thing.data.polygons) for thing in objects)
+        raise Refused("all faces are hidden" if hidden else "the mesh has no faces")
     if not any(part.chosen.any() for part in parts):
         return [Part(part.data, part.surface, part.surface.shown, part.V, part.seams) for part in parts]
     return [part for part in parts if part.chosen.any()]

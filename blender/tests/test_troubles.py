@@ -2,6 +2,7 @@
 
 import importlib
 import threading
+import time
 from types import SimpleNamespace
 
 import bpy
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import scenes
 
-ALL = ["check", "repair", "flatten", "reduce_stretch", "fit"]
+ALL = ["check", "repair", "unwrap", "flatten", "reduce_stretch", "fit"]
 
 
 def refused(act, **rest):
@@ -90,7 +91,7 @@ def test_fit_to_what_is_no_outline():
     assert set(bpy.data.objects) == things
 
 
-@pytest.mark.parametrize("act", ["repair", "flatten", "reduce_stretch", "fit"])
+@pytest.mark.parametrize("act", ["repair", "unwrap", "flatten", "reduce_stretch", "fit"])
 @pytest.mark.parametrize("edit", [False, True])
 def test_cancelled_it_leaves_everything_as_it_was(extension, act, edit, monkeypatch, said):
     job = importlib.import_module(f"{extension}.job")
@@ -172,6 +173,63 @@ class Looking:
 
     def event(self, kind):
         return self.modal(self.context, SimpleNamespace(type=kind, value="PRESS"))
+
+
+def test_progress_of_an_unwrap_is_a_bar(extension):
+    job = importlib.import_module(f"{extension}.job")
+    go_on = threading.Event()
+
+    def work(reports_progress):
+        reports_progress(SimpleNamespace(phase="flatten", done=3, total=12))
+        go_on.wait(10)
+
+    window = Looking(job, work)
+    window._job.start()
+    while window._job.step is None:
+        window._job._thread.join(0.01)
+    window.event("TIMER")
+    go_on.set()
+    window._job.wait()
+    (shown,) = (line for line in window.log if isinstance(line, dict))
+    assert shown == {"text": "Work: flatten 3 of 12 (Esc cancels)", "factor": 0.25, "type": "BAR"}
+
+
+def test_an_unwrap_stops_soon(extension):
+    job, unwrapping = (importlib.import_module(f"{extension}.{name}") for name in ("job", "unwrapping"))
+    bpy.ops.mesh.primitive_monkey_add()
+    thing = bpy.context.object
+    thing.modifiers.new("finer", "SUBSURF").levels = 2
+    bpy.ops.object.modifier_apply(modifier="finer")
+    before = scenes.places(thing)
+    parts = unwrapping.read_parts([thing], edited=False)
+    one = job.Job(lambda callback: unwrapping.unwrap_parts(parts, keep_seams=False, callback=callback))
+    one.start()
+    while one.step is None or one.step.phase == "clean":
+        one._thread.join(0.01)
+    one.stop()
+    began = time.perf_counter()
+    one.wait()
+    assert isinstance(one.error, KeyboardInterrupt)
+    assert time.perf_counter() - began < 5
+    assert np.array_equal(scenes.places(thing), before)
+
+
+def test_buttons_of_the_panel(extension):
+    panel = importlib.import_module(f"{extension}.panel")
+    shown = []
+
+    def operator(name, text=""):
+        shown.append(name)
+        return SimpleNamespace()
+
+    column = SimpleNamespace(operator=operator, separator=lambda: None)
+    curve = SimpleNamespace(type="CURVE", name="ring")
+    panel._Buttons.draw(
+        SimpleNamespace(layout=SimpleNamespace(column=lambda align: column)), SimpleNamespace(selected_objects=[curve])
+    )
+    assert set(shown) == {f"uv.qhm_{act}" for act in ALL}
+    assert shown.count("uv.qhm_fit") == 4
+    assert all(hasattr(bpy.types, f"UV_OT_{name.partition('.')[2]}") for name in shown)
 
 
 @pytest.mark.parametrize("escape", [False, True])
