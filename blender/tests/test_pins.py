@@ -8,11 +8,12 @@ import scenes
 
 def pin(thing, loops):
     """Pin the UVs of loops, and no others."""
-    layer = thing.data.uv_layers.active
-    layer.pin_ensure()
+    # Blender's name of the attribute; Blender 4.5 has no pin_ensure.
+    name = f".pn.{thing.data.uv_layers.active.name}"
+    layer = thing.data.attributes.get(name) or thing.data.attributes.new(name, "BOOLEAN", "CORNER")
     pinned = np.zeros(len(thing.data.loops), dtype=bool)
     pinned[loops] = True
-    layer.pin.foreach_set("value", pinned)
+    layer.data.foreach_set("value", pinned)
 
 
 def pin_vertices(thing, positions):
