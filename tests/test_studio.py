@@ -307,6 +307,34 @@ def test_a_model_that_is_inside_out_is_recognised_and_turned():
     assert one.last("map").header["inward"] == 1
 
 
+def test_the_surface_is_shown_before_its_map_and_every_step_reports_progress():
+    one = Visitor(*starfish(3, 8))
+    kinds = [frame.header["kind"] for frame in one.frames]
+    assert kinds[:2] == ["surface", "busy"]
+    assert "progress" in kinds[: kinds.index("map")]
+    for what in ("unwrap", "flatten"):
+        answered = one.does(what)
+        assert answered[0].header["kind"] == "busy"
+        assert any(frame.header["kind"] == "progress" for frame in answered)
+    phases = {frame.header.get("phase") for frame in one.frames if frame.header["kind"] == "progress"}
+    assert {"clean", "cut", "pack", "certify"} <= phases
+
+
+def test_a_large_model_that_must_be_cut_opens_without_a_map(monkeypatch):
+    monkeypatch.setattr("quasiharmonic.ui.studio.session.setup.MAX_AUTOMATIC", 100)
+    one = Visitor(*starfish(3, 8))
+    shown = one.last("map")
+    assert not shown.header["mapped"]
+    assert "places" not in shown.arrays
+    for what, words in (("polish", {"energy": "mips"}), ("pack", {}), ("save", {}), ("grab", {"vertex": 0})):
+        (note,) = [frame for frame in one.does(what, **words) if frame.header["kind"] == "note"]
+        assert "press Unwrap" in note.header["text"]
+    one.does("unwrap", resolution=512)
+    assert one.last("map").header["bijective"]
+    one.does("undo")
+    assert not one.last("map").header["mapped"]
+
+
 def test_an_image_is_shown_and_saved_with_the_map(tmp_path):
     one = Visitor(*cat(6))
     (note,) = one.does("image", {"content": np.frombuffer(b"no image", np.uint8)})

@@ -338,3 +338,15 @@ def test_two_fingers_zoom_and_one_drags(served_parts, browser):
     send("touchEnd")
     assert page.evaluate("studio.view.hands.space().yaw") > 0.2
     context.close()
+
+
+def test_handles_behind_the_surface_are_faded_and_not_those_in_front(address, opened):
+    page = opened(address)
+    hidden = """() => {
+      const { scene, hands } = studio.view;
+      const hidden = [...hands.space().hidden(scene.corners, scene.triangles)];
+      return hidden.map((vertex) => scene.corners.indexOf(vertex)).sort();
+    }"""
+    assert page.evaluate(hidden) == [2, 3], "the corners behind the ears"
+    page.evaluate("studio.view.hands.space().turnBy(Math.PI * 100, 0)")
+    assert not {2, 3} & set(page.evaluate(hidden))

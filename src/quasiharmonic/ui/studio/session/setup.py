@@ -46,15 +46,18 @@ def open_without_map(sheet: Sheet) -> SessionState:
 def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = None) -> SessionState:
     """Return the initial state of a model: with the map of the file; otherwise a square, a flat map, or charts.
 
-    A disk is mapped to a square. Another connected surface is flattened, and cut before if necessary. Any other model
-    is unwrapped. Large models that must be cut have no map.
+    A disk is mapped to a square if possible. Another connected surface is flattened, and cut before if necessary. Any
+    other model is unwrapped. Large models that must be cut have no map.
     """
     bare = open_without_map(sheet)
     if has_complete_map(sheet.mesh) or (sheet.fixed is not None and sheet.is_file and sheet.mesh.FT is not None):
         return _take_map(sheet, bare, callback)
     if len(bare.islands) == 1 and sheet.is_file:
         if _is_disk(bare.islands[0]):
-            return map_to_outline(bare, make_outline(_FIRST_OUTLINE), callback=callback)
+            square = map_to_outline(bare, make_outline(_FIRST_OUTLINE), callback=callback)
+            # Some disks have no map to a square, because triangles have all corners on one side of it.
+            if square.result.certificate.bijective:
+                return square
         if len(sheet.surface.F) <= MAX_AUTOMATIC:
             try:
                 return flatten_islands(bare, callback)
