@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from quasiharmonic.apps.unwrapping.chart_maps import EvenStretch, WorkingChart
 from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, in_units
@@ -28,6 +29,8 @@ _STEPS = 2
 _TOLERANCE = 1e-2
 # The search stops after this number of successive updates without fewer crossings.
 _MAX_STALLS = 4
+# In larger charts, only so many vertices move, those closest to overlaps.
+_MAX_FREE = 20_000
 
 
 class Penetrations:
@@ -91,7 +94,7 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
     """Move overlapping boundary parts of a chart apart; return whether the map is then bijective."""
     assert chart.uv is not None
     energy = chart.piece.energy(EvenStretch(bound), None)
-    fixed = np.array([int(chart.piece.loops[0][0])])
+    fixed = _find_far_vertices(chart)
     pairs = Penetrations(_WEIGHT / len(chart.F))
     system = NewtonSystem(energy.F, energy.g, len(chart.uv), fixed, "auto")
     coordinates = Coordinates.of(chart.uv, fixed, 0)
@@ -116,6 +119,15 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
         if not len(crossings) or stalls == _MAX_STALLS:
             break
     return False
+
+
+def _find_far_vertices(chart: WorkingChart) -> IntArray:
+    """Vertices that stay where they are: at least one, and in a large chart all that are far from its overlaps."""
+    assert chart.uv is not None
+    if len(chart.uv) <= _MAX_FREE:
+        return np.array([int(chart.piece.loops[0][0])])
+    distance, _ = KDTree(chart.uv[np.unique(chart.crossings)]).query(chart.uv)
+    return np.sort(np.argsort(distance, kind="stable")[_MAX_FREE:])
 
 
 def overlapping_share(chart: WorkingChart) -> float:
