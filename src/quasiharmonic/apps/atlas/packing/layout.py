@@ -16,7 +16,8 @@ from quasiharmonic.util.progress import heartbeat
 
 # Cells along a tile for at most so many charts, and on the finer board for the final layout. More charts get
 # proportionally smaller cells, up to a limit.
-_CELLS, _FINE_CELLS, _CELLS_OF_MANY, _FEW, _MOST_CELLS = 96, 256, 128, 20, 2048
+_CELLS, _FINE_CELLS, _FEW = 128, 384, 36
+_CELLS_OF_MANY, _FEW_OF_MANY, _MOST_CELLS = 128, 20, 2048
 # Directions of each chart: sixteen for at most so many charts, then eight. More than the second number get four, and
 # their boards are searched window by window.
 _MOST_DIRECTIONS, _MANY = 10, 50
@@ -29,7 +30,7 @@ _EXPECTED = 0.8
 # The number of cells along a tile varies between these multiples of the expected number.
 _FEWEST_CELLS, _MORE_CELLS = 0.8, 1.25
 # Placements tried with other orders of the charts, in all.
-_TRIALS = 60
+_TRIALS = 300
 # Directions compared for the expected scale.
 _TURNS = 16
 # Angles compared for the direction of a single chart, and the precision of the best one.
@@ -201,7 +202,8 @@ class _Search:
         self._size, self._tiles, self._padding = size, tiles, padding
         few = len(shapes) <= _MANY
         cells = (_CELLS if given is None else _FINE_CELLS) if few else _CELLS_OF_MANY
-        self.cells = ceil(min(cells * max(1.0, sqrt(len(shapes) / tiles / _FEW)), _MOST_CELLS))
+        number = _FEW if few else _FEW_OF_MANY
+        self.cells = ceil(min(cells * max(1.0, sqrt(len(shapes) / tiles / number)), _MOST_CELLS))
         # Length of a cell's side.
         self._cell = max(size) / self.cells / scale
         radius = _MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
