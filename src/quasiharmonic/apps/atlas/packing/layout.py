@@ -20,7 +20,7 @@ _CELLS, _FINE_CELLS, _FEW = 128, 384, 36
 _CELLS_OF_MANY, _FEW_OF_MANY, _MOST_CELLS = 128, 20, 2048
 # Directions of each chart: sixteen for at most so many charts, then eight. More than the second number get four, and
 # their boards are searched window by window.
-_MOST_DIRECTIONS, _MANY = 10, 50
+_MOST_DIRECTIONS, _MANY = 20, 50
 # Range of the scale on the finer board, relative to that on the coarser one.
 _FINE_GAIN, _FINE_LOSS = 1.06, 1.01
 # Charts beyond this number are placed as boxes, the smallest ones.
