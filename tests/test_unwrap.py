@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import inverted_triangles, unwrap
+from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.apps.unwrapping.rounding import round_positions
+from quasiharmonic.apps.unwrapping.separation import separate
 from quasiharmonic.surfaces import annulus, grid, random_delaunay, starfish
 from shared.exact import exact_orientation
 from shared.meshes import lift
@@ -345,3 +347,23 @@ def test_a_single_long_polygon_is_not_divided():
     inside = np.array([[False, False, True], [True, False, False]])
     assert unwrap(points, triangles, resolution=512).n_charts == 2
     assert unwrap(points, triangles, resolution=512, edge_costs=np.where(inside, 1000.0, 1.0)).n_charts == 1
+
+
+@pytest.mark.slow
+def test_separation_of_a_large_chart_moves_only_vertices_close_to_the_overlap():
+    """A strip around a circle whose ends overlap a little in the plane."""
+    V, F = grid(100, 220)
+    radius, angle = 1 + 0.3 * V[:, 0], (2 * np.pi + 0.002) * V[:, 1]
+    uv = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    V = np.column_stack([uv, 0.01 * angle])
+    chart = WorkingChart(np.arange(len(F)), np.arange(len(V)), V, F, np.ones(F.shape), uv.copy())
+    chart.use(uv)
+    before = chart.uv
+    assert len(chart.crossings) > 0
+    assert not chart.bijective
+    assert separate(chart, 1.5, lambda: None)
+    assert chart.bijective
+    far = np.argsort(uv[:, 0])[:1000]
+    scale = np.ptp(chart.uv[far], axis=0) / np.ptp(before[far], axis=0)
+    moved = (chart.uv - chart.uv[far].mean(axis=0)) / scale - (before - before[far].mean(axis=0))
+    assert np.abs(moved[far]).max() < 1e-12 < 1e-6 < np.abs(moved).max()
