@@ -28,27 +28,23 @@ def is_module(parts):
     return all(parts) and bool(parts) and (path.with_suffix(".py").exists() or (path / "__init__.py").exists())
 
 
-def docstrings(tree):
-    """Identities of the constants that are docstrings."""
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
-            yield id(body[0].value)
-
-
 def imported(tree):
     """Modules of the library that a file imports, as parts of their dotted names, including imports by string.
 
     Public names of the library itself are an error, because `quasiharmonic` imports their modules lazily.
     """
-    documentation = set(docstrings(tree))
+    docstrings = set()
+    # A node is visited after the one that contains it.
     for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
+            docstrings.add(id(body[0].value))
         if isinstance(node, ast.Import):
             dotted = [(alias.name.split("."), None) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, "a relative import"
             dotted = [((node.module or "").split("."), alias.name) for alias in node.names]
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documentation:
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
             parts = node.value.split(".")
             dotted = [(parts, None)] if parts[0] == "quasiharmonic" and is_module(tuple(parts[1:])) else []
         else:

@@ -81,6 +81,13 @@ def test_imports_of_tests_are_detected():
     assert list(imports(ast.parse("def f():\n    from test_cli import run"))) == [("test_cli", "run")]
 
 
+def test_files_named_in_scripts_exist():
+    scripts = [path for path in (ROOT / ".ci").iterdir() if path.is_file()] + [ROOT / "pyproject.toml"]
+    named = {name for path in scripts for name in re.findall(r"tests/[\w/]+\.py", path.read_text(encoding="utf-8"))}
+    assert len(named) > 10
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
 def test_packages_that_tests_skip_without_are_installed_somewhere():
     """Every package is required, is part of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
     wanted = {
