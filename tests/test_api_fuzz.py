@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, event, given, settings
+from hypothesis import HealthCheck, event, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -34,12 +34,13 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from quasiharmonic.ui.cli import main
 from shared.damaged_files import VALID, damaged
+from shared.examples import examples
 from shared.meshes import boundary_of, signed_areas
 
 pytestmark = pytest.mark.slow
 
-often = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-seldom = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+often = examples(60, suppress_health_check=[HealthCheck.too_slow])
+seldom = examples(20, suppress_health_check=[HealthCheck.too_slow])
 
 MESHES = [
     (np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])),

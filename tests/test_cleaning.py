@@ -8,13 +8,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from quasiharmonic import boundary_loops, clean, inspect_mesh, io
 from quasiharmonic.io import MeshData
 from quasiharmonic.surfaces import disk, starfish
 from quasiharmonic.ui.cli import main
+from shared.examples import examples
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 OUTWARD = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -148,7 +149,7 @@ def test_a_clean_mesh_is_returned_unchanged(mesh):
 
 
 @given(st.integers(3, 12), st.integers(1, 60), st.integers(0, 2**31), st.integers(-20, -6))
-@settings(deadline=None, max_examples=100)
+@examples(40)
 def test_triangles_that_are_almost_degenerate_form_surfaces(n, f, seed, exponent):
     rng = np.random.default_rng(seed)
     V = rng.integers(3, size=(n, 3)) + 10.0**exponent * rng.normal(size=(n, 3))
@@ -162,7 +163,7 @@ def test_triangles_that_are_almost_degenerate_form_surfaces(n, f, seed, exponent
 
 
 @given(st.integers(3, 9), st.integers(1, 40), st.integers(0, 2**31), st.booleans(), st.booleans())
-@settings(deadline=None, max_examples=150)
+@examples(60)
 @example(7, 27, 3023, False, True)  # separated triangles change the larger part of a component
 def test_any_triangles_form_surfaces(n, f, seed, weld, on_a_grid):
     rng = np.random.default_rng(seed)
@@ -178,7 +179,7 @@ def test_any_triangles_form_surfaces(n, f, seed, weld, on_a_grid):
 
 
 @given(st.integers(0, 2**31), st.floats(0, 1))
-@settings(deadline=None, max_examples=50)
+@examples(25)
 def test_mixed_winding_is_mended_to_the_larger_part(seed, share):
     V, F = starfish(rings=6)
     rows = np.flatnonzero(np.random.default_rng(seed).random(len(F)) < share)

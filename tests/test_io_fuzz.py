@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import event, given, settings
+from hypothesis import event, given
 from hypothesis import strategies as st
 
 from quasiharmonic import io
@@ -16,9 +16,10 @@ from quasiharmonic.io.formats import obj as obj_module
 from quasiharmonic.io.formats import off as off_module
 from quasiharmonic.io.formats.objlines import read_obj_lines
 from shared.damaged_files import VALID, damaged
+from shared.examples import examples
 from shared.gltf_files import SQUARE, square
 
-quick = settings(max_examples=150, deadline=None)
+quick = examples(60)
 
 
 pytestmark = pytest.mark.slow

@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic.geometry.exact.loops import contacts, simple_loops
@@ -15,6 +15,7 @@ from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
 from quasiharmonic.problem.certification import certify
 from shared.exact import exact_orientation, exact_relation
+from shared.examples import examples
 
 lattice = st.integers(-2, 2).map(float)
 # Points near a line through the origin, one unit in the last place beside it.
@@ -38,7 +39,7 @@ def simple(places):
 @coordinates
 def test_simple_loops(number):
     @given(st.lists(st.lists(st.tuples(number, number), min_size=3, max_size=9), min_size=1, max_size=3))
-    @settings(deadline=None, max_examples=150)
+    @examples(50)
     def check(polygons):
         loops = np.split(np.arange(sum(map(len, polygons))), np.cumsum([len(one) for one in polygons])[:-1])
         found = simple_loops(loops, np.concatenate([np.array(one) for one in polygons]))
@@ -53,7 +54,7 @@ def test_contacts(number):
         st.lists(st.tuples(number, number), min_size=4, max_size=7),
         st.lists(st.tuples(st.integers(0, 3), st.integers(0, 6)), min_size=2, max_size=8),
     )
-    @settings(deadline=None, max_examples=150)
+    @examples(50)
     def check(places, ends):
         ends = [(i, j % len(places)) for i, j in ends]
         expected = {}
@@ -74,7 +75,7 @@ def test_contacts(number):
 @coordinates
 def test_signs_of_triangles(number):
     @given(st.lists(st.tuples(number, number), min_size=3, max_size=6), st.data())
-    @settings(deadline=None, max_examples=100)
+    @examples(40)
     def check(places, data):
         corner = st.integers(0, len(places) - 1)
         F = np.array(data.draw(st.lists(st.tuples(corner, corner, corner), min_size=1, max_size=9)))

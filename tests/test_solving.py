@@ -482,7 +482,7 @@ class TestLinearSolver:
             factor(values)
 
         monkeypatch.setattr(solver, "factor", fail, raising=False)
-        result = solve(problem, linear_solver="superlu")
+        result = solve(problem, linear_solver="superlu", max_iterations=100)
         assert result.status is Status.UNSOLVABLE
         assert result.stages[0].n_iterations == 2
         # Untangling uses its own matrix and continues from the best map.

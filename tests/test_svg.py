@@ -7,12 +7,13 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import targets
 from quasiharmonic.targets.outlines.contours import flatten
 from quasiharmonic.targets.outlines.svgpath import parse_path
+from shared.examples import examples
 
 AREA = targets.signed_area
 
@@ -295,7 +296,7 @@ SAMPLE = drawing(
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None)
+@examples(100)
 @given(st.lists(st.tuples(st.integers(0, len(SAMPLE)), st.integers(0, 6), st.text(max_size=5)), max_size=4))
 def test_damaged_drawings_are_read_or_rejected(tmp_path_factory, edits):
     text = SAMPLE
