@@ -270,6 +270,7 @@ def run(*arguments):
     return main([str(a) for a in arguments])
 
 
+@pytest.mark.slow
 def test_the_command(head, tmp_path, capsys):
     V, F, loop = head
     targets = turning_stars(len(loop), 5)

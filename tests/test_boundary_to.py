@@ -252,6 +252,7 @@ def test_outlines_that_bound_no_region_are_rejected_at_once():
         boundary_to(V, F, [])
 
 
+@pytest.mark.slow
 def test_too_few_vertices_for_the_shape_are_rejected():
     """A thin spiral, cut off by a straight side between two vertices."""
     turn = np.linspace(0, 4 * np.pi, 200)
@@ -389,6 +390,7 @@ def test_flattened_edges_are_named_and_splitting_them_helps():
     assert injective_map(refined.V, refined.F, fixed, target).injective
 
 
+@pytest.mark.slow
 def test_flattened_edges_agree_with_the_exact_diagnosis():
     """On coordinates without rounding, an edge is flat exactly if the diagnosis finds no space beside it."""
     V, F = plain_grid(4, 4)
@@ -738,6 +740,7 @@ def test_rejection_and_refinement(qhm):
     assert len(written.V) == len(V) + facts["added_vertices"] == facts["vertices"]
 
 
+@pytest.mark.slow
 def test_refine_without_to(tmp_path, capsys):
     """It treats positions in the file like an outline."""
     V, F = plain_grid(4, 4)

@@ -125,6 +125,7 @@ def test_a_limit_on_charts_is_kept_and_what_it_costs_is_reported():
         assert chart.misses == pytest.approx(max(quantile - 1.02, worst - 3, 0), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_bound_that_no_charts_keep_is_reported():
     V, F = sphere(4)
     charts = find_charts(V, F, max_stretch=1.0)
@@ -184,6 +185,7 @@ def test_seams_avoid_sides_with_high_costs():
     assert share_below(directed) > share_below(plain) + 0.2
 
 
+@pytest.mark.slow
 def test_ten_thousand_boxes_take_seconds():
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])

@@ -216,6 +216,7 @@ class TestReportFailures:
         assert "Traceback" not in done.stderr
         assert run("check", tmp_path / "o.obj") == 0
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("arguments", "both"), [("map {} -o {}", True), ("measure {} --export {}", False)])
     def test_full_standard_error_and_exports(self, star, tmp_path, arguments, both):
         if os.name != "posix" or not Path("/dev/full").exists():
@@ -227,6 +228,7 @@ class TestReportFailures:
         assert done.returncode == 3
         assert written.exists()
 
+    @pytest.mark.slow
     @pytest.mark.skipif(os.name != "posix", reason="closes a stream by the shell")
     @pytest.mark.parametrize(("more", "status"), [("| true", 3), (">&-", 0), ("--json - >&-", 3)])
     def test_closed_standard_output(self, star, tmp_path, more, status):
@@ -276,6 +278,7 @@ class TestReportFailures:
         assert done.returncode == 1
         assert done.stdout.isascii()
 
+    @pytest.mark.slow
     @pytest.mark.skipif(os.name != "posix", reason="closes a stream by the shell")
     def test_closed_standard_error(self, star, tmp_path):
         command = f"{sys.executable} -m quasiharmonic map {star} -o {tmp_path / 'o.obj'} 2>&-"
@@ -458,6 +461,7 @@ class TestDemo:
         assert run("demo", "-o", tmp_path / "file" / "demo") == 2
         assert f"cannot create the folder {tmp_path / 'file' / 'demo'}" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_writes_three_files(self, tmp_path, capsys):
         assert run("demo", "-o", tmp_path / "d") == 0
         assert sorted(p.name for p in (tmp_path / "d").iterdir()) == ["demo.json", "demo.obj", "demo.png"]
@@ -514,6 +518,7 @@ def test_version_names_the_environment(pure):
         assert loops.startswith("loops: compiled" if built else "loops: in NumPy: ")
 
 
+@pytest.mark.slow
 def test_progress_on_a_terminal_only(star, tmp_path):
     """On a pseudo-terminal, progress lines are overwritten, and nothing remains."""
     pty = pytest.importorskip("pty")

@@ -245,6 +245,7 @@ def shell(call, streams, *, unbuffered=False):
     return done.returncode, done.stderr.decode()
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("unbuffered", [False, True])
 @pytest.mark.parametrize("call", ["--version", "--help", "map --help", "check m.obj", "measure m.obj"])
@@ -268,6 +269,7 @@ def test_closed_standard_output_is_no_failure_if_the_report_goes_elsewhere(folde
     assert ("usage" in said) == (call == "--help")
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("streams", ["2>&-", ">&- 2>&-", "2>&1 | true"])
 @pytest.mark.parametrize(("call", "status"), [("--version", (0, 141)), ("check m.obj", (0, 141)), ("check none", (2,))])
@@ -285,6 +287,7 @@ def test_json_output_stays_valid_without_standard_error(folder):
     assert done.stdout.count(b"\n") == 1
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("unbuffered", [False, True])
 @pytest.mark.parametrize("call", ["--version", "--help", "map --help", "check m.obj"])

@@ -90,6 +90,7 @@ def test_defects_are_reported(tmp_path, capsys):
     assert len(io.read_mesh(tmp_path / "out.obj").F) == len(spoilt)
 
 
+@pytest.mark.slow
 def test_seams_of_the_file_and_edge_costs(model, tmp_path):
     first, second = tmp_path / "first.obj", tmp_path / "second.obj"
     assert run("unwrap", model, "-o", first, "--resolution", 256) == 0

@@ -196,6 +196,7 @@ class TestImports:
         assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.solver.search.solving"}
         assert len(found - self.modules("pass")) < 140
 
+    @pytest.mark.slow
     def test_workers_of_a_data_set_start_without_slow_imports(self):
         found = self.modules("import quasiharmonic.ui.batch.worker")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.fft", "shapely", "pyarrow"}
@@ -204,6 +205,7 @@ class TestImports:
         found = self.modules("from quasiharmonic import injective_map")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("letter", [None, "C", "R"])
     def test_the_command_maps_a_small_mesh_without_slow_imports(self, letter, tmp_path):
         """No time is measured; SciPy's subpackages and matplotlib would take longer than the map."""

@@ -340,6 +340,7 @@ class TestLevels:
         outer = ~np.isin(graph.ends[own], ring).all(axis=1)
         assert np.array_equal(np.isinf(part.cost), outer)
 
+    @pytest.mark.slow
     def test_a_large_torus(self):
         """The inner equator and a ring are nearly the shortest cuts."""
         V, F = torus(240, 80, radius=3)

@@ -151,6 +151,7 @@ def cut_starfish(arms, rings, gain):
     return cut.V / np.abs(cut.V).max(), cut.F
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arms", [3, 5])
 @pytest.mark.parametrize("guarded", [False, True])
 def test_a_coarse_start_separates_the_two_sides_of_a_seam(arms, guarded):

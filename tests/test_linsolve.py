@@ -795,6 +795,7 @@ def finished(code):
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=600).stdout.split()
 
 
+@pytest.mark.slow
 @needs_rslab
 @pytest.mark.parametrize("trial", _ENDING)
 def test_rslab_works_after_its_first_thread_has_ended(trial):

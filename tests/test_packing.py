@@ -78,6 +78,7 @@ def problems(draw):
     return charts, size, draw(st.sampled_from([0, 1.5, 8])), draw(st.integers(1, 2)), draw(st.booleans())
 
 
+@pytest.mark.slow
 @given(problems())
 @settings(max_examples=12, deadline=None)
 def test_packing_has_its_promised_properties(problem):
@@ -207,6 +208,7 @@ def test_time(count, seconds):
     check(charts, packing, [1024 if count < 10_000 else 2048] * 2, 4)
 
 
+@pytest.mark.slow
 def test_textures_too_small():
     charts = grids(100)
     with pytest.raises(ValueError, match="100 charts with a padding of 4 texels do not fit into 32 ×") as raised:

@@ -55,6 +55,7 @@ def private_names(tree):
             yield from (part for word in words for part in word.split(".") if private(part))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(FOLDER).as_posix())
 def test_rules(path):
     text, tree = path.read_text(encoding="utf-8"), parsed(path)

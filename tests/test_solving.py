@@ -275,6 +275,7 @@ class TestNoMap:
         assert result.history[-1].energy > 1e-3
         assert not result.diagnosis.obstructions
 
+    @pytest.mark.slow
     def test_local_repair_has_a_limit(self, monkeypatch):
         """Almost nothing is inverted, and no number of restarts helps."""
         V, F = disk(2)

@@ -92,6 +92,7 @@ def test_stretch_is_that_of_singular_values(result):
     assert result.utilisation == pytest.approx(image / 2 / 512**2)
 
 
+@pytest.mark.slow
 def test_a_bound_that_cannot_be_kept_is_reported():
     result = unwrap(V, F, max_stretch=1.0, max_charts=2, resolution=256)
     assert result.misses
@@ -152,6 +153,7 @@ def test_seams_of_existing_coordinates_are_used():
     assert unwrap(points, triangles, uv=points, resolution=256).n_charts == 1
 
 
+@pytest.mark.slow
 def test_edge_costs_move_seams():
     costs = np.ones(F.shape)
     upper = V[F, 2].mean(axis=1) > 0

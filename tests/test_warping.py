@@ -171,6 +171,7 @@ def worst_stretch(warped):
     return np.maximum(measured.sigma1, 1 / measured.sigma2).max()
 
 
+@pytest.mark.slow
 def test_stretch_does_not_grow_with_the_resolution():
     def stretch(resolution, **options):
         return worst_stretch(
