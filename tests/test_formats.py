@@ -165,8 +165,8 @@ def test_help_texts_list_the_formats(capsys):
 
 def test_the_page_accepts_the_surfaces_of_a_single_file():
     page = (Path(quasiharmonic.__file__).parent / "ui/studio/static/index.html").read_text(encoding="utf-8")
-    (accepted,) = re.findall(r'id="open" type="file" class="hidden" accept="([^"]*)"', page)
-    assert accepted.split(",") == [*io.suffixes("read", "single_file"), ".svg"]
+    (accepted,) = re.findall(r'<input id="open" type="file"[^>]* accept="([^"]*)"', page)
+    assert accepted.split(",") == [*io.suffixes("read", "single_file"), ".svg", ".png", ".jpg", ".jpeg"]
 
 
 def test_every_suffix_has_one_format():

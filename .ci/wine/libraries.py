@@ -89,6 +89,6 @@ def definition(library: str, own: list[str], passed_on: list[str], to: str) -> s
 if __name__ == "__main__":
     python, ucrt = sys.argv[1:]
     source, names = complex_functions()
-    Path("ucrtbase.c").write_text(source)
-    Path("ucrtbase.def").write_text(definition("ucrtbase", names, exported(ucrt), "ucrtwine"))
-    Path("python3.def").write_text(definition("python3", [], exported(python), "python311"))
+    Path("ucrtbase.c").write_text(source, encoding="utf-8")
+    Path("ucrtbase.def").write_text(definition("ucrtbase", names, exported(ucrt), "ucrtwine"), encoding="utf-8")
+    Path("python3.def").write_text(definition("python3", [], exported(python), "python311"), encoding="utf-8")
