@@ -150,6 +150,7 @@ def test_a_clean_mesh_is_returned_unchanged(mesh):
 
 @given(st.integers(3, 12), st.integers(1, 60), st.integers(0, 2**31), st.integers(-20, -6))
 @examples(40)
+@example(10, 19, 825, -17)  # a widened triangle must not be thin in a second cleaning
 def test_triangles_that_are_almost_degenerate_form_surfaces(n, f, seed, exponent):
     rng = np.random.default_rng(seed)
     V = rng.integers(3, size=(n, 3)) + 10.0**exponent * rng.normal(size=(n, 3))

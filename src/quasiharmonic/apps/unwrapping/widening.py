@@ -83,7 +83,8 @@ def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
     shortest = np.full(len(points), np.inf)
     for k in range(3):
         np.minimum.at(shortest, F[near, k], np.minimum(sides[near, k], sides[near, k - 1]))
-    length = np.maximum(_SHIFT * shortest[apex], _THIN * sides[rows].max(axis=1))
+    # At least twice the height of a thin triangle, so that none is thin afterwards.
+    length = np.maximum(_SHIFT * shortest[apex], 4 * _THIN * sides[rows].max(axis=1))
     along = points[F[rows, (longest + 1) % 3]] - points[F[rows, longest]]
     points = points.copy()
     # Random shifts do not put several vertices on one line again. The seed is fixed, so that results are reproducible.
