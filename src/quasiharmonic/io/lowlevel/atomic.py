@@ -133,6 +133,11 @@ def retry_in_use(action: Callable[..., object], *paths: Path) -> None:
             time.sleep(_PAUSE)
 
 
+def remove_file(path: Path) -> None:
+    """Delete a file, if it exists, with the patience and the errors of `retry_in_use`."""
+    retry_in_use(lambda old: old.unlink(missing_ok=True), path)
+
+
 @contextlib.contextmanager
 def new_folder(path: str | os.PathLike[str], *, leftovers: frozenset[str] = frozenset()) -> Iterator[None]:
     """Make a folder and its missing parents; remove the new folders if the block fails and leaves them empty.

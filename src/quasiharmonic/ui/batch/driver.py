@@ -15,7 +15,7 @@ from typing import Any
 
 from quasiharmonic import __version__
 from quasiharmonic.io.errors import OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import new_folder, write_whole
+from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.lock import FILE as LOCK
 from quasiharmonic.ui.batch.lock import lock_folder
@@ -248,7 +248,7 @@ def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings) -
     try:
         for name in records.TABLES:
             # The table of the last run must not be taken for that of this run.
-            (folder / name).unlink(missing_ok=True)
+            remove_file(folder / name)
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     about = {"source": os.path.abspath(source), "settings": settings.to_dict(), "version": __version__}

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import retry_in_use, write_whole
+from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole
 
 Record = dict[str, Any]
 
@@ -137,7 +137,7 @@ def clear(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for path in (folder / FILE, folder / _MAP, *folder.glob(".qhm-*.tmp")):
-            retry_in_use(lambda old: old.unlink(missing_ok=True), path)
+            remove_file(path)
     except FileInUseError:
         raise
     except OSError as error:
