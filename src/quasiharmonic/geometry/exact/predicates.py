@@ -155,7 +155,7 @@ def _decide_scaled(x: FloatArray) -> SignArray:
 
 def _decide_by_expansion(x: FloatArray) -> SignArray:
     """Orientation by expansion, for coordinates of magnitude up to one that are 0 or ≥ 2⁻⁴⁴⁰."""
-    return np.sign(_sum(_components(x))).astype(np.int8)
+    return np.sign(exact_sum(_components(x))).astype(np.int8)
 
 
 def _components(x: FloatArray) -> FloatArray:
@@ -170,8 +170,8 @@ def _components(x: FloatArray) -> FloatArray:
     return np.concatenate([error[:2], product[:2], error[2:6], error[6:], product[2:6], product[6:]])
 
 
-def _sum(terms: FloatArray) -> FloatArray:
-    """Sum over axis 0 of (t, k) terms whose sums neither overflow nor underflow; relative error at most 2⁻⁴⁸.
+def exact_sum(terms: FloatArray) -> FloatArray:
+    """Sum over axis 0 of (t, k) terms (overwritten) whose sums neither overflow nor underflow; relative error at most 2⁻⁴⁸.
 
     Each sweep replaces the terms by others with the same exact sum. The last one is the rounded sum, and the
     others are rounding errors [2]_. A sum is decided when the last term exceeds the rest in magnitude. This takes
@@ -240,7 +240,7 @@ def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     area = np.empty(x.shape[1])
     for start in range(0, area.size, _EXACT_CHUNK):
         chunk = slice(start, start + _EXACT_CHUNK)
-        area[chunk] = _sum(_components(x[:, chunk]))
+        area[chunk] = exact_sum(_components(x[:, chunk]))
     return area
 
 
@@ -302,7 +302,7 @@ def _in_box(x: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
 
 
 def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield pairs ``i < j`` of closed boxes that meet, in portions, each pair once.
+    """Yield pairs ``i < j`` of closed boxes in the plane or in space that meet, in portions, each pair once.
 
     A binary tree over the boxes *in the given order* is traversed against itself, all pairs of a level at once. Boxes
     of consecutive edges of a curve make a tight tree, whatever the scale of the parts of the curve. So the cost for
@@ -371,8 +371,10 @@ def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArra
     while waiting:
         level, i, j = waiting.pop()
         (lo, hi), (other_lo, other_hi) = one[level], other[level]
-        meet = (lo.take(i, 0) <= other_hi.take(j, 0)) & (other_lo.take(j, 0) <= hi.take(i, 0))
-        meet = meet[:, 0] & meet[:, 1]
+        found = (lo.take(i, 0) <= other_hi.take(j, 0)) & (other_lo.take(j, 0) <= hi.take(i, 0))
+        meet = found[:, 0] & found[:, 1]
+        if found.shape[1] == 3:
+            meet &= found[:, 2]
         i, j = i[meet], j[meet]
         if level == 0:
             yield i, j

@@ -1,0 +1,190 @@
+"""Exact search for triangles in space that meet outside their common vertices and edges.
+
+Candidates are pairs of triangles whose boxes meet. For two triangles there are three cases:
+
+- Two common vertices. They meet elsewhere only if they lie in a plane, on the same side of the common edge.
+- One common vertex. They meet elsewhere if and only if the edge of one that is opposite the vertex meets the other:
+  a ray from the vertex in both triangles leaves one of them there.
+- No common vertex. They meet if and only if an edge of one meets the other.
+
+Pairs in a common plane are decided in a projection in which the plane does not become a line.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quasiharmonic.apps.tetrahedra.signs import ExactSigns, SignArray
+from quasiharmonic.geometry.exact.predicates import box_pairs, orientation
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat
+
+_SIDES = ((0, 1), (1, 2), (2, 0))
+_AXES = ((0, 1), (1, 2), (2, 0))
+
+
+def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
+    """Find pairs (k, 2) of triangles (f, 3), not degenerate, that meet outside their common vertices and edges."""
+    corners = X[F]
+    lo, hi = corners.min(axis=1), corners.max(axis=1)
+    order = _spatial_order(0.5 * lo + 0.5 * hi)
+    found = [np.empty((0, 2), dtype=np.int64)]
+    for i, j in box_pairs(lo[order], hi[order]):
+        heartbeat()
+        one, other = order[i], order[j]
+        meet = _meet(F[one], F[other], X, signs)
+        found.append(np.sort(np.stack([one[meet], other[meet]], axis=1), axis=1))
+    pairs = np.concatenate(found)
+    return pairs[np.lexsort(pairs.T[::-1])]
+
+
+def _spatial_order(centres: FloatArray) -> IntArray:
+    """Order points along a Morton curve, so that points close in the order are close in space."""
+    if not len(centres):
+        return np.empty(0, dtype=np.int64)
+    exponent = np.frexp(np.abs(centres).max())[1]
+    with np.errstate(under="ignore"):
+        grid = (np.ldexp(centres, -exponent) * (1 << 19)).astype(np.int64) + (1 << 19)
+    code = np.zeros(len(centres), dtype=np.int64)
+    for axis in range(3):
+        x = grid[:, axis]
+        for shift, mask in (
+            (32, 0x1F00000000FFFF),
+            (16, 0x1F0000FF0000FF),
+            (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3),
+            (2, 0x1249249249249249),
+        ):
+            x = (x | (x << shift)) & mask
+        code |= x << axis
+    return np.argsort(code, kind="stable")
+
+
+def _meet(F: IntArray, G: IntArray, X: FloatArray, signs: ExactSigns) -> BoolArray:
+    """Whether pairs of triangles (k, 3) meet outside their common vertices and edges."""
+    same = F[:, :, None] == G[:, None, :]
+    shared = same.sum(axis=(1, 2))
+    meet = np.zeros(len(F), dtype=np.bool_)
+    for count in range(3):
+        some = np.flatnonzero(shared == count)
+        if some.size:
+            one, other = _align(F[some], G[some], same[some], count)
+            meet[some] = _meet_aligned(one, other, count, X, signs)
+    return meet
+
+
+def _align(F: IntArray, G: IntArray, same: BoolArray, count: int) -> tuple[IntArray, IntArray]:
+    """Order the vertices of triangles such that common ones come first, in the same order."""
+    if not count:
+        return F, G
+    order = np.argsort(~same.any(axis=2), axis=1, kind="stable")
+    F = np.take_along_axis(F, order, axis=1)
+    equal = F[:, :count, None] == G[:, None, :]
+    place = np.argmax(equal, axis=2)
+    rest = np.argsort(equal.any(axis=1), axis=1, kind="stable")[:, : 3 - count]
+    return F, np.take_along_axis(G, np.concatenate([place, rest], axis=1), axis=1)
+
+
+def _meet_aligned(F: IntArray, G: IntArray, count: int, X: FloatArray, signs: ExactSigns) -> BoolArray:
+    """`_meet` for triangles whose first ``count`` vertices are the same."""
+    meet = np.zeros(len(F), dtype=np.bool_)
+    # Signs of the other vertices of G relative to the plane of F. If all are on one side, the triangles do not meet.
+    of_g = _plane_signs(F, G[:, count:], signs)
+    some = np.flatnonzero(~(np.all(of_g > 0, axis=1) | np.all(of_g < 0, axis=1)))
+    F, G, of_g = F[some], G[some], of_g[some]
+    flat = np.all(of_g == 0, axis=1)
+    meet[some[flat]] = _meet_in_plane(F[flat], G[flat], count, X)
+    if count == 2:
+        return meet
+    some, F, G, of_g = some[~flat], F[~flat], G[~flat], of_g[~flat]
+    of_f = _plane_signs(G, F[:, count:], signs)
+    near = ~(np.all(of_f > 0, axis=1) | np.all(of_f < 0, axis=1))
+    some, F, G, of_f, of_g = some[near], F[near], G[near], of_f[near], of_g[near]
+    for one, other, sign in ((F, G, of_f), (G, F, of_g)):
+        for p, q in _SIDES if not count else ((0, 1),):
+            edge = one[:, (p + count, q + count)]
+            meet[some] |= _edge_meets(edge, other, sign[:, p], sign[:, q], X, signs)
+    return meet
+
+
+def _plane_signs(F: IntArray, points: IntArray, signs: ExactSigns) -> SignArray:
+    """The side of the plane of each triangle (k, 3) on which points (k, m) lie; (k, m) int8."""
+    m = points.shape[1]
+    corners = np.concatenate([np.repeat(F, m, axis=0), points.reshape(-1, 1)], axis=1)
+    return signs(corners).reshape(-1, m)
+
+
+def _edge_meets(
+    edge: IntArray, F: IntArray, p_side: SignArray, q_side: SignArray, X: FloatArray, signs: ExactSigns
+) -> BoolArray:
+    """Whether closed edges (k, 2) meet closed triangles (k, 3), given the sides of the planes of their ends."""
+    meet = np.zeros(len(edge), dtype=np.bool_)
+    flat = (p_side == 0) & (q_side == 0)
+    if flat.any():
+        meet[flat] = ~_apart_in_plane(edge[flat], F[flat], X)
+    through = np.flatnonzero((p_side * q_side <= 0) & ~flat)
+    if through.size:
+        turns = np.stack(
+            [
+                signs(np.concatenate([edge[through], F[through][:, side]], axis=1))
+                for side in (list(side) for side in _SIDES)
+            ]
+        )
+        meet[through] = np.all(turns >= 0, axis=0) | np.all(turns <= 0, axis=0)
+    return meet
+
+
+def _project(F: IntArray, X: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Choose two axes for each triangle (k, 3) such that its projection has an area; return them and its orientation."""
+    axes, turn = np.zeros((len(F), 2), dtype=np.int64), np.zeros(len(F))
+    left = np.arange(len(F))
+    for pair in _AXES:
+        a, b, c = X[F[left]][:, :, pair].transpose(1, 0, 2)
+        sign = orientation(a, b, c)
+        axes[left], turn[left] = pair, sign
+        left = left[sign == 0]
+        if not left.size:
+            break
+    return axes, turn
+
+
+def _flatten(points: IntArray, axes: IntArray, X: FloatArray) -> FloatArray:
+    """Project points (k, m) to two axes each; (k, m, 2)."""
+    return np.take_along_axis(X[points], axes[:, None, :], axis=2)
+
+
+def _meet_in_plane(F: IntArray, G: IntArray, count: int, X: FloatArray) -> BoolArray:
+    """`_meet_aligned` for triangles in common planes."""
+    axes, turn = _project(F, X)
+    f, g = _flatten(F, axes, X), _flatten(G, axes, X)
+    if count == 2:
+        return orientation(g[:, 0], g[:, 1], g[:, 2]) == turn
+    f[turn < 0] = f[turn < 0][:, (0, 2, 1)]
+    other_turn = orientation(g[:, 0], g[:, 1], g[:, 2])
+    g[other_turn < 0] = g[other_turn < 0][:, (0, 2, 1)]
+    if count == 0:
+        return ~(_is_separated(f, g) | _is_separated(g, f))
+    inside = np.zeros(len(F), dtype=np.bool_)
+    for one, other in ((f, g), (g, f)):
+        for k in (1, 2):
+            left = orientation(one[:, 0], one[:, 1], other[:, k]) >= 0
+            inside |= left & (orientation(one[:, 0], other[:, k], one[:, 2]) >= 0)
+    return inside
+
+
+def _is_separated(one: FloatArray, other: FloatArray) -> BoolArray:
+    """Whether the second polygon lies strictly to the right of a side of the first, counterclockwise one; (k, m, 2)."""
+    apart = np.zeros(len(one), dtype=np.bool_)
+    m = one.shape[1]
+    for k in range(m):
+        tail, head = one[:, k, None], one[:, (k + 1) % m, None]
+        apart |= np.all(orientation(tail, head, other) < 0, axis=1)
+    return apart
+
+
+def _apart_in_plane(edge: IntArray, F: IntArray, X: FloatArray) -> BoolArray:
+    """Whether closed edges (k, 2) and closed triangles (k, 3) in common planes do not meet."""
+    axes, turn = _project(F, X)
+    f, segment = _flatten(F, axes, X), _flatten(edge, axes, X)
+    f[turn < 0] = f[turn < 0][:, (0, 2, 1)]
+    return _is_separated(f, segment) | _is_separated(segment, f)

@@ -1,0 +1,225 @@
+"""The exact certificate of tetrahedral meshes, against an independent oracle in rational numbers."""
+
+from fractions import Fraction
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+from shared.tetrahedral_meshes import ball, box, double_cover, random_tiny
+
+from quasiharmonic.apps.tetrahedra.certificate import certify_tetrahedra
+from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
+
+
+def exact(points):
+    return [[Fraction(value) for value in point] for point in np.asarray(points).tolist()]
+
+
+def minus(a, b):
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def dot(a, b):
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def determinant(p):
+    return dot(minus(p[1], p[0]), cross(minus(p[2], p[0]), minus(p[3], p[0])))
+
+
+def overlap(p, q):
+    """Whether the interiors of two tetrahedra meet: no axis separates them."""
+    axes = []
+    for one in (p, q):
+        axes += [cross(minus(b, a), minus(c, a)) for a, b, c in combinations(one, 3)]
+    for (a, b), (c, d) in product(combinations(p, 2), combinations(q, 2)):
+        axes.append(cross(minus(b, a), minus(d, c)))
+    for axis in axes:
+        if any(axis):
+            one, other = ([dot(axis, point) for point in points] for points in (p, q))
+            if max(one) <= min(other) or max(other) <= min(one):
+                return False
+    return True
+
+
+def clip(polygon, normal, offset):
+    """The part of a convex polygon in a closed half-space."""
+    result = []
+    for k, a in enumerate(polygon):
+        b = polygon[(k + 1) % len(polygon)]
+        left, right = dot(normal, a) - offset, dot(normal, b) - offset
+        if left >= 0:
+            result.append(a)
+        if left * right < 0:
+            t = left / (left - right)
+            result.append([x + t * (y - x) for x, y in zip(a, b, strict=True)])
+    return result
+
+
+def contact(p, q):
+    """Corners of the intersection of two triangles in space, by clipping one to the plane and sides of the other."""
+    normal = cross(minus(q[1], q[0]), minus(q[2], q[0]))
+    polygon = clip(p, normal, dot(normal, q[0]))
+    down = [-x for x in normal]
+    polygon = clip(polygon, down, dot(down, q[0]))
+    for k in range(3):
+        side = cross(normal, minus(q[(k + 1) % 3], q[k]))
+        polygon = clip(polygon, side, dot(side, q[k]))
+    return polygon
+
+
+def is_injective(T, X):
+    """Oracle: positive tetrahedra with disjoint interiors whose faces meet only in common vertices and edges."""
+    p = exact(X)
+    if any(determinant([p[v] for v in t]) <= 0 for t in T):
+        return False
+    if any(overlap([p[v] for v in s], [p[v] for v in t]) for s, t in combinations(T.tolist(), 2)):
+        return False
+    faces = sorted({tuple(sorted(face)) for t in T.tolist() for face in combinations(t, 3)})
+    for f, g in combinations(faces, 2):
+        common = [p[v] for v in set(f) & set(g)]
+        for point in contact([p[v] for v in f], [p[v] for v in g]):
+            if len(common) < 2 and point not in common:
+                return False
+            if len(common) == 2 and (
+                any(cross(minus(common[1], common[0]), minus(point, common[0])))
+                or dot(minus(point, common[0]), minus(point, common[1])) > 0
+            ):
+                return False
+    return True
+
+
+def check_tiny_meshes(seeds):
+    """Compare the certificate with the oracle; return the number of injective meshes."""
+    good = 0
+    for seed in seeds:
+        X, T = random_tiny(np.random.default_rng(seed))
+        found, expected = certify_tetrahedra(T, X), is_injective(T, X)
+        assert found.injective == expected, (seed, found.summary())
+        good += expected
+    return good
+
+
+def test_signs_agree_with_rational_numbers():
+    rng = np.random.default_rng(1)
+    for trial in range(600):
+        p = rng.integers(-2, 3, (4, 3)).astype(float)
+        if trial % 6 == 1:
+            p = 0.1 * p + rng.integers(-3, 4, (4, 3)) * 2.0**-56
+        elif trial % 6 == 2:
+            p *= 1e150
+        elif trial % 6 == 3:
+            p = (p + 0.1) * 10.0 ** rng.integers(-150, 150, (4, 3))
+        elif trial % 6 == 4:
+            p *= 1e-150 * (1 + 2.0**-52 * rng.integers(-2, 3, (4, 3)))
+        elif trial % 6 == 5:
+            p += rng.integers(-2, 3, (4, 3)) * 2.0**-51
+            p[3] = p[0] + p[1] - p[2]
+        expected = determinant(exact(p))
+        assert tetrahedron_signs(np.arange(4)[None], p)[0][0] == (expected > 0) - (expected < 0), p
+
+
+def test_tiny_meshes_agree_with_the_oracle():
+    assert 20 < check_tiny_meshes(range(150)) < 130
+
+
+@pytest.mark.slow
+def test_more_tiny_meshes_agree_with_the_oracle():
+    check_tiny_meshes(range(1000, 1300))
+
+
+def test_a_ball_covered_twice_is_not_injective():
+    X, T = double_cover()
+    found = certify_tetrahedra(T, X)
+    assert found.positive
+    assert not len(found.crossings)
+    assert found.injective is False
+    assert found.multiply_covered.size == 1
+    assert "twice" in found.summary()
+    # The sheet alone whose sphere was pushed outwards is a ball.
+    X, T = ball()
+    assert certify_tetrahedra(T, X).injective
+
+
+def test_components_inside_each_other():
+    X, T = box(2, 2, 2)
+    for scale, away, injective in ((0.1, 0.4, False), (0.1, 2.0, True), (1.0, 1.0, False), (1.0, 1.5, True)):
+        both = np.concatenate([X, scale * X + away])
+        found = certify_tetrahedra(np.concatenate([T, T + len(X)]), both)
+        assert found.injective == injective, (scale, away)
+        # Cubes that touch at a corner meet there; one inside the other does not touch it.
+        assert bool(len(found.crossings)) == (scale == away)
+
+
+def test_a_cavity_is_no_overlap():
+    X, T = box(5, 5, 5)
+    shell = T[np.abs(X[T].mean(axis=1) - 0.5).max(axis=1) > 0.1]
+    assert len(shell) == len(T) - 6
+    assert certify_tetrahedra(shell, X).injective
+    # Inside the cavity there is room for a component.
+    small, S = box(1, 1, 1, size=0.1)
+    both = np.concatenate([X, small + 0.45])
+    assert certify_tetrahedra(np.concatenate([shell, S + len(X)]), both).injective
+    # Inside out: every tetrahedron is inverted.
+    assert len(certify_tetrahedra(shell, -X).inverted) == len(shell)
+
+
+def test_names_what_is_wrong():
+    X, T = box(2, 1, 1)
+    broken = X.copy()
+    broken[T[3, 0]] = np.nan
+    found = certify_tetrahedra(T, broken)
+    assert 3 in found.nonfinite
+    assert found.injective is False
+    assert certify_tetrahedra(np.concatenate([T, T[4:5]]), X).repeated.tolist() == [len(T)]
+    # Even permutations of the vertices are the same tetrahedron.
+    found = certify_tetrahedra(np.concatenate([T, T[4:5, [1, 2, 0, 3]]]), X)
+    assert found.repeated.tolist() == [len(T)]
+    flat = X.copy()
+    flat[:, 2] = 0
+    assert len(certify_tetrahedra(T, flat).degenerate) == len(T)
+    apex = np.concatenate([X, [(0.25, 0.2, 0.3)]])
+    inner = np.append(T[0, :3], len(X))
+    found = certify_tetrahedra(np.concatenate([T, [inner]]), apex)
+    assert found.injective is False
+    assert "faces" in found.summary() or "face" in found.summary()
+    assert certify_tetrahedra(np.empty((0, 4)), X).injective is False
+    assert certify_tetrahedra(T, X, boundary=False).injective is None
+
+
+def test_crossing_boundary_triangles_are_named():
+    X, T = box(4, 1, 1)
+    bent = X.copy()
+    angle = 7.0 * X[:, 0]
+    bent[:, 0], bent[:, 1] = (0.9 + X[:, 1]) * np.sin(angle), (0.9 + X[:, 1]) * -np.cos(angle)
+    found = certify_tetrahedra(T, bent)
+    assert found.injective is False
+    assert len(found.crossings)
+    assert "boundary triangles meet" in found.summary()
+
+
+@pytest.mark.parametrize("scale", [1e-150, 1e150])
+def test_scales(scale):
+    X, T = box(2, 2, 2)
+    assert certify_tetrahedra(T, scale * X).injective
+    X, T = double_cover()
+    assert certify_tetrahedra(T, scale * X).multiply_covered.size == 1
+
+
+@pytest.mark.parametrize(
+    ("T", "X", "message"),
+    [
+        ([[0, 1, 2, 4]], np.eye(4, 3), "T refers to vertex 4"),
+        ([[0, 1, 2]], np.eye(4, 3), r"T must have shape \(t, 4\)"),
+        ([list(range(10))], np.zeros((10, 3)), "second-order tetrahedra are not supported"),
+        ([list(range(8))], np.zeros((8, 3)), "hexahedra are not supported"),
+        ([[0, 1, 2, 3]], np.eye(4, 2), r"X must have shape \(n, 3\)"),
+    ],
+)
+def test_wrong_arguments(T, X, message):
+    with pytest.raises(ValueError, match=message):
+        certify_tetrahedra(T, X)
