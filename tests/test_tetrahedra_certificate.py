@@ -1,14 +1,18 @@
 """The exact certificate of tetrahedral meshes, against an independent oracle in rational numbers."""
 
+import json
 from fractions import Fraction
 from itertools import combinations, product
 
+import meshlane
 import numpy as np
 import pytest
-from shared.tetrahedral_meshes import ball, box, double_cover, random_tiny
 
 from quasiharmonic.apps.tetrahedra.certificate import certify_tetrahedra
 from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
+from quasiharmonic.io.fem.files import read_volume
+from quasiharmonic.ui.cli import main
+from shared.tetrahedral_meshes import ball, box, double_cover, random_tiny
 
 
 def exact(points):
@@ -223,3 +227,58 @@ def test_scales(scale):
 def test_wrong_arguments(T, X, message):
     with pytest.raises(ValueError, match=message):
         certify_tetrahedra(T, X)
+
+
+SUFFIXES = (".vtu", ".vtk", ".msh")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_qhm_check_certifies_the_file(suffix, tmp_path, capsys):
+    X, T = box(2, 2, 2)
+    path = tmp_path / f"mesh{suffix}"
+    walls = certify_tetrahedra(T, X).boundary
+    form = {"file_format": "gmsh"} if suffix == ".msh" else {}
+    meshlane.write(path, meshlane.Mesh(X, [("triangle", walls), ("tetra", T)]), **form)
+    read = read_volume(path)
+    np.testing.assert_array_equal(read.T, T)
+    np.testing.assert_array_equal(read.points, X)
+    assert main(["check", str(path), "--json", str(tmp_path / "report.json")]) == 0
+    assert "Injective: the boundary does not meet itself" in capsys.readouterr().out
+    assert json.loads((tmp_path / "report.json").read_text())["boundary_triangles"] == len(walls)
+    X[13] = (0.9, 0.9, 0.2)
+    meshlane.write(path, meshlane.Mesh(X, [("tetra", T)]), **form)
+    assert main(["check", str(path)]) == 1
+    assert "are inverted" in capsys.readouterr().out
+
+
+def test_qhm_check_judges_rounded_positions(tmp_path, capsys):
+    """A tetrahedron that is positive in doubles is flat after the file has stored single precision."""
+    X = np.array([(0, 0, 1), (1, 0, 1), (0, 1, 1), (1 / 3, 1 / 3, 1 + 1e-12)])
+    path = tmp_path / "mesh.vtu"
+    meshlane.write(path, meshlane.Mesh(X, [("tetra", [[0, 1, 2, 3]])]))
+    assert main(["check", str(path)]) == 0
+    meshlane.write(path, meshlane.Mesh(X.astype(np.float32), [("tetra", [[0, 1, 2, 3]])]))
+    assert main(["check", str(path)]) == 1
+    assert "tetrahedron 0 is degenerate" in capsys.readouterr().out
+
+
+def test_qhm_check_reports_hexahedra_by_their_corners(tmp_path, capsys):
+    X = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1.0)])
+    path = tmp_path / "mesh.vtu"
+    meshlane.write(path, meshlane.Mesh(X, [("hexahedron", [list(range(8))])]))
+    assert main(["check", str(path), "--json", "-"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["injective"] is None
+    assert "does not certify" in printed.err
+    X[6] = (0.2, 0.2, 0.2)
+    meshlane.write(path, meshlane.Mesh(X, [("hexahedron", [list(range(8))])]))
+    assert main(["check", str(path)]) == 1
+    assert "hexahedron 0" in capsys.readouterr().out
+
+
+def test_second_order_tetrahedra_and_prisms_are_rejected(tmp_path, capsys):
+    X = np.random.default_rng(0).random((10, 3))
+    for kind, count, name in (("tetra10", 10, "second-order tetrahedron"), ("wedge", 6, "wedge")):
+        meshlane.write(tmp_path / "mesh.vtu", meshlane.Mesh(X, [(kind, [list(range(count))])]))
+        assert main(["check", str(tmp_path / "mesh.vtu")]) == 2
+        assert f"cells of type {name} are not supported: use tetrahedra" in capsys.readouterr().err

@@ -50,6 +50,8 @@ from .apps.mesh_motion.morphing import morph as morph
 from .apps.mesh_motion.moving_mesh import MovingMesh as MovingMesh
 from .apps.repair.uv_repair import RepairResult as RepairResult
 from .apps.repair.uv_repair import repair as repair
+from .apps.tetrahedra.certificate import TetrahedraCertificate as TetrahedraCertificate
+from .apps.tetrahedra.certificate import certify_tetrahedra as certify_tetrahedra
 from .apps.unwrapping.cleaning import clean as clean
 from .apps.unwrapping.result import UnwrapResult as UnwrapResult
 from .apps.unwrapping.unwrap import unwrap as unwrap

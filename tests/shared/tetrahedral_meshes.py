@@ -9,8 +9,8 @@ _KUHN = np.array([(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4,
 
 
 def box(*cells, size=1.0):
-    """Points and positive tetrahedra of a box of nx × ny × nz cubes."""
-    nx, ny, nz = cells
+    """Points and positive tetrahedra of a box of cubes, given their numbers along x, y and z."""
+    _, ny, nz = cells
     x = np.stack(np.meshgrid(*(np.arange(k + 1) for k in cells), indexing="ij"), axis=-1).reshape(-1, 3)
     corner = np.stack(np.meshgrid(*(np.arange(k) for k in cells), indexing="ij"), axis=-1).reshape(-1, 1, 3)
     offset = np.stack(np.meshgrid((0, 1), (0, 1), (0, 1), indexing="ij"), axis=-1).reshape(1, 8, 3)

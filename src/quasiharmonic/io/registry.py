@@ -63,7 +63,7 @@ class Format:
     single_file : bool
         Whether a file that is read never refers to further files that are needed.
     read_elements : callable, optional
-        Parses the bytes of a planar mesh of finite elements.
+        Parses the bytes of a planar mesh of finite elements, or with a second argument True of one in space.
     encode_values : callable, optional
         Returns the bytes of a file with ``V, F, uv`` and columns of values per triangle.
     """
@@ -77,7 +77,7 @@ class Format:
     image: bool = False
     companions: Callable[[FilePath, Texture], tuple[Path, ...]] | None = None
     single_file: bool = True
-    read_elements: Callable[[bytes], MeshParts] | None = None
+    read_elements: Callable[..., MeshParts] | None = None
     encode_values: Callable[[FloatArray, IntArray, FloatArray, Mapping[str, FloatArray]], bytes] | None = None
 
 

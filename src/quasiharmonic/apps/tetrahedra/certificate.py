@@ -10,10 +10,10 @@ the following conditions exactly. Together they are necessary and sufficient.
 4. The winding number of the boundary is 0 or 1 at every point off it.
 
 *Sufficient*: the winding number at a point off all faces is the degree of the map there. By condition 2 it is the
-number of tetrahedra that contain the point, so the interiors of tetrahedra are disjoint. Suppose two points had the same
-image. If both are on the boundary, this contradicts condition 3. Otherwise one is in the interior. The directions
-around it form a closed surface, whose positive triangles cover the sphere of directions. So the tetrahedra at this point
-cover a neighbourhood of the image, and overlap those at the other point.
+number of tetrahedra that contain the point, so the interiors of tetrahedra are disjoint. Suppose two points had the
+same image. If both are on the boundary, this contradicts condition 3. Otherwise one is in the interior. The directions
+around it form a closed surface, whose positive triangles cover the sphere of directions. So the tetrahedra at this
+point cover a neighbourhood of the image, and overlap those at the other point.
 
 *Necessary*: each condition fails only if two points have the same image or a tetrahedron is not positive.
 
@@ -188,8 +188,8 @@ def certify_tetrahedra(T: ArrayLike, X: ArrayLike, *, boundary: bool = True) -> 
 
     Notes
     -----
-    The result is exact for the coordinates as stored. See `quasiharmonic.apps.tetrahedra.certificate` for the conditions
-    and the proof.
+    The result is exact for the coordinates as stored. The module `quasiharmonic.apps.tetrahedra.certificate` has the
+    conditions and the proof.
 
     Examples
     --------
@@ -210,7 +210,7 @@ def certify_arrays(
     """`certify_tetrahedra` of checked arrays; ``faces`` is the result of `inspect_faces`, if known."""
     signs = ExactSigns(X)
     sign = signs(T)
-    finite = signs.finite[T].all(axis=1) if not signs.finite.all() else np.ones(len(T), dtype=np.bool_)
+    finite = np.asarray(signs.finite[T].all(axis=1)) if len(T) else np.ones(0, dtype=np.bool_)
     sign[~finite] = 0
     if faces is None:
         faces = inspect_faces(T, len(X))
@@ -245,7 +245,7 @@ def certify_arrays(
 def find_boundary_contacts(F: IntArray, X: FloatArray, signs: ExactSigns | None = None) -> IntArray:
     """`find_contacts` of the triangles (f, 3) that are finite and not degenerate, in the indices of all triangles."""
     signs = ExactSigns(X) if signs is None else signs
-    good = np.flatnonzero(signs.finite[F].all(axis=1) & ~_degenerate_triangles(F, X))
+    good = np.flatnonzero(np.asarray(signs.finite[F].all(axis=1)) & ~_degenerate_triangles(F, X))
     return good[find_contacts(F[good], X, signs)]
 
 

@@ -44,7 +44,7 @@ class ExactSigns:
     """
 
     def __init__(self, X: FloatArray) -> None:
-        self.finite = np.isfinite(X).all(axis=1)
+        self.finite = np.asarray(np.isfinite(X).all(axis=1))
         self._X = np.where(self.finite[:, None], X, 0.0)
         exponent = np.frexp(np.abs(self._X).max(initial=0.0))[1]
         with np.errstate(under="ignore"):
@@ -55,12 +55,11 @@ class ExactSigns:
         with np.errstate(under="ignore"):
             for start in range(0, len(corners), _CHUNK):
                 heartbeat()
-                chunk = slice(start, start + _CHUNK)
-                some = corners[chunk].T
-                sign[chunk] = _sign_if_certain(*(self._edges(some)))
+                block = slice(start, start + _CHUNK)
+                sign[block] = _sign_if_certain(*self._edges(corners[block].T))
             undecided = np.flatnonzero(sign == 0)
             if not self.finite.all():
-                undecided = undecided[self.finite[corners[undecided]].all(axis=1)]
+                undecided = undecided[np.asarray(self.finite[corners[undecided]].all(axis=1))]
             for start in range(0, undecided.size, _CHUNK):
                 heartbeat()
                 chunk = undecided[start : start + _CHUNK]
@@ -79,7 +78,7 @@ def tetrahedron_signs(T: IntArray, X: FloatArray) -> tuple[SignArray, IntArray]:
     sign = signs(T)
     nonfinite = np.empty(0, dtype=np.int64)
     if not signs.finite.all():
-        nonfinite = np.flatnonzero(~signs.finite[T].all(axis=1))
+        nonfinite = np.flatnonzero(~np.asarray(signs.finite[T].all(axis=1)))
         sign[nonfinite] = 0
     return sign, nonfinite
 

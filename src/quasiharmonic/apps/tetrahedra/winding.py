@@ -44,9 +44,7 @@ def outer_winding(F: IntArray, X: FloatArray, patches: IntArray) -> IntArray:
     return result
 
 
-def _first_line(
-    corners: FloatArray, lo: FloatArray, hi: FloatArray, triangles: IntArray
-) -> list[tuple[int, int]]:
+def _first_line(corners: FloatArray, lo: FloatArray, hi: FloatArray, triangles: IntArray) -> list[tuple[int, int]]:
     """Return the crossings of a line through one of some triangles: the triangle, and the winding number outside."""
     for triangle, weights, axes in _choices(triangles):
         found = _crossings(corners, lo, hi, triangle, weights, axes)

@@ -171,7 +171,9 @@ def _components(x: FloatArray) -> FloatArray:
 
 
 def exact_sum(terms: FloatArray) -> FloatArray:
-    """Sum over axis 0 of (t, k) terms (overwritten) whose sums neither overflow nor underflow; relative error at most 2⁻⁴⁸.
+    """Sum over axis 0 of (t, k) terms whose sums neither overflow nor underflow; relative error at most 2⁻⁴⁸.
+
+    The terms are overwritten.
 
     Each sweep replaces the terms by others with the same exact sum. The last one is the rounded sum, and the
     others are rounding errors [2]_. A sum is decided when the last term exceeds the rest in magnitude. This takes

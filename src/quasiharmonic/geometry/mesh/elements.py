@@ -100,6 +100,16 @@ def join_elements(blocks: Sequence[IntArray]) -> IntArray:
     return np.concatenate([np.empty((0, width), dtype=np.int64), *padded])
 
 
+def join_solids(blocks: Sequence[IntArray]) -> IntArray:
+    """Join blocks of tetrahedra (k, 4) and hexahedra (k, 8) into rows of one length.
+
+    A tetrahedron among hexahedra repeats its last node.
+    """
+    width = max((block.shape[1] for block in blocks if len(block)), default=4)
+    padded = [block[:, [*range(block.shape[1]), *[3] * 4][:width]] for block in blocks if len(block)]
+    return np.concatenate([np.empty((0, width), dtype=np.int64), *padded])
+
+
 def name_elements(F: IntArray, which: IntArray) -> str:
     """Name the first few of the given elements: ``quadrilaterals 3, 8``."""
     if F.shape[1] == 4:

@@ -8,14 +8,18 @@ from itertools import groupby
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.elements import join_elements
+from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
 from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers, stack_tables
 from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.vtk_cells import SUPPORTED
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Number of nodes of each kind of element that is read, and of the kinds that are skipped: lines and points.
 _ELEMENTS = {2: 3, 3: 4, 9: 6}
-_NODES = {**_ELEMENTS, 1: 2, 8: 3, 15: 1}
+_POINTS_AND_LINES = {1: 2, 8: 3, 15: 1}
+# The same for meshes in space, which may have elements of lower dimension on their boundary.
+_SOLIDS = {4: 4, 5: 8}
+_SURFACES = {**_ELEMENTS, 10: 9, 16: 8}
 _NAMES = {
     4: "tetrahedron",
     5: "hexahedron",
@@ -23,12 +27,13 @@ _NAMES = {
     7: "pyramid",
     10: "second-order quadrangle",
     11: "second-order tetrahedron",
+    12: "second-order hexahedron",
     16: "second-order quadrangle",
 }
 
 
-def read_gmsh(data: bytes) -> MeshParts:
-    """Parse an MSH file.
+def read_gmsh(data: bytes, solid: bool = False) -> MeshParts:
+    """Parse an MSH file, with its tetrahedra and hexahedra if ``solid``.
 
     ValueError if the file is not MSH of version 2 or 4, ends early, or has other elements than points, lines, triangles
     of three or six nodes and quadrilaterals of four.
@@ -43,7 +48,7 @@ def read_gmsh(data: bytes) -> MeshParts:
         elif name == b"ParametricNodes":
             raise ValueError("nodes with parameters are not supported in version 2: save it as 4.1, or without them")
         elif name == b"Elements":
-            elements.append(_elements(data, begin, end, version, order))
+            elements.append(_elements(data, begin, end, version, order, solid))
         elif name == b"NodeData":
             title = TableReader(data, begin, end, "<")
             if int(title.words()[0]) > 0:
@@ -143,55 +148,56 @@ def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -
     return np.concatenate(numbers), stack_tables(values, 3)
 
 
-def _elements(data: bytes, begin: int, end: int, version: str, order: str | None) -> IntArray:
-    """Return the tags of the elements' nodes, (f, 3), (f, 4) or (f, 6)."""
+def _elements(data: bytes, begin: int, end: int, version: str, order: str | None, solid: bool) -> IntArray:
+    """Return the tags of the elements' nodes, in the format of `MeshParts.F`."""
+    wanted, join = (_SOLIDS, join_solids) if solid else (_ELEMENTS, join_elements)
     found: list[IntArray] = []
     if version == "2":
         head = TableReader(data, begin, end, "<")
         count = int(head.words()[0])
         if order is None:
-            return _element_lines(list(map(int, data[head.position : end].split())), count)
+            return join(_element_lines(list(map(int, data[head.position : end].split())), count, solid))
         reader = TableReader(data, head.position, end, order)
         while count > 0:
             kind, size, tags = reader.take("i4", 3).tolist()
-            table = reader.tables(size, ("i4", 1 + tags + _nodes_of(kind)))[0].values
-            if kind in _ELEMENTS:
-                found.append(table[:, -_nodes_of(kind) :].astype(np.int64))
+            table = reader.tables(size, ("i4", 1 + tags + _nodes_of(kind, solid)))[0].values
+            if kind in wanted:
+                found.append(table[:, -_nodes_of(kind, solid) :].astype(np.int64))
             count -= max(size, 1)
-        return join_elements(found)
+        return join(found)
     reader = TableReader(data, begin, end, order)
     for _ in range(int(reader.take("u8", 2 if version == "4.0" else 4)[0])):
         kind = int(reader.take("i4", 3)[2])
         size = int(reader.take("u8", 1)[0])
-        table = reader.tables(size, ("i4" if version == "4.0" else "u8", 1 + _nodes_of(kind)))[0].values
-        if kind in _ELEMENTS:
+        table = reader.tables(size, ("i4" if version == "4.0" else "u8", 1 + _nodes_of(kind, solid)))[0].values
+        if kind in wanted:
             found.append(table[:, 1:].astype(np.int64))
-    return join_elements(found)
+    return join(found)
 
 
-def _element_lines(numbers: list[int], count: int) -> IntArray:
+def _element_lines(numbers: list[int], count: int, solid: bool) -> list[IntArray]:
     """Return the elements of lines "number kind tags … nodes …" of version 2."""
     found: list[list[int]] = []
     at = 0
     for _ in range(count):
         if at + 3 > len(numbers):
             raise ValueError("it ends too early")
-        kind, stop = numbers[at + 1], at + 3 + numbers[at + 2] + _nodes_of(numbers[at + 1])
-        if kind in _ELEMENTS:
-            found.append(numbers[stop - _nodes_of(kind) : stop])
+        kind, stop = numbers[at + 1], at + 3 + numbers[at + 2] + _nodes_of(numbers[at + 1], solid)
+        if kind in (_SOLIDS if solid else _ELEMENTS):
+            found.append(numbers[stop - _nodes_of(kind, solid) : stop])
         at = stop
     if at > len(numbers):
         raise ValueError("it ends too early")
-    return join_elements([np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)])
+    return [np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)]
 
 
-def _nodes_of(kind: int) -> int:
-    if kind not in _NODES:
+def _nodes_of(kind: int, solid: bool) -> int:
+    known = {**_POINTS_AND_LINES, **(_SOLIDS | _SURFACES if solid else _ELEMENTS)}
+    if kind not in known:
         raise ValueError(
-            f"cells of type {_NAMES.get(kind, f'number {kind}')} are not supported: use triangles of three or six "
-            "nodes or quadrilaterals"
+            f"cells of type {_NAMES.get(kind, f'number {kind}')} are not supported: use {SUPPORTED[solid]}"
         )
-    return _NODES[kind]
+    return known[kind]
 
 
 def _node_data(data: bytes, begin: int, end: int, order: str | None, tags: IntArray, which: IntArray) -> FloatArray:

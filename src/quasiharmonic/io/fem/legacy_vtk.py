@@ -34,13 +34,13 @@ _COMPONENTS = {b"VECTORS": 3, b"NORMALS": 3, b"TENSORS": 9, b"TENSORS6": 6, b"GL
 _POLY = {b"VERTICES": 2, b"LINES": 4, b"POLYGONS": 7, b"TRIANGLE_STRIPS": 6}
 
 
-def read_legacy_vtk(data: bytes) -> MeshParts:
-    """Parse a legacy VTK file.
+def read_legacy_vtk(data: bytes, solid: bool = False) -> MeshParts:
+    """Parse a legacy VTK file, with its tetrahedra and hexahedra if ``solid``.
 
     ValueError if the file is not legacy VTK, ends early, has other cells with area than triangles and quadrilaterals,
     or has an unknown section or type.
     """
-    return _LegacyReader(data).parts()
+    return _LegacyReader(data).parts(solid)
 
 
 class _LegacyReader:
@@ -63,7 +63,7 @@ class _LegacyReader:
         # Whether the following arrays belong to points, and their length.
         self._of_points, self._count = False, 0
 
-    def parts(self) -> MeshParts:
+    def parts(self, solid: bool) -> MeshParts:
         """Read all sections and return the mesh."""
         while words := self._reader.words():
             self._section(words[0].upper(), words[1:])
@@ -76,7 +76,7 @@ class _LegacyReader:
         lists = [np.full(len(offsets) - 1, kind) for offsets, _, kind in self._lists]
         kinds = self._kinds if self._kinds is not None else np.concatenate([np.empty(0, dtype=np.int64), *lists])
         place = self._points
-        F = elements(np.concatenate(connectivity), np.concatenate(starts), kinds, len(place.values))
+        F = elements(np.concatenate(connectivity), np.concatenate(starts), kinds, len(place.values), solid)
         points = place.values.astype(np.float64)
         change = partial(replace_numbers, self._data, place)
         return MeshParts(points, F, np.dtype(place.values.dtype.newbyteorder("=")), self._fields, change)

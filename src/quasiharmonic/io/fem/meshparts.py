@@ -15,10 +15,12 @@ class MeshParts:
     """Positions and elements of a file, and a function that changes only the positions."""
 
     points: FloatArray  # (n, 3): positions, converted to double
-    F: IntArray  # (f, 3), (f, 4) or (f, 6): elements in the format of `geometry.mesh.elements`
+    # (f, 3), (f, 4) or (f, 6): elements in the format of `geometry.mesh.elements`. Of a mesh in space (t, 4) or (t, 8):
+    # tetrahedra and hexahedra; a tetrahedron among hexahedra repeats its last node.
+    F: IntArray
     precision: np.dtype[np.floating]  # Precision of the positions in the file
     # Each callable returns values at all points, (n, k) float64, NaN at points without value. It raises `ValueError`
     # if the data are damaged.
     fields: Mapping[str, Callable[[], FloatArray]]
-    # Returns the bytes of the file with the first two coordinates of its points replaced by (n, 2) float64
+    # Returns the bytes of the file with the first coordinates of its points replaced, by (n, 2) or (n, 3) float64
     replace_points: Callable[[FloatArray], bytes]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.elements import join_elements
+from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
 from quasiharmonic.util.arrays import IntArray
 
 #: Kinds without area: vertices, lines, lists of them, and second-order lines.
@@ -12,39 +12,47 @@ _POINTS_AND_LINES = (1, 2, 3, 4, 21)
 # Number of nodes of the kinds that are elements. Polygons of three or four corners are elements too.
 _ELEMENTS = {5: 3, 9: 4, 22: 6}
 _POLYGON = 7
+# The same for meshes in space, and the kinds with area that these meshes may have on their boundary.
+_SOLIDS = {10: 4, 12: 8}
+_SURFACES = (5, 6, 7, 8, 9, 22, 23, 28)
+#: What can be used instead of other cells, in the plane and in space.
+SUPPORTED = "triangles of three or six nodes or quadrilaterals", "tetrahedra of four nodes or hexahedra of eight"
 _NAMES = {
     6: "triangle strip",
     8: "pixel",
     10: "tetrahedron",
+    11: "voxel",
     12: "hexahedron",
     13: "wedge",
     14: "pyramid",
     23: "second-order quadrilateral",
+    24: "second-order tetrahedron",
+    25: "second-order hexahedron",
 }
 
 
-def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: int) -> IntArray:
+def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: int, solid: bool = False) -> IntArray:
     """Return the triangles and quadrilaterals; (f, 3), (f, 4) or (f, 6) int64, as in `geometry.mesh.elements`.
 
     ``connectivity`` (m,) has the points of all cells, one cell after another. Cell i begins at ``starts[i]``, and
     ``kinds[i]`` is VTK's kind of it. A polygon with three corners is a triangle, one with four a quadrilateral.
-    ValueError for a cell with area of another kind, six-node triangles with other elements, or a point out of range.
+    ValueError for a cell with area of another kind, six-node triangles with other elements, or a point out of range. If
+    ``solid``, return the tetrahedra and hexahedra instead (`MeshParts.F`), and skip cells without volume.
     """
     if len(starts) != len(kinds) + 1 or (np.diff(starts) < 0).any() or starts[-1] > len(connectivity):
         raise ValueError("its lists of cells contradict each other")
     sizes = np.diff(starts)
-    wanted = (kinds == _POLYGON) & np.isin(sizes, (3, 4))
-    for kind, size in _ELEMENTS.items():
+    wanted = (kinds == _POLYGON) & np.isin(sizes, (3, 4)) & (not solid)
+    for kind, size in (_SOLIDS if solid else _ELEMENTS).items():
         wanted |= (kinds == kind) & (sizes == size)
-    other = np.unique(kinds[~wanted & ~np.isin(kinds, _POINTS_AND_LINES)])
+    skipped = (*_POINTS_AND_LINES, *(_SURFACES if solid else ()))
+    other = np.unique(kinds[~wanted & ~np.isin(kinds, skipped)])
     if other.size:
         names = (_NAMES.get(kind, "polygon" if kind == _POLYGON else f"number {kind}") for kind in other.tolist())
-        raise ValueError(
-            f"cells of type {', '.join(names)} are not supported: use triangles of three or six nodes or quadrilaterals"
-        )
+        raise ValueError(f"cells of type {', '.join(names)} are not supported: use {SUPPORTED[solid]}")
     begins, sizes = starts[:-1][wanted], sizes[wanted]
     changes = np.flatnonzero(np.diff(sizes)) + 1
-    F = join_elements(
+    F = (join_solids if solid else join_elements)(
         [
             connectivity[block[:, None] + np.arange(size[0])]
             for block, size in zip(np.split(begins, changes), np.split(sizes, changes), strict=True)

@@ -57,8 +57,8 @@ class _Array:
     end: int
 
 
-def read_vtu(data: bytes) -> MeshParts:
-    """Parse a VTU file.
+def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
+    """Parse a VTU file, with its tetrahedra and hexahedra if ``solid``.
 
     ValueError if the file is not VTU, has several pieces or times, an unknown encoding, or other cells with area than
     triangles and quadrilaterals.
@@ -71,7 +71,7 @@ def read_vtu(data: bytes) -> MeshParts:
     place = file.values(points, 3 * file.points).reshape(-1, 3)
     ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
     connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
-    F = elements(connectivity, np.concatenate([[0], ends]), kinds, len(place))
+    F = elements(connectivity, np.concatenate([[0], ends]), kinds, len(place), solid)
     fields = {name: partial(_rows, file, array) for name, array in file.point_data.items()}
     kind = np.dtype(_KINDS[precision])
     return MeshParts(place.astype(np.float64), F, kind, fields, partial(file.replace_points, points))
@@ -146,7 +146,7 @@ class _VtuFile:
         return np.frombuffer(self._block(array, max_count * number.itemsize)[0], number)
 
     def replace_points(self, array: _Array, points: FloatArray) -> bytes:
-        """Return the file with the first two of every three numbers of an array replaced."""
+        """Return the file with the first of every three numbers of an array replaced, by (n, 2) or (n, 3)."""
         if array.attributes.get("format") == "ascii":
             reader = TableReader(self._data, array.begin, array.end, None)
             table = reader.tables(len(points), (_KINDS[array.attributes["type"]], 3))[0]
@@ -155,7 +155,7 @@ class _VtuFile:
         block, begin, end = self._block(array, 3 * self.points * number.itemsize)
         numbers = np.frombuffer(block, number).reshape(-1, 3).copy()
         with np.errstate(over="ignore"):
-            numbers[:, :2] = points
+            numbers[:, : points.shape[1]] = points
         if numbers.tobytes() == block:
             return self._data
         encoded = self._encode(numbers.tobytes(), array)

@@ -1,4 +1,4 @@
-"""Planar finite-element meshes as inputs of ``check``, ``measure`` and ``plot``."""
+"""Finite-element meshes, in the plane and in space, as inputs of ``check``, ``measure`` and ``plot``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.io.fem.files import FemMesh
+    from quasiharmonic.io.fem.files import FemMesh, VolumeMesh
 
 
 def has_elements(path: Path) -> bool:
@@ -23,12 +23,15 @@ def has_elements(path: Path) -> bool:
 def check(options: argparse.Namespace) -> int:
     """Report what the mesh is and which elements are inverted; return the exit status of ``qhm check``."""
     from quasiharmonic.geometry.mesh.elements import name_elements
-    from quasiharmonic.io.fem.files import read_fem
+    from quasiharmonic.io.fem.files import read_fem, read_volume
     from quasiharmonic.problem.inspection import inspect_mesh
     from quasiharmonic.ui.cli import report
     from quasiharmonic.util.arrays import count_of
 
     _reject(options, ("precision", "--as"), ("any_triangulation", "--any-triangulation"), ("fixed", "--fixed"))
+    volume = read_volume(options.input)
+    if len(volume.parts.F):
+        return _check_volume(options, volume)
     mesh = read_fem(options.input)
     triangles, _, inverted = _split(mesh)
     with report.about(options.input):
@@ -45,6 +48,36 @@ def check(options: argparse.Namespace) -> int:
     text = f"{options.input}: {elements}, split into triangles: {found.summary()}\n{verdict}"
     report.emit_verdict(facts, options.json, text)
     return 1 if inverted.size else 0
+
+
+def _check_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
+    """Certify tetrahedra as they are in the file; report hexahedra with a corner that is not positive."""
+    from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
+    from quasiharmonic.apps.tetrahedra.hexahedra import find_bad_corners
+    from quasiharmonic.ui.cli import report
+    from quasiharmonic.util.arrays import count_of, names_of
+
+    facts: dict[str, Any] = {"input": str(options.input), "elements": len(mesh.parts.F)}
+    lines, good = [], True
+    if len(mesh.T):
+        # Faces to hexahedra would count as boundary, so with hexahedra the boundary is not checked.
+        certificate = certify_arrays(mesh.T, mesh.points, boundary=not len(mesh.H))
+        good = certificate.positive if len(mesh.H) else bool(certificate.injective)
+        facts |= certificate.to_dict()
+        lines.append(certificate.summary())
+    if len(mesh.H):
+        bad = find_bad_corners(mesh.H, mesh.points)
+        good = good and not bad.size
+        facts |= {"hexahedra": len(mesh.H), "corners_not_positive": bad.tolist(), "injective": None if good else False}
+        hexahedra = count_of("hexahedron", "hexahedra", len(mesh.H))
+        lines.append(
+            f"Of {hexahedra}, {names_of('hexahedron', 'hexahedra', bad)} have a corner that is not positive."
+            if bad.size
+            else f"All corners of {hexahedra} are positive. This does not certify them: a hexahedron with positive "
+            "corners can be inverted inside."
+        )
+    report.emit_verdict(facts, options.json, f"{options.input}: {' '.join(lines)}")
+    return 0 if good else 1
 
 
 def measure(options: argparse.Namespace) -> int:
