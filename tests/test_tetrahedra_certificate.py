@@ -237,7 +237,7 @@ def test_qhm_check_certifies_the_file(suffix, tmp_path, capsys):
     X, T = box(2, 2, 2)
     path = tmp_path / f"mesh{suffix}"
     walls = certify_tetrahedra(T, X).boundary
-    form = {"file_format": "gmsh"} if suffix == ".msh" else {}
+    form = {"file_format": "gmsh22"} if suffix == ".msh" else {}
     meshlane.write(path, meshlane.Mesh(X, [("triangle", walls), ("tetra", T)]), **form)
     read = read_volume(path)
     np.testing.assert_array_equal(read.T, T)

@@ -135,7 +135,7 @@ def _edge_meets(
 
 
 def _project(F: IntArray, X: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return two axes for each triangle (k, 3) such that its projection has an area, and the projection's orientation."""
+    """Return two axes for each triangle (k, 3) whose projection has an area, and the orientation of the projection."""
     axes, turn = np.zeros((len(F), 2), dtype=np.int64), np.zeros(len(F))
     left = np.arange(len(F))
     for pair in _AXES:
