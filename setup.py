@@ -21,10 +21,8 @@ OTHER_FLAGS = ["-std=c11", "-O3", "-fvisibility=hidden", *PRECISE]
 # One wheel serves this Python version and all later ones, except free-threaded builds.
 STABLE = not sysconfig.get_config_var("Py_GIL_DISABLED")
 
-# Constants that the C files share with the Python source.
-generator = runpy.run_path(str(PACKAGE / "util/kernels/constants.py"))
-text = generator["header"](generator["shared_constants"](PACKAGE))
-(PACKAGE / "util/kernels/c/constants.h").write_text(text, encoding="utf-8")
+# Write the header of the constants that the C files share with the Python source.
+runpy.run_path(str(PACKAGE / "util/kernels/constants.py"), run_name="__main__")
 
 
 class BuildKernels(build_ext):

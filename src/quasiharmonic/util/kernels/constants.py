@@ -1,7 +1,7 @@
 """Constants that the C kernels share with their NumPy versions: read from the Python source, written to a C header.
 
-`setup.py` runs this file by its path before the extension is built, so it imports only the standard library. The
-compiled extension lists the values in ``constants``; a test compares them with the Python source.
+This file runs as a script before the extension is built, so it imports only the standard library. The compiled
+extension lists the values in ``constants``; a test compares them with the Python source.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _assignments(text: str) -> dict[str, object]:
     return values
 
 
-def header(values: dict[str, object]) -> str:
+def _header(values: dict[str, object]) -> str:
     """Return the C header that defines the constants as macros, and lists the scalars for the extension."""
     lines = ["/* Written by kernels/constants.py from the Python source; do not edit. */"]
     lines += [f"#define {name} {_in_c(value)}" for name, value in values.items()]
@@ -69,3 +69,8 @@ def _in_c(value: object) -> str:
     if isinstance(value, tuple):
         return "{" + ", ".join(_in_c(one) for one in value) + "}"
     return f"({value!r})"
+
+
+if __name__ == "__main__":
+    folder = Path(__file__).resolve().parents[2]
+    (folder / "util/kernels/c/constants.h").write_text(_header(shared_constants(folder)), encoding="utf-8")
