@@ -226,7 +226,7 @@ def of_a_memoryview(array, folder):
 
 
 def of_a_file(array, folder):
-    path = folder / f"{array.shape[0]}.{array.dtype}"
+    path = folder / str(len(list(folder.iterdir())))
     array.tofile(path)
     shared = np.memmap(path, array.dtype, "r+", shape=array.shape)
     return np.memmap(path, array.dtype, "r", shape=array.shape), lambda _, now: shared.__setitem__(..., now)

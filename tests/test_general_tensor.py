@@ -287,15 +287,18 @@ class TestBoundaryCondition:
         V, F = random_delaunay(150, seed=1)
         fixed = boundary_of(F)
         problem = Problem(V, F, fixed, V[fixed])
-        found = []
-        for seed in range(12):
+        found = set()
+        # Only one or two tensors in a hundred show the second case.
+        for seed in range(400):
             A = beltrami_tensor(TANH.field(random_xi(F, 0.5, seed)).mu, 0)
             uv = conjugate_quasi_harmonic_map(problem, A)
             edges, vertices = edge_conormal(problem, A, uv), vertex_conormal(problem, A, uv)
             if np.any(signed_areas(F, uv) <= 0):
-                found.append((bool(np.all(edges.s > 0)), bool(np.all(vertices.s > 0))))
-        assert (True, False) in found
-        assert (False, True) in found
+                found.add((bool(np.all(edges.s > 0)), bool(np.all(vertices.s > 0))))
+            if {(True, False), (False, True)} <= found:
+                break
+        else:
+            pytest.fail(f"of the two cases only {found} were found")
 
     def test_s_is_not_defined_on_a_collapsed_edge(self):
         V, F = random_delaunay(60, seed=1)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http.client
-import os
-import signal
 import socket
 import sys
 import threading
@@ -14,6 +12,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import psutil
 import pytest
 
 pytest.importorskip("websockets", reason="the extra studio is not installed")
@@ -147,8 +146,7 @@ def test_pages_are_independent_and_a_crash_ends_only_its_page(running):
         assert hear(one, "map", state="settled").header["outline"] == "disk"
         other.send(encode({"do": "undo"}))
         assert hear(other, "map", state="settled").header["outline"] == "rect:1x1"
-        first = min(children(), key=lambda pid: os.stat(f"/proc/{pid}").st_ctime)
-        os.kill(first, signal.SIGKILL)
+        min(children(), key=psutil.Process.create_time).kill()
         assert "the process of this page has ended" in hear(one, "note").header["text"]
         with pytest.raises(ConnectionClosed):
             hear(one, "map")
@@ -160,10 +158,10 @@ def test_pages_are_independent_and_a_crash_ends_only_its_page(running):
 def children():
     """Return processes of pages."""
     found = []
-    for pid in filter(str.isdigit, os.listdir("/proc")):
-        with contextlib.suppress(OSError), open(f"/proc/{pid}/cmdline", "rb") as file:
-            if b"quasiharmonic.ui.studio.server.page_worker" in file.read() and parent(pid) == os.getpid():
-                found.append(int(pid))
+    for process in psutil.Process().children():
+        with contextlib.suppress(psutil.Error):
+            if "quasiharmonic.ui.studio.server.page_worker" in " ".join(process.cmdline()):
+                found.append(process)
     return found
 
 
@@ -173,11 +171,6 @@ def nobody_is_left():
     while children() and time.monotonic() < until:
         time.sleep(0.05)
     assert children() == []
-
-
-def parent(pid):
-    with open(f"/proc/{pid}/stat", encoding="utf-8") as file:
-        return int(file.read().rpartition(")")[2].split()[1])
 
 
 def test_a_socket_closed_during_a_drag_leaves_no_process(running):
@@ -468,8 +461,8 @@ def test_a_session_continues_after_a_reload_and_after_a_crash(running):
         assert again.header["outline"] == "disk"
         assert again.header["undo"]
         assert np.array_equal(again.arrays["places"], shown.arrays["places"])
-        for pid in children():
-            os.kill(pid, signal.SIGKILL)
+        for process in children():
+            process.kill()
         assert hear(page, "note").header["level"] == "gone"
     with session_page(running, name) as page:
         assert hear(page, "map", state="settled").header["outline"] == "disk"

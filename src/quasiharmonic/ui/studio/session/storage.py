@@ -78,21 +78,24 @@ def _dump(state: Any, shared: list[Any], folder: Path) -> bytes:
         _replace(path, pickle.dumps(sheet))
     shared.append(sheet)
     buffer = io.BytesIO()
-    pickler = pickle.Pickler(buffer, protocol=5)
-    pickler.persistent_id = lambda value: _key(value) if value is sheet else None  # type: ignore[method-assign]
-    pickler.dump(state)
+
+    # Python 3.13.0 does not let these methods be assigned.
+    class Pickler(pickle.Pickler):
+        def persistent_id(self, value: Any) -> str | None:
+            return _key(value) if value is sheet else None
+
+    Pickler(buffer, protocol=5).dump(state)
     return buffer.getvalue()
 
 
 def _load(data: bytes, sheets: dict[str, Any], folder: Path) -> Any:
-    def find(key: Any) -> Any:
-        if key not in sheets:
-            sheets[key] = pickle.loads((folder / f"sheet-{key}").read_bytes())
-        return sheets[key]
+    class Unpickler(pickle.Unpickler):
+        def persistent_load(self, key: Any) -> Any:
+            if key not in sheets:
+                sheets[key] = pickle.loads((folder / f"sheet-{key}").read_bytes())
+            return sheets[key]
 
-    unpickler = pickle.Unpickler(io.BytesIO(data))
-    unpickler.persistent_load = find  # type: ignore[method-assign]
-    return unpickler.load()
+    return Unpickler(io.BytesIO(data)).load()
 
 
 def _replace(path: Path, data: bytes) -> None:
