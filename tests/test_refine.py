@@ -141,7 +141,9 @@ def test_ctrl_c_in_any_attempt():
     V, F, fixed, target = chevron()
     seen = []
     injective_map(V, F, fixed, target, refine=True, callback=seen.append)
-    for last in (1, len(seen) // 2, len(seen) - 1):
+    # On a slow machine some steps are reported twice, so their numbers count.
+    steps = max(step.iteration for step in seen)
+    for last in (1, steps // 2, steps):
         left = iter(range(last))
 
         def stop(step, left=left):
