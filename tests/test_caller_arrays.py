@@ -217,7 +217,7 @@ def of_a_buffer(array, folder):
     memory = bytearray(array.tobytes())
     view = np.frombuffer(memory, array.dtype).reshape(array.shape)
     view.flags.writeable = False
-    return view, lambda _, now: memory.__setitem__(slice(None), np.broadcast_to(now, array.shape).tobytes())
+    return view, lambda _, now: memory.__setitem__(slice(None), np.full(array.shape, now, array.dtype).tobytes())
 
 
 def of_a_memoryview(array, folder):
@@ -236,7 +236,7 @@ def of_foreign_memory(array, folder):
     memory = (ctypes.c_char * array.nbytes).from_buffer_copy(array.tobytes())
     view = np.frombuffer(memory, array.dtype).reshape(array.shape)
     view.flags.writeable = False
-    return view, lambda _, now: ctypes.memmove(memory, np.broadcast_to(now, array.shape).tobytes(), array.nbytes)
+    return view, lambda _, now: ctypes.memmove(memory, np.full(array.shape, now, array.dtype).tobytes(), array.nbytes)
 
 
 KINDS = (plain, read_only_view, opened_again, of_a_buffer, of_a_memoryview, of_a_file, of_foreign_memory)

@@ -134,7 +134,7 @@ def disk(rings: int = 12) -> tuple[FloatArray, IntArray]:
     V, F = [np.zeros((1, 2))], []
     inner, m = 0, 1  # the first vertex of the previous ring, and its number of vertices
     for k in range(1, rings + 1):
-        outer, step = inner + m, np.arange(6 * k)
+        outer, step = inner + m, np.arange(6 * k, dtype=np.int64)
         angle = step * (np.pi / (3 * k))
         V.append(np.stack([np.cos(angle), np.sin(angle)], axis=1) * (k / rings))
         # In each of six sectors k triangles have an edge on the outer ring and k - 1 on the inner ring.

@@ -188,8 +188,8 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
     >>> V, F = annulus(8)
     >>> F[5] = F[5, ::-1]
     >>> cleaned = clean(V, F)
-    >>> cleaned.triangles[cleaned.flipped], cleaned.report.clean
-    (array([5]), False)
+    >>> cleaned.triangles[cleaned.flipped].tolist(), cleaned.report.clean
+    ([5], False)
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))

@@ -111,8 +111,8 @@ def find_overlapping(F: IntArray, uv: FloatArray) -> IntArray:
     Examples
     --------
     >>> uv = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.3, 0.3], [1.0, 1.0]])
-    >>> find_overlapping(np.array([[0, 1, 2], [1, 4, 2], [3, 4, 2]]), uv)
-    array([0, 1, 2])
+    >>> find_overlapping(np.array([[0, 1, 2], [1, 4, 2], [3, 4, 2]]), uv).tolist()
+    [0, 1, 2]
     """
     found = np.zeros(len(F), dtype=np.bool_)
     corners = uv[F]
