@@ -536,7 +536,7 @@ class TestRun:
 
         def attend_all(supervisor, some):
             for files in some:
-                folder = supervisor.orders.folder(files.name)
+                folder = supervisor.orders.folder(files)
                 records.clear(folder)
                 records.write_record(folder, {"problem": files.name, "outcome": "injective"})
                 yield Finished(files.name, "injective", 0.0)

@@ -28,7 +28,7 @@ def jobs_of(source, out, **settings):
         {
             "mesh": str(files.mesh),
             "fixed": None if files.fixed is None else str(files.fixed),
-            "folder": str(orders.folder(files.name)),
+            "folder": str(orders.folder(files)),
             "settings": orders.settings.to_dict(),
             "record": {"problem": files.name, "key": orders.settings.key(files)},
         }

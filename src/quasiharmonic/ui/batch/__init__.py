@@ -4,6 +4,7 @@ The package builds on `solver` and `apps`. Start reading in `driver`, then `work
 """
 
 from quasiharmonic.ui.batch.driver import Progress, run
+from quasiharmonic.ui.batch.merging import Merged, merge
 from quasiharmonic.ui.batch.problems import ProblemFiles, find_problems
 from quasiharmonic.ui.batch.records import COLUMNS, OUTCOMES, read_table, write_table
 from quasiharmonic.ui.batch.settings import Settings
@@ -12,11 +13,13 @@ from quasiharmonic.ui.batch.supervisor import WorkerError
 __all__ = [
     "COLUMNS",
     "OUTCOMES",
+    "Merged",
     "ProblemFiles",
     "Progress",
     "Settings",
     "WorkerError",
     "find_problems",
+    "merge",
     "read_table",
     "run",
     "write_table",

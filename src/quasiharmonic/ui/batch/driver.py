@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any
 
 from quasiharmonic import __version__
 from quasiharmonic.io.errors import OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole
 from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.lock import FILE as LOCK
-from quasiharmonic.ui.batch.lock import lock_folder
-from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, find_problems, group_small
+from quasiharmonic.ui.batch.lock import lock_folder, lock_name
+from quasiharmonic.ui.batch.loose import LooseProblems
+from quasiharmonic.ui.batch.pool import core_count, on_this_machine
+from quasiharmonic.ui.batch.problems import MARKER, group_small
 from quasiharmonic.ui.batch.settings import Orders, Settings
-from quasiharmonic.ui.batch.supervisor import ClosedError, Finished, Supervisor, resident
+from quasiharmonic.ui.batch.shards import WHOLE, Shard, read_shard, shard_of, table_name
+from quasiharmonic.ui.batch.supervisor import Finished, resident
 from quasiharmonic.util.arrays import check_bool, check_callback, check_instance, check_integer, check_positive
-
-# Seconds between two calls of a callback while nothing is finished.
-_POLL_INTERVAL = 0.2
 
 
 @dataclass
@@ -35,7 +32,7 @@ class Progress:
     Attributes
     ----------
     total : int
-        Number of problems in the data set.
+        Number of problems in the data set or in the shard.
     outcomes : dict of str to int
         Number of finished problems per outcome; see `quasiharmonic.ui.batch.records.OUTCOMES`.
     resumed : int
@@ -86,6 +83,7 @@ def run(
     memory_limit: int | None = None,
     retry: bool = False,
     table: str = "csv",
+    shard: str | None = None,
     scheduler: Any = None,
     callback: Callable[[Progress], object] | None = None,
 ) -> Progress:
@@ -118,6 +116,10 @@ def run(
         limit than the present one are always tried again.
     table : {"csv", "parquet"}
         Format of the table of records.
+    shard : str, optional
+        ``"i/n"``, with i from 1 to n: solve only one of n disjoint parts of the data set, chosen by a hash of the
+        problem's name. The table is then ``records-i-of-n.csv``. The n runs may have the same output folder at the same
+        time. `quasiharmonic.batch.merge` joins their tables.
     scheduler : str, distributed.Client or cluster, optional
         Address of a Dask scheduler, or a client or cluster. Its workers solve as many problems at a time as they have
         threads. They must see ``source`` and ``output`` under the same paths.
@@ -149,33 +151,46 @@ def run(
     check_instance("settings", settings, Settings)
     settings = _check_files(settings)
     _check(jobs, threads, time_limit, memory_limit, scheduler)
+    part = read_shard(shard)
     folder = Path(os.path.abspath(output))
-    table_path = folder / f"records.{table}"
+    table_path = folder / table_name(part, table)
     records.check_table(table_path)
     began = time.perf_counter()
-    # The problems are enumerated twice, for counting and for solving, so that memory does not grow with their number.
-    progress = Progress(_count(source, settings, folder))
+    data = LooseProblems(source, Orders(folder, settings, threads, time_limit, memory_limit, retry), part)
+    progress = Progress(data.total)
     _check_folder(folder)
-    with new_folder(folder, leftovers=frozenset({LOCK})), lock_folder(folder):
-        _prepare(folder, source, settings)
-        orders = Orders(folder, settings, threads, time_limit, memory_limit, retry)
-        todo = find_problems(source, plain=settings.plain)
+    lock = lock_name(part)
+    with new_folder(folder, leftovers=frozenset({lock})), lock_folder(folder, lock):
+        _prepare(folder, source, settings, part)
+        todo = data.problems()
         if scheduler is None:
-            finished = _local(todo, orders, min(jobs or _cores(), progress.total))
+            groups = group_small(todo) if settings.together else ([files] for files in todo)
+            finished = on_this_machine(groups, data.orders, _workers(jobs, data.total))
         else:
             from quasiharmonic.ui.batch.cluster import on_cluster
 
-            finished = on_cluster(todo, orders, scheduler)
+            finished = on_cluster(todo, data.orders, scheduler)
+
+        def count(some: Iterable[Finished]) -> None:
+            for one in some:
+                progress.outcomes[one.outcome] = progress.outcomes.get(one.outcome, 0) + 1
+                progress.resumed += one.resumed
+            progress.total, progress.seconds = data.total, time.perf_counter() - began
+            if callback is not None:
+                callback(progress)
+
         with closing(finished):
             for item in finished:
-                progress.seconds = time.perf_counter() - began
-                if item is not None:
-                    progress.outcomes[item.outcome] = progress.outcomes.get(item.outcome, 0) + 1
-                    progress.resumed += item.resumed
-                if callback is not None:
-                    callback(progress)
-        records.write_table(table_path, _records(source, orders))
+                count(data.collect(item))
+            count(data.finish())
+        records.write_table(table_path, data.records())
     return progress
+
+
+def _workers(jobs: int | None, total: int) -> int:
+    """Return the number of worker processes; not more than problems, if their number is known."""
+    jobs = jobs or core_count()
+    return min(jobs, total or jobs)
 
 
 def _check_files(settings: Settings) -> Settings:
@@ -216,21 +231,6 @@ def _check(jobs: int | None, threads: int, time_limit: float | None, memory_limi
         raise ValueError("a limit of memory needs psutil on this system: pip install 'quasiharmonic[batch]'")
 
 
-def _count(source: str | os.PathLike[str], settings: Settings, folder: Path) -> int:
-    """Return the number of problems; raise ValueError if there are none or if one lies in the output folder."""
-    count, inside = 0, folder.is_relative_to(os.path.abspath(source))
-    for files in find_problems(source, plain=settings.plain):
-        if inside and files.mesh.is_relative_to(folder):
-            raise ValueError(f"{folder} contains a problem, {files.mesh}: choose another folder for the results")
-        count += 1
-    if not count:
-        raise ValueError(
-            f"there are no problems in {source}: a problem is a folder with input.obj and handles.txt"
-            + ("" if settings.plain else "; for plain meshes, give an outline or flatten them")
-        )
-    return count
-
-
 def _check_folder(folder: Path) -> None:
     """Raise OutputError if the path exists but is not a run's folder."""
     if os.path.lexists(folder) and not folder.is_dir():
@@ -243,73 +243,20 @@ def _check_folder(folder: Path) -> None:
         raise OutputError(f"{folder} has a {tables[0]} that belongs to no run: choose another folder for the results")
 
 
-def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings) -> None:
+def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, part: Shard) -> None:
     """Write the marker file with source, settings and version into the run's folder, and delete old tables."""
     try:
-        for name in records.TABLES:
-            # The table of the last run must not be taken for that of this run.
-            remove_file(folder / name)
+        for path in folder.glob("records*"):
+            # The table of the last run must not be taken for that of this run, nor the tables of other shards.
+            if path.name in records.TABLES or (
+                shard_of(path.name) is not None and part in (WHOLE, shard_of(path.name))
+            ):
+                remove_file(path)
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     about = {"source": os.path.abspath(source), "settings": settings.to_dict(), "version": __version__}
-    write_whole(folder / MARKER, json.dumps(about, indent=2).encode() + b"\n")
-
-
-def _records(source: str | os.PathLike[str], orders: Orders) -> Iterator[records.Record]:
-    for files in find_problems(source, plain=orders.settings.plain):
-        record = records.read_record(orders.folder(files.name))
-        if record is not None:
-            yield record
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
-
-
-def _local(todo: Iterator[ProblemFiles], orders: Orders, jobs: int) -> Generator[Finished | None]:
-    """Solve problems in processes of this machine; yield None regularly while no problem is finished."""
-    supervisors = [Supervisor(orders) for _ in range(jobs)]
-    groups = group_small(todo) if orders.settings.together else ([files] for files in todo)
-    lock, finished = threading.Lock(), SimpleQueue[Finished | BaseException | None]()
-
-    def attend(supervisor: Supervisor) -> None:
-        try:
-            while True:
-                with lock:
-                    group = next(groups, None)
-                if group is None:
-                    break
-                for item in supervisor.attend_all(group):
-                    finished.put(item)
-        except ClosedError:
-            pass
-        except BaseException as error:
-            finished.put(error)
-        finished.put(None)
-
-    threads = [threading.Thread(target=attend, args=(supervisor,), daemon=True) for supervisor in supervisors]
-    for thread in threads:
-        thread.start()
-    working = jobs
-    try:
-        while working:
-            try:
-                item = finished.get(timeout=_POLL_INTERVAL)
-            except Empty:
-                yield None
-                continue
-            if isinstance(item, BaseException):
-                raise item
-            if item is None:
-                working -= 1
-            else:
-                yield item
-    finally:
-        for supervisor in supervisors:
-            supervisor.close()
-        for thread in threads:
-            thread.join()
+    contents = json.dumps(about, indent=2).encode() + b"\n"
+    marker = folder / MARKER
+    # Other shards write the same contents.
+    if part == WHOLE or not marker.exists() or marker.read_bytes() != contents:
+        write_whole(marker, contents)

@@ -7,20 +7,26 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from quasiharmonic.io.errors import OutputError
+from quasiharmonic.ui.batch.shards import WHOLE, Shard
 
-#: The lock file in the output folder. It is not deleted after the run; only the system's lock on it counts.
-FILE = "qhm-batch.lock"
+
+def lock_name(part: Shard) -> str:
+    """Return the name of the lock file in the output folder; every shard has its own.
+
+    The file is not deleted after the run; only the system's lock on it counts.
+    """
+    return "qhm-batch.lock" if part == WHOLE else f"qhm-batch-{part.label}.lock"
 
 
 @contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Lock a folder against other runs; the system releases the lock when this process ends for any reason.
+def lock_folder(folder: Path, name: str) -> Iterator[None]:
+    """Lock a folder against other runs with the same lock file; the system releases the lock when this process ends.
 
     If the system or the file system has no such locks, the folder is not locked. OutputError if another run has locked
     the folder, or the folder cannot be written to.
     """
     try:
-        file = open(folder / FILE, "ab")  # noqa: SIM115
+        file = open(folder / name, "ab")  # noqa: SIM115
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     with file:

@@ -38,11 +38,17 @@ class ProblemFiles:
         Absolute path of the mesh.
     fixed : Path or None
         Absolute path of the list of fixed vertices, if there is one.
+    results : Path or None
+        Absolute path of the folder for its map and record; by default ``results/NAME`` in the run's folder.
+    source : str or None
+        What the record names as the source; by default ``mesh``.
     """
 
     name: str
     mesh: Path
     fixed: Path | None
+    results: Path | None = None
+    source: str | None = None
 
 
 def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Iterator[ProblemFiles]:

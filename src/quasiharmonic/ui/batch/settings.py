@@ -224,6 +224,6 @@ class Orders:
     memory_limit: int | None = None  # Bytes of resident memory of the process that solves a problem
     retry: bool = False  # Whether to try again problems that failed for other reasons than their input
 
-    def folder(self, name: str) -> Path:
+    def folder(self, files: ProblemFiles) -> Path:
         """Return the folder of a problem's map and record."""
-        return self.output / "results" / name
+        return files.results or self.output / "results" / files.name

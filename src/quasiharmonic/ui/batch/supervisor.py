@@ -41,6 +41,7 @@ class Finished(NamedTuple):
     outcome: str  # As in the record
     seconds: float  # As in the record
     resumed: bool = False  # Whether an earlier run had finished it
+    starved: bool = False  # Whether it failed because memory ran out, or possibly so
 
 
 class ClosedError(Exception):
@@ -67,6 +68,12 @@ class Supervisor:
         called in the meantime.
         """
         job = self._job(files)
+        return job if isinstance(job, Finished) else self._solve_one(job)
+
+    def attend_again(self, files: ProblemFiles) -> Finished:
+        """Solve a problem in a new process, and replace its record."""
+        self.rest()
+        job = self._job(files, again=True)
         return job if isinstance(job, Finished) else self._solve_one(job)
 
     def attend_all(self, some: Sequence[ProblemFiles]) -> Iterator[Finished]:
@@ -96,16 +103,18 @@ class Supervisor:
         for job in jobs:
             yield self._solve_one(job)
 
-    def _job(self, files: ProblemFiles) -> dict[str, Any] | Finished:
+    def _job(self, files: ProblemFiles, *, again: bool = False) -> dict[str, Any] | Finished:
         """Return the job for the process, or the outcome if there is nothing to do."""
-        folder, orders = self.orders.folder(files.name), self.orders
+        orders = self.orders
+        folder = orders.folder(files)
         known = _start_record(files, orders)
         try:
             known["key"] = orders.settings.key(files)
         except OSError as error:
             return _conclude(folder, known | {"outcome": "invalid", "error": str(error)}, 0.0)
-        before = records.read_record(folder)
-        if before is not None and before.get("key") == known["key"] and _is_valid(folder, before, orders):
+        before = None if again else records.read_record(folder)
+        valid = before is not None and before.get("key") == known["key"] and is_valid(before, orders)
+        if before is not None and valid and records.is_complete(folder, before):
             return Finished(files.name, before["outcome"], before.get("seconds") or 0.0, resumed=True)
         return {
             "mesh": str(files.mesh),
@@ -149,7 +158,7 @@ class Supervisor:
         while True:
             answer, _ = process.answer(orders)
             if answer is None:
-                self._replace()
+                self.rest()
                 if self._closed:
                     raise ClosedError
                 return
@@ -173,16 +182,19 @@ class Supervisor:
             if "outcome" in answer:
                 if answer["outcome"] == "memory":
                     # A failed allocation may leave the process in a bad state.
-                    self._replace()
-                return Finished(record["problem"], answer["outcome"], answer["seconds"])
+                    self.rest()
+                return Finished(
+                    record["problem"], answer["outcome"], answer["seconds"], starved=answer["outcome"] == "memory"
+                )
             record = answer["facts"]
-        self._replace()
+        self.rest()
         if self._closed:
             raise ClosedError
-        return _conclude(Path(job["folder"]), record | why, time.perf_counter() - began)
+        starved = why["outcome"] == "memory" or process.was_killed
+        return _conclude(Path(job["folder"]), record | why, time.perf_counter() - began)._replace(starved=starved)
 
-    def _replace(self) -> None:
-        """Kill the process; the next job starts another one."""
+    def rest(self) -> None:
+        """Kill the process, which releases its memory; the next job starts another one."""
         with self._lock:
             if self._process is not None:
                 self._process.end()
@@ -194,14 +206,14 @@ def record_crash(files: ProblemFiles, orders: Orders, why: str) -> Finished:
     record = _start_record(files, orders) | {"outcome": "crash", "error": why}
     with suppress(OSError):
         record["key"] = orders.settings.key(files)
-    return _conclude(orders.folder(files.name), record, 0.0)
+    return _conclude(orders.folder(files), record, 0.0)
 
 
 def _start_record(files: ProblemFiles, orders: Orders) -> Record:
     """Return the part of a record that is known before the problem is read."""
     return {
         "problem": files.name,
-        "source": str(files.mesh),
+        "source": files.source or str(files.mesh),
         "threads": orders.threads,
         "time_limit": orders.time_limit,
         "memory_limit": orders.memory_limit,
@@ -217,12 +229,10 @@ def _conclude(folder: Path, record: Record, seconds: float) -> Finished:
     return Finished(record["problem"], record["outcome"], seconds)
 
 
-def _is_valid(folder: Path, record: Record, orders: Orders) -> bool:
-    """Whether an existing record of the same input and settings is valid for these orders."""
+def is_valid(record: Record, orders: Orders) -> bool:
+    """Whether an existing record of the same input and settings is valid for these orders, if its map is complete."""
     outcome = record["outcome"]
-    if outcome in records.JUDGED:
-        return records.is_complete(folder, record)
-    if outcome == "invalid":
+    if outcome in records.JUDGED or outcome == "invalid":
         return True
     if orders.retry:
         return False
@@ -249,6 +259,8 @@ class _Process:
             raise WorkerError(f"cannot start {COMMAND[0]}: {error}") from error
         self._answers: SimpleQueue[bytes | None] = SimpleQueue()
         self._ready = False
+        #: Whether another program ended the process by SIGKILL, as the system does when memory runs out.
+        self.was_killed = False
         assert self._process.stdout is not None
         threading.Thread(target=_pump, args=(self._process.stdout, self._answers), daemon=True).start()
 
@@ -292,7 +304,7 @@ class _Process:
                 return None, why | self._memory()
             if line is not None:
                 return json.loads(line), {}
-            self._process.wait()
+            self.was_killed = hasattr(signal, "SIGKILL") and self._process.wait() == -signal.SIGKILL
             return None, {"outcome": "crash", "error": self._cause()} | self._memory()
 
     def end(self) -> None:
@@ -321,7 +333,7 @@ class _Process:
         if code < 0:
             with suppress(ValueError):
                 text = f"the process was ended by {signal.Signals(-code).name}"
-            if -code == signal.SIGKILL:
+            if self.was_killed:
                 text += ", as the system does when memory runs out"
         words = self._last_words()
         return f"{text}: {words}" if words else text

@@ -38,6 +38,8 @@ def add_parser(commands: Commands) -> None:
             "qhm batch problems/ -o results/ --report",
             "qhm batch meshes/ -o flat/ --flatten --cut -j 4",
             "qhm batch -o results/ --report --against other.csv",
+            "qhm batch problems/ -o results/ --shard $SLURM_ARRAY_TASK_ID/16",
+            "qhm batch -o results/ --merge --report",
         ),
     )
     parser.add_argument(
@@ -67,6 +69,19 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--retry", action="store_true", help="retry problems that failed by an error, a crash or a limit"
+    )
+
+    parser.add_argument(
+        "--shard",
+        metavar="I/N",
+        help="solve part I (1 to N) of N disjoint parts, for array jobs; parts may share OUT and run at the same time",
+    )
+    parser.add_argument(
+        "--merge",
+        type=Path,
+        nargs="*",
+        metavar="RUN",
+        help="join the tables of finished parts in the folders RUN (default: OUT) into OUT/records.csv",
     )
 
     work = parser.add_argument_group("workers and limits")
@@ -153,10 +168,13 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the data set with progress, then print a summary and write the report page."""
     from quasiharmonic.ui import batch
+    from quasiharmonic.ui.batch.shards import read_shard, table_name
     from quasiharmonic.ui.cli import report
 
     if options.against is not None and not options.report:
         raise ValueError("--against needs --report: add --report, or omit --against")
+    if options.merge is not None:
+        return _merge(options)
     if options.source is None:
         if not options.report:
             raise ValueError("name a folder or a list of problems, or add --report to describe a run")
@@ -192,6 +210,7 @@ def run(options: argparse.Namespace) -> int:
             memory_limit=options.memory_limit,
             retry=options.retry,
             table=options.table,
+            shard=options.shard,
             scheduler=options.scheduler,
             callback=show,
         )
@@ -204,13 +223,33 @@ def run(options: argparse.Namespace) -> int:
     finally:
         show.clear()
     wanted = "bijective" if options.flatten else "injective"
-    records = options.output / f"records.{options.table}"
+    records = options.output / table_name(read_shard(options.shard), options.table)
     with report.after_writing(records):
         print(_account(progress, wanted, records), flush=True)
     if options.report:
         with report.after_writing(records):
             _write_report(options)
     return 0 if progress.solved == progress.total else 1
+
+
+def _merge(options: argparse.Namespace) -> int:
+    """Merge tables, print a summary and write the report page; return the exit status."""
+    from quasiharmonic.ui import batch
+    from quasiharmonic.ui.cli import report
+
+    if options.source is not None or options.shard is not None:
+        raise ValueError("--merge joins finished runs: omit the data set and --shard")
+    merged = batch.merge(options.merge or [options.output], options.output, table=options.table)
+    table = options.output / f"records.{options.table}"
+    with report.after_writing(table):
+        print(f"{merged.solved} of {merged.total} problems have a certified map\nwrote {table}", flush=True)
+    if merged.missing:
+        shown = ", ".join(merged.missing[:20]) + (", …" if len(merged.missing) > 20 else "")
+        tell(f"qhm batch: warning: no table of the shards {shown}: they are not finished, or in another folder")
+    if options.report:
+        with report.after_writing(table):
+            _write_report(options)
+    return 0 if merged.solved == merged.total and not merged.missing else 1
 
 
 def _write_report(options: argparse.Namespace) -> int:

@@ -1,0 +1,120 @@
+"""Solve problems in processes of this machine."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from collections.abc import Generator, Iterator
+from queue import Empty, SimpleQueue
+
+from quasiharmonic.ui.batch.problems import ProblemFiles
+from quasiharmonic.ui.batch.settings import Orders
+from quasiharmonic.ui.batch.slots import Slots
+from quasiharmonic.ui.batch.supervisor import ClosedError, Finished, Supervisor
+
+# Seconds between two values None while nothing is finished.
+_POLL_INTERVAL = 0.2
+# Number of problems waiting to be solved alone from which this is done before the end.
+_MANY = 16
+
+
+def core_count() -> int:
+    """Return the number of cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+def on_this_machine(groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> Generator[Finished | None]:
+    """Solve problems, several at a time; yield None regularly while no problem is finished.
+
+    The problems of a group may be solved together. A problem whose process ran out of memory is solved again in a new
+    process while no other is solved; only the result of that is yielded.
+    """
+    workers = _Workers(groups, orders, jobs)
+    try:
+        yield from workers.finished()
+    finally:
+        workers.close()
+
+
+class _Workers:
+    """Threads that each supervise one process."""
+
+    def __init__(self, groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> None:
+        self._groups = groups
+        self._lock = threading.Lock()  # of the groups, whose iterator must not run in two threads
+        self._slots = Slots(jobs)
+        self._starved: deque[ProblemFiles] = deque()
+        self._answers = SimpleQueue[Finished | BaseException | None]()
+        self._supervisors = [Supervisor(orders) for _ in range(jobs)]
+        self._threads = [threading.Thread(target=self._work, args=(one,), daemon=True) for one in self._supervisors]
+        for thread in self._threads:
+            thread.start()
+
+    def finished(self) -> Iterator[Finished | None]:
+        """Yield finished problems until all threads have ended; raise the first error of a thread."""
+        working = len(self._threads)
+        while working:
+            try:
+                item = self._answers.get(timeout=_POLL_INTERVAL)
+            except Empty:
+                yield None
+                continue
+            if isinstance(item, BaseException):
+                raise item
+            if item is None:
+                working -= 1
+            else:
+                yield item
+
+    def close(self) -> None:
+        """End all processes and threads."""
+        for supervisor in self._supervisors:
+            supervisor.close()
+        self._slots.close()
+        for thread in self._threads:
+            thread.join()
+
+    def _work(self, supervisor: Supervisor) -> None:
+        try:
+            while (group := self._next()) is not None:
+                self._solve(supervisor, group)
+                if len(self._starved) >= _MANY:
+                    self._solve_alone(supervisor)
+            supervisor.rest()
+            self._solve_alone(supervisor)
+        except ClosedError:
+            pass
+        except BaseException as error:
+            self._answers.put(error)
+        self._answers.put(None)
+
+    def _next(self) -> list[ProblemFiles] | None:
+        with self._lock:
+            return next(self._groups, None)
+
+    def _solve(self, supervisor: Supervisor, group: list[ProblemFiles]) -> None:
+        files = {one.name: one for one in group}
+        starved = False
+        with self._slots.one(supervisor.rest):
+            for item in supervisor.attend_all(group):
+                if item.starved:
+                    starved = True
+                    self._starved.append(files[item.name])
+                else:
+                    self._answers.put(item)
+            self._slots.record(starved=starved)
+
+    def _solve_alone(self, supervisor: Supervisor) -> None:
+        """Solve the problems whose processes ran out of memory, while all other processes are ended or idle."""
+        while self._starved:
+            with self._slots.alone():
+                try:
+                    files = self._starved.popleft()
+                except IndexError:
+                    return
+                self._answers.put(supervisor.attend_again(files))
+                supervisor.rest()
