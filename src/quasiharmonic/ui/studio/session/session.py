@@ -68,6 +68,7 @@ class Session:
         self._drag_state: _DragState | None = None
         self._after = -1
         self._origin = np.zeros(2)
+        self._working = False
 
     @property
     def state(self) -> SessionState:
@@ -112,9 +113,10 @@ class Session:
             self._show()
         except (ValueError, OSError, ArithmeticError, RuntimeError, ImportError) as error:
             self._drag_state = None
-            self._tell({"kind": "note", "level": "error", "text": str(error)}, {})
-            if self._history and not isinstance(error, RequestError):
+            if self._history and (self._working or not isinstance(error, RequestError)):
                 self._show()
+            # The surface of another model hides what was said before.
+            self._tell({"kind": "note", "level": "error", "text": str(error)}, {})
 
     # --- models, selection and seams ---------------------------------------------------------------------------------
 
@@ -338,7 +340,7 @@ class Session:
 
     def _show(self, *, fit: bool = False) -> None:
         """Send the current state to the page."""
-        state = self.state
+        state, self._working = self.state, False
         if not state.numbering.same(self._numbering):
             self._send_surface(state)
             fit = True
@@ -389,6 +391,7 @@ class Session:
         self._tell(header, arrays)
 
     def _busy(self, what: str) -> None:
+        self._working = True
         self._tell({"kind": "busy", "what": what}, {})
 
     _HANDLERS: dict[str, Callable[[Session, Frame], None]] = {  # noqa: RUF012

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -54,10 +55,11 @@ def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = No
         return _take_map(sheet, bare, callback)
     if len(bare.islands) == 1 and sheet.is_file:
         if _is_disk(bare.islands[0]):
-            square = map_to_outline(bare, make_outline(_FIRST_OUTLINE), callback=callback)
-            # Some disks have no map to a square, because triangles have all corners on one side of it.
-            if square.result.certificate.bijective:
-                return square
+            # Some disks have no map to a square: a boundary of three vertices, triangles with all corners on one side.
+            with suppress(ValueError):
+                square = map_to_outline(bare, make_outline(_FIRST_OUTLINE), callback=callback)
+                if square.result.certificate.bijective:
+                    return square
         if len(sheet.surface.F) <= MAX_AUTOMATIC:
             try:
                 return flatten_islands(bare, callback)

@@ -20,6 +20,8 @@ from quasiharmonic.util.arrays import IntArray
 
 #: Maximum number of triangles; larger meshes are too slow to draw and drag.
 MAX_TRIANGLES = 1_000_000
+#: Maximum absolute coordinate; graphics cards compute in single precision.
+MAX_COORDINATE = 1e15
 # Defects that do not prevent a model from being mapped as it is in the file.
 _HARMLESS = {"vertices without triangle", "vertices where surfaces touch"}
 
@@ -128,6 +130,8 @@ def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> S
         )
     if not len(mesh.F):
         raise ValueError(f"{name} has no triangles")
+    if (largest := float(np.abs(mesh.V).max())) > MAX_COORDINATE:
+        raise ValueError(f"{name} has coordinates up to {largest:.0e}, but at most {MAX_COORDINATE:.0e} can be drawn: scale it")
     report = inspect_mesh(mesh.V, mesh.F)
     sound = not any(found.size for what, found in report.defects.items() if what not in _HARMLESS)
     texture = io.own_texture(mesh) if mesh.source else None

@@ -74,12 +74,16 @@ function outline(context, scene, plane, style) {
   context.beginPath();
   let start = 0;
   for (const loop of scene.loops) {
-    const first = start;
-    path(context, loop, (_, i) => plane.pointOf(scene.asked[2 * (first + i)], scene.asked[2 * (first + i) + 1]));
-    start += loop.length;
+    const target = scene.asked.subarray(2 * start, 2 * (start += loop.length));
+    // Boundaries that are at their target have none to show.
+    if (misses(loop, target, scene.places)) path(context, loop, (_, i) => plane.pointOf(target[2 * i], target[2 * i + 1]));
   }
   context.stroke();
   context.setLineDash([]);
+}
+
+function misses(loop, target, places) {
+  return loop.some((vertex, i) => target[2 * i] !== places[2 * vertex] || target[2 * i + 1] !== places[2 * vertex + 1]);
 }
 
 function badTriangles(context, scene, plane) {

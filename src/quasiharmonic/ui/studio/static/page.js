@@ -6,6 +6,8 @@ import { Panel } from "./panel.js";
 import { createView } from "./view.js";
 
 const $ = (id) => document.getElementById(id);
+// Names of models, images and drawings, in the order in which they are opened if several are dropped.
+const KINDS = [/\.(obj|off|ply|glb|stl)$/i, /\.(png|jpe?g)$/i, /\.svg$/i];
 const RATE_OVER = 1000; // window in milliseconds for the rate of maps
 
 class Page {
@@ -75,6 +77,13 @@ class Page {
     const now = performance.now();
     this.arrivals.push(now);
     while (this.arrivals[0] < now - RATE_OVER) this.arrivals.shift();
+  }
+
+  /** Take files that the user opened or dropped together: a model first, then an image for it. */
+  async takeAll(files) {
+    const rank = (file) => KINDS.findIndex((suffixes) => suffixes.test(file.name));
+    const chosen = KINDS.map((_, kind) => files.find((file) => rank(file) === kind)).filter(Boolean);
+    for (const file of chosen.length ? chosen : files.slice(0, 1)) await this.take(file);
   }
 
   /** Upload a file of the user: a model, an image for it, or a drawing of an outline. */

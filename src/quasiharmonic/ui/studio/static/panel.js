@@ -43,7 +43,7 @@ export class Panel {
     $("note-close").addEventListener("click", () => this.status.forget());
     for (const id of ["open", "svg", "image"]) {
       $(id).addEventListener("change", () => {
-        if ($(id).files.length) page.take($(id).files[0]);
+        if ($(id).files.length) page.takeAll([...$(id).files]);
         $(id).value = "";
       });
     }
@@ -61,7 +61,7 @@ export class Panel {
     for (const kind of ["dragover", "drop"]) {
       document.addEventListener(kind, (event) => {
         event.preventDefault();
-        if (kind === "drop" && event.dataTransfer.files.length) this.page.take(event.dataTransfer.files[0]);
+        if (kind === "drop" && event.dataTransfer.files.length) this.page.takeAll([...event.dataTransfer.files]);
       });
     }
   }
@@ -104,7 +104,7 @@ export class Panel {
   }
 
   surface(header) {
-    $("name").textContent = `${header.name} — ${header.triangles.toLocaleString("en")} triangles`;
+    $("name").textContent = `${header.name} — ${header.triangles.toLocaleString("en")} ${header.triangles === 1 ? "triangle" : "triangles"}`;
     $("name").title = header.defects.length ? `Repaired for mapping: ${header.defects.join(", ")}` : "";
     this.status.surface();
   }
@@ -121,7 +121,7 @@ export class Panel {
     $("undo").disabled = !header.undo;
     $("redo").disabled = !header.redo;
     $("outward").hidden = !header.inward;
-    $("outward-words").textContent = `${header.inward === 1 ? "A closed part" : `${header.inward} closed parts`} of the model face inward.`;
+    $("outward-words").textContent = header.inward === 1 ? "A closed part of the model faces inward." : `${header.inward} closed parts of the model face inward.`;
     $("repeat").hidden = !header.command && header.mapped === false;
     $("command").textContent = header.command || "The map is the one in the file.";
     $("python").textContent = header.python || "# The map is the one in the file.";

@@ -10,6 +10,24 @@ export class PlaneView {
     this.followed = true;
   }
 
+  /** Return another view of the same part of the plane. */
+  copy() {
+    return Object.assign(new PlaneView(), this);
+  }
+
+  sameAs(other) {
+    return this.pixels === other.pixels && this.centre.every((value, k) => value === other.centre[k]);
+  }
+
+  /** Return the view that is a part `s` of the way to another one, in the box of that one. */
+  toward(other, s) {
+    const between = other.copy();
+    between.centre = this.centre.map((value, k) => value + s * (other.centre[k] - value));
+    between.pixels = this.pixels * (other.pixels / this.pixels) ** s;
+    between.extent = this.extent * (other.extent / this.extent) ** s;
+    return between;
+  }
+
   /** Fit the view to some positions (n × 2), with a margin. */
   fit(places) {
     let [left, right, bottom, top] = [Infinity, -Infinity, Infinity, -Infinity];

@@ -67,7 +67,7 @@ void main() {
   }
   vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
   float facing = dot(normal, toward);
-  float light = flat_pane ? 0.82 + 0.18 * facing : 0.45 + 0.55 * abs(facing);
+  float light = flat_pane ? 0.9 + 0.1 * facing : 0.45 + 0.55 * abs(facing);
   vec3 base = vec3(0.72, 0.74, 0.78);
   if (colouring == 0) base = checker();
   if (colouring == 1) base = ramp(log2(stretch()) / reach);

@@ -1,5 +1,14 @@
 // View of the surface: rotation, projection, and picking of vertices.
 
+/** Return the largest distance of some points (n × 3) from a centre. */
+function farthest(positions, [x, y, z]) {
+  let most = 0;
+  for (let i = 0; i < positions.length; i += 3) {
+    most = Math.max(most, (positions[i] - x) ** 2 + (positions[i + 1] - y) ** 2 + (positions[i + 2] - z) ** 2);
+  }
+  return Math.sqrt(most);
+}
+
 /** An orthographic view of points (n × 3) that supports rotation, pan and zoom. Angles in radians. */
 export class SpaceView {
   constructor(positions) {
@@ -11,7 +20,7 @@ export class SpaceView {
     }
     this.positions = positions;
     this.centre = low.map((value, k) => (value + high[k]) / 2);
-    this.radius = Math.hypot(...low.map((value, k) => (high[k] - value) / 2)) || 1;
+    this.radius = farthest(positions, this.centre) || 1;
     this.box = { x: 0, y: 0, width: 1, height: 1 };
     this.reset();
   }

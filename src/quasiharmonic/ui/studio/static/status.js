@@ -15,6 +15,7 @@ const PHASES = {
   flatten: "Flattening",
   improve: "Improving",
   pack: "Packing",
+  separate: "Separating overlaps",
   certify: "Verifying",
 };
 const NUMBER = new Intl.NumberFormat("en", { maximumSignificantDigits: 4 });
@@ -60,7 +61,7 @@ export class Status {
     $("worst").textContent = header.worst === null ? "∞" : `${shown(header.worst)} ×`;
     $("energy").textContent = shown(header.energy);
     $("used").textContent = header.used === null ? "–" : `${Math.round(100 * header.used)} %`;
-    $("used-of").textContent = header.packed ? "of the unit square" : "of its box";
+    $("used-of").textContent = header.packed ? "of the square" : "of its box";
     if (header.state === "following") $("rate").textContent = rate;
     this.hint();
   }
@@ -129,7 +130,8 @@ export class Status {
 
   /** Show an error, until it is closed or something else happens. */
   note(text) {
-    $("note-text").textContent = text;
+    // A message that begins with a word, and not with a name, is a sentence.
+    $("note-text").textContent = text.replace(/^[a-z]+(?=[ ,])/, (word) => word[0].toUpperCase() + word.slice(1));
     $("note").hidden = false;
   }
 

@@ -25,7 +25,8 @@ const SURFACE_EVERY = 4;
 const REST = 150;
 // Width of seams in CSS pixels.
 const SEAM = 3;
-const SMOOTH = 220; // duration of a transition to another map, in milliseconds
+const SMOOTH = 200; // duration of a transition to another map, in milliseconds
+const TOO_SLOW = 120; // milliseconds for a full picture above which a transition would not be smooth
 
 /** Latencies: milliseconds from a pointer motion to the picture of its map, for the last thousand. */
 class Clock {
@@ -70,7 +71,7 @@ export function createView(element, options = {}) {
   let moves = true; // whether all requests for the next picture come from motion
   let followed = 0; // maps since the surface was redrawn
   let resting = 0;
-  let transition = 0;
+  let transition = null; // the transition to the current map, while it runs
 
   element.classList.add("qhm-view");
   const canvas = document.createElement("canvas");
@@ -122,6 +123,7 @@ export function createView(element, options = {}) {
     const ratio = density() / (coarse ? COARSER : 1);
     const resized = fill(canvas, ratio);
     const every = resized || !coarse;
+    const shown = transition?.plane ?? plane;
     if (space) {
       const within = (box) => ({
         x: Math.round(box.x * ratio),
@@ -133,7 +135,7 @@ export function createView(element, options = {}) {
         ...look,
         colouring: scene.places ? look.colouring : "plain",
         scale,
-        squares: look.squares / plane.extent,
+        squares: look.squares / shown.extent,
         toward: space.axes[2],
         turn: space.matrix,
         origin: scene.origin,
@@ -145,7 +147,7 @@ export function createView(element, options = {}) {
           painter.clearPane(within(pane.box));
           continue;
         }
-        painter.pane(within(pane.box), { ...shared, flat: pane === plane, window: plane.window });
+        painter.pane(within(pane.box), { ...shared, flat: pane === plane, window: shown.window });
       }
       if (every || stale.has("space")) followed = 0;
     } else painter.clear();
@@ -158,8 +160,8 @@ export function createView(element, options = {}) {
     }
     if (!space) return;
     const style = getComputedStyle(element);
-    if (look.grid && scene.places) drawGrid(ground, scene, plane, style);
-    drawOverlay(context, scene, space, plane, { moving: coarse, style });
+    if (look.grid && scene.places) drawGrid(ground, scene, shown, style);
+    drawOverlay(context, transition?.scene ?? scene, space, shown, { moving: coarse, style });
   }
 
   function density() {
@@ -203,7 +205,7 @@ export function createView(element, options = {}) {
     space = new SpaceView(positions);
     // The same model with other seams keeps its direction.
     if (turned && scene.name === header.name) space.turnLike(turned);
-    cancelAnimationFrame(transition);
+    transition = null;
     Object.assign(scene, new Scene(), { size: scene.size, sizes: scene.sizes, name: header.name, triangles });
     scene.setIslands(header, Array.from(arrays.boundary));
     hands.forget();
@@ -212,13 +214,14 @@ export function createView(element, options = {}) {
 
   function map(header, arrays) {
     if (!space) return;
+    finish();
+    const before = { places: scene.places, origin: scene.origin, plane: plane.copy(), bad: scene.bad.length };
     scene.origin = header.origin;
     scene.asked = arrays.asked ?? null;
     scene.corners = header.corners;
     scene.numbers = header.numbers;
     scene.pins = header.pins;
     scene.selected = new Set(header.selected);
-    cancelAnimationFrame(transition);
     if (arrays.places && header.start !== undefined && scene.places) {
       scene.places.set(arrays.places, 2 * header.start);
       painter.setSomePlaces(arrays.places, header.start);
@@ -234,10 +237,12 @@ export function createView(element, options = {}) {
     }
     if (header.fit) {
       scene.chosen = -1;
-      if (scene.places) glide();
+      if (scene.places) plane.fit(scene.places);
     }
+    if (arrays.places && header.seq < 0) begin(before);
     seq = header.seq;
     hands.answered(header.seq, header.after);
+    if (transition) return;
     if (seq < 0 || header.fit) redraw();
     else {
       redraw("plane");
@@ -255,24 +260,50 @@ export function createView(element, options = {}) {
     redraw();
   }
 
-  /** Move the view of the map to its new fit smoothly, unless the user prefers less motion. */
-  function glide() {
-    const from = { centre: plane.centre, pixels: plane.pixels };
-    const first = !plane.size;
-    plane.fit(scene.places);
-    if (first || painter.software || matchMedia("(prefers-reduced-motion: reduce)").matches) return;
-    const to = { centre: plane.centre, pixels: plane.pixels };
+  /**
+   * Move the map and its view smoothly from where they were, unless the user prefers less motion. Only the picture moves:
+   * `scene` and `plane` are already those of the new map.
+   */
+  function begin(before) {
+    const same = before.places?.length === scene.places.length && before.places !== scene.places;
+    // Inverted triangles are shown at once.
+    if (!same || before.bad || scene.bad.length || (painter.software && clock.whole > TOO_SLOW)) return;
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+    const shift = before.origin.map((value, k) => value - scene.origin[k]);
+    const from = before.places.map((value, i) => value + shift[i % 2]);
+    const to = scene.places;
+    before.plane.centre = before.plane.centre.map((value, k) => value + shift[k]);
+    const still = plane.sameAs(before.plane) && from.every((value, i) => Math.abs(value - to[i]) < 0.5 / plane.pixels);
+    if (still) return;
+    const places = new Float32Array(from.length);
+    const moving = Object.create(scene, { places: { value: places }, asked: { value: null } });
+    const own = { plane: before.plane, scene: moving };
     const began = performance.now();
+    transition = own;
     const step = () => {
+      if (transition !== own) return;
       const t = Math.min((performance.now() - began) / SMOOTH, 1);
+      if (t >= 1) return finish();
       const s = t * t * (3 - 2 * t);
-      plane.centre = from.centre.map((c, k) => c + s * (to.centre[k] - c));
-      plane.pixels = from.pixels * (to.pixels / from.pixels) ** s;
+      for (let i = 0; i < places.length; i++) places[i] = from[i] + s * (to[i] - from[i]);
+      own.plane = before.plane.toward(plane, s);
+      painter.setPlaces(places);
       redraw("plane");
-      if (t < 1) transition = requestAnimationFrame(step);
+      redraw("space");
+      requestAnimationFrame(step);
     };
     step();
   }
+
+  /** Show the current map at once. */
+  function finish() {
+    if (!transition) return;
+    transition = null;
+    painter.setPlaces(scene.places);
+    redraw();
+  }
+
+  for (const kind of ["pointerdown", "wheel", "keydown"]) element.addEventListener(kind, finish, { capture: true });
 
   const observer = new ResizeObserver(resize);
   observer.observe(element);
@@ -324,6 +355,7 @@ export function createView(element, options = {}) {
     /** Show another map of the same surface, for example a stored one. */
     show(places, bad = new Uint32Array(0)) {
       if (places.length !== scene.places?.length) return;
+      finish();
       scene.places = places;
       scene.bad = bad;
       painter.setPlaces(places);
@@ -334,6 +366,7 @@ export function createView(element, options = {}) {
 
     /** Return a canvas with the current picture on white. */
     picture() {
+      finish();
       paint();
       const whole = document.createElement("canvas");
       [whole.width, whole.height] = [canvas.width, canvas.height];
@@ -348,7 +381,7 @@ export function createView(element, options = {}) {
 
     dispose() {
       clearTimeout(resting);
-      cancelAnimationFrame(transition);
+      transition = null;
       observer.disconnect();
       painter.dispose();
       element.replaceChildren();
