@@ -125,23 +125,24 @@ export class Painter {
       this.at[name] = gl.getUniformLocation(this.program, name);
     }
     this.buffers = {};
-    for (const name of ["position", "place", "triangles", "edges", "bad"]) this.buffers[name] = gl.createBuffer();
+    for (const name of ["position", "place", "triangles", "edges", "bad", "coarse"]) this.buffers[name] = gl.createBuffer();
     this.lines = new LinePainter(gl, compiled);
     this.texture = gl.createTexture();
     if (this.picture) this.setImage(this.picture);
     if (this.surface) {
-      const { positions, triangles, places, bad, seams } = this.surface;
+      const { positions, triangles, places, bad, seams, coarse } = this.surface;
       this.setSurface(positions, triangles);
       if (seams) this.setSeams(...seams);
       this.setPlaces(places);
       this.setBad(bad);
+      this.setCoarse(coarse);
     }
   }
 
   /** Set positions (n × 3) and triangles (f × 3) of a surface. */
   setSurface(positions, triangles) {
     const gl = this.gl;
-    this.surface = { positions, triangles, edges: null, seams: null, places: new Float32Array((positions.length / 3) * 2), bad: new Uint32Array(0) };
+    this.surface = { positions, triangles, edges: null, seams: null, coarse: null, places: new Float32Array((positions.length / 3) * 2), bad: new Uint32Array(0) };
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers.position);
     gl.bufferData(gl.ARRAY_BUFFER, positions, gl.STATIC_DRAW);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.buffers.triangles);
@@ -184,6 +185,15 @@ export class Painter {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, picture);
     gl.generateMipmap(gl.TEXTURE_2D);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+  }
+
+  /** Set the triangles (f × 3) that stand for all in coarse pictures; null if all are drawn. */
+  setCoarse(triangles) {
+    const gl = this.gl;
+    this.surface.coarse = triangles;
+    if (!triangles) return;
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.buffers.coarse);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.DYNAMIC_DRAW);
   }
 
   /** Set the positions (n × 2) of the vertices in the map. */
@@ -241,10 +251,12 @@ export class Painter {
     gl.enable(gl.POLYGON_OFFSET_FILL);
     gl.polygonOffset(1, 1);
     gl.uniform1i(this.at.colouring, COLOURINGS[look.colouring === "image" && !this.picture ? "checker" : look.colouring]);
-    this.#draw(gl.TRIANGLES, this.buffers.triangles, this.surface.triangles.length);
+    const { triangles, coarse } = this.surface;
+    if (look.coarse && coarse) this.#draw(gl.TRIANGLES, this.buffers.coarse, coarse.length);
+    else this.#draw(gl.TRIANGLES, this.buffers.triangles, triangles.length);
     gl.disable(gl.POLYGON_OFFSET_FILL);
     gl.uniform1i(this.at.colouring, FLAT);
-    if (look.edges) {
+    if (look.edges && !(look.coarse && coarse)) {
       gl.enable(gl.BLEND);
       // Keep the canvas opaque, otherwise the page shines through.
       gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);

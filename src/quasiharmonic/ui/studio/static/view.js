@@ -5,6 +5,7 @@
 // "pin" | "unpin" | "corner" | "polygon" | "select" | "seam" | "erase"}; docs/development/page_protocol.md describes them.
 // Without `send` the view is read-only.
 
+import { coarsen } from "./coarse.js";
 import { decodeFrame } from "./frames.js";
 import { drawGrid } from "./grid.js";
 import { Hands } from "./hands.js";
@@ -23,6 +24,9 @@ const COARSER = 3;
 const QUICK = 12;
 const SURFACE_EVERY = 4;
 const REST = 150;
+// Of models with more triangles than MANY, coarse pictures show about FEWER.
+const MANY = 100_000;
+const FEWER = 30_000;
 // Width of seams in CSS pixels.
 const SEAM = 3;
 const SMOOTH = 200; // duration of a transition to another map, in milliseconds
@@ -71,6 +75,7 @@ export function createView(element, options = {}) {
   let moves = true; // whether all requests for the next picture come from motion
   let followed = 0; // maps since the surface was redrawn
   let resting = 0;
+  let thinned = false; // whether the painter has the triangles for coarse pictures of this map
   let transition = null; // the transition to the current map, while it runs
 
   element.classList.add("qhm-view");
@@ -123,6 +128,10 @@ export function createView(element, options = {}) {
     const ratio = density() / (coarse ? COARSER : 1);
     const resized = fill(canvas, ratio);
     const every = resized || !coarse;
+    if (coarse && !thinned && scene.triangles.length > 3 * MANY) {
+      painter.setCoarse(coarsen({ ...scene, positions: space.positions }, FEWER));
+      thinned = true;
+    }
     const shown = transition?.plane ?? plane;
     if (space) {
       const within = (box) => ({
@@ -140,6 +149,7 @@ export function createView(element, options = {}) {
         turn: space.matrix,
         origin: scene.origin,
         width: SEAM * ratio,
+        coarse,
       };
       for (const [name, pane] of [["space", space], ["plane", plane]]) {
         if (!every && !stale.has(name)) continue;
@@ -206,6 +216,7 @@ export function createView(element, options = {}) {
     // The same model with other seams keeps its direction.
     if (turned && scene.name === header.name) space.turnLike(turned);
     transition = null;
+    thinned = false;
     Object.assign(scene, new Scene(), { size: scene.size, sizes: scene.sizes, name: header.name, triangles });
     scene.setIslands(header, Array.from(arrays.boundary));
     hands.forget();
@@ -231,6 +242,8 @@ export function createView(element, options = {}) {
     } else if (header.mapped === false) scene.places = null;
     if (arrays.places) {
       scene.bad = arrays.bad;
+      // A map at rest differs from the one for which triangles were chosen.
+      if (header.seq < 0) thinned = false;
       scale = header.scale;
       painter.setBad(arrays.bad);
       clock.maps += 1;
