@@ -194,6 +194,14 @@ def test_holes_closed_surfaces_and_planes_are_accepted():
     assert star.recipe.command == "qhm flatten star.obj --cut -o flat.obj"
 
 
+def test_a_boundary_of_three_vertices_opens(visitor):
+    """It has no map to a square, whose corners need four."""
+    content = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv .2 .2 1\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name="tent.obj")
+    assert visitor.session.state.sheet.name == "tent.obj"
+    assert visitor.session.state.result.certificate.bijective
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
@@ -208,7 +216,8 @@ def test_holes_closed_surfaces_and_planes_are_accepted():
 )
 def test_invalid_meshes_are_rejected_with_a_message_about_the_users_file(name, content, says, visitor):
     before = visitor.session.state
-    text = visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name=name)[0].header["text"]
+    # The reason comes last, because a surface hides what was said before.
+    text = visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name=name)[-1].header["text"]
     assert says in text
     assert "/tmp" not in text
     assert "dropped" not in text

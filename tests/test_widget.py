@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, boundary_loops, certify, injective_map, solve
-from quasiharmonic.io import MeshData, write_map
+from quasiharmonic.io import MeshData, checkerboard, own_texture, read_mesh, write_map
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui import notebook
 from quasiharmonic.ui.studio.assets import bundle
@@ -127,6 +127,31 @@ def test_a_model_of_several_parts(cell):
     assert widget.mesh.uv.min() >= 0
     with pytest.raises(ValueError, match="a list of numbers below 2"):
         widget.select([7])
+
+
+def test_image_selection_and_file_of_the_view(cell, tmp_path):
+    """What a view does is seen in Python, and the other way round."""
+    widget = cell.show(np.concatenate([V, V + 9]), np.concatenate([F, F + len(V)]))
+    seen = []
+    widget.observe(lambda change: seen.append((change["new"], widget.selected, widget.image)), "revision")
+    assert widget.image is None
+    cell.does("select", islands=[1])
+    assert [selected for _, selected, _ in seen] == [[1]]
+    board = checkerboard()
+    (tmp_path / "board.png").write_bytes(board.data)
+    widget.show_image(tmp_path / "board.png")
+    assert seen[-1][2].data == board.data
+    assert seen[-1][0] == seen[0][0] + 1
+    (frame,) = (frame for content, frame in cell.does("show") if content["kind"] == "image")
+    assert bytes(frame.arrays["content"]) == board.data
+    widget.pack(resolution=256)
+    for name in ("two.glb", "two.obj", "two.ply"):
+        widget.save(tmp_path / name)
+        saved = read_mesh(tmp_path / name)
+        assert np.ptp(saved.vt, axis=0) == pytest.approx(np.ptp(widget.mesh.uv, axis=0), abs=1e-6)
+    assert own_texture(read_mesh(tmp_path / "two.glb")).data == board.data
+    with pytest.raises(ValueError, match="not a PNG or JPEG"):
+        widget.show_image(tmp_path / "two.obj")
 
 
 def test_invalid_messages(cell):

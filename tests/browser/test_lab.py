@@ -13,6 +13,8 @@ from contextlib import suppress
 
 import pytest
 
+from quasiharmonic.io import checkerboard, own_texture, read_mesh
+
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed (.ci/browser does it)")
 
 CELLS = [
@@ -26,6 +28,13 @@ view = MapWidget(Problem(V, F, *boundary_to(V, F, "rect:1x1")))
 before = view.result.uv
 view""",
     'print("moved", abs(view.result.uv - before).max().round(3), view.result.certificate.bijective)',
+    """import numpy as np
+H = np.concatenate([F, F + len(V)])
+two = MapWidget(np.concatenate([V, V + 3]), H)
+counts = []
+two.observe(lambda change: counts.append(change.new), "revision")
+two""",
+    'print("state", two.selected, len(two.image.data), len(counts), len(two.mesh.islands))',
 ]
 
 
@@ -59,7 +68,7 @@ def lab(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_drag_in_jupyterlab_moves_the_map_of_the_kernel(browser, lab):
+def test_a_drag_in_jupyterlab_moves_the_map_of_the_kernel(browser, lab, tmp_path):
     page = browser.new_page(viewport={"width": 1200, "height": 900})
     page.set_default_timeout(60_000)
     page.goto(lab, wait_until="commit")
@@ -84,4 +93,35 @@ def test_a_drag_in_jupyterlab_moves_the_map_of_the_kernel(browser, lab):
     said = page.locator(".jp-OutputArea-output", has_text="moved").inner_text().split()
     assert float(said[1]) > 0.05
     assert said[2] == "True"
+    # Keys of the view are not those of the notebook, where B inserts a cell.
+    cells = page.locator(".jp-CodeCell").count()
+    page.locator(".qhm-map").focus()
+    page.keyboard.press("b")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(300)
+    assert page.locator(".jp-CodeCell").count() == cells
+    use_image_islands_and_export(page, tmp_path)
     page.close()
+
+
+def use_image_islands_and_export(page, folder):
+    """Select an island, show an image and save it in the second widget; the kernel follows."""
+    page.locator(".jp-CodeCell").nth(2).locator(".cm-content").click()
+    page.keyboard.press("Shift+Enter")
+    view = page.locator(".jp-CodeCell").nth(2)
+    view.get_by_role("button", name="1: 600").click()
+    view.locator("button[data-island='1'][aria-pressed=true]").wait_for()
+    assert view.locator("button[data-island='0'][aria-pressed=false]").count() == 1
+    (folder / "board.png").write_bytes(checkerboard().data)
+    view.locator("input[type=file]").set_input_files(folder / "board.png")
+    view.locator("select").wait_for()
+    page.wait_for_timeout(500)
+    assert view.locator("select").input_value() == "image"
+    with page.expect_download() as download:
+        view.get_by_role("button", name="Save GLB").click()
+    download.value.save_as(folder / "map.glb")
+    assert own_texture(read_mesh(folder / "map.glb")).data == checkerboard().data
+    page.locator(".jp-CodeCell").nth(3).locator(".cm-content").click()
+    page.keyboard.press("Shift+Enter")
+    said = page.locator(".jp-OutputArea-output", has_text="state").inner_text().split()
+    assert said == ["state", "[1]", str(len(checkerboard().data)), "2", "2"]

@@ -136,6 +136,32 @@ def test_an_image_is_dropped_shown_and_saved(served_parts, opened, tmp_path):
     assert io.own_texture(io.read_mesh(tmp_path / "map.glb")).data == bytes(data)
 
 
+def test_a_model_and_its_image_are_dropped_together(served_parts, opened, models):
+    page = opened(served_parts)
+    page.evaluate(
+        """async ([text, data]) => {
+          const files = [["board.png", new Uint8Array(data)], ["dropped.obj", text], ["a.mtl", "newmtl a"]];
+          await studio.takeAll(files.map(([name, content]) => new File([content], name)));
+        }""",
+        [models["closed"].read_text(), list(io.checkerboard().data)],
+    )
+    page.wait_for_selector("input[value=image]:checked", state="attached")
+    assert page.inner_text("#name").startswith("dropped.obj")
+    assert page.is_hidden("#note")
+
+
+@pytest.mark.parametrize("motion", ["no-preference", "reduce"])
+def test_maps_change_smoothly_unless_less_motion_is_preferred(served_parts, opened, settled, motion):
+    page = opened(served_parts)
+    page.emulate_media(reduced_motion=motion)
+    act(page, settled, lambda: page.click("#flatten"))
+    page.wait_for_timeout(400)
+    page.evaluate("studio.view.clock.frames = 0")
+    act(page, settled, lambda: page.click("#undo"))
+    page.wait_for_timeout(400)
+    assert (page.evaluate("studio.view.clock.frames") > 3) == (motion == "no-preference")
+
+
 def test_a_reload_and_a_crash_lose_nothing(served_parts, opened, settled):
     page = opened(served_parts)
     act(page, settled, lambda: page.click("#flatten"))

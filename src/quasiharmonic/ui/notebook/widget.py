@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io import MeshData
+from quasiharmonic.io import MeshData, Texture, read_texture
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
+from quasiharmonic.io.registry import find_format
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.studio.assets import bundle
 from quasiharmonic.ui.studio.protocol import Array, Frame, ProtocolError, decode, encode
+from quasiharmonic.ui.studio.session.exports import mapped_model, write_model
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.surface import Sheet, make_sheet, read_sheet
 from quasiharmonic.util.arrays import IntArray, describe
@@ -35,7 +37,8 @@ _REPEATED = "surface", "seams", "map", "obstructions", "image"
 class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
     """View of a model and its map, as in ``qhm studio``: drag the outline, corners and pins, and the map follows.
 
-    The buttons above the view unwrap and flatten, draw seams and undo. The attributes follow what is done there.
+    The buttons of the view unwrap, flatten and pack, draw seams, select islands, show an image, save and undo. The
+    attributes follow what is done there.
 
     Parameters
     ----------
@@ -57,6 +60,11 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         The map of the first selected island.
     problem : Problem
         The problem of that map.
+    image : Texture or None
+        The image on the surface; the method `show_image` sets it.
+    revision : int
+        Number of maps, selections and images so far. ``view.observe(function, "revision")`` calls a function after
+        each.
     vertices : (n,) int64
         Indices of the problem's vertices in the surface. A surface that is cut has copies of vertices.
 
@@ -70,6 +78,7 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
 
     _esm = f"{bundle('widget')}\nexport default {{ render }};\n"
     height = traitlets.Int(480).tag(sync=True)
+    revision = traitlets.Int(0)
 
     def __init__(
         self, surface: Problem | MapResult | ArrayLike | MeshLike, F: ArrayLike | None = None, *, height: int = 480
@@ -77,9 +86,11 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         super().__init__(height=height)
         self._sent: dict[str, bytes] = {}
         self._note = ""
+        self._changed = False
         sheet = _sheet(surface, F)
         self._session = Session(self._tell)
         self._session.open(sheet)
+        self._count()
         self.on_msg(self._receive)
 
     @property
@@ -123,6 +134,25 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         """Lower the distortion, as `quasiharmonic.polish` does; raise ValueError if that is not possible."""
         self._ask({"do": "polish", "energy": energy, "slide": slide})
 
+    def pack(self, *, resolution: int = 1024, padding: float = 4) -> None:
+        """Pack all islands, as `quasiharmonic.atlas.pack_charts` does; raise ValueError if there is no map."""
+        self._ask({"do": "pack", "resolution": resolution, "padding": padding})
+
+    @property
+    def image(self) -> Texture | None:
+        return self._session.texture
+
+    def show_image(self, path: str | PathLike[str]) -> None:
+        """Show a PNG or JPEG file on the surface and in the map; raise an error if it is neither."""
+        content = np.frombuffer(read_texture(path).data, dtype=np.uint8)
+        self._ask({"do": "image"}, {"content": content})
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the model with its map, and the image if the format stores one; raise ValueError if there is no map."""
+        path = Path(fspath(path))
+        image = self.image if find_format(path, "write_map").image else None
+        write_model(path, mapped_model(self._session.state, image))
+
     def undo(self) -> None:
         """Return to the previous map."""
         self._ask({"do": "undo"})
@@ -131,10 +161,11 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         """Revert the last undo."""
         self._ask({"do": "redo"})
 
-    def _ask(self, header: dict[str, Any]) -> None:
+    def _ask(self, header: dict[str, Any], arrays: Mapping[str, Array] | None = None) -> None:
         """Handle a message as if from the view; raise ValueError with the message that the view would show."""
         self._note = ""
-        self._session.handle(Frame(header, {}))
+        self._session.handle(Frame(header, dict(arrays or {})))
+        self._count()
         if self._note:
             raise ValueError(self._note)
 
@@ -147,10 +178,17 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
             return
         if frame.header.get("do") != "show":
             self._session.handle(frame)
+            self._count()
             return
         for kind in _REPEATED:
             if kind in self._sent:
                 self.send({"kind": kind, "first": True}, [self._sent[kind]])
+
+    def _count(self) -> None:
+        """Tell observers that the state changed, now that the message is handled."""
+        if self._changed:
+            self._changed = False
+            self.revision += 1
 
     def _tell(self, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
         """Send to all views, and store the messages that later views need."""
@@ -158,6 +196,7 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         if kind == "progress":  # cells do not show progress
             return
         data = encode(header, arrays)
+        self._changed |= kind == "image" or header.get("state") == "settled"
         if kind == "note":
             self._note = header["text"]
         # A map message without positions contains only the target of the boundary and must not replace a full one.

@@ -20,15 +20,19 @@ def list_files(state: SessionState, form: str, texture: io.Texture | None) -> di
 
     In OBJ, also those that the command and the script read. RequestError if there is no map.
     """
-    if state.mesh.uv is None:
-        raise RequestError("there is no map to save yet: press Unwrap or Flatten first")
     if form not in FORMATS:
         raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
-    mesh = state.sheet.mapped_file(state.mesh)
-    if texture is not None and form != "ply":
-        mesh = replace(mesh, texture=texture)
+    mesh = mapped_model(state, None if form == "ply" else texture)
     files = _write(mesh, MAP if form == "obj" else f"map.{form}")
     return files | (list_recipe_files(state) if form == "obj" else {})
+
+
+def mapped_model(state: SessionState, texture: io.Texture | None) -> io.MeshData:
+    """Return the file's mesh with the map of a state and an image; RequestError if there is no map."""
+    if state.mesh.uv is None:
+        raise RequestError("there is no map to save yet: press Unwrap or Flatten first")
+    mesh = state.sheet.mapped_file(state.mesh)
+    return mesh if texture is None else replace(mesh, texture=texture)
 
 
 def list_recipe_files(state: SessionState) -> dict[str, bytes]:
@@ -38,12 +42,16 @@ def list_recipe_files(state: SessionState) -> dict[str, bytes]:
     return start | recipe.texts
 
 
+def write_model(path: Path, mesh: io.MeshData) -> None:
+    """Write a mesh in the format of the suffix; without a map as OBJ."""
+    if mesh.FT is None:
+        io.write_obj(path, mesh)
+    else:
+        io.write_mapped(path, mesh)
+
+
 def _write(mesh: io.MeshData, name: str) -> dict[str, bytes]:
     """Return a mesh as a file, with the files that belong to it."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / name
-        if mesh.FT is None:
-            io.write_obj(path, mesh)
-        else:
-            io.write_mapped(path, mesh)
+        write_model(Path(folder) / name, mesh)
         return {each.name: each.read_bytes() for each in sorted(Path(folder).iterdir())}

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.io.models.textures import texture_of
+from quasiharmonic.io.models.textures import Texture, texture_of
 from quasiharmonic.ui.studio.protocol import Array, Frame
 from quasiharmonic.ui.studio.session import frames, operations, validation
 from quasiharmonic.ui.studio.session.drag import DragMap, Follower
@@ -74,6 +74,11 @@ class Session:
     def state(self) -> SessionState:
         """The state that the page shows."""
         return self._history.state
+
+    @property
+    def texture(self) -> Texture | None:
+        """The image on the surface."""
+        return self._history.texture
 
     def open(self, sheet: Sheet | None = None) -> None:
         """Open a model, by default a built-in one; its surface is shown before there is a map.

@@ -131,7 +131,8 @@ def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> S
     if not len(mesh.F):
         raise ValueError(f"{name} has no triangles")
     if (largest := float(np.abs(mesh.V).max())) > MAX_COORDINATE:
-        raise ValueError(f"{name} has coordinates up to {largest:.0e}, but at most {MAX_COORDINATE:.0e} can be drawn: scale it")
+        most = f"at most {MAX_COORDINATE:.0e} can be drawn: scale it"
+        raise ValueError(f"{name} has coordinates up to {largest:.0e}, but {most}")
     report = inspect_mesh(mesh.V, mesh.F)
     sound = not any(found.size for what, found in report.defects.items() if what not in _HARMLESS)
     texture = io.own_texture(mesh) if mesh.source else None

@@ -86,7 +86,8 @@ export function createView(element, options = {}) {
     Object.assign(each.style, { position: "absolute", inset: "0", width: "100%", height: "100%" });
     each.setAttribute("aria-hidden", "true");
   }
-  if (getComputedStyle(element).position === "static") element.style.position = "relative";
+  // An element that is not in the document yet has no computed position.
+  if (["static", ""].includes(getComputedStyle(element).position)) element.style.position = "relative";
   // The grid lies behind the map.
   under.style.zIndex = "-1";
   element.style.isolation = "isolate";
