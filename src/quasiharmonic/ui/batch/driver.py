@@ -5,24 +5,52 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterable
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol
 
 from quasiharmonic import __version__
 from quasiharmonic.io.errors import OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole
 from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.archives import places
+from quasiharmonic.ui.batch.archives.archived import ArchivedProblems
+from quasiharmonic.ui.batch.archives.finding import find_archives
+from quasiharmonic.ui.batch.archives.outputs import Outputs
+from quasiharmonic.ui.batch.archives.scratch import scratch_folder
 from quasiharmonic.ui.batch.lock import lock_folder, lock_name
 from quasiharmonic.ui.batch.loose import LooseProblems
 from quasiharmonic.ui.batch.pool import core_count, on_this_machine
-from quasiharmonic.ui.batch.problems import MARKER, group_small
+from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, group_small
 from quasiharmonic.ui.batch.settings import Orders, Settings
 from quasiharmonic.ui.batch.shards import WHOLE, Shard, read_shard, shard_of, table_name
 from quasiharmonic.ui.batch.supervisor import Finished, resident
 from quasiharmonic.util.arrays import check_bool, check_callback, check_instance, check_integer, check_positive
+
+
+class DataSet(Protocol):
+    """Problems of a run: files in folders (`LooseProblems`), or archives (`ArchivedProblems`)."""
+
+    orders: Orders
+
+    @property
+    def total(self) -> int:
+        """Number of problems; may be an estimate during the run."""
+
+    def problems(self) -> Iterator[ProblemFiles]:
+        """Yield the problems."""
+
+    def collect(self, item: Finished | None) -> Iterable[Finished]:
+        """Keep the results of an item of the pool; return the problems that are finished."""
+
+    def finish(self) -> Iterable[Finished]:
+        """Complete the results; return the problems that this finishes."""
+
+    def records(self) -> Iterator[records.Record]:
+        """Yield the records of the finished problems."""
 
 
 @dataclass
@@ -89,7 +117,8 @@ def run(
 ) -> Progress:
     """Solve every problem of a data set in separate processes; a failure does not affect other problems.
 
-    Every problem gets a folder in ``output/results`` with its map, ``map.obj``, and its record, ``record.json``. Both
+    If the problems are in archives, their results are in archives of the same names in ``output/results``. Otherwise
+    every problem gets a folder in ``output/results`` with its map, ``map.obj``, and its record, ``record.json``. Both
     are written completely when the problem is finished. The same call resumes an interrupted run: a problem is skipped
     if its record has the same input and settings. At the end all records are collected in ``output/records.csv`` or
     ``.parquet``.
@@ -97,9 +126,12 @@ def run(
     Parameters
     ----------
     source : path
-        As for `quasiharmonic.batch.find_problems`: a folder with problems at any depth, or a list.
-    output : path
-        The run's folder; created if necessary.
+        As for `quasiharmonic.batch.find_problems`: a folder with problems at any depth, or a list. Or archives, which
+        are ``.tar``, ``.tar.gz`` and ``.parquet`` files: one of them, a folder without other problems, a list, a name
+        with numbers such as ``data-{0000..0015}.tar``, or a URL.
+    output : path or URL
+        The run's folder; created if necessary. A URL is possible for archives: each archive of results is sent when it
+        is finished. Runs with the same URL do not exclude each other.
     settings : Settings, optional
         How problems are solved.
     jobs : int, optional
@@ -152,38 +184,61 @@ def run(
     settings = _check_files(settings)
     _check(jobs, threads, time_limit, memory_limit, scheduler)
     part = read_shard(shard)
-    folder = Path(os.path.abspath(output))
-    table_path = folder / table_name(part, table)
-    records.check_table(table_path)
+    url = os.fspath(output) if places.is_url(output) else None
+    archives = find_archives(source, plain=settings.plain)
+    if url is not None and (not archives or scheduler is not None):
+        raise ValueError("results are sent to a URL only if the problems are in archives and solved on this machine")
     began = time.perf_counter()
-    data = LooseProblems(source, Orders(folder, settings, threads, time_limit, memory_limit, retry), part)
-    progress = Progress(data.total)
-    _check_folder(folder)
-    lock = lock_name(part)
-    with new_folder(folder, leftovers=frozenset({lock})), lock_folder(folder, lock):
+    with ExitStack() as stack:
+        folder = Path(os.path.abspath(output) if url is None else stack.enter_context(TemporaryDirectory()))
+        table_path = folder / table_name(part, table)
+        records.check_table(table_path)
+        orders = Orders(folder, settings, threads, time_limit, memory_limit, retry)
+        loose = None if archives else LooseProblems(source, orders, part)
+        _check_folder(folder)
+        lock = lock_name(part)
+        stack.enter_context(new_folder(folder, leftovers=frozenset({lock})))
+        stack.enter_context(lock_folder(folder, lock))
         _prepare(folder, source, settings, part)
-        todo = data.problems()
-        if scheduler is None:
-            groups = group_small(todo) if settings.together else ([files] for files in todo)
-            finished = on_this_machine(groups, data.orders, _workers(jobs, data.total))
+        if loose is None:
+            scratch = stack.enter_context(scratch_folder(folder, part, shared=scheduler is not None))
+            data: DataSet = ArchivedProblems(archives, orders, part, Outputs(folder, url), scratch)
         else:
-            from quasiharmonic.ui.batch.cluster import on_cluster
-
-            finished = on_cluster(todo, data.orders, scheduler)
-
-        def count(some: Iterable[Finished]) -> None:
-            for one in some:
-                progress.outcomes[one.outcome] = progress.outcomes.get(one.outcome, 0) + 1
-                progress.resumed += one.resumed
-            progress.total, progress.seconds = data.total, time.perf_counter() - began
-            if callback is not None:
-                callback(progress)
-
-        with closing(finished):
-            for item in finished:
-                count(data.collect(item))
-            count(data.finish())
+            data = loose
+        progress = _solve(data, jobs, scheduler, began, callback)
         records.write_table(table_path, data.records())
+        if url is not None:
+            for path in (folder / MARKER, table_path):
+                places.send(path, places.join(url, path.name))
+    return progress
+
+
+def _solve(
+    data: DataSet, jobs: int | None, scheduler: Any, began: float, callback: Callable[[Progress], object] | None
+) -> Progress:
+    """Solve the problems of a data set."""
+    progress = Progress(data.total)
+    todo = data.problems()
+    if scheduler is None:
+        groups = group_small(todo) if data.orders.settings.together else ([files] for files in todo)
+        finished = on_this_machine(groups, data.orders, _workers(jobs, data.total))
+    else:
+        from quasiharmonic.ui.batch.cluster import on_cluster
+
+        finished = on_cluster(todo, data.orders, scheduler)
+
+    def count(some: Iterable[Finished]) -> None:
+        for one in some:
+            progress.outcomes[one.outcome] = progress.outcomes.get(one.outcome, 0) + 1
+            progress.resumed += one.resumed
+        progress.total, progress.seconds = data.total, time.perf_counter() - began
+        if callback is not None:
+            callback(progress)
+
+    with closing(finished):
+        for item in finished:
+            count(data.collect(item))
+        count(data.finish())
     return progress
 
 
@@ -243,6 +298,10 @@ def _check_folder(folder: Path) -> None:
         raise OutputError(f"{folder} has a {tables[0]} that belongs to no run: choose another folder for the results")
 
 
+def _absolute(source: str | os.PathLike[str]) -> str:
+    return os.fspath(source) if places.is_url(source) else os.path.abspath(source)
+
+
 def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, part: Shard) -> None:
     """Write the marker file with source, settings and version into the run's folder, and delete old tables."""
     try:
@@ -254,7 +313,7 @@ def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, p
                 remove_file(path)
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
-    about = {"source": os.path.abspath(source), "settings": settings.to_dict(), "version": __version__}
+    about = {"source": _absolute(source), "settings": settings.to_dict(), "version": __version__}
     contents = json.dumps(about, indent=2).encode() + b"\n"
     marker = folder / MARKER
     # Other shards write the same contents.

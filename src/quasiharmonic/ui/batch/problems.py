@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -152,13 +153,19 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
         return False
 
 
-def _read_list(path: Path, plain: bool) -> Iterator[ProblemFiles]:
-    seen = set()
+def list_lines(path: Path) -> Generator[tuple[int, str]]:
+    """Yield the numbers and contents of the lines of a list, without comments and blank lines."""
     with open(path, encoding="utf-8-sig", errors="surrogateescape") as lines:
         for number, line in enumerate(lines, 1):
             text = _COMMENT.split(line, maxsplit=1)[0].strip()
-            if not text:
-                continue
+            if text:
+                yield number, text
+
+
+def _read_list(path: Path, plain: bool) -> Iterator[ProblemFiles]:
+    seen = set()
+    with closing(list_lines(path)) as lines:
+        for number, text in lines:
             place = Path(os.path.abspath(path.parent / text))
             if not (place.is_dir() or (place.suffix.lower() in suffixes("read") and place.is_file())):
                 raise ValueError(

@@ -113,8 +113,16 @@ def write_record(folder: Path, record: Record) -> None:
 def read_record(folder: Path) -> Record | None:
     """Read the record of a problem; return None if it is missing or incomplete."""
     try:
-        record = json.loads((folder / FILE).read_bytes())
-    except (OSError, ValueError):
+        return parse_record((folder / FILE).read_bytes())
+    except OSError:
+        return None
+
+
+def parse_record(data: bytes) -> Record | None:
+    """Return the record in the contents of a file; None if it is incomplete."""
+    try:
+        record = json.loads(data)
+    except ValueError:
         return None
     return record if isinstance(record, dict) and _is_whole(record) else None
 
@@ -176,14 +184,14 @@ def write_table(path: str | os.PathLike[str], records: Iterable[Record]) -> None
     if _suffix(path) == ".csv":
         write_whole(path, lambda file: _write_csv(file, records))
     else:
-        parquet = _pyarrow()
+        parquet = load_pyarrow()
         write_whole(path, lambda file: _write_parquet(parquet, file, records))
 
 
 def check_table(path: str | os.PathLike[str]) -> None:
     """Check whether a table of this name can be written; raise the errors of `write_table`."""
     if _suffix(path) == ".parquet":
-        _pyarrow()
+        load_pyarrow()
 
 
 def read_table(path: str | os.PathLike[str]) -> Iterator[Record]:
@@ -223,7 +231,8 @@ def _suffix(path: str | os.PathLike[str]) -> str:
     return suffix
 
 
-def _pyarrow() -> Any:
+def load_pyarrow() -> Any:
+    """Return the module `pyarrow.parquet`; ImportError with the install command if it is missing."""
     try:
         import pyarrow.parquet
     except ImportError as error:
@@ -244,14 +253,25 @@ def _write_csv(file: BinaryIO, records: Iterable[Record]) -> None:
     text.detach()
 
 
-def _write_parquet(parquet: Any, file: BinaryIO, records: Iterable[Record]) -> None:
+def table_schema() -> Any:
+    """Return the pyarrow schema of a table."""
     import pyarrow
 
     names = {str: pyarrow.string(), bool: pyarrow.bool_(), int: pyarrow.int64(), float: pyarrow.float64()}
-    schema = pyarrow.schema([(column, names[kind]) for column, kind in COLUMNS.items()])
-    rest = iter(records)
+    return pyarrow.schema([(column, names[kind]) for column, kind in COLUMNS.items()])
+
+
+def table_row(record: Record) -> Record:
+    """Return the values of a record for all columns of a table."""
+    return {column: _plain(record.get(column)) for column in COLUMNS}
+
+
+def _write_parquet(parquet: Any, file: BinaryIO, records: Iterable[Record]) -> None:
+    import pyarrow
+
+    schema, rest = table_schema(), iter(records)
     with parquet.ParquetWriter(file, schema) as writer:
-        while rows := [{c: _plain(record.get(c)) for c in COLUMNS} for record in islice(rest, _ROWS)]:
+        while rows := [table_row(record) for record in islice(rest, _ROWS)]:
             writer.write_table(pyarrow.Table.from_pylist(rows, schema=schema))
 
 
@@ -266,7 +286,7 @@ def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
 
 
 def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
-    parquet = _pyarrow()
+    parquet = load_pyarrow()
     import pyarrow
 
     try:

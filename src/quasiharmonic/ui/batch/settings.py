@@ -167,10 +167,13 @@ class Settings:
         OSError
             If a file cannot be read; the message names it.
         """
+        return self.key_of(*(b"" if path is None else _contents(path) for path in (files.mesh, files.fixed)))
+
+    def key_of(self, mesh: bytes, fixed: bytes) -> str:
+        """Return the `key` of a problem whose files have these contents."""
         digest = blake2b(digest_size=16)
-        named = [Path(name) if name is not None and os.path.isfile(name) else None for name in self._names()]
-        for path in (files.mesh, files.fixed, *named):
-            contents = b"" if path is None else _contents(path)
+        named = [_contents(Path(name)) if name is not None and os.path.isfile(name) else b"" for name in self._names()]
+        for contents in (mesh, fixed, *named):
             digest.update(len(contents).to_bytes(8, "little"))
             digest.update(contents)
         digest.update(json.dumps([__version__, sources_digest(), self.to_dict()], sort_keys=True).encode())

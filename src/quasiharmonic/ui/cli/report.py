@@ -192,7 +192,7 @@ class ReportError(Exception):
 
 
 @contextmanager
-def after_writing(output: Path) -> Iterator[None]:
+def after_writing(output: str | Path) -> Iterator[None]:
     """Convert errors after writing to `ReportError`, so that the message says that the output was written."""
     try:
         yield

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.archives.results import find_records
 from quasiharmonic.ui.batch.problems import MARKER
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.util.arrays import FloatArray
@@ -79,6 +80,7 @@ def _read_records(results: Path) -> Iterable[Record]:
         record = records.read_record(path.parent)
         if record is not None:
             yield record
+    yield from find_records(results)
 
 
 def _is_number(value: object) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic import io
 from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.archives.results import find_map
 from quasiharmonic.ui.batch.records import Record
 
 if TYPE_CHECKING:
@@ -49,6 +51,12 @@ def thumbnail(record: Record, results: Path | None) -> str:
 
 def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:
     """Return the mesh to draw, and whether it has a map."""
+    data = None if results is None else find_map(results, record["problem"])
+    if data is not None:
+        with TemporaryDirectory() as folder:
+            path = Path(folder, "map.obj")
+            path.write_bytes(data)
+            return io.read_mesh(path), True
     candidates = [] if results is None else [(records.map_path(results / record["problem"]), True)]
     if record.get("source"):
         candidates.append((Path(record["source"]), False))

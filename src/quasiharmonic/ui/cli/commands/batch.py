@@ -45,12 +45,20 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "source",
         metavar="DIR_OR_LIST",
-        type=Path,
+        type=_location,
         nargs="?",
-        help="folder with problems (input.obj and handles.txt) at any depth, or a text file that lists folders and "
-        "meshes, one per line; may be omitted with --report",
+        help="folder with problems (input.obj and handles.txt) at any depth, archives of problems (.tar, .parquet; a "
+        "folder of them, data-{0000..0015}.tar, or a URL), or a text file that lists folders, meshes or archives, one "
+        "per line; may be omitted with --report",
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=_location,
+        required=True,
+        metavar="OUT",
+        help="folder for the results; for archives or a URL",
+    )
     parser.add_argument(
         "--report",
         action="store_true",
@@ -168,6 +176,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the data set with progress, then print a summary and write the report page."""
     from quasiharmonic.ui import batch
+    from quasiharmonic.ui.batch.archives import places
     from quasiharmonic.ui.batch.shards import read_shard, table_name
     from quasiharmonic.ui.cli import report
 
@@ -181,6 +190,8 @@ def run(options: argparse.Namespace) -> int:
         return _write_report(options)
     if options.flatten and options.strategy is not None:
         raise ValueError("--strategy needs a given boundary, but --flatten leaves the boundary free: omit one of them")
+    if options.report:
+        _folder(options)
     settings = batch.Settings(
         to=options.to,
         font=options.font,
@@ -223,7 +234,7 @@ def run(options: argparse.Namespace) -> int:
     finally:
         show.clear()
     wanted = "bijective" if options.flatten else "injective"
-    records = options.output / table_name(read_shard(options.shard), options.table)
+    records = places.join(options.output, table_name(read_shard(options.shard), options.table))
     with report.after_writing(records):
         print(_account(progress, wanted, records), flush=True)
     if options.report:
@@ -239,8 +250,9 @@ def _merge(options: argparse.Namespace) -> int:
 
     if options.source is not None or options.shard is not None:
         raise ValueError("--merge joins finished runs: omit the data set and --shard")
-    merged = batch.merge(options.merge or [options.output], options.output, table=options.table)
-    table = options.output / f"records.{options.table}"
+    folder = _folder(options)
+    merged = batch.merge(options.merge or [folder], folder, table=options.table)
+    table = folder / f"records.{options.table}"
     with report.after_writing(table):
         print(f"{merged.solved} of {merged.total} problems have a certified map\nwrote {table}", flush=True)
     if merged.missing:
@@ -252,20 +264,30 @@ def _merge(options: argparse.Namespace) -> int:
     return 0 if merged.solved == merged.total and not merged.missing else 1
 
 
+def _folder(options: argparse.Namespace) -> Path:
+    """Return the output, which must not be a URL."""
+    if not isinstance(options.output, Path):
+        raise ValueError(
+            "--report and --merge need a folder on this machine, not a URL: copy the table of records there"
+        )
+    return options.output
+
+
 def _write_report(options: argparse.Namespace) -> int:
     """Write the page about a run or a table of records; return the exit status."""
     from quasiharmonic.ui.cli import report
     from quasiharmonic.ui.report import write_report
 
-    folder: Path = options.output if options.output.is_dir() else options.output.parent
+    output = _folder(options)
+    folder = output if output.is_dir() else output.parent
     page = folder / "report.html"
-    write_report(page, options.output, options.against)
+    write_report(page, output, options.against)
     with report.after_writing(page):
         print(f"wrote {page}", flush=True)
     return 0
 
 
-def _account(progress: Progress, wanted: str, table: Path) -> str:
+def _account(progress: Progress, wanted: str, table: str) -> str:
     from quasiharmonic.ui.batch import OUTCOMES
 
     failures = [
@@ -313,6 +335,11 @@ def _duration(seconds: float) -> str:
     if rounded < 3600:
         return f"{rounded // 60} min {rounded % 60} s"
     return f"{rounded // 3600} h {rounded % 3600 // 60} min"
+
+
+def _location(text: str) -> str | Path:
+    """Return a URL as text, anything else as a path."""
+    return text if "://" in text else Path(text)
 
 
 def _seconds(text: str) -> float:

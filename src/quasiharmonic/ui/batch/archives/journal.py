@@ -1,0 +1,137 @@
+"""Results of an archive that is not finished, in the order in which they were found."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+from quasiharmonic.io.errors import OutputError
+from quasiharmonic.ui.batch import records
+from quasiharmonic.ui.batch.archives import results
+from quasiharmonic.ui.batch.archives.tar_stream import Damage, pack_member, read_members
+from quasiharmonic.ui.batch.records import Record
+
+# What is kept of a record: whether it is still valid, and how the archive's statement counts it.
+_KEPT = "key", "outcome", "time_limit", "memory_limit", "seconds"
+
+
+class _Entry(NamedTuple):
+    start: int
+    end: int
+    record: Record  # The values `_KEPT`
+
+
+class Journal:
+    """Tar file to which results are appended, and which a killed process leaves behind.
+
+    What follows the last complete result is cut off when the journal is opened.
+
+    Parameters
+    ----------
+    path : Path
+        The finished archive; the journal has the same name with the suffix ``.part``. A finished archive without a
+        journal becomes the journal.
+
+    Attributes
+    ----------
+    entries : dict of str to _Entry
+        The newest result of each problem.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.part = path.with_name(path.name + results.PART)
+        self.entries: dict[str, _Entry] = {}
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not self.part.exists() and path.exists():
+                if not results.is_parquet(path):
+                    os.replace(path, self.part)
+                else:
+                    for key, record, data in results.read_results(path):
+                        self.add(key, record, data)
+            self._repair()
+        except OSError as error:
+            raise _cannot_write(self.part, error) from error
+
+    def record(self, key: str) -> Record | None:
+        """Return what is kept of the newest record of a problem."""
+        entry = self.entries.get(key)
+        return None if entry is None else entry.record
+
+    def add(self, key: str, record: Record, data: bytes | None) -> None:
+        """Append a result; OutputError if it cannot be written."""
+        packed = b"" if data is None else pack_member(key + results.MAP, data)
+        packed += pack_member(key + results.RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
+        try:
+            with open(self.part, "ab") as file:
+                start = file.tell()
+                file.write(packed)
+        except OSError as error:
+            raise _cannot_write(self.part, error) from error
+        self._note(key, start, start + len(packed), record)
+
+    def finish(self, order: Sequence[str], stamp: str, settings: str) -> None:
+        """Write the finished archive, in the given order of names, and delete the journal."""
+        entries = [(key, self.entries[key]) for key in order]
+        about = results.describe((entry.record for _, entry in entries), stamp, settings)
+        try:
+            # An archive without problems has no journal.
+            with open(self.part, "a+b") as file:
+                if results.is_parquet(self.path):
+                    results.write_parquet(self.path, about, _unpacked(file, entries))
+                else:
+                    results.write_tar(self.path, about, _packed(file, entries))
+            self.part.unlink()
+        except OutputError:
+            raise
+        except OSError as error:
+            raise _cannot_write(self.path, error) from error
+
+    def _note(self, key: str, start: int, end: int, record: Record) -> None:
+        self.entries[key] = _Entry(start, end, {name: record[name] for name in _KEPT if name in record})
+
+    def _repair(self) -> None:
+        """Read the journal and cut off what follows the last complete result."""
+        if not self.part.exists():
+            return
+        with open(self.part, "r+b") as file:
+            end, start, mapped = 0, None, ""
+            for member in read_members(file, lambda name: name.endswith(results.RECORD)):
+                if isinstance(member, Damage):
+                    break
+                key, extension = os.path.splitext(member.name)
+                if extension == results.MAP:
+                    start, mapped = member.start, key
+                    continue
+                record = records.parse_record(member.data or b"")
+                if extension != results.RECORD or record is None:
+                    break
+                self._note(key, start if start is not None and mapped == key else member.start, member.end, record)
+                start, end = None, member.end
+            file.truncate(end)
+
+
+def _packed(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator[bytes]:
+    for _, entry in entries:
+        file.seek(entry.start)
+        yield file.read(entry.end - entry.start)
+
+
+def _unpacked(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator[tuple[str, Record, bytes | None]]:
+    import io
+
+    for (key, _), packed in zip(entries, _packed(file, entries), strict=True):
+        data: dict[str, Any] = {
+            os.path.splitext(member.name)[1]: member.data
+            for member in read_members(io.BytesIO(packed))
+            if not isinstance(member, Damage)
+        }
+        yield key, json.loads(data[results.RECORD]), data.get(results.MAP)
+
+
+def _cannot_write(path: Path, error: OSError) -> OutputError:
+    return OutputError(f"cannot write {path}: {error.strerror or error}")

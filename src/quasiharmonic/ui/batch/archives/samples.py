@@ -1,0 +1,186 @@
+"""Read the problems of an archive as a stream."""
+
+from __future__ import annotations
+
+import os
+import posixpath
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from quasiharmonic.io import suffixes
+from quasiharmonic.ui.batch.archives.tar_stream import Damage, open_tar, read_members
+from quasiharmonic.ui.batch.records import load_pyarrow
+
+#: Suffixes of archives.
+TAR = ".tar", ".tar.gz", ".tgz"
+PARQUET = ".parquet"
+#: Columns of a Parquet file with the names of its problems; the first that exists counts.
+KEYS = "__key__", "problem", "name"
+# Extensions of the list of fixed vertices.
+_FIXED = "handles.txt", "txt"
+# Problem folders in a tar file have these files, so that the folder is the name.
+_FOLDER_FILES = {"input.obj": "obj", "handles.txt": "txt"}
+_ROWS = 64
+
+
+@dataclass
+class Sample:
+    """Problem of an archive.
+
+    Attributes
+    ----------
+    key : str
+        Its name in the archive.
+    files : dict of str to bytes
+        Contents of the mesh and of the list of fixed vertices by extension, such as ``"obj"`` and ``"txt"``.
+    error : str or None
+        Why the problem cannot be used.
+    """
+
+    key: str
+    files: dict[str, bytes] = field(default_factory=dict)
+    error: str | None = None
+
+    @property
+    def mesh(self) -> str | None:
+        """Extension of the mesh."""
+        return next((extension for extension in self.files if _is_mesh(extension)), None)
+
+    @property
+    def fixed(self) -> str | None:
+        """Extension of the list of fixed vertices."""
+        return next((extension for extension in self.files if extension in _FIXED), None)
+
+
+def is_archive(name: str) -> bool:
+    """Whether the name is that of an archive."""
+    return name.lower().endswith((*TAR, PARQUET))
+
+
+def read_samples(path: Path) -> Iterator[Sample]:
+    """Read the problems of an archive, in order; constant memory.
+
+    Consecutive members of a tar file with the same name up to the first dot are one problem, as in WebDataset; members
+    ``input.obj`` and ``handles.txt`` of a folder are one, too. In a Parquet file each row is a problem: the columns are
+    named by the extensions, and the column ``__key__``, ``problem`` or ``name`` has the name.
+
+    Yields
+    ------
+    Sample
+        What cannot be read is a sample with an error. OSError if the archive cannot be opened.
+    """
+    seen: set[str] = set()
+    for sample in _parquet_samples(path) if path.name.lower().endswith(PARQUET) else _tar_samples(path):
+        if sample.error is None:
+            _check(sample, seen)
+        seen.add(sample.key)
+        yield sample
+
+
+def _check(sample: Sample, seen: set[str]) -> None:
+    """Note in a sample why it cannot be used."""
+    meshes = [extension for extension in sample.files if _is_mesh(extension)]
+    if sample.key in seen:
+        sample.key, sample.error = _unused(sample.key, seen), f"the name {sample.key} is used twice in the archive"
+    elif not meshes:
+        sample.error = "it has no mesh"
+    elif len(meshes) > 1:
+        sample.error = f"it has several meshes: {', '.join(meshes)} (the name of a problem ends at the first dot)"
+
+
+def _unused(key: str, seen: set[str]) -> str:
+    number = 2
+    while f"{key} ({number})" in seen:
+        number += 1
+    return f"{key} ({number})"
+
+
+def _is_mesh(extension: str) -> bool:
+    return posixpath.splitext("." + extension.lower())[1] in _MESHES or "." + extension.lower() in _MESHES
+
+
+_MESHES = frozenset(suffixes("read"))
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return key and extension of a member's name."""
+    folder, base = posixpath.split(name.removeprefix("./"))
+    if base in _FOLDER_FILES and folder:
+        return folder, _FOLDER_FILES[base]
+    stem, _, extension = base.partition(".")
+    return posixpath.join(folder, stem), extension
+
+
+def _is_wanted(name: str) -> bool:
+    extension = _split(name)[1]
+    return extension in _FIXED or _is_mesh(extension)
+
+
+def _tar_samples(path: Path) -> Iterator[Sample]:
+    sample: Sample | None = None
+    lists = after_damage = False  # Whether problems have lists of fixed vertices; whether damage precedes the problem
+    with open_tar(os.fspath(path)) as file:
+        for member in read_members(file, _is_wanted):
+            damaged = isinstance(member, Damage)
+            key, extension = ("", "") if isinstance(member, Damage) else _split(member.name)
+            if sample is not None and (damaged or key != sample.key):
+                lists = lists or sample.fixed is not None
+                if lists and sample.fixed is None and (damaged or after_damage):
+                    sample.error = "its list of fixed vertices may be lost, because the archive is damaged next to it"
+                yield sample
+                sample, after_damage = None, False
+            if isinstance(member, Damage):
+                after_damage = True
+                yield Sample(f"damaged-{member.start}", error=f"damaged at byte {member.start}: {member.what}")
+                continue
+            sample = sample or Sample(key)
+            if member.data is not None:
+                sample.files[extension] = member.data
+        yield from () if sample is None else (sample,)
+
+
+def _parquet_samples(path: Path) -> Iterator[Sample]:
+    parquet = load_pyarrow()
+    import pyarrow
+
+    number = 0
+    try:
+        with parquet.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            key = next((name for name in KEYS if name in names), None)
+            columns = [name for name in names if name == key or name in _FIXED or _is_mesh(name)]
+            for group in range(file.num_row_groups):
+                end = number + file.metadata.row_group(group).num_rows
+                try:
+                    for rows in file.iter_batches(_ROWS, row_groups=[group], columns=columns):
+                        for row in rows.to_pylist():
+                            yield _row_sample(row, key, number)
+                            number += 1
+                except (OSError, pyarrow.ArrowException) as error:
+                    what = f"rows {number} to {end - 1} are damaged: {error}"
+                    yield Sample(f"damaged-{number}", error=what)
+                    number = end
+    except (OSError, pyarrow.ArrowException) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        yield Sample(f"damaged-{number}", error=f"the archive is damaged: {error}")
+
+
+def _row_sample(row: Mapping[str, Any], key: str | None, number: int) -> Sample:
+    """Return the problem of a row; lists of fixed vertices may be text or lists of integers."""
+    named = None if key is None else row[key]
+    sample = Sample(f"{number:09d}" if named is None else str(named))
+    for name, value in row.items():
+        if name == key or value is None:
+            continue
+        if isinstance(value, str):
+            sample.files[name] = value.encode("utf-8", "surrogateescape")
+        elif isinstance(value, bytes):
+            sample.files[name] = value
+        elif isinstance(value, list) and name in _FIXED:
+            sample.files[name] = "".join(f"{vertex}\n" for vertex in value).encode()
+        else:
+            sample.error = f"column {name} has values of an unknown type"
+    return sample
