@@ -42,11 +42,20 @@ CASES = [
 ]
 
 
+OPTIONAL = "no dependency, not even of the tests: .ci/optional installs it"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("code", CASES)
 def test_block_runs(code, tmp_path, monkeypatch, capsys):
     if "import SimpleITK" in code:
-        pytest.importorskip("SimpleITK", reason="no dependency, not even of the tests: .ci/optional installs it")
+        pytest.importorskip("SimpleITK", reason=OPTIONAL)
+    if "import nibabel" in code:
+        pytest.importorskip("nibabel", reason=OPTIONAL)
+    if "from nilearn" in code:
+        pytest.importorskip("nilearn", reason=OPTIONAL)
+    if "from skfem" in code:
+        pytest.importorskip("skfem", reason=OPTIONAL)
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "block", "exec"), {"__name__": "block"})
     printed = capsys.readouterr().out.splitlines()

@@ -539,7 +539,9 @@ def test_positions_are_the_map_of_a_planar_mesh(put):
     planar = io.read_mesh(put(SQUARE.replace(" 0\n", " 7\n") + "f 1 2 3\n"))
     assert io.map_of(planar).tolist() == [[0, 0], [1, 0], [1, 1], [0, 1]]
     with pytest.raises(MeshFileError, match="no texture coordinates and is not planar"):
-        io.map_of(io.read_mesh(put(SQUARE + "v 0 0 1\nf 1 2 3\n")))
+        io.map_of(io.read_mesh(put(SQUARE + "v 0 0 1\nf 1 2 3\nf 1 2 5\n")))
+    # Flat surfaces of the cortex have vertices outside the map.
+    assert io.map_of(io.read_mesh(put(SQUARE + "v 0 0 1\nf 1 2 3\n"))).shape == (5, 2)
 
 
 # OFF

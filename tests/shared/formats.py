@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify
-from quasiharmonic.io import MeshData, MeshFileError, map_of
+from quasiharmonic.io import MeshData, MeshFileError, find_format, map_of, write_map
 from quasiharmonic.surfaces import disk
 
 GARBAGE = b"", b"\0" * 64, b"no mesh\n", b"PK\x03\x04" + b"\xff" * 60, bytes(range(256)) * 4
 
-SINGLE = ".glb", ".gltf"
+SINGLE = ".glb", ".gltf", ".gii", ".surf", ".patch.3d"
 
 
 def maps():
@@ -24,8 +24,10 @@ def maps():
     return MeshData(V, F), [uv, inverted]
 
 
-def single(uv):
-    """A map after a round trip through glTF: v is stored downwards, and coordinates are rounded to single precision."""
+def single(uv, suffix):
+    """A map after a round trip: coordinates are rounded to single precision, and glTF stores v downwards."""
+    if suffix not in (".glb", ".gltf"):
+        return uv.astype(np.float32).astype(np.float64)
     down = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32).astype(np.float64)
     return np.stack([down[:, 0], 1 - down[:, 1]], axis=1)
 
@@ -38,10 +40,14 @@ def with_map(write):
 def try_format(read, write, path):
     """Test a reader and a writer of maps at a path with their suffix: round trips, bad maps and damaged files."""
     mesh, uvs = maps()
+    if find_format(path).suffix == ".patch.3d":
+        # Its triangles are those of a surface beside it.
+        write_map(path.with_name("mesh.surf"), mesh, mesh.V[:, :2])
     for uv in uvs:
         write(path, mesh, uv)
         again = read(path)
-        kept = single(uv) if path.suffix.lower() in SINGLE else uv
+        suffix = find_format(path).suffix
+        kept = single(uv, suffix) if suffix in SINGLE else uv
         np.testing.assert_array_equal(again.F, mesh.F)
         np.testing.assert_array_equal(map_of(again).view(np.int64), kept.view(np.int64))
         expected, found = certify(mesh.F, kept), certify(again.F, map_of(again))

@@ -4,6 +4,12 @@ from .errors import MeshFileError as MeshFileError
 from .errors import OutputError as OutputError
 from .formats.gltf.reader import read_gltf as read_gltf
 from .formats.gltf.writer import write_gltf as write_gltf
+from .formats.neuro import read_freesurfer as read_freesurfer
+from .formats.neuro import read_gifti as read_gifti
+from .formats.neuro import read_patch as read_patch
+from .formats.neuro import write_freesurfer as write_freesurfer
+from .formats.neuro import write_gifti as write_gifti
+from .formats.neuro import write_patch as write_patch
 from .formats.obj import read_obj as read_obj
 from .formats.obj import write_obj as write_obj
 from .formats.off import read_off as read_off
@@ -25,6 +31,7 @@ from .lowlevel.atomic import write_whole as write_whole
 from .mesh_files import check_output as check_output
 from .mesh_files import not_held as not_held
 from .mesh_files import read_mesh as read_mesh
+from .mesh_files import read_written as read_written
 from .mesh_files import write_map as write_map
 from .mesh_files import write_mapped as write_mapped
 from .models.cut_seams import cut_at_seams as cut_at_seams
@@ -45,4 +52,5 @@ from .registry import FORMATS as FORMATS
 from .registry import Format as Format
 from .registry import find_format as find_format
 from .registry import format_names as format_names
+from .registry import format_of as format_of
 from .registry import suffixes as suffixes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 
 from numpy.typing import ArrayLike
 
@@ -13,9 +14,11 @@ from quasiharmonic.io.registry import find_format
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshData:
-    """Read a triangle mesh from an OBJ, OFF, PLY, GLB, glTF or STL file; the suffix of its name selects the format.
+    """Read a triangle mesh from a file; its name selects the format.
 
-    See `read_obj`, `read_off`, `read_ply`, `read_gltf` and `read_stl`.
+    Formats are OBJ, OFF, PLY, GLB, glTF, STL, GIFTI (``.gii``, ``.gii.gz``), and FreeSurfer's surfaces (``lh.…``,
+    ``rh.…``, ``.surf``) and patches (``….patch.3d``, ``….patch.flat``). See `read_obj`, `read_off`, `read_ply`,
+    `read_gltf`, `read_stl`, `read_gifti`, `read_freesurfer` and `read_patch`.
 
     Raises
     ------
@@ -56,10 +59,10 @@ def write_map(path: str | os.PathLike[str], mesh: MeshLike, uv: ArrayLike) -> No
 def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """Write a mesh with its map; the suffix of the file name selects the format.
 
-    OBJ, PLY and glTF files contain the mesh as it was read, with the map as its texture coordinates. OFF files contain
-    the map alone, as a mesh in the plane z = 0. Numbers are written so that reading them returns the same doubles,
-    except in glTF, which has single precision. An error never leaves a partial file. `not_held` lists the data that the
-    file will not contain.
+    OBJ, PLY and glTF files contain the mesh as it was read, with the map as its texture coordinates. OFF, GIFTI and
+    FreeSurfer files contain the map alone, as a mesh in the plane z = 0. Numbers are written so that reading them
+    returns the same doubles, except in glTF, GIFTI and FreeSurfer files, which have single precision. An error never
+    leaves a partial file. `not_held` lists the data that the file will not contain.
 
     Parameters
     ----------
@@ -89,9 +92,22 @@ def check_output(path: str | os.PathLike[str]) -> None:
         If the format is not supported.
     OutputError
         If the file cannot be written.
+    ImportError
+        If the format needs a package that is not installed.
     """
-    find_format(path, "write_map")
+    form = find_format(path, "write_map")
+    if form.requires is not None and find_spec(form.requires) is None:
+        raise ImportError(f"{form.name} files need {form.requires}: pip install quasiharmonic[neuro]")
     check_writable(path)
+
+
+def read_written(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
+    """Read a file that `write_mapped` wrote of ``mesh``.
+
+    As `read_mesh`, except for a FreeSurfer patch without a surface beside it, which has the mesh's triangles.
+    """
+    read = find_format(path, "read").read_written
+    return read_mesh(path) if read is None else read(path, mesh)
 
 
 def not_held(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:

@@ -8,6 +8,7 @@ its help without NumPy.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -48,10 +49,16 @@ class Format:
         Name in help texts.
     suffix : str
         Suffix of its files, in lower case, with the dot.
+    pattern : str, optional
+        Regular expression of further file names, in lower case. The suffixes of all formats precede all patterns, and
+        the first pattern counts.
     read : callable, optional
         Reads the surface of a file, with its map if there is one.
     write_map : callable, optional
         Writes a mesh that has a map.
+    read_written : callable, optional
+        Reads a file that ``write_map`` wrote, with the mesh it wrote as second argument. Required if ``read`` needs
+        further files.
     list_losses : callable, optional
         Returns descriptions of the data of a mesh that ``write_map`` drops. Required with ``write_map``.
     seams : bool
@@ -62,6 +69,8 @@ class Format:
         Returns the paths of further files that ``write_map`` writes for a texture.
     single_file : bool
         Whether a file that is read never refers to further files that are needed.
+    requires : str, optional
+        Module of the extra ``neuro`` that reading and writing need.
     read_elements : callable, optional
         Parses the bytes of a planar mesh of finite elements, or with a second argument True of one in space.
     encode_values : callable, optional
@@ -70,13 +79,16 @@ class Format:
 
     name: str
     suffix: str
+    pattern: str | None = None
     read: Callable[[FilePath], MeshData] | None = None
     write_map: Callable[[FilePath, MeshData], None] | None = None
+    read_written: Callable[[FilePath, MeshData], MeshData] | None = None
     list_losses: Callable[[MeshData], list[str]] | None = None
     seams: bool = False
     image: bool = False
     companions: Callable[[FilePath, Texture], tuple[Path, ...]] | None = None
     single_file: bool = True
+    requires: str | None = None
     read_elements: Callable[..., MeshParts] | None = None
     encode_values: Callable[[FloatArray, IntArray, FloatArray, Mapping[str, FloatArray]], bytes] | None = None
 
@@ -132,6 +144,34 @@ FORMATS: tuple[Format, ...] = (
         for name, suffix in (("GLB", ".glb"), ("glTF", ".gltf"))
     ),
     Format(name="STL", suffix=".stl", read=import_later("formats.stl", "read_stl")),
+    Format(
+        name="GIFTI",
+        suffix=".gii",
+        pattern=r".*\.gii\.gz",
+        read=import_later("formats.neuro", "read_gifti"),
+        write_map=import_later("formats.neuro", "write_gifti"),
+        list_losses=import_later("formats.neuro", "not_in_flat_surface"),
+        requires="nibabel",
+    ),
+    Format(
+        name="FreeSurfer patch",
+        suffix=".patch.3d",
+        pattern=r".*\.patch(\.\w+)?",
+        read=import_later("formats.neuro", "read_patch"),
+        read_written=import_later("formats.neuro", "read_written_patch"),
+        write_map=import_later("formats.neuro", "write_patch"),
+        list_losses=import_later("formats.neuro", "not_in_flat_surface"),
+        single_file=False,
+    ),
+    Format(
+        name="FreeSurfer surface",
+        suffix=".surf",
+        pattern=r"[lr]h\..+",
+        read=import_later("formats.neuro", "read_freesurfer"),
+        write_map=import_later("formats.neuro", "write_freesurfer"),
+        list_losses=import_later("formats.neuro", "not_in_flat_surface"),
+        requires="nibabel",
+    ),
     Format(name="Gmsh (version 2 or 4)", suffix=".msh", read_elements=import_later("fem.gmsh", "read_gmsh")),
     Format(name="legacy VTK", suffix=".vtk", read_elements=import_later("fem.legacy_vtk", "read_legacy_vtk")),
     Format(name="VTU", suffix=".vtu", read_elements=import_later("fem.vtu", "read_vtu")),
@@ -158,12 +198,22 @@ def find_format(path: FilePath, *needs: Feature) -> Format:
     """
     check_path("path", path)
     suffix = Path(path).suffix.lower()
-    form = next((form for form in FORMATS if form.suffix == suffix), None)
+    form = format_of(path)
     lacking = [need for need in needs if form is None or not getattr(form, need)]
     if form is None or lacking:
         fault = f"{suffix} files {_FAULTS[lacking[0]]}" if suffix else "has no suffix, so its format is unknown"
         raise MeshFileError(path, fault, remedy=f"supported: {', '.join(suffixes(*needs))}")
     return form
+
+
+def format_of(path: FilePath) -> Format | None:
+    """Return the format of a file by its name, or None."""
+    name = Path(path).name.lower()
+    suffix = Path(name).suffix
+    for form in FORMATS:
+        if form.suffix == suffix:
+            return form
+    return next((form for form in FORMATS if form.pattern and re.fullmatch(form.pattern, name)), None)
 
 
 def suffixes(*needs: Feature) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Vertices and triangles of a mesh, given as an object of another library, a mapping or a file.
 
 No library is imported: the adapter recognises an object by the attribute names of its positions and faces. It supports
-trimesh, PyVista, meshio, Open3D, vedo, SciPy's triangulations and this package's classes.
+trimesh, PyVista, meshio, Open3D, vedo, nibabel, SciPy's triangulations and this package's classes.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from os import PathLike
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
 from quasiharmonic.io.seamed_mesh import SeamedMesh
@@ -73,7 +74,14 @@ class _Geometry(Protocol):
     def geometry(self) -> Any: ...
 
 
-#: A mesh: an object with vertices and faces, a mapping with these keys, or the path of a file.
+class _Gifti(Protocol):
+    @property
+    def darrays(self) -> Any: ...
+    def agg_data(self) -> Any: ...
+
+
+#: A mesh: an object with vertices and faces, a mapping with these keys, a surface of nibabel (a ``GiftiImage``, or a
+#: tuple of an array of points and an array of triangles), or the path of a file.
 MeshLike = (
     _VerticesFaces
     | _VerticesTriangles
@@ -82,6 +90,10 @@ MeshLike = (
     | _VF
     | _DoflocsT
     | _Geometry
+    | _Gifti
+    | tuple[NDArray[Any], NDArray[Any]]
+    | tuple[NDArray[Any], NDArray[Any], Any]
+    | tuple[NDArray[Any], NDArray[Any], Any, Any]
     | Mapping[str, Any]
     | str
     | PathLike[str]
@@ -109,12 +121,33 @@ def stands_for_mesh(value: object) -> bool:
     """
     if isinstance(value, np.ndarray):
         return False
+    if is_surface_tuple(value) or _is_gifti(value):
+        return True
     if isinstance(value, str | PathLike | Mapping) or None not in _parts(value) or hasattr(value, _BY_COLUMNS):
         return True
     numbers = isinstance(value, Number | Sequence | bytes | memoryview | type(None))
     return not numbers and not any(
         hasattr(value, name) for name in ("__array__", "__array_interface__", "__dlpack__", "__iter__")
     )
+
+
+def is_surface_tuple(value: object) -> bool:
+    """Return whether a value is a tuple as nibabel's ``agg_data`` and ``read_geometry`` return it.
+
+    Its first two elements are arrays of points (n, 3) and of integers (f, 3). ``read_geometry`` may add a dictionary
+    and text.
+    """
+    if type(value) is not tuple or not 2 <= len(value) <= 4:
+        return False
+    points, triangles, *more = value
+    if any(isinstance(one, np.ndarray) for one in more):
+        return False
+    arrays = isinstance(points, np.ndarray) and isinstance(triangles, np.ndarray)
+    return arrays and points.shape[1:] == triangles.shape[1:] == (3,) and triangles.dtype.kind in "iu"
+
+
+def _is_gifti(value: object) -> bool:
+    return hasattr(value, "darrays") and hasattr(value, "agg_data")
 
 
 def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
@@ -125,7 +158,8 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     mesh : object, mapping or path
         An object or mapping with positions as ``vertices``, ``points``, ``V``, ``coordinates`` or ``verts``, and faces
         as ``faces``, ``triangles``, ``F``, ``cells`` or ``simplices``. Faces are rows of corners, VTK's list (count,
-        corners, count, …), or meshio's blocks. Also a mesh of scikit-fem, or the path of a file that
+        corners, count, …), or meshio's blocks. Also a mesh of scikit-fem; nibabel's ``GiftiImage`` or a tuple that its
+        ``agg_data`` or ``read_geometry`` returns; or the path of a file that
         `quasiharmonic.io.read_mesh` reads. Larger faces are cut into triangles, as those of files are. Points and lines
         among the cells are skipped.
 
@@ -147,6 +181,16 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
         read = read_mesh(mesh)
         return read.V, read.F
     what = describe(mesh)
+    if _is_gifti(mesh) or is_surface_tuple(mesh):
+        from quasiharmonic.io.formats.neuro import gifti_arrays
+
+        pair: Any = mesh
+        try:
+            points, triangles = gifti_arrays(pair) if _is_gifti(mesh) else pair[:2]
+        except ValueError as error:
+            raise ValueError(f"{what} {error}") from error
+        V = vertex_array(points, f"points of {what}")
+        return V, _triangles(V, f"triangles of {what}", triangles, None)
     by_columns = getattr(mesh, _BY_COLUMNS, None)
     if by_columns is not None:
         V = vertex_array(np.asarray(by_columns).T, f"{_BY_COLUMNS} of {what}")

@@ -278,13 +278,20 @@ def is_planar(points: FloatArray) -> bool:
 
 def has_map(mesh: MeshData) -> bool:
     """Return whether a mesh has texture coordinates on some faces, or is planar."""
-    return mesh.FT is not None or is_planar(mesh.V)
+    return mesh.FT is not None or _is_flat(mesh)
+
+
+def _is_flat(mesh: MeshData) -> bool:
+    """Return whether the vertices that triangles use lie in a plane z = constant."""
+    used = np.zeros(len(mesh.V), dtype=np.bool_)
+    used[mesh.F] = True
+    return is_planar(mesh.V) or (not used.all() and bool(used.any()) and is_planar(mesh.V[used]))
 
 
 def check_mapped(mesh: MeshData) -> None:
     """Raise `MeshFileError` if a mesh has no map, or has it on some faces only."""
     if mesh.FT is None:
-        if not is_planar(mesh.V):
+        if not _is_flat(mesh):
             raise MeshFileError(
                 mesh.source,
                 "has no map: the mesh has no texture coordinates and is not planar",

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from io import TextIOWrapper
+from pathlib import Path
 from typing import Any
 
 from quasiharmonic.ui.cli.interrupts import Interrupts
@@ -52,6 +54,21 @@ GROUPS = {
 }
 COMMANDS = tuple(name for group in GROUPS.values() for name in group)
 
+# The commands that read surfaces, and so patches of FreeSurfer.
+SURFACE_COMMANDS = (
+    "map",
+    "flatten",
+    "unwrap",
+    "polish",
+    "harmonise",
+    "repair",
+    "animate",
+    "check",
+    "measure",
+    "plot",
+    "view",
+)
+
 _INTERRUPTED = "interrupted, nothing was written"
 
 
@@ -72,7 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return output_failed(error)
         run: Callable[[argparse.Namespace], int] = options.run
         try:
-            return run(options)
+            with _parent_surface(getattr(options, "parent_surface", None)):
+                return run(options)
         except ReportError as error:
             return _fail(options.command, error, 3)
         except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
@@ -86,6 +104,21 @@ def main(argv: Sequence[str] | None = None) -> int:
             if isinstance(error, ImportError):
                 return _fail(options.command, error, 2)
             raise
+
+
+@contextmanager
+def _parent_surface(path: Path | None) -> Iterator[None]:
+    """Take the triangles of FreeSurfer's patches from a surface."""
+    if path is None:
+        yield
+        return
+    from quasiharmonic.io.formats.neuro import set_parent_surface
+
+    set_parent_surface(path)
+    try:
+        yield
+    finally:
+        set_parent_surface(None)
 
 
 def _fail(command: str, why: str | Exception, status: int) -> int:
@@ -146,4 +179,13 @@ def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
     )
     for name in names:
         import_module(f"{__name__}.commands.{name}").add_parser(commands)
+        if name in SURFACE_COMMANDS:
+            commands.choices[name].add_argument(
+                "--surface",
+                dest="parent_surface",
+                type=Path,
+                metavar="FILE",
+                help="the surface with the triangles of a FreeSurfer patch (default: beside the patch, such as "
+                "lh.inflated for lh.cortex.patch.3d)",
+            )
     return parser

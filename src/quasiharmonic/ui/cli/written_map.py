@@ -114,4 +114,4 @@ def write(output: Path, mesh: MeshData) -> WrittenMap:
     tell_losses(output, mesh)
     io.write_mapped(output, mesh)
     with report.after_writing(output):
-        return certify_map(io.read_mesh(output))
+        return certify_map(io.read_written(output, mesh))

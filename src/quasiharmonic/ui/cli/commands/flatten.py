@@ -138,7 +138,9 @@ def run(options: argparse.Namespace) -> int:
         )
     certified = written_map.write(options.output, mesh.with_places(seam_options.pack_islands(options, mapped.mesh)))
     with report.after_writing(options.output):
-        flat = io.without_idle(certified.V, certified.F, certified.uv)
+        # Some formats hold the map alone; their vertices have the numbers of the surface's.
+        V = mesh.V if len(mesh.V) == len(certified.V) else certified.V
+        flat = io.without_idle(V, certified.F, certified.uv)
         measured = distortion(*flat, rings=options.rings if options.energy == "distances" else None)
         facts = {
             **mapped.to_dict(),
