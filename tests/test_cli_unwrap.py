@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import inspect
 import json
+import signal
 
 import numpy as np
 import pytest
 
 from quasiharmonic import io, unwrap
+from quasiharmonic.apps.atlas.packing.pack import pack_charts
+from quasiharmonic.geometry.mesh.topology import components
 from quasiharmonic.surfaces import starfish
 from quasiharmonic.ui.cli import parser_of
 from shared.commands import run
@@ -114,13 +117,46 @@ def test_wrong_input_writes_nothing(model, tmp_path, capsys):
     assert run("unwrap", model, "-o", tmp_path / "out.off") == 2
 
 
-def test_interrupt_writes_nothing(model, tmp_path, monkeypatch):
+@pytest.mark.parametrize("where", ["targets.cuts.find.shorten_cuts", "apps.unwrapping.unwrap.certify_charts"])
+def test_interrupt_writes_nothing(where, model, tmp_path, monkeypatch, capsys):
     def interrupt(*args, **options):
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("the interrupt was lost")
 
-    monkeypatch.setattr("quasiharmonic.apps.unwrapping.unwrap.certify_charts", interrupt)
+    monkeypatch.setattr(f"quasiharmonic.{where}", interrupt)
     assert run("unwrap", model, "-o", tmp_path / "out.obj") == 2
+    assert capsys.readouterr().err == "qhm unwrap: interrupted, nothing was written\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model.obj"]
+
+
+def test_memory_is_bounded_in_every_phase(model, tmp_path, monkeypatch, capsys):
+    """The process exceeds the bound while charts are packed."""
+    used = [10 << 20]
+    monkeypatch.setattr("quasiharmonic.ui.batch.supervisor.resident", lambda pid: used[-1])
+
+    def pack(*args, **options):
+        used.append(900 << 20)
+        return pack_charts(*args, **options)
+
+    monkeypatch.setattr("quasiharmonic.apps.unwrapping.unwrap.pack_charts", pack)
+    call = ["unwrap", model, "-o", tmp_path / "out.obj", "--resolution", 256, "--memory"]
+    assert run(*call, "800M") == 2
+    assert "used more than 800 MiB of memory (--memory), nothing was written" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.obj"]
+    assert run(*call, "1G") == 0
+
+
+def test_vertices_at_one_position_share_coordinates(tmp_path):
+    """Triangles that have their own vertices are joined in the file's map as in the certified one."""
+    corners = V[F].reshape(-1, 3)
+    io.write_obj(tmp_path / "model.obj", io.MeshData(corners, np.arange(len(corners)).reshape(-1, 3)))
+    report = tmp_path / "report.json"
+    call = ["unwrap", tmp_path / "model.obj", "-o", tmp_path / "out.obj", "--resolution", 256, "--json", report]
+    assert run(*call) == 0
+    written = io.read_mesh(tmp_path / "out.obj")
+    np.testing.assert_array_equal(written.V, corners)
+    islands = components(written.FT, len(written.vt))[written.FT[:, 0]]
+    assert len(np.unique(islands)) == json.loads(report.read_text())["charts"]
 
 
 def test_the_default_bound_is_that_of_the_function():

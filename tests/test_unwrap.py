@@ -141,6 +141,15 @@ def test_degenerate_models_are_an_error():
         unwrap(V, np.array([[0, 0, 1], [2, 3, 3]]))
 
 
+@pytest.mark.parametrize("exponent", [-700, 700])
+def test_extreme_units(exponent, result):
+    other = unwrap(np.ldexp(V, exponent), F, resolution=512)
+    np.testing.assert_array_equal(other.uvs, result.uvs)
+    assert other.stretch == result.stretch
+    assert np.ldexp(other.seam_length, -exponent) == pytest.approx(result.seam_length)
+    assert np.ldexp(other.texels_per_unit, exponent) == pytest.approx(result.texels_per_unit)
+
+
 def test_seams_of_existing_coordinates_are_used():
     points, triangles = grid(8, 8)
     corner_uv = points[triangles].copy()

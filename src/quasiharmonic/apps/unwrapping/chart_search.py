@@ -52,7 +52,7 @@ _SMALL_OVERLAP = 0.005
 # It divides charts to reach its aim only up to this number of charts, plus a multiple of the root of the number of
 # triangles; and to keep the bound up to this number.
 _FEW_CHARTS = 8, 0.125
-_MANY_CHARTS = 64, 1.0
+_MANY_CHARTS = 64, 4.0
 # Seconds between two calls of the callback while nothing is finished.
 _TICK = 0.25
 

@@ -40,9 +40,21 @@ def corner_positions(mesh: MeshData) -> FloatArray:
 
 
 def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:
-    """Return the mesh with its map, and the number of polygons that are divided into triangles along seams."""
-    mapped = replace(mesh, vt=result.uvs, FT=result.indices)
-    return divide_polygons(mapped)
+    """Return the mesh with its map, and the number of polygons that are divided into triangles along seams.
+
+    Vertices at the same position share texture coordinates where no seam separates them.
+    """
+    vt, FT = result.uvs, result.indices
+    if result.cleaned.report.coincident.size:
+        chart = np.empty(len(vt))
+        chart[FT] = result.charts[:, None]
+        _, first, which = np.unique(np.column_stack([chart, vt]), axis=0, return_index=True, return_inverse=True)
+        # Rows keep their order.
+        order = np.argsort(first)
+        number = np.empty(len(order), dtype=np.int64)
+        number[order] = np.arange(len(order))
+        vt, FT = vt[first[order]], number[which.reshape(-1)][FT]
+    return divide_polygons(replace(mesh, vt=vt, FT=FT))
 
 
 def divide_polygons(mesh: MeshData) -> tuple[MeshData, int]:

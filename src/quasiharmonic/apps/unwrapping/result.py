@@ -29,7 +29,7 @@ class UnwrapStatus(Enum):
     UNWRAPPED = "Every chart is bijective and no two charts overlap, verified exactly. The stretch is within the bound."
     STRETCHED = (
         "Every chart is bijective and no two charts overlap, verified exactly. Some charts exceed the bound on the "
-        "stretch: see misses. Allow more charts (max_charts) or more stretch (max_stretch)."
+        "stretch: see misses. Raise max_stretch, or max_charts if it was given."
     )
     ROUNDED = (
         "Rounding to the stored coordinates inverts some extremely thin triangles: see certificate. All other "
@@ -162,8 +162,10 @@ class UnwrapResult(Outcome):
     @property
     def seam_length(self) -> float:
         """Total length of the seams, each counted once, in the unit of the model."""
-        ends = self.V[self.seams]
-        return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum())
+        # In this unit, squares neither overflow nor underflow.
+        exponent = int(np.frexp(np.abs(self.V).max())[1])
+        ends = np.ldexp(self.V[self.seams], -exponent)
+        return float(np.ldexp(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum(), exponent))
 
     def to_trimesh(self) -> Trimesh:
         """Return the model as a trimesh.Trimesh with texture coordinates; vertices are split at seams."""

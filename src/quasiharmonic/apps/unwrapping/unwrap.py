@@ -30,6 +30,9 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.progress import reports_progress
 
+# Positions beyond this power of two, or all below its reciprocal, are scaled.
+_MAX_EXPONENT = 300
+
 
 @accepts_mesh
 @reports_progress
@@ -131,7 +134,10 @@ def unwrap(
 
     report("clean")
     cleaned = clean(V, F, outward)
-    points = np.pad(cleaned.V, [(0, 0), (0, 3 - V.shape[1])])
+    # In this unit, areas neither overflow nor underflow.
+    exponent = int(np.frexp(np.abs(cleaned.V).max())[1])
+    exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
+    points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)
     charts = find_charts(
         points,
@@ -152,7 +158,7 @@ def unwrap(
         [(chart.uv, chart.F) for chart in charts],
         resolution=size,
         padding=float(padding),
-        texels_per_unit=texels_per_unit,
+        texels_per_unit=None if texels_per_unit is None else float(np.ldexp(texels_per_unit, exponent)),
         tiles=tiles,
         rotate=rotate,
         stack=stack,
@@ -163,7 +169,7 @@ def unwrap(
     # Rows of texture coordinates are ordered by vertex, then by chart.
     key, indices = np.unique(F * len(layout.uv) + cleaned.restore_corners(layout.rows), return_inverse=True)
     vmapping, row = np.divmod(key, len(layout.uv))
-    stretch, area = _measure(cleaned, layout, size)
+    stretch, area = _measure(points, cleaned, layout, size)
     misses = [
         Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), chart.misses)
         for k, chart in enumerate(charts)
@@ -186,7 +192,7 @@ def unwrap(
         cleaned=cleaned,
         status=_find_status(certificate, misses),
         resolution=size,
-        texels_per_unit=packing.texels_per_unit,
+        texels_per_unit=float(np.ldexp(packing.texels_per_unit, -exponent)),
         V=V,
     )
 
@@ -236,10 +242,15 @@ def _find_status(certificate: UnwrapCertificate, misses: Sequence[Miss]) -> Unwr
     return UnwrapStatus.ROUNDED if certificate.disjoint and not certificate.injective else UnwrapStatus.OVERLAPPING
 
 
-def _measure(cleaned: CleanedMesh, layout: ChartLayout, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return stretch and share of the area (f',) of the cleaned triangles; NaN and 0 for those without area."""
-    V, texels = np.empty((len(layout.uv), cleaned.V.shape[1])), layout.uv * size
-    V[layout.rows] = cleaned.V[cleaned.F]
+def _measure(
+    points: FloatArray, cleaned: CleanedMesh, layout: ChartLayout, size: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Return stretch and share of the area (f',) of the cleaned triangles; NaN and 0 for those without area.
+
+    ``points`` (n', 3) are the positions in any unit.
+    """
+    V, texels = np.empty((len(layout.uv), 3)), layout.uv * size
+    V[layout.rows] = points[cleaned.F]
     # The orientation of a mirrored chart does not matter for its stretch.
     texels[layout.rows[layout.mirrored], 0] *= -1
     measured = distortion(V, layout.rows, texels)

@@ -148,13 +148,15 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
     """Return pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
     tree, pools, parts, known = document.tree, list[VertexPool](), list[Primitive](), dict[str, int]()
     triangles, statements, vertices, faces = [np.empty((0, 3), dtype=np.int64)], [], 0, 0
+    placed = _placements(tree)
     for m, mesh in enumerate(tree.get("meshes", [])):
         for p, primitive in enumerate(mesh["primitives"]):
             attributes, targets = primitive["attributes"], primitive.get("targets", [])
             mode = primitive.get("mode", _TRIANGLES)
             if mode not in (_TRIANGLES, _STRIP, _FAN) or "POSITION" not in attributes:
                 continue
-            key = json.dumps([attributes, targets], sort_keys=True)
+            # Meshes at different places have different positions, even if they share attributes in the file.
+            key = json.dumps([attributes, targets, placed[m].tolist() if m in placed else []], sort_keys=True)
             if key not in known:
                 known[key] = len(pools)
                 count = _common_count(document, [attributes, *targets])
