@@ -52,6 +52,8 @@ from .apps.repair.uv_repair import RepairResult as RepairResult
 from .apps.repair.uv_repair import repair as repair
 from .apps.tetrahedra.certificate import TetrahedraCertificate as TetrahedraCertificate
 from .apps.tetrahedra.certificate import certify_tetrahedra as certify_tetrahedra
+from .apps.tetrahedra.result import TetrahedraResult as TetrahedraResult
+from .apps.tetrahedra.tetrahedral_maps import injective_tetrahedra as injective_tetrahedra
 from .apps.unwrapping.cleaning import clean as clean
 from .apps.unwrapping.result import UnwrapResult as UnwrapResult
 from .apps.unwrapping.unwrap import unwrap as unwrap

@@ -1,4 +1,4 @@
-"""Morphing of planar meshes: compute a valid interior after the boundary has moved."""
+"""Morphing of meshes: compute a valid interior after the boundary has moved."""
 
 from __future__ import annotations
 
@@ -19,6 +19,9 @@ from quasiharmonic.apps.mesh_motion.midsides import (
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult, find_forbidden
 from quasiharmonic.apps.mesh_motion.quadrilaterals import make_convex
 from quasiharmonic.apps.mesh_motion.quality import element_quality
+from quasiharmonic.apps.tetrahedra.placement import Settings
+from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
+from quasiharmonic.apps.tetrahedra.tetrahedral_maps import morph_tetrahedra
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
 from quasiharmonic.energies.polishing import PolishOptions, find_energy, polish_result
@@ -47,6 +50,7 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_finite,
+    check_integer,
     check_range,
     index_array,
     map_array,
@@ -71,24 +75,26 @@ def morph(
     rest: ArrayLike | None = None,
     start: ArrayLike | None = None,
     tol: float = 1e-8,
-) -> MorphResult:
-    """Move some nodes of a planar mesh and place the others so that no element is inverted.
+) -> MorphResult | TetrahedraResult:
+    """Move some nodes of a mesh, planar or of tetrahedra, and place the others so that no element is inverted.
 
     Parameters
     ----------
-    points : (n, 2) array, or a mesh in the plane in place of ``points`` and ``F``
+    points : (n, 2) or (n, 3) array, or a mesh in place of ``points`` and ``F``
         The current mesh.
     F : (f, 3), (f, 4) or (f, 6) array of int
-        Triangles, quadrilaterals or six-node triangles, clockwise or counterclockwise, corners first (see
-        `quasiharmonic.geometry.mesh.elements`). A quadrilateral whose last two nodes are equal is a triangle.
+        If points are in space, tetrahedra (f, 4). Otherwise triangles, quadrilaterals or six-node triangles,
+        clockwise or counterclockwise, corners first (see `quasiharmonic.geometry.mesh.elements`). A quadrilateral whose
+        last two nodes are equal is a triangle.
     moved_vertices : (k,) array of int
         Nodes to move, on the boundary or inside. Other boundary nodes are fixed, except mid-side nodes, which follow
         their side.
-    target : (k, 2) array
+    target : (k, 2) or (k, 3) array
         Target positions of the moved nodes.
     energy : str, Energy or None
         Energy that the placement minimises; see `quasiharmonic.polish`. The default preserves shapes and sizes of the
-        triangles, so a graded mesh stays graded. None returns the first valid mesh.
+        triangles, so a graded mesh stays graded. None returns the first valid mesh. Tetrahedra have one isotropic
+        energy, whatever the name.
     max_iterations : int
         Maximum number of linear solves to find a valid mesh.
     linear_solver : str
@@ -99,11 +105,12 @@ def morph(
     slide : bool or BoundaryCurves
         Let the boundary vertices that are not moved slide along their outline, with fixed corners, like nodes on the
         walls of a channel. With `quasiharmonic.geometry.curves.BoundaryCurves` they slide along these curves, with True
-        along the boundary polygon. Moved vertices slide only if ``BoundaryCurves`` assigns them a curve.
-    rest : (n, 2) array, optional
+        along the boundary polygon. Moved vertices slide only if ``BoundaryCurves`` assigns them a curve. Not
+        supported for tetrahedra.
+    rest : array of the shape of ``points``, optional
         The mesh against which distortion is measured; default ``points``. In a chain of steps use the first mesh, so
         that the chain does not drift (`MorphResult.drift`).
-    start : (n, 2) array, optional
+    start : array of the shape of ``points``, optional
         Initial mesh, close to the result. Default: ``points`` if ``rest`` is given, otherwise the harmonic extension of
         the displacement.
     tol : float
@@ -112,7 +119,7 @@ def morph(
 
     Returns
     -------
-    MorphResult
+    MorphResult, or TetrahedraResult for tetrahedra
         If no valid mesh was found, ``result.status`` has the reason, or ``inverted`` has the inverted elements.
 
     Raises
@@ -123,6 +130,10 @@ def morph(
 
     Notes
     -----
+    Tetrahedra are untangled by a regularised energy, then the energy is lowered further. In space no theorem says
+    that a valid mesh is found. If the moved boundary crosses itself, the result names the triangles, without a
+    search.
+
     Triangles are searched as any map. For quadrilaterals the search uses the triangles on either side of a diagonal;
     then the triangles at all four corners are untangled and their energy is lowered.
 
@@ -146,6 +157,12 @@ def morph(
     >>> morphed.valid, bool(morphed.quality_after.min() > 0.25)
     (True, True)
     """
+    if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
+        if slide is not False:
+            raise ValueError("slide is not supported for tetrahedra")
+        check_integer("max_iterations", max_iterations, minimum=0)
+        options = Settings(energy is not None, max_iterations, tol, callback)
+        return morph_tetrahedra(points, F, moved_vertices, target, rest=rest, start=start, settings=options)
     points = map_array("points", points, finite=False)
     F = element_array(F, len(points))
     used = np.unique(F)

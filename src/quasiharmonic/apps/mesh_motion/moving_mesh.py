@@ -12,6 +12,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.tetrahedra.moving import MovingTetrahedra
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.energies.newton.boundary_continuation import MovingDescent
@@ -44,28 +45,30 @@ _MAX_STEPS = 25
 
 
 class MovingMesh:
-    """A planar mesh that follows its boundary in small steps.
+    """A mesh, planar or of tetrahedra, that follows its boundary in small steps.
 
     Use it for a simulation with a moving boundary. Each call moves the boundary and lets the interior follow, with one
     or two factorisations of the size of linear elasticity. For a single large displacement use `morph`.
 
     Parameters
     ----------
-    points : (n, 2) array, or a mesh in the plane in place of ``points`` and ``F``
+    points : (n, 2) or (n, 3) array, or a mesh in place of ``points`` and ``F``
         The initial mesh, valid; the shapes and sizes of its triangles are preserved. Every vertex belongs to a
         triangle.
     F : (f, 3) array of int
-        Triangles, clockwise or counterclockwise.
+        Triangles, clockwise or counterclockwise; tetrahedra (f, 4) if points are in space.
     moved_vertices : (k,) array of int
         Vertices that will move, on the boundary or inside. Other boundary vertices are fixed.
     energy : str or Energy
         Distortion energy to keep low; see `quasiharmonic.polish`. The default weights shapes more than sizes.
+        Tetrahedra have one isotropic energy.
     settle : int
         Newton steps down the energy after each move. With 0 the mesh is also valid, and a step is faster.
     slide : bool
         Let the boundary vertices that are not moved slide along their outline, with fixed corners; needs ``settle`` of
         at least 1. They lag one step behind the mesh, so moved vertices that arrive along the same wall are blocked by
-        them. `morph` does not have this limitation.
+        them. `morph` does not have this limitation. Not
+        supported for tetrahedra.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 
@@ -127,6 +130,13 @@ class MovingMesh:
         slide: bool = False,
         linear_solver: str = "auto",
     ) -> None:
+        self._volume: MovingTetrahedra | None = None
+        if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
+            if slide is not False:
+                raise ValueError("slide is not supported for tetrahedra")
+            check_integer("settle", settle, minimum=0)
+            self._volume = MovingTetrahedra(points, F, moved_vertices, settle)
+            return
         self._points = map_array("points", points)
         F = triangle_array(F, len(self._points))
         ratio = mean_ratio(self._points, F)
@@ -162,12 +172,16 @@ class MovingMesh:
 
     @property
     def points(self) -> FloatArray:
-        """A copy of the current mesh, (n, 2) float64; every triangle is strictly positive, verified exactly."""
+        """A copy of the current mesh; every triangle or tetrahedron is strictly positive, verified exactly."""
+        if self._volume is not None:
+            return self._volume.points.copy()
         return self._points.copy()
 
     @property
     def F(self) -> IntArray:
-        """The triangles (f, 3), counterclockwise."""
+        """The triangles (f, 3), counterclockwise, or tetrahedra (f, 4), positive."""
+        if self._volume is not None:
+            return self._volume.T
         return self._domain.F
 
     def advance(self, target: ArrayLike) -> FloatArray:
@@ -175,12 +189,12 @@ class MovingMesh:
 
         Parameters
         ----------
-        target : (k, 2) array
+        target : (k, 2) or (k, 3) array
             Next positions of the moved vertices.
 
         Returns
         -------
-        (n, 2) float64
+        (n, 2) or (n, 3) float64
             The new mesh; also available as ``points``.
 
         Raises
@@ -190,6 +204,8 @@ class MovingMesh:
         RuntimeError
             If triangles prevent the boundary from reaching its positions. The mesh is then unchanged.
         """
+        if self._volume is not None:
+            return self._volume.advance(target)
         there = map_array("target", target, self._moved.size, finite=False)
         check_finite("target", "row", "rows", there)
         goal = np.concatenate([there, self._points[self._domain.fixed[self._moved.size :]]])

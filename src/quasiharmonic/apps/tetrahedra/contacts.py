@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns, SignArray
-from quasiharmonic.geometry.exact.predicates import box_pairs, orientation
+from quasiharmonic.geometry.exact.predicates import box_pairs, box_pairs_between, orientation
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
@@ -36,6 +36,44 @@ def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
         found.append(np.sort(np.stack([one[meet], other[meet]], axis=1), axis=1))
     pairs = np.concatenate(found)
     return pairs[np.lexsort(pairs.T[::-1])]
+
+
+def edges_meeting_triangles(edges: IntArray, F: IntArray, X: FloatArray) -> IntArray:
+    """Find pairs (k, 2) of edges and triangles, not degenerate, that meet outside their common vertices."""
+    ends, corners = X[edges], X[F]
+    order, other_order = _spatial_order(0.5 * ends.sum(axis=1)), _spatial_order(corners.mean(axis=1))
+    boxes = (
+        (part[place].min(axis=1), part[place].max(axis=1)) for part, place in ((ends, order), (corners, other_order))
+    )
+    signs = ExactSigns(X)
+    found = [np.empty((0, 2), dtype=np.int64)]
+    for i, j in box_pairs_between(*(box for pair in boxes for box in pair)):
+        heartbeat()
+        edge, triangle = order[i], other_order[j]
+        one, other = edges[edge], F[triangle]
+        # From a common vertex, an edge meets the triangle again only if it lies in its plane.
+        common = (one[:, :, None] == other[:, None, :]).any(axis=2)
+        side = _plane_signs(other, one, signs)
+        meet = np.zeros(len(one), dtype=np.bool_)
+        apart = np.flatnonzero(~common.any(axis=1) & (side[:, 0] * side[:, 1] <= 0))
+        meet[apart] = _edge_meets(one[apart], other[apart], side[apart, 0], side[apart, 1], X, signs)
+        touching = np.flatnonzero((common.sum(axis=1) == 1) & (side == 0).all(axis=1))
+        if touching.size:
+            meet[touching] = _starts_inside(one[touching], other[touching], common[touching, 1], X)
+        found.append(np.stack([edge[meet], triangle[meet]], axis=1))
+    return np.concatenate(found)
+
+
+def _starts_inside(edge: IntArray, F: IntArray, second: BoolArray, X: FloatArray) -> BoolArray:
+    """Whether edges (k, 2) in the planes of triangles (k, 3) start into them from a common vertex."""
+    edge = np.where(second[:, None], edge[:, ::-1], edge)
+    place = np.argmax(edge[:, :1] == F, axis=1)
+    F = np.take_along_axis(F, (place[:, None] + np.arange(3)) % 3, axis=1)
+    axes, turn = _project(F, X)
+    f, end = _flatten(F, axes, X), _flatten(edge[:, 1:], axes, X)[:, 0]
+    one = orientation(f[:, 0], f[:, 1], end) * turn
+    other = orientation(f[:, 0], end, f[:, 2]) * turn
+    return np.asarray((one >= 0) & (other >= 0))
 
 
 def _spatial_order(centres: FloatArray) -> IntArray:

@@ -11,7 +11,7 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.adapters.cells import planar_cells
+from quasiharmonic.io.adapters.cells import simulation_cells
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe
 
@@ -59,8 +59,8 @@ def writer_accepts_mesh(function: Callable[Concatenate[Path, ArrayLike, ArrayLik
 
 
 def accepts_planar_mesh(function: Callable[Concatenate[ArrayLike, ArrayLike, P], R]) -> AcceptsPlanarMesh[P, R]:
-    """Decorate a function of planar ``points`` and elements ``F`` so that it accepts one mesh in their place."""
-    return _decorate(function, 0, planar_cells)
+    """Decorate a function of ``points`` and elements ``F`` so that it accepts one simulation mesh in their place."""
+    return _decorate(function, 0, simulation_cells)
 
 
 def init_accepts_mesh(init: Callable[..., None]) -> Callable[..., None]:
@@ -70,8 +70,8 @@ def init_accepts_mesh(init: Callable[..., None]) -> Callable[..., None]:
 
 
 def init_accepts_planar_mesh(init: Callable[..., None]) -> Callable[..., None]:
-    """Decorate an ``__init__`` of planar ``points`` and elements ``F`` so that it accepts one mesh in their place."""
-    made: Callable[..., None] = _decorate(init, 1, planar_cells)
+    """Decorate an ``__init__`` of ``points`` and elements ``F`` so that it accepts one simulation mesh."""
+    made: Callable[..., None] = _decorate(init, 1, simulation_cells)
     return made
 
 

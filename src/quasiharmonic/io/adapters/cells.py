@@ -1,4 +1,4 @@
-"""Nodes and elements of planar simulation meshes: scikit-fem, meshio, PyVista, DOLFINx, and files.
+"""Nodes and elements of simulation meshes: scikit-fem, meshio, PyVista, DOLFINx, and files.
 
 As in `objects`, no library is imported: the adapter recognises an object by its attribute names.
 """
@@ -19,11 +19,52 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, describe, index_arra
 
 # Number of nodes by kind of cell, in meshio's and VTK's names; then the kinds to skip, which have no area.
 _NODES = {"triangle": 3, "quad": 4, "triangle6": 6, 5: 3, 9: 4, 22: 6}
+_TETRAHEDRA = ("tetra", 10)
+_SOLIDS = ("tetra10", "hexahedron", "wedge", "pyramid", "hexahedron20", "hexahedron27", 11, 12, 13, 14, 24, 25)
 _SKIPPED_CELLS = ("vertex", "line", "line3", 1, 2, 3, 4, 21)
 # VTK's kind number of polygons, which are cut into triangles.
 _POLYGON = 7
 # Permutation from DOLFINx's node order to the order around the element, by number of nodes.
 _DOLFINX_ORDER = {3: [0, 1, 2], 4: [0, 1, 3, 2], 6: [0, 1, 2, 5, 3, 4]}
+
+
+def simulation_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
+    """Return the nodes and the elements of a simulation mesh, given as an object, a mapping or a path.
+
+    If the mesh has tetrahedra, these are positions (n, 3) and tetrahedra (t, 4), and cells without volume are skipped.
+    Otherwise they are those of `planar_cells`. ValueError for second-order tetrahedra and other cells with volume.
+    """
+    given: Any = mesh
+    what = describe(mesh)
+    if isinstance(mesh, str | PathLike):
+        if Path(mesh).suffix.lower() in suffixes("read_elements"):
+            from quasiharmonic.io.fem.files import read_volume
+
+            read = read_volume(mesh)
+            if len(read.H):
+                raise ValueError(f"{what} has hexahedra: only tetrahedra are supported")
+            if len(read.T):
+                return read.points, read.T
+        return planar_cells(mesh)
+    if hasattr(given, "doflocs"):
+        X, T = np.asarray(given.doflocs).T, np.asarray(given.dofs.element_dofs).T
+        if X.shape[1:] == (3,):
+            return vertex_array(X, f"doflocs of {what}", finite=False), index_array(f"t of {what}", T)
+    elif hasattr(given, "geometry"):
+        X, T = np.asarray(given.geometry.x), np.asarray(given.geometry.dofmap)
+        if X.ndim == 2 and X.shape[1] == 3 and T.shape[1:] in ((4,), (10,)) and len(X) and np.ptp(X[:, 2]):
+            return vertex_array(X, f"geometry of {what}", finite=False), index_array(f"dofmap of {what}", T)
+    else:
+        blocks = [(kind, nodes) for kind, nodes in _blocks(mesh) or () if kind in _TETRAHEDRA or kind in _SOLIDS]
+        other = [kind for kind, _ in blocks if kind in _SOLIDS]
+        if other:
+            raise ValueError(
+                f"cells of {what} have the cell type {other[0]!r}: only tetrahedra of four nodes are supported"
+            )
+        if blocks and np.ndim(given.points) == 2 and np.shape(given.points)[1] == 3:
+            X = vertex_array(given.points, f"points of {what}", finite=False)
+            return X, np.concatenate([index_array(f"cells of {what}", nodes).reshape(-1, 4) for _, nodes in blocks])
+    return planar_cells(mesh)
 
 
 def planar_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:

@@ -1,4 +1,4 @@
-"""``qhm morph``: move the boundary of a planar mesh, and keep its interior valid."""
+"""``qhm morph``: move the boundary of a mesh, planar or of tetrahedra, and keep its interior valid."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
-    from quasiharmonic.io.fem.files import FemMesh
+    from quasiharmonic.io.fem.files import FemMesh, VolumeMesh
     from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.util.arrays import FloatArray
 
@@ -31,10 +31,10 @@ def add_parser(commands: Commands) -> None:
 
     parser = commands.add_parser(
         "morph",
-        description="Move some nodes of a planar mesh and place the others such that no element is inverted: triangles "
-        "of three or six nodes, quadrilaterals of four. Boundary nodes without a displacement stay fixed; mid-side "
-        "nodes move with their sides. Only positions change in the file; data, times and physical groups stay "
-        "byte for byte.",
+        description="Move some nodes of a mesh and place the others such that no element is inverted: planar triangles "
+        "of three or six nodes, quadrilaterals of four, or tetrahedra of four. Boundary nodes without a displacement "
+        "stay fixed; mid-side nodes move with their sides. Only positions change in the file; data, times and physical "
+        "groups stay byte for byte.",
         epilog="Exit status: 0 no element of the written mesh is inverted, verified exactly; 1 some are; 2 wrong "
         "input or call, nothing written; 3 written, but the report failed.",
         examples=(
@@ -50,7 +50,10 @@ def add_parser(commands: Commands) -> None:
     )
     given = parser.add_mutually_exclusive_group(required=True)
     given.add_argument(
-        "--positions", type=Path, metavar="CSV", help="file of target positions: lines 'vertex,x,y', counting from 0"
+        "--positions",
+        type=Path,
+        metavar="CSV",
+        help="file of target positions: lines 'vertex,x,y', or 'vertex,x,y,z' for tetrahedra, counting from 0",
     )
     given.add_argument(
         "--field",
@@ -83,16 +86,20 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, morph, write, read back, certify, report."""
+    from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
     from quasiharmonic.apps.mesh_motion.morphing import morph
     from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.geometry.mesh.elements import rim
-    from quasiharmonic.io.fem.files import check_fem_output, read_fem, write_fem
+    from quasiharmonic.io.fem.files import check_fem_output, read_fem, read_volume, write_fem
     from quasiharmonic.ui.cli import progress_line, report
 
     if options.no_polish and options.energy is not None:
         raise ValueError("--energy needs polishing: omit --no-polish")
     report.check_moved(options.output, options.json, inputs=(options.input, options.positions, options.rest))
     check_fem_output(options.output, options.input)
+    volume = read_volume(options.input)
+    if len(volume.parts.F):
+        return _run_volume(options, volume)
     mesh = read_fem(options.input)
     rest = None if options.rest is None else _rest(options.rest, mesh)
     if options.field is not None:
@@ -102,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
             goes = (positions != mesh.points[moved]).any(axis=1)
             moved, positions = moved[goes], positions[goes]
     else:
-        moved, positions = _positions(options.positions, len(mesh.points))
+        moved, positions = _positions(options.positions, len(mesh.points), 2)
     with report.about(options.input), progress_line.line() as show:
         morphed = morph(
             mesh.points,
@@ -116,6 +123,7 @@ def run(options: argparse.Namespace) -> int:
             slide=options.slide,
             rest=rest,
         )
+    assert isinstance(morphed, MorphResult)
     write_fem(options.output, mesh, morphed.points)
     with report.after_writing(options.output):
         # Certify the file as read back, because a format may store fewer digits.
@@ -132,6 +140,69 @@ def run(options: argparse.Namespace) -> int:
         }
         report.emit(facts, options.json, _sentences(morphed, len(inverted), drift, options.output))
     return 0 if not inverted.size else 1
+
+
+def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
+    """`run` for a mesh of tetrahedra."""
+    import numpy as np
+
+    from quasiharmonic.apps.mesh_motion.morphing import morph
+    from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
+    from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
+    from quasiharmonic.apps.tetrahedra.topology import inspect_faces
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.fem.files import read_volume, write_volume
+    from quasiharmonic.ui.cli import progress_line, report
+
+    if len(mesh.H):
+        raise MeshFileError(options.input, "has hexahedra", remedy="split them into tetrahedra")
+    if options.slide or options.energy is not None:
+        raise ValueError("--slide and --energy are for planar meshes: omit them for tetrahedra")
+    rest = None
+    if options.rest is not None:
+        first = read_volume(options.rest)
+        if first.points.shape != mesh.points.shape or not np.array_equal(first.T, mesh.T):
+            raise MeshFileError(
+                options.rest, f"must have the same nodes and elements, in the same order, as {mesh.source}"
+            )
+        rest = first.points
+    if options.field is not None:
+        moved = np.unique(inspect_faces(mesh.T, len(mesh.points)).boundary)
+        positions = mesh.points[moved] + mesh.point_field(options.field, moved)
+    else:
+        moved, positions = _positions(options.positions, len(mesh.points), 3)
+    with report.about(options.input), progress_line.line() as show:
+        morphed = morph(
+            mesh.points,
+            mesh.T,
+            moved,
+            positions,
+            energy=None if options.no_polish else "symmetric-dirichlet",
+            max_iterations=options.max_iterations,
+            callback=show,
+            rest=rest,
+        )
+    assert isinstance(morphed, TetrahedraResult)
+    write_volume(options.output, mesh, morphed.points)
+    with report.after_writing(options.output):
+        certificate = certify_arrays(morphed.T, read_volume(options.output).points)
+        facts = {
+            **morphed.to_dict(),
+            "certificate": certificate.to_dict(),
+            "injective": certificate.injective,
+            "inverted": certificate.inverted.tolist(),
+            "input": str(options.input),
+            "output": str(options.output),
+            "moved": len(moved),
+        }
+        lines = [f"wrote {options.output}: {certificate.summary()}"]
+        if not certificate.injective:
+            lines.append(morphed.summary())
+        for name, quality in (("before", morphed.quality_before), ("after", morphed.quality_after)):
+            worst = f"worst {quality.min():.3g} (tetrahedron {int(quality.argmin())})"
+            lines.append(f"mean-ratio quality {name}: {worst}, mean {quality.mean():.3g}")
+        report.emit(facts, options.json, "\n".join(lines))
+    return 0 if certificate.injective else 1
 
 
 def _rest(path: Path, mesh: FemMesh) -> FloatArray:
@@ -168,7 +239,7 @@ def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output:
     return "\n".join(lines)
 
 
-def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _positions(path: Path, n: int, axes: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Read lines of a vertex and its target position."""
     import numpy as np
 
@@ -176,9 +247,14 @@ def _positions(path: Path, n: int) -> tuple[NDArray[np.int64], NDArray[np.float6
     from quasiharmonic.io.lowlevel.textual import read_rows
 
     positions: dict[int, list[float]] = {}
-    for line, (vertex, *place) in read_rows(path, 3):
+    for line, (vertex, *place) in read_rows(path, 1 + axes):
         if not (0 <= vertex < n and vertex.is_integer()):
-            raise MeshFileError(path, f"{vertex:g} is not a vertex from 0 to {n - 1}", line, "write lines 'vertex,x,y'")
+            raise MeshFileError(
+                path,
+                f"{vertex:g} is not a vertex from 0 to {n - 1}",
+                line,
+                f"write lines 'vertex,x,y{',z' * (axes - 2)}'",
+            )
         if int(vertex) in positions:
             raise MeshFileError(path, f"lists vertex {int(vertex)} a second time", line)
         positions[int(vertex)] = place

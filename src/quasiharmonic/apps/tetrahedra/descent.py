@@ -1,0 +1,121 @@
+"""Descent of the energy of a tetrahedral mesh with fixed vertices: Newton's method by conjugate gradients.
+
+Conjugate gradients with the diagonal blocks as preconditioner solve the systems, because a factorisation of a mesh in
+space fills in. Untangling lowers the regularised energy, and the regularisation parameter after each step, until no
+tetrahedron is inverted. Polishing lowers the energy without regularisation, which is infinite at inverted tetrahedra.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from quasiharmonic.apps.tetrahedra.energy import BlockMatrix, ShapeEnergy, reduce_epsilon
+from quasiharmonic.energies.newton.line_search import backtrack
+from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat
+
+# Relative residual of the linear systems, and maximum number of iterations.
+_RESIDUAL = 0.05
+_MAX_CONJUGATE_STEPS = 250
+# The regularisation parameter is kept after a step that lowers the energy by more than this share, but not more often.
+_QUICK_DECREASE = 0.1
+_MAX_REPEATED = 10
+# Step lengths that a line search tries.
+_TRIES = 30
+# First and least regularisation parameter; determinants are about 1.
+_FIRST_EPSILON = 1.0
+_MIN_EPSILON = 1e-14
+
+
+class Descent:
+    """Newton's method on the energy of a mesh with free vertices ``free`` (k,); ``X`` (n, 3) are the positions."""
+
+    def __init__(self, energy: ShapeEnergy, free: IntArray, X: FloatArray) -> None:
+        self.energy, self.free, self.X = energy, free, X.copy()
+        self._blocks = BlockMatrix(energy.T, energy.n, free)
+        self.iterations = 0
+        self.converged = False
+        self.conjugate_steps = 0
+
+    def untangle(self, max_steps: int) -> Iterator[float]:
+        """Lower the regularised energy; yield the least determinant after each step, and end when it is positive."""
+        epsilon, repeated = _FIRST_EPSILON, 0
+        for _ in range(max_steps):
+            before = self.energy.value(self.X, epsilon)
+            after = self._step(epsilon)
+            least = float(self.energy.determinants(self.X).min())
+            yield least
+            if least > 0 or (after is None and epsilon < _MIN_EPSILON):
+                return
+            ratio = 1.0 if after is None else after / before
+            # While the energy falls quickly, keep the parameter. Lowering it too early leads to worse local minima.
+            repeated += 1
+            if ratio > 1.0 - _QUICK_DECREASE or repeated > _MAX_REPEATED:
+                epsilon, repeated = max(reduce_epsilon(epsilon, least, ratio), _MIN_EPSILON), 0
+
+    def polish(self, max_steps: int, tol: float) -> Iterator[float]:
+        """Lower the energy of positive tetrahedra; yield it after each step, and end when it has converged."""
+        before = self.energy.value(self.X, 0.0)
+        for _ in range(max_steps):
+            after = self._step(0.0)
+            if after is None:
+                self.converged = True
+                return
+            self.converged = before - after < tol * after
+            yield after
+            if self.converged:
+                return
+            before = after
+
+    def _step(self, epsilon: float) -> float | None:
+        """Take a Newton step; return the energy after it, or None if no step lowers the energy."""
+        heartbeat()
+        value, gradient, blocks = self.energy.derivatives(self.X, epsilon)
+        g = gradient[self.free].ravel()
+        p = self._direction(self._blocks.assemble(blocks), g)
+        decrease = -float(g @ p)
+        self.iterations += 1
+        if not decrease > 0:
+            return None
+        direction = p.reshape(-1, 3)
+
+        def trial(t: float, bound: float) -> tuple[float, FloatArray | None]:
+            X = self.X.copy()
+            X[self.free] += t * direction
+            found = self.energy.value(X, epsilon)
+            return found, X if found < bound else None
+
+        accepted = backtrack(trial, value, decrease, tries=_TRIES)
+        if accepted is None:
+            return None
+        self.X = accepted.state
+        return accepted.value
+
+    def _direction(self, data: FloatArray, g: FloatArray) -> FloatArray:
+        """Solve the Newton system approximately by preconditioned conjugate gradients."""
+        matrix = self._blocks.matrix(data)
+        diagonal = data[self._blocks.diagonal]
+        scale = np.trace(diagonal, axis1=1, axis2=2)
+        shift = 1e-12 * np.where(scale > 0, scale, 1.0)
+        inverse = np.linalg.inv(diagonal + shift[:, None, None] * np.eye(3))
+        x, r = np.zeros_like(g), -g
+        z = np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3)).ravel()
+        p, rz = z.copy(), float(r @ z)
+        first = rz
+        for _ in range(_MAX_CONJUGATE_STEPS):
+            if not rz > _RESIDUAL**2 * first:
+                break
+            Ap = matrix @ p
+            curvature = float(p @ Ap)
+            if not curvature > 0:
+                break
+            alpha = rz / curvature
+            x += alpha * p
+            r -= alpha * Ap
+            z = np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3)).ravel()
+            rz, old = float(r @ z), rz
+            p = z + (rz / old) * p
+            self.conjugate_steps += 1
+        return x if x.any() else z

@@ -1,0 +1,255 @@
+"""Place the free vertices of a tetrahedral mesh whose other vertices are fixed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.tetrahedra.certificate import certify_arrays, find_boundary_contacts, tetrahedron_array
+from quasiharmonic.apps.tetrahedra.descent import Descent
+from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
+from quasiharmonic.apps.tetrahedra.obstructions import find_obstructions
+from quasiharmonic.apps.tetrahedra.result import (
+    TetrahedraObstruction,
+    TetrahedraResult,
+    TetrahedraStatus,
+    tetrahedron_quality,
+)
+from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
+from quasiharmonic.apps.tetrahedra.topology import FaceReport, inspect_faces
+from quasiharmonic.problem.result import Step
+from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
+
+# Maximum number of crossing pairs of boundary triangles that are listed.
+_MAX_LISTED = 20
+# Newton steps without progress after which untangling has stalled.
+_PATIENCE = 100
+
+
+@dataclass(frozen=True, eq=False)
+class RestMesh:
+    """A checked rest mesh: positive tetrahedra ``T`` (t, 4), positions ``X`` (n, 3), and the faces."""
+
+    T: IntArray
+    X: FloatArray
+    faces: FaceReport
+
+    @property
+    def boundary_vertices(self) -> IntArray:
+        """Ascending vertices of the boundary."""
+        return np.unique(self.faces.boundary)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of a search."""
+
+    polish: bool = True
+    max_iterations: int = 2000
+    tol: float = 1e-8
+    callback: Callable[[Step], object] | None = None
+
+
+def check_rest(T: ArrayLike, X: FloatArray) -> RestMesh:
+    """Check a rest mesh and turn its tetrahedra positive.
+
+    ValueError if there are no tetrahedra, a vertex of one is not finite, or one is degenerate, repeated or overlaps a
+    neighbour.
+    """
+    T = tetrahedron_array(T, len(X))
+    if not len(T):
+        raise ValueError("the mesh has no tetrahedra")
+    sign, nonfinite = tetrahedron_signs(T, X)
+    if nonfinite.size:
+        raise ValueError(f"points are not finite at {names_of('tetrahedron', 'tetrahedra', nonfinite)}")
+    flat = np.flatnonzero(sign == 0)
+    if flat.size:
+        raise ValueError(f"{names_of('tetrahedron', 'tetrahedra', flat)} degenerate at rest: repair the mesh first")
+    T = np.where((sign < 0)[:, None], T[:, [1, 0, 2, 3]], T)
+    faces = inspect_faces(T, len(X))
+    for found, what in (
+        (faces.repeated, "repeated"),
+        (faces.nonmanifold, "a face is in three or more tetrahedra"),
+        (faces.inconsistent, "two tetrahedra are on the same side of a face, so one is inverted at rest"),
+    ):
+        if len(found):
+            names = names_of("tetrahedron", "tetrahedra", found) if found.ndim == 1 else str(tuple(found[0].tolist()))
+            raise ValueError(f"the rest mesh is not valid: {what}: {names}")
+    return RestMesh(T, X, faces)
+
+
+def place_vertices(
+    mesh: RestMesh,
+    points: FloatArray,
+    fixed: IntArray,
+    target: FloatArray,
+    start: FloatArray | None,
+    settings: Settings,
+) -> TetrahedraResult:
+    """Find positions of the free vertices such that every tetrahedron is positive, then lower the distortion.
+
+    ``points`` (n, 3) are the current positions, ``fixed`` (k,) the fixed vertices, and ``target`` (k, 3) their
+    positions. Without ``start`` (n, 3) the search starts at the harmonic extension of the displacement.
+    """
+    began = time.perf_counter()
+    T = mesh.T
+    begin = points.copy()
+    begin[fixed] = target
+    free = np.setdiff1d(np.unique(T), fixed)
+    whole = bool(np.isin(mesh.boundary_vertices, fixed).all())
+    obstructions = _find_crossings(mesh, begin) if whole else ()
+    status, iterations = TetrahedraStatus.CROSSING, 0
+    energy, X, exponent = make_energy(mesh, begin, whole)
+    if not obstructions:
+        if start is not None:
+            X[free] = np.ldexp(start[free], -exponent)
+        else:
+            X = extend_harmonically(energy, np.ldexp(points, -exponent), fixed, X[fixed])
+        X, status, iterations = _search(energy, free, X, settings)
+        after = np.ldexp(X, exponent)
+        begin[free] = after[free]
+    certificate = certify_arrays(T, begin, faces=mesh.faces)
+    sign, _ = tetrahedron_signs(T, begin)
+    is_fixed = np.zeros(len(points), dtype=np.bool_)
+    is_fixed[fixed] = True
+    forbidden = np.flatnonzero((sign <= 0) & is_fixed[T].all(axis=1))
+    if not certificate.positive and status is not TetrahedraStatus.CROSSING:
+        obstructions = find_obstructions(T, begin, is_fixed, mesh.faces.boundary if whole else None, sign)
+        if obstructions:
+            status = TetrahedraStatus.IMPOSSIBLE
+        elif status is not TetrahedraStatus.OUT_OF_ITERATIONS:
+            status = TetrahedraStatus.STALLED
+    return TetrahedraResult(
+        points=begin,
+        T=T,
+        certificate=certificate,
+        status=status,
+        obstructions=obstructions,
+        forbidden=forbidden,
+        iterations=iterations,
+        seconds=time.perf_counter() - began,
+        energy=float(energy.densities(X).mean()) if certificate.positive else np.inf,
+        quality_before=tetrahedron_quality(T, points),
+        quality_after=tetrahedron_quality(T, begin),
+    )
+
+
+def _find_crossings(mesh: RestMesh, X: FloatArray) -> tuple[TetrahedraObstruction, ...]:
+    """Describe pairs of boundary triangles that meet at target positions."""
+    F = mesh.faces.boundary
+    pairs = F[find_boundary_contacts(F, X)]
+    rest = f" (first of {len(pairs)} pairs)" if len(pairs) > 1 else ""
+    return tuple(
+        TetrahedraObstruction(
+            f"The boundary triangles {tuple(one)} and {tuple(other)} meet{rest if not k else ''}.", (*one, *other)
+        )
+        for k, (one, other) in enumerate(pairs[:_MAX_LISTED].tolist())
+    )
+
+
+def make_energy(mesh: RestMesh, begin: FloatArray, whole: bool) -> tuple[ShapeEnergy, FloatArray, int]:
+    """The energy with rest and target scaled to magnitude one and equal volume; the scaled start, and its exponent."""
+    used = np.unique(mesh.T)
+    rest = np.zeros_like(mesh.X)
+    X = np.zeros_like(begin)
+    exponents = []
+    for there, here in ((mesh.X, rest), (begin, X)):
+        exponents.append(int(np.frexp(np.abs(there[used]).max())[1]))
+        here[used] = np.ldexp(there[used], -exponents[-1])
+    with np.errstate(all="ignore"):
+        ratio = 0.0
+        if whole:
+            old, new = (_volume(mesh.faces.boundary, positions) for positions in (rest, X))
+            ratio = new / old if old > 0 else 0.0
+        scale = float(np.cbrt(ratio)) if 0 < ratio < np.inf else 2.0 ** (exponents[0] - exponents[1])
+        energy = ShapeEnergy(mesh.T, rest * scale)
+    bad = np.flatnonzero(~np.isfinite(energy.gradients).all(axis=(0, 1)))
+    if bad.size:
+        raise ValueError(
+            f"{names_of('tetrahedron', 'tetrahedra', bad)} too thin or too small at rest for double precision"
+        )
+    return energy, X, exponents[1]
+
+
+def _volume(F: IntArray, X: FloatArray) -> float:
+    """Six times the volume that oriented triangles enclose."""
+    a, b, c = X[F].transpose(1, 0, 2)
+    return float((a * np.cross(b, c)).sum())
+
+
+def extend_harmonically(energy: ShapeEnergy, X: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
+    """Add to positions (n, 3) the harmonic extension of the displacement of the fixed vertices to ``target`` (k, 3)."""
+    from scipy.sparse import coo_array, dia_array
+    from scipy.sparse.linalg import cg
+
+    T, G = energy.T, energy.gradients
+    n = len(X)
+    displacement = np.zeros_like(X)
+    displacement[fixed] = target - X[fixed]
+    rows, columns, values = [], [], []
+    for i in range(4):
+        for j in range(4):
+            rows.append(T[:, i])
+            columns.append(T[:, j])
+            values.append((G[i] * G[j]).sum(axis=0) * energy.volumes)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    matrix = coo_array((np.concatenate(values), where), shape=(n, n)).tocsr()
+    free = np.setdiff1d(np.unique(T), fixed)
+    if not free.size:
+        return X + displacement
+    own = matrix[free][:, free]
+    load = -(matrix[free] @ displacement)
+    diagonal = own.diagonal()
+    inverse = dia_array((1.0 / np.where(diagonal > 0, diagonal, 1.0)[None], [0]), shape=own.shape)
+    for axis in range(3):
+        if load[:, axis].any():
+            displacement[free, axis] = cg(own, load[:, axis], rtol=1e-6, maxiter=2000, M=inverse)[0]
+    there = X + displacement
+    return there if np.isfinite(there).all() else X
+
+
+def _search(
+    energy: ShapeEnergy, free: IntArray, X: FloatArray, settings: Settings
+) -> tuple[FloatArray, TetrahedraStatus, int]:
+    """Untangle and polish; return the best positions, why the search ended, and the number of steps."""
+    descent = Descent(energy, free, X)
+
+    def report(value: float, inverted: int) -> None:
+        if settings.callback is not None:
+            settings.callback(Step(descent.iterations, inverted, value))
+
+    with np.errstate(all="ignore"):
+        D = energy.determinants(X)
+        count, best = int(np.count_nonzero(~(D > 0))), (np.inf, X)
+        report(np.inf, count)
+        if count and free.size:
+            best = (count, X)
+            since, least = 0, float(D.min())
+            for now in descent.untangle(settings.max_iterations):
+                count = int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
+                report(np.inf, count)
+                since += 1
+                if count < best[0] or now > least + 0.05 * abs(least):
+                    since, least = 0, max(now, least)
+                if count < best[0]:
+                    best = (count, descent.X)
+                if since >= _PATIENCE:
+                    return best[1], TetrahedraStatus.STALLED, descent.iterations
+        if count:
+            ended = descent.iterations >= settings.max_iterations
+            status = TetrahedraStatus.OUT_OF_ITERATIONS if ended else TetrahedraStatus.STALLED
+            return best[1], status, descent.iterations
+        status = TetrahedraStatus.FIRST_VALID
+        if settings.polish and free.size:
+            status = TetrahedraStatus.STILL_FALLING
+            before, left = np.inf, settings.max_iterations - descent.iterations
+            for value in descent.polish(left, settings.tol):
+                report(value, 0)
+                before = value
+            if descent.converged and np.isfinite(before):
+                status = TetrahedraStatus.POLISHED
+    return descent.X, status, descent.iterations

@@ -1,0 +1,147 @@
+"""Result of a search for positions of a tetrahedral mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from quasiharmonic.apps.tetrahedra.certificate import TetrahedraCertificate
+from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
+from quasiharmonic.util.outcome import Outcome
+
+_SIDES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
+class TetrahedraStatus(Enum):
+    """Why a search ended; the value is a message for the user."""
+
+    POLISHED = "Every tetrahedron is strictly positive, and the distortion has converged."
+    STILL_FALLING = "Every tetrahedron is strictly positive. The distortion was still falling after the last iteration."
+    FIRST_VALID = "Every tetrahedron is strictly positive."
+    STALLED = (
+        "Stalled: some tetrahedra are still inverted and further iterations do not help. No known obstruction forbids "
+        "a valid mesh, but this mesh and this target may still allow none."
+    )
+    OUT_OF_ITERATIONS = "Some tetrahedra were still inverted after the last iteration: allow more iterations."
+    IMPOSSIBLE = "No valid mesh with these fixed vertices exists. The obstructions are listed."
+    CROSSING = "The target positions of the boundary cross themselves, so no valid mesh exists. Nothing was computed."
+
+
+@dataclass(frozen=True)
+class TetrahedraObstruction:
+    """A reason why no valid mesh with these fixed vertices exists.
+
+    Attributes
+    ----------
+    text : str
+    vertices : tuple of int
+        The vertices of the tetrahedron, edge or triangles, or the free vertex.
+    """
+
+    text: str
+    vertices: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TetrahedraResult(Outcome):
+    """A tetrahedral mesh with some fixed vertices; returned by `morph` and `injective_tetrahedra`.
+
+    Attributes
+    ----------
+    points : (n, 3) float64
+        All vertices; those in no tetrahedron keep their positions.
+    T : (t, 4) int64
+        The tetrahedra in the given order, positive at rest.
+    certificate : TetrahedraCertificate
+        The exact certificate of ``points``.
+    status : TetrahedraStatus
+    obstructions : tuple of TetrahedraObstruction
+        Reasons why no valid mesh exists, as far as they were found; at most 20.
+    forbidden : (k,) int64
+        Inverted or degenerate tetrahedra whose four vertices are fixed.
+    iterations : int
+        Newton steps.
+    seconds : float
+    energy : float
+        Mean isotropic energy relative to the rest mesh, 1 for a rotation; infinite if a tetrahedron is not positive.
+    quality_before, quality_after : (t,) float64
+        `tetrahedron_quality` of every tetrahedron.
+    """
+
+    points: FloatArray
+    T: IntArray
+    certificate: TetrahedraCertificate
+    status: TetrahedraStatus
+    obstructions: tuple[TetrahedraObstruction, ...]
+    forbidden: IntArray
+    iterations: int
+    seconds: float
+    energy: float
+    quality_before: FloatArray
+    quality_after: FloatArray
+
+    @property
+    def inverted(self) -> IntArray:
+        """Tetrahedra that are inverted or degenerate, ascending."""
+        return np.union1d(self.certificate.inverted, self.certificate.degenerate)
+
+    @property
+    def valid(self) -> bool:
+        """Whether every tetrahedron is strictly positive, verified exactly."""
+        return self.certificate.positive
+
+    @property
+    def success(self) -> bool:
+        """Whether the mesh is certified injective: positive tetrahedra, and no point covered twice."""
+        return bool(self.certificate.injective)
+
+    @property
+    def message(self) -> str:
+        """The outcome in one sentence."""
+        return self.status.value
+
+    def summary(self) -> str:
+        """Describe the outcome, the certificate and the obstructions."""
+        lines = [self.status.value, self.certificate.summary()]
+        if self.forbidden.size:
+            which = names_of("tetrahedron", "tetrahedra", self.forbidden)
+            lines.append(f"Inverted or degenerate with four fixed vertices: {which}.")
+        lines += [obstruction.text for obstruction in self.obstructions[:5]]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result for JSON."""
+        return {
+            "success": self.success,
+            "valid": self.valid,
+            "status": self.status.name,
+            "message": self.message,
+            "certificate": self.certificate.to_dict(),
+            "forbidden": self.forbidden.tolist(),
+            "obstructions": [{"text": o.text, "vertices": list(o.vertices)} for o in self.obstructions],
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "energy": self.energy if np.isfinite(self.energy) else None,
+            **{
+                name: {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())}
+                for name, quality in (("quality_before", self.quality_before), ("quality_after", self.quality_after))
+            },
+        }
+
+
+def tetrahedron_quality(T: IntArray, X: FloatArray) -> FloatArray:
+    """Return the mean ratio of tetrahedra: 1 if regular, 0 without volume, negative if inverted; (t,) float64.
+
+    This is ``12 (3 V)^(2/3) / Σ l²`` with the volume V and the edge lengths l.
+    """
+    p = X[T] - X[T[:, :1]]
+    size = np.abs(p).max(axis=(1, 2))
+    p /= np.where(size > 0, size, 1.0)[:, None, None]
+    u, v, w = p[:, 1], p[:, 2], p[:, 3]
+    volume = (u * np.cross(v, w)).sum(axis=1) / 6
+    squares = sum(((p[:, i] - p[:, j]) ** 2).sum(axis=1) for i, j in _SIDES)
+    ratio = 12 * np.cbrt(3 * np.abs(volume)) ** 2 / np.where(squares > 0, squares, 1.0)
+    return np.asarray(np.sign(volume) * ratio)

@@ -1,0 +1,138 @@
+"""Maps of tetrahedral meshes with fixed vertices, and tetrahedral meshes whose boundary moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.tetrahedra.certificate import space_array
+from quasiharmonic.apps.tetrahedra.placement import RestMesh, Settings, check_rest, place_vertices
+from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
+from quasiharmonic.problem.result import Step
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_bool,
+    check_callback,
+    check_integer,
+    check_positive,
+    check_range,
+    fixed_vertices,
+    index_array,
+    names_of,
+)
+from quasiharmonic.util.progress import reports_progress
+
+
+@reports_progress
+def injective_tetrahedra(
+    X: ArrayLike,
+    T: ArrayLike,
+    fixed: ArrayLike,
+    target: ArrayLike,
+    *,
+    start: ArrayLike | None = None,
+    polish: bool = True,
+    max_iterations: int = 1000,
+    tol: float = 1e-6,
+    callback: Callable[[Step], object] | None = None,
+) -> TetrahedraResult:
+    """Map a tetrahedral mesh such that fixed vertices have target positions and every tetrahedron is positive.
+
+    Parameters
+    ----------
+    X : (n, 3) array
+        Rest positions.
+    T : (t, 4) array of int
+        Tetrahedra. The orientation of a row does not matter; neighbours must not overlap at rest.
+    fixed : (k,) array of int
+        Fixed vertices, usually the whole boundary.
+    target : (k, 3) array
+        Their target positions.
+    start : (n, 3) array, optional
+        Initial positions; default: the harmonic map.
+    polish : bool
+        Whether to lower the distortion after the first valid mesh.
+    max_iterations : int
+        Maximum number of Newton steps.
+    tol : float
+        The distortion has converged if a step lowers it by less than this fraction.
+    callback : callable, optional
+        Called with a `Step` at every iteration.
+
+    Returns
+    -------
+    TetrahedraResult
+        The mesh with its certificate, what is still inverted, and obstructions that were found.
+
+    Raises
+    ------
+    ValueError
+        If an argument is malformed or not finite, or a tetrahedron at rest is degenerate, repeated, or overlaps a
+        neighbour. The message names the elements.
+
+    Notes
+    -----
+    In space no theorem says that the search finds an existing map. A boundary that crosses itself is reported before
+    any search.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> X = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.2, 0.2, 0.2]])
+    >>> T = [[0, 1, 2, 4], [0, 1, 3, 4], [0, 2, 3, 4], [1, 2, 3, 4]]
+    >>> injective_tetrahedra(X, T, range(4), 2.0 * X[:4] + 1.0).success
+    True
+    """
+    X = space_array("X", X, finite=False)
+    mesh = check_rest(T, X)
+    held = fixed_vertices(fixed, len(X))
+    goal = space_array("target", target, held.size)
+    check_bool("polish", polish)
+    check_integer("max_iterations", max_iterations, minimum=0)
+    check_positive(tol=tol)
+    check_callback(callback)
+    begin = None if start is None else space_array("start", start, len(X))
+    settings = Settings(polish, max_iterations, tol, callback)
+    return place_vertices(mesh, X, held, goal, begin, settings)
+
+
+def morph_tetrahedra(
+    points: ArrayLike,
+    T: ArrayLike,
+    moved_vertices: ArrayLike,
+    target: ArrayLike,
+    *,
+    rest: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    settings: Settings | None = None,
+) -> TetrahedraResult:
+    """`quasiharmonic.morph` for points (n, 3) and tetrahedra (t, 4); boundary vertices that are not moved are fixed."""
+    points = space_array("points", points, finite=False)
+    first = points if rest is None else space_array("rest", rest, len(points), finite=False)
+    mesh = check_rest(T, first)
+    fixed, goal = find_fixed(mesh, points, moved_vertices, target)
+    begin = (None if rest is None else points) if start is None else space_array("start", start, len(points))
+    return place_vertices(mesh, points, fixed, goal, begin, settings or Settings())
+
+
+def find_fixed(
+    mesh: RestMesh, points: FloatArray, moved_vertices: ArrayLike, target: ArrayLike
+) -> tuple[IntArray, FloatArray]:
+    """Return the fixed vertices, moved ones first and then the rest of the boundary, and their target positions."""
+    moved = index_array("moved_vertices", moved_vertices)
+    if moved.ndim != 1:
+        raise ValueError(f"moved_vertices must have shape (k,), not {moved.shape}")
+    check_range("moved_vertices", moved, len(points))
+    if np.bincount(moved, minlength=1).max() > 1:
+        raise ValueError("moved_vertices has a vertex twice")
+    goal = space_array("target", target, moved.size)
+    idle = moved[~np.isin(moved, mesh.T)]
+    if idle.size:
+        raise ValueError(
+            f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, but no tetrahedron uses them"
+        )
+    still = np.setdiff1d(mesh.boundary_vertices, moved)
+    return np.concatenate([moved, still]), np.concatenate([goal, points[still]])
