@@ -36,7 +36,7 @@ from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Stage, Status, Step
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each
 
 _MAX_STEPS = 200
 _TOLERANCE = 1e-6
@@ -208,6 +208,6 @@ def bend_map(
 
 def _entry_indices(part: csr_array, whole: csr_array) -> IntArray:
     """Indices of the entries of ``part`` in ``whole``, whose pattern contains them; rows are sorted in both."""
-    rows = [np.repeat(np.arange(one.shape[0]), np.diff(one.indptr)) for one in (part, whole)]
+    rows = [repeat_each(np.arange(one.shape[0]), np.diff(one.indptr)) for one in (part, whole)]
     keys = [row * whole.shape[1] + one.indices for row, one in zip(rows, (part, whole), strict=True)]
     return np.searchsorted(keys[1], keys[0]).astype(np.int64)

@@ -22,6 +22,7 @@ from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
+    as_offsets,
     check_range,
     count_of,
     edge_names,
@@ -186,7 +187,11 @@ class SeamedMesh:
         order = np.argsort(key, kind="stable")
         first = np.flatnonzero(np.diff(key[order], prepend=-1))
         sides = places.ravel()[order]
-        apart = np.minimum.reduceat(sides, first) < np.maximum.reduceat(sides, first) if first.size else first > 0
+        apart = (
+            np.minimum.reduceat(sides, as_offsets(first)) < np.maximum.reduceat(sides, as_offsets(first))
+            if first.size
+            else first > 0
+        )
         at = order[first[apart]]
         ends = np.stack([tail.ravel()[at], head.ravel()[at]], axis=1)
         return np.unique(np.sort(ends, axis=1), axis=0)

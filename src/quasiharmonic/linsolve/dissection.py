@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, as_offsets
 
 IntArray = NDArray[np.integer]
 Codes = NDArray[np.int32]
@@ -84,8 +84,8 @@ def _grid_cells(points: FloatArray, part: Codes, parts: int) -> Codes:
     used = count > 0
     first = (np.cumsum(count) - count)[used]
     low, size = np.zeros((parts, d)), np.zeros((parts, d))
-    low[used] = np.minimum.reduceat(points[order], first)
-    size[used] = np.maximum.reduceat(points[order], first) - low[used]
+    low[used] = np.minimum.reduceat(points[order], as_offsets(first))
+    size[used] = np.maximum.reduceat(points[order], as_offsets(first)) - low[used]
     axes = np.argsort(-size, axis=1, kind="stable")[:, :2]
     flat, start = points.ravel(), np.arange(0, n * d, d, dtype=np.int32)
     code = np.zeros(n, dtype=np.int32)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, as_offsets, repeat_each
 from quasiharmonic.util.kernels import compiled
 
 # Maximum residual that a backward stable factorisation can cause, relative to |A||x| + |b| after scaling the diagonal
@@ -101,8 +101,8 @@ def probe_matrix(
 
 def _product(indptr: NDArray[np.int32], indices: NDArray[np.int32], values: FloatArray, x: FloatArray) -> FloatArray:
     """A @ x for x of shape (n,)."""
-    product: FloatArray = np.add.reduceat(values * x[indices], indptr[:-1])
-    product += np.bincount(indices, values * np.repeat(x, np.diff(indptr)), x.size)
+    product: FloatArray = np.add.reduceat(values * x[indices], as_offsets(indptr[:-1]))
+    product += np.bincount(indices, values * repeat_each(x, np.diff(indptr)), x.size)
     product -= values[indptr[:-1]] * x
     return product
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quasiharmonic.linsolve import make_solver, takes_order
 from quasiharmonic.linsolve.dissection import nested_dissection
 from quasiharmonic.linsolve.pattern import stiffness_pattern
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, own_triangles
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, as_offsets, own_triangles
 from quasiharmonic.util.kernels import compiled
 
 # Number of unknowns from which dissection is used. For fewer unknowns minimum degree is equally good (10,000 unknowns:
@@ -187,7 +187,7 @@ def assemble(
     values: FloatArray,
 ) -> None:
     """Fill in the upper triangle from the stiffness (3 f,) of the half-edges, by a `StiffnessPattern`."""
-    above, size = np.add.reduceat(stiffness[halves], offsets[:-1]), indptr.size - 1
+    above, size = np.add.reduceat(stiffness[halves], as_offsets(offsets[:-1])), indptr.size - 1
     # Rows of Gᵀ A G sum to zero, so each half-edge is subtracted from the diagonal at both of its ends.
     # If no two free vertices are neighbours, `above` is empty, and bincount of an empty array gives integers.
     on = np.bincount(row, above, size).astype(np.float64, copy=False)

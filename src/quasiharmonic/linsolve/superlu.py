@@ -8,7 +8,7 @@ import numpy as np
 
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, repeat_each
 
 
 class SuperLU(LinearSolver):
@@ -29,7 +29,7 @@ class SuperLU(LinearSolver):
         lower.setdiag(0)
         lower.eliminate_zeros()
         full = csc_array(upper + lower)
-        filler = np.where(full.indices == np.repeat(np.arange(self.n), np.diff(full.indptr)), self.n + 1.0, -1.0)
+        filler = np.where(full.indices == repeat_each(np.arange(self.n), np.diff(full.indptr)), self.n + 1.0, -1.0)
         if self._ordered:
             self._order = np.arange(self.n)
         else:

@@ -17,7 +17,7 @@ from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.topology import Edges, components, edges, trace_loops
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.problem import Problem
-from quasiharmonic.util.arrays import IntArray, index_array, real_array, triangle_rows
+from quasiharmonic.util.arrays import IntArray, as_offsets, index_array, real_array, repeat_each, triangle_rows
 
 # Largest binary exponent of a mesh's size, in absolute value, so that lengths neither overflow nor underflow.
 _MAX_EXPONENT = 400
@@ -91,7 +91,7 @@ def _surfaces(F: IntArray, starts: IntArray) -> Edges | None:
     if ((a == b) | (b == c) | (c == a)).any() or found.nonmanifold.size or found.inconsistent.size:
         return None
     # A vertex of no triangle is a component of its own.
-    if not np.array_equal(components(F, n), np.repeat(starts[:-1], np.diff(starts))):
+    if not np.array_equal(components(F, n), repeat_each(starts[:-1], np.diff(starts))):
         return None
     bounded = np.zeros(starts.size - 1, dtype=bool)
     bounded[np.searchsorted(starts, found.boundary[:, 0], side="right") - 1] = True
@@ -100,11 +100,11 @@ def _surfaces(F: IntArray, starts: IntArray) -> Edges | None:
 
 def _have_areas(V: NDArray[np.float64], F: IntArray, starts: IntArray) -> bool:
     """Return whether all triangles have a positive rest area, computed as in `Domain.check_areas`."""
-    size = np.maximum.reduceat(np.abs(V).max(axis=1), starts[:-1])
+    size = np.maximum.reduceat(np.abs(V).max(axis=1), as_offsets(starts[:-1]))
     exponent = np.frexp(size)[1]
     if (np.abs(exponent) > _MAX_EXPONENT).any():
         return False
-    z1, z2 = rest_frames(np.ldexp(V, -np.repeat(exponent, np.diff(starts))[:, None]), F)
+    z1, z2 = rest_frames(np.ldexp(V, -repeat_each(exponent, np.diff(starts))[:, None]), F)
     return not ((z1 == 0) | (z2.imag == 0)).any()
 
 

@@ -111,6 +111,16 @@ def unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
     return own.view(np.ndarray)
 
 
+def as_offsets(starts: ArrayLike) -> NDArray[np.intp]:
+    """Starts of segments (k,) for ``reduceat``, which rejects 64-bit integers on 32-bit systems."""
+    return np.asarray(starts, dtype=np.intp)
+
+
+def repeat_each(values: ArrayLike, counts: ArrayLike) -> NDArray[Any]:
+    """Repeat each entry by its count (k,), as ``np.repeat``, which rejects 64-bit counts on 32-bit systems."""
+    return np.repeat(values, np.asarray(counts, dtype=np.intp))
+
+
 def own_triangles(F: ArrayLike) -> IntArray:
     """Triangles as from `triangle_rows`, contiguous and unchangeable, as kernels require."""
     return unchangeable(triangle_rows(F, copy=False))

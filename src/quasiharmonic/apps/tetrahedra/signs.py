@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.geometry.exact.predicates import exact_sum, two_product, two_sum
+from quasiharmonic.geometry.exact.predicates import ROUNDS_ONCE, exact_sum, two_product, two_sum
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
@@ -124,7 +124,7 @@ def _decide(p: FloatArray) -> SignArray:
             same |= (p[:, i] == p[:, j]).all(axis=1)
     open_ = (sign == 0) & ~same
     small = (np.abs(difference) < _MIN_DIFFERENCE) & (difference != 0)
-    summable = exact & ~(tail != 0).any(axis=(1, 2)) & ~small.any(axis=(1, 2))
+    summable = ROUNDS_ONCE & exact & ~(tail != 0).any(axis=(1, 2)) & ~small.any(axis=(1, 2))
     some = np.flatnonzero(open_ & summable)
     if some.size:
         sign[some] = np.sign(_determinant(difference[some].reshape(-1, 9).T))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.util.arrays import IntArray
+from quasiharmonic.util.arrays import IntArray, repeat_each
 
 #: Faces of a positive tetrahedron, counterclockwise seen from outside; face k is opposite vertex k.
 FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
@@ -58,7 +58,7 @@ def inspect_faces(T: IntArray, n: int) -> FaceReport:
     opposite = T.ravel()  # face k of a tetrahedron is opposite its vertex k
     twins = opposite[one] == opposite[other]
     twice = np.flatnonzero((np.sort(T, axis=1)[:, 1:] == np.sort(T, axis=1)[:, :-1]).any(axis=1)) if len(T) else one
-    crowded = np.unique(order[np.repeat(size > 2, size)] // 4)
+    crowded = np.unique(order[repeat_each(size > 2, size)] // 4)
     repeated = [np.maximum(one, other)[twins] // 4, twice]
     if crowded.size:
         keys = np.sort(T[crowded], axis=1)

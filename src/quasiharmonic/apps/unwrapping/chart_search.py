@@ -14,10 +14,9 @@ All charts together may exceed the bound on one per cent of the surface, so a sm
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -31,6 +30,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import (
     guard_chart,
 )
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
+from quasiharmonic.util.threads import HAS_THREADS, count_cores, make_executor
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -64,7 +64,7 @@ class Workers:
     """
 
     def __init__(self, jobs: int | None, callback: Callback | None) -> None:
-        self._jobs = jobs or _cores()
+        self._jobs = jobs or count_cores() if HAS_THREADS else 1
         self._callback = callback
         self._stop = threading.Event()
 
@@ -78,7 +78,7 @@ class Workers:
         self._report(phase, 0, len(items))
         if self._jobs == 1 or len(items) < 2:
             return self._map_here(phase, function, items)
-        pool = ThreadPoolExecutor(self._jobs, thread_name_prefix="find_charts")
+        pool = make_executor(self._jobs, "find_charts")
         try:
             futures = [pool.submit(function, item) for item in items]
             waiting: set[Future[R]] = set(futures)
@@ -199,11 +199,3 @@ def _improve(bound: float, workers: Workers, job: _Job) -> tuple[list[WorkingCha
         return [chart], True
     parts = divide(chart, bound) if apart else divide_overlap(chart)
     return [done for part in parts for done in _flatten(bound, workers, part)], False
-
-
-def _cores() -> int:
-    """Number of cores available to this process."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1

@@ -14,7 +14,7 @@ from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.loops import Obstacle
 from quasiharmonic.geometry.exact.predicates import box_pairs
 from quasiharmonic.geometry.mesh.topology import label_components
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, names_of
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, names_of, repeat_each
 
 # Largest distance between the boxes of stacked charts, in sides of the texture. Congruent charts may differ by a share
 # of 1e-4 of their radius.
@@ -135,13 +135,15 @@ def _rank_in_stack(uv: FloatArray, chart: IntArray) -> IntArray:
     """Return for each chart the number of charts before it at the same place, up to rounding."""
     order = np.argsort(chart, kind="stable")
     starts = np.flatnonzero(np.diff(chart[order], prepend=-1))
-    boxes = np.hstack([np.minimum.reduceat(uv[order], starts), np.maximum.reduceat(uv[order], starts)])
+    boxes = np.hstack(
+        [np.minimum.reduceat(uv[order], as_offsets(starts)), np.maximum.reduceat(uv[order], as_offsets(starts))]
+    )
     pairs = cKDTree(boxes).query_pairs(_SAME_PLACE, output_type="ndarray").astype(np.int64)
     label = label_components(pairs[:, 0], pairs[:, 1], len(boxes))
     by_label = np.argsort(label, kind="stable")
     first = np.flatnonzero(np.diff(label[by_label], prepend=-1))
     rank = np.empty(len(boxes), dtype=np.int64)
-    rank[by_label] = np.arange(len(boxes)) - np.repeat(first, np.diff(first, append=len(boxes)))
+    rank[by_label] = np.arange(len(boxes)) - repeat_each(first, np.diff(first, append=len(boxes)))
     return rank
 
 

@@ -19,7 +19,7 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.targets.cuts.find import find_cuts
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 
 #: Default of ``max_stretch``.
 MAX_STRETCH = 1.5
@@ -126,7 +126,7 @@ def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, lis
     first = np.cumsum([0, *(len(origin) for _, _, origin in parts)])
     rows = np.concatenate([rows for rows, _, _ in parts])
     own = np.concatenate([own + start for (_, own, _), start in zip(parts, first, strict=False)])
-    component = np.repeat(np.arange(len(parts)), [len(rows) for rows, _, _ in parts])
+    component = repeat_each(np.arange(len(parts)), [len(rows) for rows, _, _ in parts])
     flat, uv = lay_flat_parts(V[vertices], own, component)
     charts = []
     for k in np.flatnonzero(flat).tolist():

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 
 # At an edge of more triangles than this, none are joined. The number of pairs grows with its square.
 _MAX_TRIANGLES = 16
@@ -100,7 +100,7 @@ def join_sheets(points: FloatArray, F: IntArray, corners: IntArray, area: FloatA
     contested = [one[~fits], other[~fits]]
     links = links.select(fits)
     if (count > 2).any():
-        crowd = np.repeat(count > 2, count)
+        crowd = repeat_each(count > 2, count)
         # The order of equal keys is arbitrary.
         crowded = order[crowd][np.lexsort((order[crowd], key[order[crowd]]))]
         contested.append(crowded)
@@ -198,7 +198,7 @@ def _pair(
         start = starts[count == size, None]
         picks.append(np.stack([start + i, start + j], axis=-1).reshape(-1, 2))
     one, other = np.concatenate(picks).T
-    edge = np.repeat(np.arange(count.size), count)[one]
+    edge = repeat_each(np.arange(count.size), count)[one]
     score = _score_pairs(points, F, corners, turned, crowded[one], crowded[other])
     score += _FLIMSY * (thin[crowded[one] // 3] | thin[crowded[other] // 3])
     order = np.lexsort((other, one, score, edge))
@@ -285,11 +285,11 @@ def _split(F: IntArray, links: Links, turned: BoolArray, contested: IntArray) ->
         wrong[count == 2] = upward[two] == upward[two + 1]
         if not wrong.any():
             tails, heads = F.ravel(), F[:, (1, 2, 0)].ravel()
-            rim = side[np.repeat(count == 1, count)]
+            rim = side[repeat_each(count == 1, count)]
             seams = np.sort(np.stack([tails[rim], heads[rim]], axis=1), axis=1)
             return fan, links, np.unique(seams, axis=0)
         # Only the first pair of sides, or the first side, stays at this edge. The others get a vertex of their own.
-        away = side[np.repeat(wrong, count) & (leader != np.repeat(leader[first], count))]
+        away = side[repeat_each(wrong, count) & (leader != repeat_each(leader[first], count))]
         at_start = fan[away] < fan[_ahead(away)]
         cut = np.zeros(F.size, dtype=bool)
         cut[np.where(at_start, _behind(away), _ahead(away))] = True

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
 from quasiharmonic.linsolve.pattern import stiffness_pattern
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, work
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, work
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat
 
@@ -90,7 +90,7 @@ class NewtonSystem:
         self._turns = np.where(corner <= corner[(1, 2, 0), :], 1.0, -1.0)
         self._slots = np.full((2, 2, *corner.shape), upper[-1], dtype=np.int32)
         of_sides, of_corners = self._slots.reshape(2, 2, -1)
-        nth_side = np.repeat(np.arange(row.size), np.diff(edges.offsets))
+        nth_side = repeat_each(np.arange(row.size), np.diff(edges.offsets))
         of_sides[0, edges.halves], of_sides[1, edges.halves] = xx[nth_side], yx[nth_side]
         free = np.flatnonzero(corner.ravel() >= 0)
         of = corner.ravel()[free]

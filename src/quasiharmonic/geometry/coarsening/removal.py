@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import edge_keys
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 from quasiharmonic.util.kernels import compiled
 
 #: Maximum number of neighbours of a vertex to remove.
@@ -187,7 +187,7 @@ def _adds_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[Boo
     _, first = np.unique(claims[repeated], return_index=True)
     lost[np.delete(repeated, first)] = True
     size = [rings.shape[1] for rings in candidates]
-    claimed = np.repeat([len(rings) - 3 for rings in candidates], size)
+    claimed = repeat_each([len(rings) - 3 for rings in candidates], size)
     good = np.ones(claimed.size, dtype=bool)
-    good[np.arange(claimed.size).repeat(claimed)[lost]] = False
+    good[repeat_each(np.arange(claimed.size), claimed)[lost]] = False
     return np.split(good, np.cumsum(size)[:-1])

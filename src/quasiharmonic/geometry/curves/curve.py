@@ -26,7 +26,7 @@ from quasiharmonic.geometry.curves.arcs import (
     split_piece,
     subcurve,
 )
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, repeat_each
 
 # Squares, and products of four numbers, of coordinates below this do not overflow
 _MAX_SIZE = 1e75
@@ -273,10 +273,11 @@ class Curve:
         a, b, c, d = self._control.T
         by_degree = [(a, 0 * a, 0 * a, 0 * a), (a, b - a, 0 * a, 0 * a), (a, 2 * (b - a), a - 2 * b + c, 0 * a)]
         by_degree.append((a, 3 * (b - a), 3 * (a - 2 * b + c), d - a + 3 * (b - c)))
-        self._powers = np.stack([np.choose(self._degree, rows) for rows in zip(*by_degree, strict=True)], axis=1)
+        degree = self._degree.astype(np.intp)  # 32-bit systems reject others
+        self._powers = np.stack([np.choose(degree, rows) for rows in zip(*by_degree, strict=True)], axis=1)
         count = np.array([count_chords(*part) for part in zip(self._degree, self._control, self._angles, strict=True)])
-        self._chord_piece = np.repeat(np.arange(count.size), count)
-        nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        self._chord_piece = repeat_each(np.arange(count.size), count)
+        nth = np.arange(count.sum()) - repeat_each(np.cumsum(count) - count, count)
         self._chord_width = 1.0 / count[self._chord_piece]
         self._chord_first = nth * self._chord_width
         self._chord_tail = self._point(self._chord_piece, self._chord_first)

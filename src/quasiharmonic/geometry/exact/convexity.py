@@ -6,7 +6,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.geometry.mesh.polygons import Polygons
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 
 
 def find_concave(polygons: Polygons | None, F: IntArray, uv: FloatArray) -> IntArray:
@@ -19,7 +19,7 @@ def find_concave(polygons: Polygons | None, F: IntArray, uv: FloatArray) -> IntA
     if polygons is None:
         polygons = Polygons(np.arange(F.size), 3 * np.arange(len(F) + 1))
     ring = F.ravel()[polygons.corners]
-    face = np.repeat(np.arange(len(polygons)), polygons.sizes)
+    face = repeat_each(np.arange(len(polygons)), polygons.sizes)
     first, last = polygons.starts[:-1][face], polygons.starts[1:][face] - 1
     at = np.arange(len(ring))
     ahead = np.where(at == last, first, at + 1)

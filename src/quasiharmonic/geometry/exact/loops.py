@@ -20,7 +20,7 @@ from quasiharmonic.geometry.exact.predicates import (
     segment_relation,
     sure_orientation,
 )
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 from quasiharmonic.util.kernels import compiled
 
 SignArray = NDArray[np.int8]
@@ -231,7 +231,7 @@ def _cross_rays(
     while begin < len(tails):
         done = until[begin - 1] if begin else 0
         end = max(int(np.searchsorted(until, done + PAIR_CHUNK, side="right")), begin + 1)
-        edge = np.repeat(np.arange(begin, end), count[begin:end])
+        edge = repeat_each(np.arange(begin, end), count[begin:end])
         point = by_level[first[edge] + np.arange(edge.size) - (until[edge] - count[edge] - done)]
         begin = end
         ahead = high[edge, 0] >= points[point, 0]
@@ -265,7 +265,7 @@ class _Curves:
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:
         tail, start, following = _concatenate_loops(loops)
-        head, owner = tail[following], np.repeat(np.arange(len(loops)), np.diff(start))
+        head, owner = tail[following], repeat_each(np.arange(len(loops)), np.diff(start))
         return cls(start, owner, np.stack([tail, head], 1), uv[tail], uv[head], following)
 
 

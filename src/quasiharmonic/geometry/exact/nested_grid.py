@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 from quasiharmonic.util.kernels import compiled
 
 # Finest cells have integer coordinates below 2 to this power. A cell ``s`` halvings coarser has these coordinates
@@ -63,7 +63,7 @@ class _Level:
         """Return the level with empty lists for the given cells."""
         kept = np.ones(self.length.size, dtype=np.bool_)
         kept[cells] = False
-        triangle = self.triangle[np.repeat(kept, self.length)]
+        triangle = self.triangle[repeat_each(kept, self.length)]
         return _Level(self.coordinates, np.where(kept, self.length, 0), triangle, self.crowded)
 
 
@@ -132,7 +132,7 @@ class NestedGrid:
         split = np.flatnonzero((level.length > _LONG_LIST) & ~level.crowded)
         number = np.full(level.length.size, -1, dtype=np.int64)
         number[split] = np.arange(split.size)
-        parent = np.repeat(number, level.length)
+        parent = repeat_each(number, level.length)
         concerned = np.flatnonzero(parent >= 0)
         finer = self._divide(level.triangle[concerned], parent[concerned], 4 * level.coordinates[split], 4, 4, shift)
         parts = finer.length.reshape(-1, 16)
@@ -144,7 +144,7 @@ class NestedGrid:
         more = np.cumsum(np.where(chosen, after - before, 0)[order])
         chosen[order[more > capacity]] = False
         part = np.repeat(chosen, 16)
-        entry = np.repeat(part, finer.length)
+        entry = repeat_each(part, finer.length)
         crowded = ((parts == before[:, None]) & (before <= _MAX_CROWD)[:, None])[chosen].ravel()
         return split[chosen], _Level(finer.coordinates[part], finer.length[part], finer.triangle[entry], crowded)
 
@@ -212,8 +212,8 @@ def divide_cells(
         first = np.maximum(low[t] >> shift, corner[p])
         last = np.minimum(high[t] >> shift, corner[p] + [columns - 1, lines - 1])
         wide, tall = (last - first + 1).T
-        row = np.repeat(np.arange(t.size), wide * tall)
-        step = np.arange(row.size) - np.repeat(np.cumsum(wide * tall) - wide * tall, wide * tall)
+        row = repeat_each(np.arange(t.size), wide * tall)
+        step = np.arange(row.size) - repeat_each(np.cumsum(wide * tall) - wide * tall, wide * tall)
         across = wide[row]
         down = step // across
         x, y = first[row, 0] + step - down * across, first[row, 1] + down

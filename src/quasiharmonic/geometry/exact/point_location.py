@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.nested_grid import NestedGrid
 from quasiharmonic.geometry.exact.predicates import orientation, twice_area
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 from quasiharmonic.util.kernels import compiled
 
 # Error bound of the determinant l − r of differences of up to 1: (3u + O(u²)) · 2 with u = 2⁻⁵³.
@@ -118,7 +118,7 @@ def _pairs(begin: IntArray, end: IntArray) -> Iterator[tuple[IntArray, IntArray]
     start = done = 0
     while start < begin.size:
         stop = max(int(np.searchsorted(total, done + _PAIRS_PER_BLOCK, side="right")), start + 1)
-        point = np.repeat(np.arange(start, stop), count[start:stop])
+        point = repeat_each(np.arange(start, stop), count[start:stop])
         yield point, np.arange(done, int(total[stop - 1])) + (end - total)[point]
         start, done = stop, int(total[stop - 1])
 

@@ -10,7 +10,8 @@ processes the cases that the previous one could not decide:
 3. integers of any size, for triples whose coordinates span more than 130 orders of magnitude.
 
 The code requires IEEE 754 doubles with gradual underflow. NumPy has these unless another library in the
-process makes its thread flush subnormal numbers to zero.
+process makes its thread flush subnormal numbers to zero. If NumPy computes in x87 registers, as on 32-bit x86 without
+SSE2, sums are rounded twice; then stage 3 replaces stage 2.
 
 References
 ----------
@@ -30,7 +31,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 
 SignArray = NDArray[np.int8]
 
@@ -42,6 +43,8 @@ _UNDERFLOW_BOUND = 2.0**-1060
 # After scaling, a coordinate of stage 2 is 0 or at least this; stage 3 takes the other triples. So all
 # intermediate values are multiples of 2⁻⁹⁸⁴, and no product underflows.
 _MIN_SCALED = 2.0**-440
+# Whether NumPy rounds a sum once. x87 registers round this one to 1 + 2⁻⁵³ first, and then to 1.
+ROUNDS_ONCE = bool(np.add(np.ones(1), 2.0**-53 + 2.0**-78)[0] > 1.0)
 # Triples per block in stage 2, so that the sixteen components stay in the cache.
 _EXACT_CHUNK = 8192
 # Levels of a box tree, from the root, whose pairs are enumerated directly.
@@ -143,7 +146,7 @@ def _decide_scaled(x: FloatArray) -> SignArray:
     exponent = np.frexp(np.abs(x).max(axis=0))[1]
     scaled = np.ldexp(x, -exponent)
     # Scaling may have rounded the coordinates of these triples; the following code is valid for the others.
-    wide = ((np.abs(scaled) < _MIN_SCALED) & (x != 0)).any(axis=0)
+    wide = ((np.abs(scaled) < _MIN_SCALED) & (x != 0)).any(axis=0) | (not ROUNDS_ONCE)
     sign = _sign_if_certain(*scaled)
     undecided = (sign == 0) & ~wide
     if np.any(undecided):
@@ -323,7 +326,7 @@ def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterat
     sizes, groups = np.diff(starts), len(starts) - 1
     depth = int(max(sizes.max(initial=1) - 1, 0)).bit_length()
     # Each group has its own tree. All trees have the same depth.
-    leaf = np.arange(len(lo)) + np.repeat((np.arange(groups) << depth) - starts[:-1], sizes)
+    leaf = np.arange(len(lo)) + repeat_each((np.arange(groups) << depth) - starts[:-1], sizes)
     number = np.full(groups << depth, -1)
     number[leaf] = np.arange(len(lo))
     leaves = np.full((2, groups << depth, 2), np.array([np.inf, -np.inf])[:, None, None])

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, names_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, as_offsets, names_of
 from quasiharmonic.util.progress import heartbeat
 
 # Number of sources in one Dijkstra run, on the subgraph around them.
@@ -193,7 +193,7 @@ def _minimum_lengths(row: IntArray, column: IntArray, length: FloatArray, n: int
     order = np.argsort(key, kind="stable")
     key = key[order]
     first = np.flatnonzero(np.diff(key, prepend=-1))
-    smallest, at = np.minimum.reduceat(length[order], first), order[first]
+    smallest, at = np.minimum.reduceat(length[order], as_offsets(first)), order[first]
     return csr_array((smallest, (row[at].astype(np.int32), column[at].astype(np.int32))), shape=(n, n))
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, names_of
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, names_of, repeat_each
 
 # Ears whose scores differ by less count as equal, and the first one is cut, so that rounding does not decide.
 _SCORE_TOLERANCE = 1e-9
@@ -51,7 +51,7 @@ class Polygons:
     @property
     def of_triangle(self) -> IntArray:
         """Index of the polygon of each triangle; (f,) int64."""
-        return np.repeat(np.arange(len(self)), self.sizes - 2)
+        return repeat_each(np.arange(len(self)), self.sizes - 2)
 
     def divide(self, divided: BoolArray) -> Polygons:
         """Polygons of which those in a mask (p,) are replaced by their triangles."""
@@ -64,7 +64,7 @@ class Polygons:
 
     def diagonals(self, F: IntArray) -> IntArray:
         """Edges (d, 2) of the triangles ``F`` inside polygons, by vertices; a mesh cannot be cut there."""
-        inside = np.repeat(self.sizes > 3, self.sizes - 2)
+        inside = repeat_each(self.sizes > 3, self.sizes - 2)
         parent = self.of_triangle[inside]
         tail = F[inside]
         ends = np.stack([tail, tail[:, (1, 2, 0)]], axis=2).reshape(-1, 2)
@@ -122,8 +122,8 @@ def _check_rings(vertices: IntArray, sizes: IntArray) -> None:
     small = np.flatnonzero(sizes < 3)
     if small.size:
         raise ValueError(f"{names_of('face', 'faces', small)} of fewer than three corners")
-    face = np.repeat(np.arange(len(sizes)), np.where(sizes > 3, sizes, 0))
-    vertices = vertices[np.repeat(sizes > 3, sizes)]
+    face = repeat_each(np.arange(len(sizes)), np.where(sizes > 3, sizes, 0))
+    vertices = vertices[repeat_each(sizes > 3, sizes)]
     order = np.lexsort((vertices, face))
     same = (np.diff(face[order]) == 0) & (np.diff(vertices[order]) == 0)
     if same.any():

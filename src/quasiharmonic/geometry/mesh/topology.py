@@ -13,7 +13,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.util.arrays import BoolArray, IntArray, check_range, names_of, own_triangles, unchangeable
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    IntArray,
+    check_range,
+    names_of,
+    own_triangles,
+    repeat_each,
+    unchangeable,
+)
 from quasiharmonic.util.kernels import compiled
 
 # Number of half-edges from which the sparse matrix is faster than a sort.
@@ -109,7 +117,7 @@ def _sort_by_rows(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> t
     del table
     by_low = csr_array((turned.data, np.maximum(tail, head).take(turned.indices), turned.indptr), shape=(n, n))
     by_low.sort_indices()
-    low: _Integers = np.repeat(np.arange(n, dtype=by_low.indices.dtype), np.diff(by_low.indptr))
+    low: _Integers = repeat_each(np.arange(n, dtype=by_low.indices.dtype), np.diff(by_low.indptr))
     return low, by_low.indices, by_low.data
 
 

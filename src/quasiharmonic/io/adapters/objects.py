@@ -22,6 +22,7 @@ from quasiharmonic.util.arrays import (
     check_range,
     describe,
     index_array,
+    repeat_each,
     triangle_rows,
     vertex_array,
 )
@@ -291,7 +292,7 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
         wrong = np.setdiff1d(kinds, (*_FACE_CELLS_OF_VTK, *_SKIPPED_CELLS_OF_VTK))
         if wrong.size:
             raise ValueError(f"{name} has cells of VTK type {wrong[0]}: only surface cells are supported")
-    corner = np.repeat(faces, sizes + 1)
+    corner = repeat_each(faces, sizes + 1)
     corner[heads] = False
     return numbers[corner], sizes[faces]
 

@@ -15,7 +15,7 @@ from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encod
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import Carried, MeshData, polygon_mesh, vertex_places
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 
 # Property names of texture coordinates, at vertices and at the corners of faces.
 _PLACES = ("s", "t"), ("u", "v"), ("texture_u", "texture_v")
@@ -165,7 +165,7 @@ def _read_places(
                 f"face {odd[0]} (0-based) has {of_faces.sizes[odd[0]]} numbers of {_CORNER_PLACES} "
                 f"and {sizes[odd[0]]} corners"
             )
-        has = np.repeat(of_faces.sizes > 0, sizes)
+        has = repeat_each(of_faces.sizes > 0, sizes)
         # One row for each vertex and texture coordinate of it.
         pairs = np.column_stack([corners[has], of_faces.values.astype(np.float64).reshape(-1, 2) + 0.0])
         rows, which = np.unique(pairs, axis=0, return_inverse=True)
@@ -206,7 +206,7 @@ def _corner_places(mesh: MeshData) -> Column:
     assert mesh.vt is not None
     ring, sizes = _rings(mesh)
     at = mesh.FT.ravel()[ring]
-    face = np.repeat(np.arange(len(sizes)), sizes)
+    face = repeat_each(np.arange(len(sizes)), sizes)
     bare = np.unique(face[at < 0])
     given = ~np.isin(face, bare)
     count = 2 * sizes

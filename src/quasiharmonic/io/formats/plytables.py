@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.lowlevel.textual import shown
-from quasiharmonic.util.arrays import IntArray
+from quasiharmonic.util.arrays import IntArray, repeat_each
 
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -303,7 +303,7 @@ def _rows(element: Element) -> bytes:
     for within, values, sizes in fields:
         at = begin + within
         if sizes is not None:
-            at = np.repeat(at - values.itemsize * (np.cumsum(sizes) - sizes), sizes)
+            at = repeat_each(at - values.itemsize * (np.cumsum(sizes) - sizes), sizes)
             at += values.itemsize * np.arange(len(values))
         out[at[:, None] + np.arange(values.itemsize)] = values.view(np.uint8).reshape(-1, values.itemsize)
     return out.tobytes()

@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.geometry.mesh.polygons import Polygons
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 
 if TYPE_CHECKING:
     from quasiharmonic.geometry.mesh.refinement import Refined
@@ -74,10 +74,10 @@ def _refine_polygons(mesh: MeshData, parent: IntArray) -> tuple[Polygons | None,
     unsplit = count == old.sizes - 2
     first = np.concatenate([[0], np.cumsum(np.where(unsplit, 1, count))])
     # Unsplit faces keep their rings, with the new indices of their triangles. Each triangle of a split face is a ring.
-    unsplit_corners = np.repeat(unsplit, old.sizes)
+    unsplit_corners = repeat_each(unsplit, old.sizes)
     triangle, corner = np.divmod(old.corners[unsplit_corners], 3)
     rings = 3 * np.searchsorted(parent, triangle) + corner
-    place = first[np.repeat(np.arange(len(old)), old.sizes)[unsplit_corners]]
+    place = first[repeat_each(np.arange(len(old)), old.sizes)[unsplit_corners]]
     split = np.flatnonzero(~unsplit[face])
     among = split - np.searchsorted(face, face[split])
     corners = np.concatenate([rings, (3 * split[:, None] + np.arange(3)).ravel()])

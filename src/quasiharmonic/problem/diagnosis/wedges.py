@@ -10,7 +10,7 @@ import numpy as np
 
 from quasiharmonic.problem.diagnosis.clipping import MARGIN, Convex, Lattice, cross, line
 from quasiharmonic.problem.diagnosis.effort import Effort
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets
 
 # Number of consecutive wedges that form a row for a first comparison.
 _ROW = 16
@@ -100,7 +100,7 @@ class Wedges:
     def _boxes(self) -> FloatArray:
         """Corners of bounding boxes of rows of wedges; (rows, 4, 2)."""
         first = np.arange(0, len(self), _ROW)
-        low, high = (extreme.reduceat(self._triangles, first) for extreme in (np.minimum, np.maximum))
+        low, high = (extreme.reduceat(self._triangles, as_offsets(first)) for extreme in (np.minimum, np.maximum))
         (x0, y0), (x1, y1) = low.min(axis=1).T, high.max(axis=1).T
         return np.stack([np.stack(corner, axis=1) for corner in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1)
 

@@ -14,7 +14,7 @@ import numpy as np
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh, blocks, wirtinger
 from quasiharmonic.solver.field.functionals import beltrami_terms
 from quasiharmonic.solver.field.tensor import TANH, Parameterisation, own_tensor, parameterisation_of
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, as_offsets
 from quasiharmonic.util.kernels import compiled
 
 
@@ -98,7 +98,7 @@ def dirichlet_sweep(
         gradient[part] = field.pull(in_mu)
     # A NaN area does not count as positive.
     for column, values in enumerate((~(area > 0), 2.0 * density, area, np.abs(area))):
-        sums[:, column] = np.add.reduceat(values, starts[:-1], dtype=np.float64)
+        sums[:, column] = np.add.reduceat(values, as_offsets(starts[:-1]), dtype=np.float64)
 
 
 @compiled
@@ -120,7 +120,7 @@ def at_own_tensors(
         field = TANH.field(TANH.invert(own_tensor(p, q)))
         density[part], mu[part] = beltrami_terms(m[part], field, p, q)[0], field.mu
     for column, values in enumerate((2.0 * density, area)):
-        sums[:, column] = np.add.reduceat(values, starts[:-1])
+        sums[:, column] = np.add.reduceat(values, as_offsets(starts[:-1]))
 
 
 @compiled

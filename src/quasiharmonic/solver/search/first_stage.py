@@ -30,7 +30,7 @@ from quasiharmonic.solver.search.solving import result_of
 from quasiharmonic.solver.search.stage_run import Round, StageRun, visit_rounds
 from quasiharmonic.solver.search.stages import Stages
 from quasiharmonic.solver.search.strategy import stages_of
-from quasiharmonic.util.arrays import ComplexArray
+from quasiharmonic.util.arrays import ComplexArray, repeat_each
 
 # Meshes with more triangles are solved separately: the overhead per NumPy call is then negligible.
 SMALL = 4_000
@@ -198,7 +198,7 @@ class _BatchDescent:
         if not due:
             return []
         F = np.concatenate([batch.F[batch.triangles_of(k)] for k in due])
-        mesh = np.repeat(np.arange(len(due)), [self.members[k].size for k in due])
+        mesh = repeat_each(np.arange(len(due)), [self.members[k].size for k in due])
         w, solved = relocate_each(F, maps.w, batch.fixed, mesh)
         good = [k for k, is_good in zip(due, solved.tolist(), strict=True) if is_good]
         if not good:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import dataclass, replace
 from typing import Any, get_args
@@ -29,6 +28,7 @@ from quasiharmonic.solver.search.solving import finish_search, search_map
 from quasiharmonic.solver.search.stages import Stages
 from quasiharmonic.solver.search.strategy import STRATEGIES
 from quasiharmonic.util.arrays import check_callback, check_choice, check_integer, check_sequence
+from quasiharmonic.util.threads import count_cores, make_executor
 
 #: A problem as arrays: ``V, F, fixed, target`` as `quasiharmonic.Problem` takes them.
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
@@ -121,7 +121,7 @@ def injective_maps(
     search = SearchOptions(strategy=strategy, max_iterations=max_iterations, linear_solver=linear_solver)
     settings = _Settings(reference, search, None if polish is None else find_energy(polish))
     check_sequence("problems", problems, "problems")
-    return _solve_groups(iter(problems), settings, jobs or _count_cores(), errors == "raise", callback)
+    return _solve_groups(iter(problems), settings, jobs or count_cores(), errors == "raise", callback)
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _solve_groups(
         return own.solve(first, group)
 
     groups, waiting, done = _group_problems(problems), deque[Future[list[MapResult | Exception]]](), 0
-    pool = ThreadPoolExecutor(jobs, thread_name_prefix="injective_maps")
+    pool = make_executor(jobs, "injective_maps")
     try:
         while True:
             while len(waiting) <= jobs and (group := next(groups, None)) is not None:
@@ -308,11 +308,3 @@ def _add_number(number: int, error: Exception) -> Exception:
         return numbered
     error.add_note(f"in problem {number}")
     return error
-
-
-def _count_cores() -> int:
-    """Number of cores available to this process."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1

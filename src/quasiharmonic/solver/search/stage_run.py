@@ -17,7 +17,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Stage, Status
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Descent, Patience, Steps
-from quasiharmonic.util.arrays import ComplexArray
+from quasiharmonic.util.arrays import ComplexArray, as_offsets
 
 if TYPE_CHECKING:
     from quasiharmonic.solver.search.search import Search
@@ -120,5 +120,5 @@ def count_not_positive(maps: Sequence[tuple[Problem, ComplexArray]]) -> list[int
     F = np.concatenate([problem.F + first for (problem, _), first in zip(maps, starts[:-1], strict=True)])
     sign, _ = triangle_signs(F, np.concatenate([problem.positions(w) for problem, w in maps]))
     first = np.cumsum([0, *(len(problem.F) for problem, _ in maps[:-1])])
-    counts: list[int] = np.add.reduceat(sign <= 0, first, dtype=np.int64).tolist()
+    counts: list[int] = np.add.reduceat(sign <= 0, as_offsets(first), dtype=np.int64).tolist()
     return counts

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 
 # A concave edge with this dihedral bend, or a convex edge with twice as much, has half its cost.
 _SHARP = 0.5 * np.pi
@@ -110,7 +110,7 @@ class EdgeGraph:
         triangles = np.empty(0, dtype=np.int64)
         for _ in range(rings):
             count = start[vertices + 1] - start[vertices]
-            first = np.repeat(start[vertices] - np.cumsum(count) + count, count)
+            first = repeat_each(start[vertices] - np.cumsum(count) + count, count)
             triangles = distinct(star[first + np.arange(first.size)])
             vertices = distinct(self.F[triangles])
         side = self.side[:, triangles]

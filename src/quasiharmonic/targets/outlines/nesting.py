@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.exact.loops import contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
 from quasiharmonic.targets.outlines.contours import check_contour, distinct, in_unit, signed_area
-from quasiharmonic.util.arrays import FloatArray, check_sequence
+from quasiharmonic.util.arrays import FloatArray, check_sequence, repeat_each
 
 # Maximum number of meeting sides to find; the first is reported.
 _MAX_MEETINGS = 100
@@ -119,7 +119,7 @@ def _check_simple(contours: list[FloatArray]) -> None:
     """Raise if two sides of contours share more than the point that joins them."""
     length = np.array([len(c) for c in contours])
     start = np.concatenate([[0], np.cumsum(length)])
-    owner = np.repeat(np.arange(len(contours)), length)
+    owner = repeat_each(np.arange(len(contours)), length)
     following = np.arange(1, start[-1] + 1)
     following[start[1:] - 1] = start[:-1]
     points = np.concatenate(contours)

@@ -25,7 +25,7 @@ from quasiharmonic.ui.plot.canvas import (
     verdict,
 )
 from quasiharmonic.ui.plot.shading import drawable, lit, view
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, map_array
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, map_array, repeat_each
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -226,8 +226,8 @@ def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArra
     cuts = np.searchsorted(np.cumsum(count), np.arange(_CHUNK, count.sum(), _CHUNK))
     for part in np.split(np.arange(len(corners)), np.unique(cuts)):
         many = count[part]
-        triangle = np.repeat(part, many)
-        within = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+        triangle = repeat_each(part, many)
+        within = np.arange(many.sum()) - repeat_each(np.cumsum(many) - many, many)
         column = first[triangle, 0] + within % np.maximum(extent[triangle, 0], 1)
         row = first[triangle, 1] + within // np.maximum(extent[triangle, 0], 1)
         at = np.stack([column, row], axis=1) + 0.5

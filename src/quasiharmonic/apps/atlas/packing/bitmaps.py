@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import Shape
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, repeat_each
 
 # Maximum distance between samples of an edge, in cells.
 _SPACING = 0.5
@@ -53,8 +53,10 @@ def _fill(tails: ComplexArray, heads: ComplexArray, h: int, w: int) -> BoolArray
     first, end = np.ceil(lower.imag - 0.5).astype(np.int64), np.ceil(upper.imag - 0.5).astype(np.int64)
     count = end - first
     crossed = np.flatnonzero(count)
-    edge = np.repeat(crossed, count[crossed])
-    row = np.arange(len(edge)) + np.repeat(first[crossed] - np.cumsum(count[crossed]) + count[crossed], count[crossed])
+    edge = repeat_each(crossed, count[crossed])
+    row = np.arange(len(edge)) + repeat_each(
+        first[crossed] - np.cumsum(count[crossed]) + count[crossed], count[crossed]
+    )
     ahead = upper[edge] - lower[edge]
     x = lower.real[edge] + (row + 0.5 - lower.imag[edge]) * (ahead.real / ahead.imag)
     column = np.clip(np.ceil(x - 0.5).astype(np.int64), 0, w)
@@ -66,8 +68,8 @@ def _mark_near(cells: BoolArray, tails: ComplexArray, heads: ComplexArray, radiu
     """Mark the cells whose centres are within a distance of an edge."""
     h, w = cells.shape
     count = np.maximum(np.ceil(np.abs(heads - tails) / _SPACING), 1).astype(np.int64)
-    edge = np.repeat(np.arange(len(tails)), count)
-    step = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+    edge = repeat_each(np.arange(len(tails)), count)
+    step = np.arange(len(edge)) - repeat_each(np.cumsum(count) - count, count)
     samples = tails[edge] + (heads - tails)[edge] * (step / count[edge])
     # Every point of an edge is at most half the spacing from a sample.
     reach = radius**2 + _SPACING**2 / 4

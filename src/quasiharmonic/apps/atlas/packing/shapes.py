@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from quasiharmonic.geometry.exact.triangles import triangle_signs
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each
 
 # Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
 _AS_SMALL = 1e-9
@@ -62,7 +62,7 @@ def make_shape(uv: FloatArray, F: IntArray) -> Shape:
     count = np.bincount(place, np.where(tail < head, 1, -1), len(key)).astype(np.int64)
     lower, upper = np.divmod(key, len(z))
     first, second = np.where(count > 0, lower, upper), np.where(count > 0, upper, lower)
-    first, second = np.repeat(first, np.abs(count)), np.repeat(second, np.abs(count))
+    first, second = repeat_each(first, np.abs(count)), repeat_each(second, np.abs(count))
     thin = F[sign == 0]
     if thin.size:
         tail, head = thin.ravel(), np.roll(thin, -1, axis=1).ravel()

@@ -15,7 +15,7 @@ from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load
 from quasiharmonic.io.formats.normals import normal_lines
 from quasiharmonic.io.formats.welding import weld
 from quasiharmonic.io.models.meshdata import Carried, MeshData
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 
 PLACES = "TEXCOORD_0"
 # Modes of a glTF primitive.
@@ -244,7 +244,7 @@ def _positions(document: Document, pools: list[VertexPool]) -> tuple[FloatArray,
             rows = slice(pool.first, pool.first + pool.count)
             matrix = placed[pool.mesh]
             points[rows] = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
-    return points, np.repeat([pool.mesh for pool in pools], [pool.count for pool in pools]).astype(np.float64)
+    return points, repeat_each([pool.mesh for pool in pools], [pool.count for pool in pools]).astype(np.float64)
 
 
 def _transform_normals(document: Document, pools: list[VertexPool], normals: FloatArray) -> FloatArray:

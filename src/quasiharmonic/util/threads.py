@@ -1,0 +1,39 @@
+"""Threads where the system has them: Pyodide, Python in a browser, has none."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+#: Whether threads can be started.
+HAS_THREADS = sys.platform not in ("emscripten", "wasi")
+
+
+def count_cores() -> int:
+    """Number of cores that this process may use; 1 if threads cannot be started."""
+    if not HAS_THREADS:
+        return 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def make_executor(jobs: int, name: str) -> Executor:
+    """Return a pool of threads, or without threads an executor that calls functions when they are submitted."""
+    return ThreadPoolExecutor(jobs, thread_name_prefix=name) if HAS_THREADS else _Immediate()
+
+
+class _Immediate(Executor):
+    """Executor that calls each function at once, in the caller's thread."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        future = Future[T]()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
