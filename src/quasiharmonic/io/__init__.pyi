@@ -6,6 +6,7 @@ from .formats.gltf.reader import read_gltf as read_gltf
 from .formats.gltf.writer import write_gltf as write_gltf
 from .formats.neuro import read_freesurfer as read_freesurfer
 from .formats.neuro import read_gifti as read_gifti
+from .formats.neuro import read_gifti_values as read_gifti_values
 from .formats.neuro import read_patch as read_patch
 from .formats.neuro import write_freesurfer as write_freesurfer
 from .formats.neuro import write_gifti as write_gifti

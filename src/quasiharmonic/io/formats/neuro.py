@@ -26,6 +26,8 @@ from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
 
+# The intents that the standard has for points and triangles.
+_POINTS, _TRIANGLES = 1008, 1009
 _SIDES = {"lh": "CortexLeft", "rh": "CortexRight"}
 
 
@@ -44,6 +46,32 @@ def read_gifti(path: str | os.PathLike[str]) -> MeshData:
     ImportError
         If nibabel is not installed.
     """
+    image = _read_gifti(path)
+    try:
+        return MeshData(*gifti_arrays(image), source=os.fspath(path))
+    except (TypeError, ValueError) as error:
+        raise MeshFileError(path, str(error)) from error
+
+
+def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray:
+    """Read the values per vertex of a GIFTI file (``.func.gii``, ``.shape.gii``): (n,), or (n, k) of k arrays.
+
+    Raises
+    ------
+    MeshFileError
+        If the file is not valid, is a surface, or its arrays differ in shape.
+    ImportError
+        If nibabel is not installed.
+    """
+    arrays = [array.data for array in _read_gifti(path).darrays if array.intent not in (_POINTS, _TRIANGLES)]
+    if not arrays or any(array.shape != arrays[0].shape for array in arrays):
+        raise MeshFileError(path, "does not hold arrays of values of one shape")
+    values = np.stack(arrays, axis=-1).astype(np.float64)
+    return values[..., 0] if len(arrays) == 1 else values
+
+
+def _read_gifti(path: str | os.PathLike[str]) -> Any:
+    """Return the ``GiftiImage`` of a file; MeshFileError if it is not valid."""
     nibabel, data = _nibabel(), read_bytes(path)
     if os.fspath(path).lower().endswith(".gz"):
         try:
@@ -54,19 +82,14 @@ def read_gifti(path: str | os.PathLike[str]) -> MeshData:
         warnings.simplefilter("ignore")
         try:
             # The parser raises errors of many types for damaged files.
-            image = nibabel.gifti.GiftiImage.from_bytes(data)
+            return nibabel.gifti.GiftiImage.from_bytes(data)
         except Exception as error:
             raise MeshFileError(path, f"is not valid GIFTI: {error}") from error
-    try:
-        return MeshData(*gifti_arrays(image), source=os.fspath(path))
-    except (TypeError, ValueError) as error:
-        raise MeshFileError(path, str(error)) from error
 
 
 def gifti_arrays(image: Any) -> tuple[Any, Any]:
     """Return points and triangles of a ``nibabel.GiftiImage``; ValueError if it does not have one array of each."""
-    # The intents that the standard has for points and triangles.
-    points, triangles = ([array for array in image.darrays if array.intent == code] for code in (1008, 1009))
+    points, triangles = ([array for array in image.darrays if array.intent == code] for code in (_POINTS, _TRIANGLES))
     if len(points) != 1 or len(triangles) != 1:
         raise ValueError(
             f"has {count_of('array', 'arrays', len(points))} of points and {len(triangles)} of triangles, not one of "

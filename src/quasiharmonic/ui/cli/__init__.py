@@ -40,6 +40,7 @@ GROUPS = {
         "refine": "split the edges that prevent a map",
         "animate": "map a surface to a sequence of targets, each frame certified, without jumps",
         "morph": "move the boundary of a planar mesh (Gmsh, VTK) and keep its interior valid",
+        "transfer": "transfer positions, values and landmarks between two mapped surfaces",
         "field": "make a displacement field of an image invertible",
     },
     "commands that verify, measure and show, and others": {
@@ -63,6 +64,7 @@ SURFACE_COMMANDS = (
     "harmonise",
     "repair",
     "animate",
+    "transfer",
     "check",
     "measure",
     "plot",

@@ -1,0 +1,291 @@
+"""``qhm transfer``: transfer values, positions and landmarks from one surface to another."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from quasiharmonic.apps.inverse.inverse_map import InverseMap
+    from quasiharmonic.apps.inverse.transfer import SurfaceMap
+    from quasiharmonic.io import MeshData
+    from quasiharmonic.ui.cli.arguments import Commands
+
+_TABLES = ".npy", ".csv", ".txt"
+
+
+@dataclass(frozen=True, eq=False)
+class _MappedFile:
+    """A surface with its map, from a file."""
+
+    mesh: MeshData
+    inverse: InverseMap  # The surface cut at its seams; the vertices of the file come first
+    origin: NDArray[np.int64]  # For each vertex of the cut surface, the vertex of the file; -1 without triangles
+
+
+def add_parser(commands: Commands) -> None:
+    """Declare the command."""
+    from quasiharmonic.io.registry import format_names
+    from quasiharmonic.ui.cli import arguments
+
+    parser = commands.add_parser(
+        "transfer",
+        description="Transfer positions, values and landmarks from one surface to another. Points that the maps of "
+        "both surfaces send to the same position correspond. Both maps must be bijective, which is certified exactly, "
+        "so no two points have the same partner. For maps onto one outline, call qhm map --to with the same outline "
+        "for both.",
+        epilog="Exit status: 0 both maps are certified bijective, and the files are written; 2 wrong input or call, or "
+        "a map is not bijective, nothing written; 3 written, but the report failed.",
+        examples=(
+            "qhm transfer a_map.obj b_map.obj --values depth.csv depth_on_b.csv",
+            "qhm transfer a_map.obj b_map.obj --landmarks points.txt points_on_b.csv -o b_in_the_shape_of_a.obj",
+        ),
+    )
+    for name, text in (("source", "surface that the data belong to"), ("target", "surface that receives them")):
+        parser.add_argument(
+            name, type=Path, metavar=name.upper(), help=f"{text}: {format_names('write_map')} file with a map"
+        )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help="write the target with its vertices moved to their partners on the source: its triangles, and the "
+        f"source's shape; as {format_names('write_map', 'seams')}",
+    )
+    parser.add_argument(
+        "--values",
+        nargs=2,
+        type=Path,
+        metavar=("FILE", "OUT"),
+        help=f"transfer values of the source to the target's vertices: {', '.join(_TABLES)} (one row per vertex or "
+        "triangle), or GIFTI data to read",
+    )
+    parser.add_argument(
+        "--per",
+        choices=("vertex", "triangle"),
+        help="for --values: what the rows belong to (default: vertex)",
+    )
+    parser.add_argument(
+        "--landmarks",
+        nargs=2,
+        type=Path,
+        metavar=("FILE", "OUT"),
+        help="transfer vertices of the source, 0-based, one per line; writes .csv: vertex, triangle of the target, "
+        "three weights of its corners, its nearest corner, position",
+    )
+    parser.add_argument(
+        "--outside",
+        choices=("nearest", "nan"),
+        default="nearest",
+        help="for points without a partner: the nearest point of the other map's boundary, or nan (default: nearest)",
+    )
+    arguments.add_report(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, certify, transfer, write, report."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.apps.inverse.transfer import SurfaceMap
+    from quasiharmonic.ui.cli import arguments, report, written_map
+    from quasiharmonic.util.arrays import count_of
+
+    arguments.set_default(options, "per", "vertex", asked=options.values is not None, belongs="--values")
+    outputs = _outputs(options)
+    inputs = (options.source, options.target, *(pair[0] for pair in (options.values, options.landmarks) if pair))
+    report.check_new(outputs, options.json, inputs=inputs)
+    source, target = _read(options.source), _read(options.target)
+    between = SurfaceMap(target.inverse, source.inverse)
+    n = len(target.mesh.V)
+    used = target.origin[:n] >= 0
+    found = source.inverse.locate(target.inverse.uv[:n])
+    outside = int((used & ~found.found).sum())
+    written: list[str] = []
+    facts: dict[str, Any] = {
+        "bijective": True,
+        "onto": between.onto,
+        "vertices": int(used.sum()),
+        "outside": outside,
+        "source": {"file": str(options.source), "certificate": source.inverse.certificate.to_dict()},
+        "target": {"file": str(options.target), "certificate": target.inverse.certificate.to_dict()},
+    }
+    # Compute everything before a file is written.
+    values = None if options.values is None else _values(options, source, between)[:n]
+    marks = None if options.landmarks is None else _landmarks(options, source, target, between)
+    moved = None
+    if options.output is not None:
+        V = between.transfer(source.inverse.V, outside=options.outside)[:n]
+        if np.isnan(V[used]).any():
+            raise ValueError(
+                f"{count_of('vertex', 'vertices', outside)} of {options.target} have no partner on {options.source}, "
+                "so -o has no positions for them: omit --outside nan, or map both onto the same outline"
+            )
+        V[~used] = target.mesh.V[~used]
+        with_map = target.mesh.with_places(io.mapped(target.mesh))
+        moved = replace(with_map, V=V, normals=b"", FN=None)
+        written_map.tell_losses(options.output, moved)
+        io.write_mapped(options.output, moved)
+        written.append(str(options.output))
+    if values is not None:
+        _write_table(options.values[1], values)
+        written.append(str(options.values[1]))
+    if marks is not None:
+        io.write_whole(options.landmarks[1], marks)
+        written.append(str(options.landmarks[1]))
+    with report.after_writing(Path(written[0])):
+        facts["written"] = written
+        instead = "the nearest point of its boundary" if options.outside == "nearest" else "nan"
+        lines = [
+            f"wrote {', '.join(written)}",
+            "Both maps are bijective, verified exactly: "
+            f"{count_of('vertex', 'vertices', int(used.sum()) - outside)} of the target "
+            "have a partner on the source, and no two the same.",
+        ]
+        if outside:
+            lines.append(f"{count_of('vertex', 'vertices', outside)} outside the source's map: {instead}")
+        report.emit(facts, options.json, "\n".join(lines))
+    return 0
+
+
+def _outputs(options: argparse.Namespace) -> dict[str, Path]:
+    """Return descriptions of the outputs and their paths; ValueError for a wrong suffix, or without outputs."""
+    from quasiharmonic import io
+
+    outputs = {}
+    if options.output is not None:
+        io.find_format(options.output, "write_map", "seams")
+        io.check_output(options.output)
+        outputs["-o"] = options.output
+    for name, endings in (("values", _TABLES), ("landmarks", (".csv",))):
+        pair = getattr(options, name)
+        if pair is not None:
+            if pair[1].suffix.lower() not in endings:
+                raise ValueError(f"--{name} … {pair[1]}: written as {', '.join(endings)}")
+            outputs[f"--{name}"] = pair[1]
+    if not outputs:
+        raise ValueError("nothing to transfer: add --values, --landmarks or -o")
+    return outputs
+
+
+def _read(path: Path) -> _MappedFile:
+    """Read a surface with a bijective map; ValueError if the map is not bijective."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.apps.inverse.inverse_map import InverseMap
+    from quasiharmonic.ui.cli import report
+
+    mesh = io.read_mesh(path)
+    V, F, uv = io.cut_at_seams(mesh)
+    origin = np.full(len(V), -1, dtype=np.int64)
+    origin[F] = mesh.F
+    with report.about(path):
+        inverse = InverseMap(V, F, np.where(origin[:, None] < 0, 0.0, uv))
+    return _MappedFile(mesh, inverse, origin)
+
+
+def _values(options: argparse.Namespace, source: _MappedFile, between: SurfaceMap) -> NDArray[np.float64]:
+    """Read the values of the source, and return those of the target's vertices; NaN for unused vertices."""
+    path = options.values[0]
+    values = _read_table(path)
+    count = len(source.mesh.V) if options.per == "vertex" else len(source.mesh.F)
+    if len(values) != count:
+        raise ValueError(
+            f"{path} has {len(values)} rows, but {options.source} has {count} "
+            f"{'vertices' if options.per == 'vertex' else 'triangles'}"
+        )
+    if options.per == "vertex":
+        values = values[source.origin]
+    out = between.transfer(values, per=options.per, outside=options.outside)
+    out[_unused(between.source)] = float("nan")
+    return out
+
+
+def _unused(surface: InverseMap) -> NDArray[np.bool_]:
+    """Return which vertices no triangle uses."""
+    import numpy as np
+
+    unused = np.ones(len(surface.V), dtype=np.bool_)
+    unused[surface.F] = False
+    return unused
+
+
+def _landmarks(options: argparse.Namespace, source: _MappedFile, target: _MappedFile, between: SurfaceMap) -> bytes:
+    """Return a table of the landmarks' partners on the target, as CSV."""
+    import numpy as np
+
+    from quasiharmonic import io
+
+    marks = io.read_handles(options.landmarks[0], len(source.mesh.V))
+    if (source.origin[marks] < 0).any():
+        raise ValueError(f"{options.landmarks[0]}: vertex {marks[source.origin[marks] < 0][0]} belongs to no triangle")
+    places = source.inverse.uv[marks]
+    at = between.source.locate(places)
+    if options.outside == "nearest":
+        at = between.source.nearest(places, at)
+    points = target.inverse.surface(at)
+    lines = ["vertex,triangle,weight_0,weight_1,weight_2,nearest_vertex,x,y,z"]
+    for mark, triangle, weights, point in zip(
+        marks.tolist(), at.triangle.tolist(), at.barycentric.tolist(), points.tolist(), strict=True
+    ):
+        near = -1 if triangle < 0 else int(target.mesh.F[triangle, int(np.argmax(weights))])
+        lines.append(",".join([f"{mark},{triangle}", *map(repr, weights), str(near), *map(repr, point)]))
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _read_table(path: Path) -> NDArray[np.float64]:
+    """Read rows of numbers; NaN is allowed."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.util.arrays import real_array
+
+    form = io.format_of(path)
+    if form is not None and form.name == "GIFTI":
+        return io.read_gifti_values(path)
+    if path.suffix.lower() not in _TABLES:
+        raise ValueError(f"--values {path}: supported: {', '.join(_TABLES)}, .gii")
+    try:
+        if path.suffix.lower() == ".npy":
+            return real_array(str(path), np.load(path, allow_pickle=False))
+        lines = [line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+        rows = [line.replace(",", " ").split() for line in lines if line]
+        # A first line without numbers is a heading.
+        if rows and not any(_is_number(word) for word in rows[0]):
+            rows = rows[1:]
+        table = np.array(rows, dtype=np.float64)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{path}: not a table of numbers: {error}") from error
+    return table[:, 0] if table.ndim == 2 and table.shape[1] == 1 else table
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _write_table(path: Path, values: NDArray[np.float64]) -> None:
+    """Write one row per vertex."""
+    import numpy as np
+
+    from quasiharmonic import io
+
+    if path.suffix.lower() == ".npy":
+        io.write_whole(path, lambda file: np.save(file, values))
+        return
+    between = "," if path.suffix.lower() == ".csv" else " "
+    rows = values.reshape(len(values), -1).tolist()
+    io.write_whole(path, "".join(between.join(map(repr, row)) + "\n" for row in rows).encode())
