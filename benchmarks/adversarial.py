@@ -13,9 +13,8 @@ import numpy as np
 import outlines
 import planar
 from planar import Draft, blank, flow, roughen
-from quasiharmonic import Problem, quasi_harmonic_map
+from quasiharmonic import Problem, quasi_harmonic_map, refine
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops, edges
-from quasiharmonic.solver.refine.refining import refine
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 Generator = np.random.Generator

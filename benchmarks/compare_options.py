@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from quasiharmonic import MapResult, Problem, distortion, harmonise, io, polish, solve
-from quasiharmonic.solver.methods import LBFGS, Alternating, Descent, Newton, Untangling, VectorAdam
+from quasiharmonic import Descent, MapResult, Problem, distortion, harmonise, io, polish, solve
+from quasiharmonic.solver.methods import LBFGS, Alternating, Newton, Untangling, VectorAdam
 from quasiharmonic.solver.search.strategy import STRATEGIES
 from speed import machine
 

@@ -30,10 +30,9 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic import flatten, io, surfaces
+from quasiharmonic import find_cuts, flatten, io, surfaces
 from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edges
-from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.targets.cuts.graph import edge_graph
 from quasiharmonic.targets.cuts.shrinking import Shrinking
 from quasiharmonic.ui.plot.shading import lit

@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from quasiharmonic.apps.displacement_fields.nearest import fold_free, nearest_invertible
+from quasiharmonic import nearest_invertible
+from quasiharmonic.apps.displacement_fields.nearest import fold_free
 from quasiharmonic.util.arrays import FloatArray
 from speed import machine
 

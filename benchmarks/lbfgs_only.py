@@ -19,8 +19,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from quasiharmonic import Problem, io, solve, targets
-from quasiharmonic.energies.measures import distortion
+from quasiharmonic import Problem, distortion, io, solve, targets
 from quasiharmonic.solver.methods import LBFGS
 from quasiharmonic.util.arrays import FloatArray, IntArray
 

@@ -22,7 +22,7 @@ import planar
 import problems
 from quasiharmonic import certify, flatten
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
-from quasiharmonic.io.formats.obj import read_obj
+from quasiharmonic.io import read_obj
 from quasiharmonic.surfaces import cat
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 

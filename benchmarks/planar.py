@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from quasiharmonic import surfaces
+from quasiharmonic import refine, surfaces
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops, components, edges
-from quasiharmonic.solver.refine.refining import refine
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 Generator = np.random.Generator

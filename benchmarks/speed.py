@@ -38,10 +38,10 @@ import numpy as np
 
 import phases
 from peers import PEERS
-from quasiharmonic import Problem, boundary_loops, io, is_injective, solve, surfaces
+from quasiharmonic import Descent, Problem, boundary_loops, io, is_injective, solve, surfaces
 from quasiharmonic.linsolve import available
 from quasiharmonic.solver import mapping
-from quasiharmonic.solver.methods import Descent, VectorAdam
+from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.search.strategy import STRATEGIES
 from quasiharmonic.targets import arc_length, letter, rectangle
 from quasiharmonic.util.arrays import FloatArray, IntArray

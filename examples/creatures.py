@@ -17,9 +17,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LogNorm
 
 from common import INK, FloatArray, colorbar, panels, run, save
-from quasiharmonic import cut_open, distortion, flatten
+from quasiharmonic import cut_open, distortion, find_cuts, flatten
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys
-from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.ui.plot.shading import lit
 from quasiharmonic.util.arrays import IntArray
 from sculptures import creature

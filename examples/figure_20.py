@@ -19,11 +19,10 @@ from matplotlib.collections import PolyCollection
 from shapely import LineString, Point, Polygon, contains_xy, union_all
 
 from common import INK, panels, run, save
-from quasiharmonic import AirMesh, certify, harmonise, injective_map
+from quasiharmonic import AirMesh, Certificate, certify, harmonise, injective_map
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP, AreaBarrier, Combination, UnsignedARAP
 from quasiharmonic.energies.newton.map_model import newton_descent
-from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 

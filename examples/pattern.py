@@ -16,8 +16,8 @@ from matplotlib.colors import TwoSlopeNorm
 from numpy.typing import NDArray
 
 from common import INK, FloatArray, colorbar, panels, run, save
-from quasiharmonic import distortion, flatten, surfaces
-from quasiharmonic.apps.flattening.patterns import pattern, write_pattern
+from quasiharmonic import distortion, flatten, surfaces, write_pattern
+from quasiharmonic.apps.flattening.patterns import pattern
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.ui.plot.shading import lit
 from quasiharmonic.util.arrays import IntArray

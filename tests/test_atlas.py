@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import atlas, io
+from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.geometry.exact.convexity import find_concave
-from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.surfaces import grid, starfish
 from shared.commands import run
 from shared.meshes import lift

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from quasiharmonic import batch, io
+from quasiharmonic.batch import ProblemFiles
 from quasiharmonic.linsolve import available
 from quasiharmonic.ui.batch import groups, supervisor, worker
-from quasiharmonic.ui.batch.problems import GROUP_OF_FILES, SMALL_FILE, ProblemFiles, group_small
+from quasiharmonic.ui.batch.problems import GROUP_OF_FILES, SMALL_FILE, group_small
 from quasiharmonic.ui.batch.settings import Orders
 from shared.datasets import lasting, record_of, star_of, write_problem, write_stars
 

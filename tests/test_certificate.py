@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quasiharmonic import certify, inverted_triangles, is_injective
 from quasiharmonic.geometry.exact.certificate import Obstacle
-from quasiharmonic.problem.certification import certify, inverted_triangles, is_injective
 from shared.exact import exact_orientation
 from shared.sheets import CORNERS, SQUARE, fan, kinds, ring, spiral, square, strip, together
 

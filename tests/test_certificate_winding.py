@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from quasiharmonic import certify, injective_map
 from quasiharmonic.geometry.exact.certificate import Obstacle
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.problem.certification import certify
-from quasiharmonic.solver.mapping import injective_map
 from quasiharmonic.surfaces import annulus
 from shared.exact import exact_orientation, exact_relation
 from shared.sheets import CORNERS, SQUARE, fan, kinds, polar, ring, spiral, square, strip, together

@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 import problems
-from quasiharmonic import __version__, io
-from quasiharmonic.energies.measures import distortion
+from quasiharmonic import __version__, distortion, io
 from quasiharmonic.linsolve import available
 from quasiharmonic.surfaces import random_delaunay
 from quasiharmonic.ui import cli

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import io, unwrap
-from quasiharmonic.apps.atlas.packing.pack import pack_charts
+from quasiharmonic.atlas import pack_charts
 from quasiharmonic.geometry.mesh.topology import components
 from quasiharmonic.surfaces import starfish
 from quasiharmonic.ui.cli import parser_of

@@ -26,7 +26,7 @@ from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods.local_repair import remap_patches
 from quasiharmonic.solver.methods.untangling import untangle
 from quasiharmonic.surfaces import disk, grid
-from quasiharmonic.targets.boundary.chords import flattened_edges
+from quasiharmonic.targets import flattened_edges
 from shared.polygons import circle, random_polygon, spread
 from shared.simple_targets import onto_polygon, polygon, turned_ring, with_holes, without_inner_vertices
 from shared.small_meshes import handle, wheel

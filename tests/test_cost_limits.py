@@ -13,8 +13,7 @@ import pytest
 from quasiharmonic import Problem, boundary_loops, certify, io, solve
 from quasiharmonic.geometry.coarsening.levels import coarsen
 from quasiharmonic.geometry.coarsening.prolongation import prolong
-from quasiharmonic.linsolve import available
-from quasiharmonic.linsolve.base import LinearSolver
+from quasiharmonic.linsolve import LinearSolver, available
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.surfaces import disk

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import crease_costs, flatten, surfaces
+from quasiharmonic import crease_costs, find_cuts, flatten, surfaces
 from quasiharmonic.geometry.coarsening.levels import coarsen
 from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edge_keys, edges
-from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.targets.cuts.graph import edge_graph
 from quasiharmonic.targets.cuts.levels import insert_vertices
 from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches

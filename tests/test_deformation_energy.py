@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quasiharmonic import Energy, distortion
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.derivatives import derivative_error
 from quasiharmonic.energies.energies import (
@@ -12,14 +13,12 @@ from quasiharmonic.energies.energies import (
     MIPS,
     AreaPreserving,
     Combination,
-    Energy,
     Isotropic,
     QuadraticForm,
     SymmetricDirichlet,
     UnsignedARAP,
     conformal_area_blend,
 )
-from quasiharmonic.energies.measures import distortion
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.energies.polishing import ENERGIES
 from quasiharmonic.energies.springs import MassSpring

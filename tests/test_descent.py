@@ -9,18 +9,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, solve
+from quasiharmonic import Descent, Problem, solve
 from quasiharmonic.solver import methods as descent
 from quasiharmonic.solver.field.functionals import beltrami_energy
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import PARAMETERISATIONS, TANH, own_tensor
-from quasiharmonic.solver.methods import (
-    LBFGS,
-    Alternating,
-    Descent,
-    Newton,
-    VectorAdam,
-)
+from quasiharmonic.solver.methods import LBFGS, Alternating, Newton, VectorAdam
 from quasiharmonic.solver.methods.base import FunctionalDescent, SearchState, Steps
 from quasiharmonic.solver.methods.newton import SecondOrderModel
 from shared.descent import path

@@ -7,10 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis import Forbids, Kind, diagnose
-from quasiharmonic.solver.mapping import injective_map
-from quasiharmonic.solver.refine.refining import refine
+from quasiharmonic import Problem, diagnose, injective_map, refine
+from quasiharmonic.problem.diagnosis import Forbids, Kind
 from quasiharmonic.surfaces import disk
 from shared.infeasible_problems import HOUSE, OBSTRUCTED, moved, onto
 from shared.polygons import circle

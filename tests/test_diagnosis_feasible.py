@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
+from quasiharmonic import Problem, diagnose
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.topology import edges
-from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis import Forbids, Kind, diagnose
+from quasiharmonic.problem.diagnosis import Forbids, Kind
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.infeasible_problems import OBSTRUCTED, moved, onto
 from shared.meshes import bend, boundary_of

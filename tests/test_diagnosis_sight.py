@@ -11,11 +11,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from quasiharmonic import Problem, diagnose
 from quasiharmonic.geometry.exact.loops import contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation, segment_relation
 from quasiharmonic.geometry.exact.sweep import triangulate
-from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis import Kind, diagnose, examine, shortcuts
+from quasiharmonic.problem.diagnosis import Kind, examine, shortcuts
 from quasiharmonic.problem.diagnosis.clearance import clear
 from quasiharmonic.problem.diagnosis.clipping import Lattice
 from quasiharmonic.problem.diagnosis.effort import Effort

@@ -17,7 +17,10 @@ from PIL import Image
 
 import quasiharmonic
 from quasiharmonic import (
+    Diagnosis,
+    MapResult,
     Problem,
+    Status,
     boundary_loops,
     certify,
     diagnose,
@@ -29,8 +32,7 @@ from quasiharmonic import (
     polish,
     solve,
 )
-from quasiharmonic.problem.diagnosis import Diagnosis
-from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.result import Step
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.display.markup import MAX_TRIANGLES, html

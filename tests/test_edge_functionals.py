@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import solve
+from quasiharmonic import Problem, solve
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
-from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.passes import own_sweep

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quasiharmonic import Energy
 from quasiharmonic.energies.derivatives import check_energy, derivative_error, random_deformation
 from quasiharmonic.energies.energies import (
     ARAP,
@@ -13,7 +14,6 @@ from quasiharmonic.energies.energies import (
     AreaPreserving,
     Combination,
     Deformation,
-    Energy,
     SymmetricDirichlet,
     conformal_area_blend,
 )

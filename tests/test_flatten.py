@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import boundary_loops, flatten
+from quasiharmonic import Status, boundary_loops, certify, flatten
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.layout import align_with_axis
 from quasiharmonic.energies.deformation import DeformationEnergy
@@ -13,8 +13,6 @@ from quasiharmonic.energies.derivatives import check_energy
 from quasiharmonic.energies.energies import Deformation, Isotropic, SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
-from quasiharmonic.problem.certification import certify
-from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, cat, disk, grid
 from shared.distinct_steps import DistinctSteps
 

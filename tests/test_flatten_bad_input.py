@@ -8,8 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from quasiharmonic import flatten, io
-from quasiharmonic.problem.certification import certify
+from quasiharmonic import certify, flatten, io
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.cli import main
 

@@ -9,8 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from quasiharmonic import atlas, distortion, io
-from quasiharmonic.problem.certification import certify
+from quasiharmonic import atlas, certify, distortion, io
 from quasiharmonic.surfaces import cat, grid
 from quasiharmonic.ui.cli import main
 

@@ -5,20 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import flatten, inverted_triangles
-from quasiharmonic.apps.atlas.island_functions import flatten as flatten_atlas
+from quasiharmonic import Status, certify, distortion, find_cuts, flatten, inverted_triangles
 from quasiharmonic.apps.flattening.collapse import has_collapsed, stretch_of_boundary, worst_stretch
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.atlas import SeamedMesh
+from quasiharmonic.atlas import flatten as flatten_atlas
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.energies.measures import distortion
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.io.seamed_mesh import SeamedMesh
-from quasiharmonic.problem.certification import certify
-from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import cat, disk, starfish
-from quasiharmonic.targets.cuts.find import find_cuts
 from shared.closed_surfaces import TETRAHEDRON
 
 

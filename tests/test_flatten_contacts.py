@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import boundary_loops
+from quasiharmonic import boundary_loops, certify
 from quasiharmonic.apps.flattening.contacts import HATS, Contacts, Rim
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.problem.certification import certify
 from quasiharmonic.surfaces import annulus, grid
 
 

@@ -10,18 +10,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from quasiharmonic import distortion, flatten, surfaces
+from quasiharmonic import Status, certify, distortion, flatten, keep_distances, surfaces
 from quasiharmonic.apps.flattening import free_boundary, piece
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.distances.distance_descent import DistancePairs, keep_distances, lower_distance_error
+from quasiharmonic.apps.flattening.distances.distance_descent import DistancePairs, lower_distance_error
 from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy
 from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.piece import Piece, Settings
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
 from quasiharmonic.energies.distances import surface_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.problem.certification import certify
-from quasiharmonic.problem.result import Status
 from shared.distances import make_dome, rolled, spherical, turned
 from shared.distinct_steps import DistinctSteps
 

@@ -7,22 +7,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from quasiharmonic import flatten
+from quasiharmonic import Status, certify, distortion, find_cuts, flatten, is_injective
 from quasiharmonic.apps.flattening import free_boundary, piece
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
 from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
 from quasiharmonic.apps.flattening.multilevel.hierarchy import Hierarchy
 from quasiharmonic.apps.flattening.multilevel.local_smoothing import smooth_map, thick_energy
+from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.energies.measures import distortion
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
-from quasiharmonic.io.seamed_mesh import SeamedMesh
-from quasiharmonic.problem.certification import certify, is_injective
-from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, cat, grid, random_delaunay, starfish
-from quasiharmonic.targets.cuts.find import find_cuts
 
 
 def in_space(V):

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import boundary_loops, flatten
+from quasiharmonic import Status, boundary_loops, certify, flatten
 from quasiharmonic.io import MeshData, map_of, read_mesh, write_obj
-from quasiharmonic.problem.certification import certify
 from quasiharmonic.problem.diagnosis import Forbids, Kind
-from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, disk
 from quasiharmonic.ui.cli import main
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from quasiharmonic import certify, solve
+from quasiharmonic import Problem, certify, solve
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.functionals import neumann_target
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH

@@ -14,11 +14,10 @@ from general_tensor import (
     edge_conormal,
     vertex_conormal,
 )
+from quasiharmonic import Problem, quasi_harmonic_map
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
-from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.tensor import TANH
-from quasiharmonic.solver.mapping import quasi_harmonic_map
 from quasiharmonic.surfaces import random_delaunay
 from shared.meshes import bend, boundary_of, lift, random_xi, signed_areas, surfaces
 

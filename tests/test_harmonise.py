@@ -5,12 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem, Status, boundary_loops, certify, harmonise, polish, quasi_harmonic_map
+from quasiharmonic import (
+    Energy,
+    Problem,
+    Status,
+    boundary_loops,
+    certify,
+    distortion,
+    harmonise,
+    polish,
+    quasi_harmonic_map,
+)
 from quasiharmonic.energies import polishing
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.derivatives import check_energy, derivative_error
-from quasiharmonic.energies.energies import MIPS, AreaPreserving, Combination, Energy
-from quasiharmonic.energies.measures import distortion
+from quasiharmonic.energies.energies import MIPS, AreaPreserving, Combination
 from quasiharmonic.linsolve import available
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.regularisers import Conformal

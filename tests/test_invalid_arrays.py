@@ -20,9 +20,8 @@ from quasiharmonic import (
     refine,
     warp_by_landmarks,
 )
-from quasiharmonic.apps.atlas.packing.pack import pack_charts
 from quasiharmonic.apps.mesh_motion.quality import element_quality
-from quasiharmonic.atlas import SeamedMesh
+from quasiharmonic.atlas import SeamedMesh, pack_charts
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP
 from quasiharmonic.energies.measures import mean_ratio

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from quasiharmonic import certify
 from quasiharmonic.geometry.exact.loops import contacts, simple_loops
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
-from quasiharmonic.problem.certification import certify
 from shared.exact import exact_orientation, exact_relation
 from shared.examples import examples
 

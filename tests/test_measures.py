@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic.energies.measures import MEASURES, distortion
-from quasiharmonic.problem.certification import inverted_triangles
+from quasiharmonic import distortion, inverted_triangles
+from quasiharmonic.energies.measures import MEASURES
 from quasiharmonic.surfaces import grid, random_delaunay
 from shared.meshes import bend, lift, surfaces
 

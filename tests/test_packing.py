@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic import is_injective, surfaces
-from quasiharmonic.apps.atlas.packing.pack import pack_charts
+from quasiharmonic.atlas import pack_charts
 
 shapely = pytest.importorskip("shapely")
 

@@ -9,8 +9,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from quasiharmonic import surfaces
-from quasiharmonic.apps.flattening.patterns import UNITS, pattern, write_pattern
+from quasiharmonic import surfaces, write_pattern
+from quasiharmonic.apps.flattening.patterns import UNITS, pattern
 from quasiharmonic.io import OutputError
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quasiharmonic import Energy, Status, distortion, is_injective, polish
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.energies.energies import ARAP, MIPS, AreaPreserving, Energy, conformal_area_blend
-from quasiharmonic.energies.measures import distortion
+from quasiharmonic.energies.energies import ARAP, MIPS, AreaPreserving, conformal_area_blend
 from quasiharmonic.energies.newton import map_model
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
-from quasiharmonic.energies.polishing import ENERGIES, PolishOptions, polish, polish_map
+from quasiharmonic.energies.polishing import ENERGIES, PolishOptions, polish_map
 from quasiharmonic.energies.springs import MassSpring
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Domain
-from quasiharmonic.problem.certification import is_injective
-from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.distinct_steps import DistinctSteps
 from shared.meshes import bend, boundary_of, lift

@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quasiharmonic import io
+from quasiharmonic import io, refine
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
-from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.solver.refine.refining import refine
+from quasiharmonic.io import MeshFileError
 
 
 def rings(polygons):

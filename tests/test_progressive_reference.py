@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quasiharmonic import Status, is_injective, polish
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import MIPS, SymmetricDirichlet
 from quasiharmonic.energies.newton import progressive_reference as approach
@@ -12,9 +13,6 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.newton.progressive_reference import REACH, reference_energy
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
-from quasiharmonic.energies.polishing import polish
-from quasiharmonic.problem.certification import is_injective
-from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import disk
 
 RINGS = 12

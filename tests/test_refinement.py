@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import Problem
+from quasiharmonic import Problem, diagnose, refine, refine_problem
 from quasiharmonic.geometry.mesh.topology import edges
-from quasiharmonic.problem.diagnosis import diagnose
-from quasiharmonic.solver.refine.refining import refine, refine_problem
 from shared.infeasible_problems import OBSTRUCTED
 from shared.meshes import boundary_of, signed_areas, surfaces
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify
+from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.geometry.mesh.fans import fans
-from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import lift
 from shared.seam_meshes import islands, strips

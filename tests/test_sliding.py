@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from quasiharmonic import Status, boundary_loops, certify, injective_map, polish, surfaces
+from quasiharmonic import BoundaryCurves, Status, boundary_loops, certify, distortion, injective_map, polish, surfaces
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.energies.measures import distortion
 from quasiharmonic.energies.newton.sliding_boundary import SlidingModel
-from quasiharmonic.geometry.curves import BoundaryCurves, Curve
+from quasiharmonic.geometry.curves import Curve
 from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from shared.sliding import SQUARE, lettered, off_the_glyph, points_of, sheared, z_of
 

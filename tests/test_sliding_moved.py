@@ -7,9 +7,18 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic import boundary_loops, certify, injective_map, io, morph, polish, surfaces
-from quasiharmonic.energies.measures import distortion
-from quasiharmonic.geometry.curves import BoundaryCurves, Curve
+from quasiharmonic import (
+    BoundaryCurves,
+    boundary_loops,
+    certify,
+    distortion,
+    injective_map,
+    io,
+    morph,
+    polish,
+    surfaces,
+)
+from quasiharmonic.geometry.curves import Curve
 from quasiharmonic.io.fem.files import read_fem
 from quasiharmonic.ui.cli import main
 from shared.meshes import lift

@@ -8,10 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from quasiharmonic import certify, io
-from quasiharmonic.problem import Problem
-from quasiharmonic.problem.certification import is_injective
-from quasiharmonic.solver.mapping import quasi_harmonic_map
+from quasiharmonic import Problem, certify, io, is_injective, quasi_harmonic_map
 from quasiharmonic.surfaces import annulus, cat, grid, starfish
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
 from quasiharmonic.ui.studio.session.drag import Follower

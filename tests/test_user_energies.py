@@ -7,6 +7,7 @@ import pytest
 
 from quasiharmonic import (
     Problem,
+    Status,
     animate,
     flatten,
     flatten_derivative,
@@ -20,7 +21,6 @@ from quasiharmonic import (
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, QuadraticForm, SymmetricDirichlet
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.problem.result import Status
 from quasiharmonic.surfaces import disk, grid
 
 UV, F = disk(4)

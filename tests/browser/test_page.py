@@ -7,8 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from quasiharmonic import certify, io
-from quasiharmonic.problem.certification import is_injective
+from quasiharmonic import certify, io, is_injective
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
 

@@ -6,7 +6,7 @@ import os
 import signal
 import time
 
-from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io import OutputError
 from quasiharmonic.ui.batch.supervisor import Supervisor
 
 plain_attend = getattr(Supervisor.attend, "plain", Supervisor.attend)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from quasiharmonic import Problem
 from quasiharmonic.geometry.mesh.operators import operators
-from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from shared.meshes import bend, boundary_of, surfaces
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic import boundary_loops
-from quasiharmonic.problem import Problem
+from quasiharmonic import Problem, boundary_loops
 from quasiharmonic.surfaces import annulus, disk, grid
 from shared.meshes import boundary_of
 from shared.polygons import U, circle, spiral, spread

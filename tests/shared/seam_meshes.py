@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.surfaces import grid
 from shared.meshes import bend, lift
 
