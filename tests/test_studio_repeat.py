@@ -61,7 +61,7 @@ def corners_of(mesh):
     return mesh.vt[mesh.FT] if isinstance(mesh, io.MeshData) else mesh.uv[mesh.FT]
 
 
-def check_repeated(one, folder, monkeypatch):
+def check_repeated(one, folder, monkeypatch, *, code=0):
     """Run command and script in a folder with the file as opened and the files that the page saves."""
     for name, content in one.files().items():
         if name != "map.obj":
@@ -72,7 +72,7 @@ def check_repeated(one, folder, monkeypatch):
     words = shown["command"].split()
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with contextlib.redirect_stdout(text_io.StringIO()), contextlib.redirect_stderr(text_io.StringIO()):
-        assert main(words[1:]) == 0
+        assert main(words[1:]) == code
         names = {}
         exec(shown["python"], names)
     assert all((folder / name).read_bytes() == content for name, content in before.items())
@@ -161,6 +161,22 @@ def test_the_command_and_the_script_make_the_map_of_the_page(model, step, opened
     shown = one.last("map").header
     assert shown["injective"], shown["verdict"]
     check_repeated(one, tmp_path, monkeypatch)
+
+
+def test_a_map_with_inverted_triangles_is_made_again_too(opened, tmp_path, monkeypatch):
+    """A point of the boundary goes across the opposite side, so that one island of two has no map."""
+    one = opened("two parts")
+    state = one.session.state
+    loop = state.islands[0].loops[0]
+    near = state.uv[loop[0]]
+    far = state.uv[loop[np.argmax(np.linalg.norm(state.uv[loop] - near, axis=1))]]
+    one.drags(int(loop[0]), (far + 0.5 * (far - near)).tolist())
+    shown = one.last("map").header
+    assert not shown["injective"]
+    check_repeated(one, tmp_path, monkeypatch, code=1)
+    for what in ("pack", "polish"):
+        said = one.does(what, energy="mips")[-1].header["text"]
+        assert said == "island 0 has inverted triangles: undo, or select it and press Flatten"
 
 
 def test_the_final_map_does_not_depend_on_the_path_of_the_drag(opened):

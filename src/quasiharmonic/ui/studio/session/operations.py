@@ -96,7 +96,13 @@ def map_to_outline(
     command = recipes.write_command(["map", source.command, *options, *recipes.island_words(only)], "again.obj", source)
     small = all(len(state.islands[k].island.F) <= LARGEST_SMOOTHED for k in state.selected)
     python = recipes.outline_script(
-        source, outline.to, any(fills), corners if corners == "auto" else dict(corners), state.selected, small
+        source,
+        outline.to,
+        any(fills),
+        corners if corners == "auto" else dict(corners),
+        state.selected,
+        small,
+        checked=not all(mapped.islands[k].result.injective for k in state.selected),
     )
     texts = {} if outline.content is None else {outline.to: outline.content}
     recipe = Recipe(command, python, source.start, texts, outline.to)
@@ -141,7 +147,10 @@ def map_in_place(
     if anew or not follows:
         command = recipes.write_command(["map", source.command, *options], "again.obj", source)
         name = None if fixed is None else FIXED
-        python = recipes.map_script(source, only, max(len(one.triangles) for one in done), name)
+        chosen = list(range(len(mapped.islands))) if only is None else only
+        small = max(len(one.triangles) for one in done) <= LARGEST_SMOOTHED
+        smoothed = [k for k in chosen if small and mapped.islands[k].result.injective]
+        python = recipes.map_script(source, only, only if smoothed == chosen else smoothed, name)
     else:
         given: dict[str, Any] = {"energy": "blend", "max_iterations": SMOOTHING_STEPS}
         mapped = atlas.polish(start, fixed=numbers, islands=only, callback=callback, **given)
@@ -381,6 +390,15 @@ def require_map(state: SessionState) -> None:
     """Raise RequestError unless the selected islands have maps."""
     if any(state.islands[k].result is None for k in state.selected):
         raise RequestError("there is no map yet: press Unwrap or Flatten first")
+
+
+def require_injective(state: SessionState) -> None:
+    """Raise RequestError if the map of a selected island has inverted triangles."""
+    require_map(state)
+    bad = [k for k in state.selected if not state.islands[k].injective]
+    if bad:
+        which = "the map has" if len(state.islands) == 1 else f"island {bad[0]} has"
+        raise RequestError(f"{which} inverted triangles: undo, or select it and press Flatten")
 
 
 def fixed_positions(one: IslandState, target: FloatArray, uv: FloatArray | None) -> FloatArray:

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS
+from quasiharmonic.energies.polishing import SMOOTHING_STEPS
 from quasiharmonic.io import MeshData
 
 #: Names of the files that the page saves: the map, the map from which the last step started, the fixed vertices, the
@@ -90,20 +90,23 @@ def write_script(lines: Sequence[str], *, names: Sequence[str] = (), modules: Se
     return "\n".join([*head, *modules, "", text, ""])
 
 
-def map_script(source: Source, only: Sequence[int] | None, count: int, fixed: str | None) -> str:
-    """Return a script that maps islands again with their fixed vertices in place; ``count`` is that of triangles."""
-    given = arguments(fixed=read_indices(fixed), islands=only)
-    lines = [f"result = atlas.injective_map({source.name!r}{given})"]
-    if count <= LARGEST_SMOOTHED:
-        more = arguments(energy="blend", max_iterations=SMOOTHING_STEPS)
-        lines.append(f"result = atlas.polish(result.mesh{given}{more})")
+def map_script(source: Source, only: Sequence[int] | None, smoothed: Sequence[int] | None, fixed: str | None) -> str:
+    """Return a script that maps islands again with their fixed vertices in place, and smooths some; None means all."""
+    read = read_indices(fixed)
+    lines = [f"result = atlas.injective_map({source.name!r}{arguments(fixed=read, islands=only)})"]
+    if smoothed is None or len(smoothed):
+        more = arguments(fixed=read, islands=smoothed, energy="blend", max_iterations=SMOOTHING_STEPS)
+        lines.append(f"result = atlas.polish(result.mesh{more})")
     return write_script([*lines, "mesh = result.mesh"], names=["atlas"])
 
 
 def outline_script(
-    source: Source, to: str, filled: bool, corners: object, islands: Sequence[int], smoothed: bool
+    source: Source, to: str, filled: bool, corners: object, islands: Sequence[int], smoothed: bool, checked: bool
 ) -> str:
-    """Return a script that maps islands to an outline; several of them to copies side by side."""
+    """Return a script that maps islands to an outline; several of them to copies side by side.
+
+    ``smoothed`` if it smooths the maps, and ``checked`` if only those without inverted triangles.
+    """
     contours = f"outline({to!r})"
     lines = [
         f"mesh = atlas.SeamedMesh({source.name!r})",
@@ -125,7 +128,9 @@ def outline_script(
     ]
     if smoothed:
         more = arguments(fixed=Code("fixed"), energy="blend", max_iterations=SMOOTHING_STEPS)
-        lines.append(f"    result = polish(island.V, island.F, result.uv{more})")
+        lines += ["    if result.injective:"] if checked else []
+        indent = "        " if checked else "    "
+        lines.append(f"{indent}result = polish(island.V, island.F, result.uv{more})")
     lines += ["    places[k] = result.uv", "mesh = mesh.with_places(places)"]
     used = [name for name in ("boundary_to", "filled", "outline") if any(f"{name}(" in line for line in lines)]
     names = ["atlas", "injective_map", *(["polish"] if smoothed else [])]

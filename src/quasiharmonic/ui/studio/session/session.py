@@ -203,7 +203,7 @@ class Session:
 
     def _pack(self, frame: Frame) -> None:
         self._refuse_drawn()
-        operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
+        operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
         resolution = int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, 1024))
         self._busy("packing")
         padding = float(validation.amount(frame, "padding", 0, 64, 4))
@@ -214,7 +214,7 @@ class Session:
         if energy not in ENERGIES:
             raise RequestError(f"unknown energy {energy[:40]!r}: use {', '.join(ENERGIES)}")
         self._refuse_drawn()
-        operations.require_map(self.state)
+        operations.require_injective(self.state)
         self._busy("lowering the distortion")
         self._keep(operations.polish_islands(self.state, energy, slide, self._step))
 
