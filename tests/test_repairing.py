@@ -41,6 +41,17 @@ def exact_signs(uv, FT):
 
 
 class TestRepair:
+    def test_fixed_vertices_keep_their_positions(self):
+        V, F = random_delaunay(400, seed=2)
+        start, pushed = damaged(bend(V), inner_rows(F), 1, 0.1, seed=3)
+        assert inverted_triangles(F, start).size
+        result = repair(lift(V), F, start, fixed=pushed)
+        assert result.injective, "the vertices around it move in its place"
+        assert np.array_equal(result.uv[pushed], start[pushed])
+        for wrong in ([400], [-1], [[0]]):
+            with pytest.raises(ValueError, match="fixed must"):
+                repair(V, F, start, fixed=wrong)
+
     @pytest.mark.parametrize(("count", "scale"), [(1, 0.4), (12, 0.05), (12, 0.4), (120, 0.05)])
     def test_only_displaced_vertices_move(self, count, scale):
         V, F = random_delaunay(400, seed=2)

@@ -110,6 +110,7 @@ STEPS = {
     ],
     "one of two to a disk": lambda one: [one.does("select", islands=[0]), one.does("outline", to="disk")],
     "both to squares": lambda one: [one.does("select", islands=[]), one.does("outline", to="rect:1x1")],
+    "one of two moved": lambda one: [one.does("select", islands=[0]), one.does("place", to=[0.3, -0.2], turn=15)],
     "seams drawn, flat": lambda one: [draw(one), one.does("flatten")],
     "seams drawn, unwrapped": lambda one: [draw(one), one.does("unwrap", resolution=512)],
     "seams erased": lambda one: [draw(one), one.does("erase", vertex=0), one.does("flatten")],
@@ -151,7 +152,7 @@ def draw(one):
         *(("closed", step) for step in ("as it is", "unwrap", "letter", "drag", "seams drawn, flat", "pack")),
         *(("closed", step) for step in ("seams drawn, unwrapped", "seams kept", "turned, unwrapped")),
         *(("two parts", step) for step in ("as it is", "one of two", "one of two polished", "one of two to a disk")),
-        *(("two parts", step) for step in ("drag", "flatten", "pack", "polish", "unwrap")),
+        *(("two parts", step) for step in ("drag", "flatten", "pack", "polish", "unwrap", "one of two moved")),
         *(("spoilt", step) for step in ("as it is", "flatten", "polish", "drag", "turned, unwrapped")),
     ],
 )

@@ -177,6 +177,14 @@ class Working(bpy.types.Operator):
             return {"CANCELLED"}
 
 
+def find_objects(context: bpy.types.Context, mode: str, edited: list[bpy.types.Object]) -> list[bpy.types.Object]:
+    """Return the mesh objects that an operator works on, the active one first: in edit mode those edited."""
+    active, things = context.active_object, edited
+    if mode != "EDIT":
+        things = context.selected_objects if active.select_get() else []
+    return [active, *(thing for thing in things if thing.type == "MESH" and thing != active)]
+
+
 @contextmanager
 def _object_mode(context: bpy.types.Context) -> Iterator[tuple[str, list[bpy.types.Object]]]:
     """Leave the current mode, and enter it again with the same objects; yields the mode and these objects."""

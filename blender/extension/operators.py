@@ -24,7 +24,7 @@ from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 from quasiharmonic.util.arrays import IntArray, count_of
 
 from . import outline, pins, surface
-from .job import Work, Working
+from .job import Work, Working, find_objects
 from .surface import Refused
 
 _ENERGIES = [
@@ -35,24 +35,61 @@ _ENERGIES = [
 
 
 class UvWorking(Working):
-    """An operator on the UVs of the active object."""
+    """An operator on the UVs of objects, one after another: the selected ones, or in edit mode those edited.
 
-    def read(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
-        """Return the active object's mesh; in edit mode, only islands with selected faces unless ``whole`` is true."""
+    `prepare_one` returns the work on the mesh `data` of one object, and reads it into `surface`. `finish_one` receives
+    the result. If the work on an object fails, none is changed.
+    """
+
+    def prepare(self, context: bpy.types.Context) -> Work:
+        """Return the work on all objects."""
+        parts = []
+        for thing in self.find_objects(context):
+            self.data = thing.data
+            work = self.prepare_one(context)
+            parts.append((thing, self.surface, work))
+        self._parts = parts
+        return lambda reports_progress: [work(reports_progress) for _, _, work in parts]
+
+    def finish(self, context: bpy.types.Context, result: Any) -> None:
+        """Write the results of all objects."""
+        for (thing, here, _), one in zip(self._parts, result, strict=True):
+            self.data, self.surface = thing.data, here
+            self.label = f"{self.bl_label}: {thing.name}: " if len(self._parts) > 1 else f"{self.bl_label}: "
+            self.finish_one(context, one)
+
+    def prepare_one(self, context: bpy.types.Context) -> Work:
+        """Return the work on one object, whose mesh is `data`. It must not access Blender's data."""
+        raise NotImplementedError
+
+    def finish_one(self, context: bpy.types.Context, result: Any) -> None:
+        """Write the result of one object."""
+        raise NotImplementedError
+
+    def find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        """Return the mesh objects to work on, the active one first; of objects that share a mesh the first."""
+        found: list[bpy.types.Object] = []
+        for thing in find_objects(context, self.mode, self.edited):
+            if thing == context.active_object or (len(thing.data.polygons) and thing.data.library is None):
+                found += [] if any(other.data == thing.data for other in found) else [thing]
+        return found
+
+    def read(self, *, whole: bool = True) -> SeamedMesh:
+        """Return the object's mesh; in edit mode, only islands with selected faces unless ``whole`` is true."""
         self.surface = surface.read(
-            context.active_object.data, edited=self.mode == "EDIT", chosen_only=not whole and self.mode == "EDIT"
+            self.data, edited=self.mode == "EDIT", chosen_only=not whole and self.mode == "EDIT"
         )
         return self.surface.mesh
 
-    def read_map(self, context: bpy.types.Context, *, whole: bool = True) -> SeamedMesh:
+    def read_map(self, *, whole: bool = True) -> SeamedMesh:
         """Return the mesh as `read` does; require a UV layer."""
-        mesh = self.read(context, whole=whole)
+        mesh = self.read(whole=whole)
         surface.require_map(self.surface)
         return mesh
 
-    def take(self, context: bpy.types.Context, mapped: SeamedMesh, remark: str = "") -> None:
+    def take(self, mapped: SeamedMesh, remark: str = "") -> None:
         """Write a map to Blender and report the verdict of the map as stored there."""
-        stored = surface.write(context.active_object.data, self.surface, mapped)
+        stored = surface.write(self.data, self.surface, mapped)
         verdict = atlas.certify(stored)
         lost = np.setdiff1d(verdict.inverted, atlas.certify(mapped).inverted)
         if lost.size:
@@ -60,7 +97,7 @@ class UvWorking(Working):
                 f"{count_of('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
             )
         kind = "INFO" if verdict.injective else "WARNING"
-        self.report({kind}, f"{self.bl_label}: {remark}{_told(verdict)}{_describe_others(self.surface, stored)}")
+        self.report({kind}, f"{self.label}{remark}{_told(verdict)}{_describe_others(self.surface, stored)}")
 
 
 class ChosenWorking(UvWorking):
@@ -77,34 +114,37 @@ class QHM_OT_check(UvWorking):
     bl_idname = "uv.qhm_check"
     bl_label = "Check UVs"
 
-    def prepare(self, context: bpy.types.Context) -> Work:
+    def prepare_one(self, context: bpy.types.Context) -> Work:
         """Return the work that certifies the map."""
-        mesh = self.read_map(context)
+        mesh, polygons = self.read_map(), self.surface.polygons
 
         def work(reports_progress: Callable[[Step], None]) -> tuple[AtlasVerdict, IntArray, IntArray]:
             verdict = atlas.certify(mesh)
-            return verdict, _lying(mesh, verdict), _bent(mesh, self.surface.polygons, verdict)
+            return verdict, _lying(mesh, verdict), _bent(mesh, polygons, verdict)
 
         return work
 
-    def finish(self, context: bpy.types.Context, result: Any) -> None:
+    def finish_one(self, context: bpy.types.Context, result: Any) -> None:
         """Select the faces found and report the verdict."""
         verdict, lying, bent = result
+        self._found = [] if self.data == self._parts[0][0].data else self._found
         face = self.surface.polygons.of_triangle
         inverted = np.unique(face[verdict.inverted])
         chosen = np.union1d(inverted, face[lying])
-        surface.select_faces(context, self.surface, chosen)
+        self._found.append((self.data, self.surface, chosen))
+        if len(self._found) == len(self._parts):
+            surface.select_faces(context, self._found)
         text = f"{count_of('face', 'faces', len(chosen))} selected, of which {len(inverted)} inverted. {_told(verdict)}"
         if len(bent):
             text += (
                 f" {count_of('face is', 'faces are', len(bent))} not convex: cut into other triangles, some would flip."
             )
         sound = verdict.bijective and not len(verdict.overlapping)
-        self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {text}")
+        self.report({"INFO" if sound else "WARNING"}, f"{self.label}{text}")
 
 
 class QHM_OT_repair(ChosenWorking):
-    """Untangle inverted faces. Borders stay unchanged, and so does every UV that need not move."""
+    """Untangle inverted faces. Borders and pins stay unchanged, and so does every UV that need not move."""
 
     bl_idname = "uv.qhm_repair"
     bl_label = "Repair UVs"
@@ -112,19 +152,19 @@ class QHM_OT_repair(ChosenWorking):
         name="Turn mirrored islands over", description="Otherwise they are left, as some are on purpose", default=False
     )
 
-    def prepare(self, context: bpy.types.Context) -> Work:
+    def prepare_one(self, context: bpy.types.Context) -> Work:
         """Return the work that repairs the map."""
-        mesh = self.read_map(context, whole=self.whole)
-        unmirror = self.unmirror
+        mesh = self.read_map(whole=self.whole)
+        unmirror, fixed = self.unmirror, pins.list_pinned(self.surface)
         return lambda reports_progress: repair(
-            mesh.V, mesh.F, mesh.uv, FT=mesh.FT, unmirror=unmirror, callback=reports_progress
+            mesh.V, mesh.F, mesh.uv, FT=mesh.FT, fixed=fixed, unmirror=unmirror, callback=reports_progress
         )
 
-    def finish(self, context: bpy.types.Context, result: Any) -> None:
+    def finish_one(self, context: bpy.types.Context, result: Any) -> None:
         """Write the map and report the result."""
         mesh = self.surface.mesh
         reasons = " ".join(island.reason for island in result.islands if island.reason)
-        self.take(context, SeamedMesh(mesh.V, mesh.F, result.FT, result.uv), f"{reasons} " if reasons else "")
+        self.take(SeamedMesh(mesh.V, mesh.F, result.FT, result.uv), f"{reasons} " if reasons else "")
 
 
 class QHM_OT_flatten(ChosenWorking):
@@ -140,11 +180,11 @@ class QHM_OT_flatten(ChosenWorking):
     )
     energy: bpy.props.EnumProperty(name="Keep", items=_ENERGIES)  # type: ignore[valid-type]
 
-    def prepare(self, context: bpy.types.Context) -> Work:
+    def prepare_one(self, context: bpy.types.Context) -> Work:
         """Return the work that cuts and flattens the mesh."""
-        mesh, polygons = self.read(context), self.surface.polygons
+        mesh, polygons = self.read(), self.surface.polygons
         here = self.surface
-        seams = surface.marked_seams(context.active_object.data)
+        seams = surface.marked_seams(self.data)
         cut, pack, energy, whole = self.cut, self.pack, self.energy, self.whole or self.mode != "EDIT"
 
         def work(reports_progress: Callable[[Step], None]) -> SeamedMesh:
@@ -167,9 +207,9 @@ class QHM_OT_flatten(ChosenWorking):
 
         return work
 
-    def finish(self, context: bpy.types.Context, result: Any) -> None:
+    def finish_one(self, context: bpy.types.Context, result: Any) -> None:
         """Write the map and report the result."""
-        self.take(context, result)
+        self.take(result)
 
 
 class QHM_OT_reduce(ChosenWorking):
@@ -182,17 +222,17 @@ class QHM_OT_reduce(ChosenWorking):
     )
     energy: bpy.props.EnumProperty(name="Keep", items=_ENERGIES)  # type: ignore[valid-type]
 
-    def prepare(self, context: bpy.types.Context) -> Work:
+    def prepare_one(self, context: bpy.types.Context) -> Work:
         """Return the work that reduces the distortion."""
-        mesh, here = self.read_map(context, whole=self.whole), self.surface
+        mesh, here = self.read_map(whole=self.whole), self.surface
         free, energy = self.free, self.energy
         return lambda reports_progress: pins.reduce_stretch(
             here, mesh, free=free, energy=energy, reports_progress=reports_progress
         )
 
-    def finish(self, context: bpy.types.Context, result: Any) -> None:
+    def finish_one(self, context: bpy.types.Context, result: Any) -> None:
         """Write the map and report the result."""
-        self.take(context, result)
+        self.take(result)
 
 
 class QHM_OT_fit(ChosenWorking):
@@ -213,9 +253,13 @@ class QHM_OT_fit(ChosenWorking):
     letter: bpy.props.StringProperty(name="Letter", default="G", maxlen=1)  # type: ignore[valid-type]
     curve: bpy.props.StringProperty(name="Curve", description="Name of the object")  # type: ignore[valid-type]
 
-    def prepare(self, context: bpy.types.Context) -> Work:
+    def find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        """Return the active object; there is one island to fit."""
+        return [context.active_object]
+
+    def prepare_one(self, context: bpy.types.Context) -> Work:
         """Return the work that fits the boundary to the outline, with corners detected, and computes the map."""
-        mesh = self.read(context, whole=self.whole)
+        mesh = self.read(whole=self.whole)
         if len(mesh.islands) != 1:
             raise Refused(f"there are {len(mesh.islands)} islands: in edit mode, select faces of the one to fit only")
         _require_borders(mesh)
@@ -239,9 +283,9 @@ class QHM_OT_fit(ChosenWorking):
             each_island(mesh, lambda island: find(island, reports_progress), reflect=False).mesh
         )
 
-    def finish(self, context: bpy.types.Context, result: Any) -> None:
+    def finish_one(self, context: bpy.types.Context, result: Any) -> None:
         """Write the map and report the result."""
-        self.take(context, result)
+        self.take(result)
 
     def _contours(self, context: bpy.types.Context) -> list[Any]:
         """Return the outline as contours in the unit square; a rectangle may be higher."""

@@ -48,6 +48,11 @@ def find_pins(surface: Surface, island: Island) -> tuple[IntArray, FloatArray]:
     return vertices, surface.mesh.uv[pairs[:, 1]]
 
 
+def list_pinned(surface: Surface) -> IntArray:
+    """Return the pinned vertices (k,) of the islands to change, in the numbering of the mesh."""
+    return np.unique(surface.mesh.F[surface.pinned[surface.loops] & (surface.mesh.FT >= 0)])
+
+
 def flatten_with_pins(surface: Surface, mesh: SeamedMesh, energy: str, reports_progress: Report) -> SeamedMesh:
     """Flatten every island; islands with pins keep them, and the others stand in a row beside these.
 

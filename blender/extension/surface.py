@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -170,15 +171,16 @@ def set_places(data: bpy.types.Mesh, layer: bpy.types.MeshUVLoopLayer, places: F
     data.update()
 
 
-def select_faces(context: bpy.types.Context, surface: Surface, faces: IntArray) -> None:
-    """Select these faces of the active object and deselect all others, in object mode; switch to face selection."""
+def select_faces(context: bpy.types.Context, found: Sequence[tuple[bpy.types.Mesh, Surface, IntArray]]) -> None:
+    """Select faces of meshes and deselect all others of these, in object mode; switch to face selection."""
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.mesh.select_all(action="DESELECT")
     bpy.ops.object.mode_set(mode="OBJECT")
-    chosen = np.zeros(len(surface.polygons), dtype=np.bool_)
-    chosen[faces] = True
-    # In face selection mode, edit mode selects the edges and vertices of these faces by itself.
-    context.active_object.data.polygons.foreach_set("select", chosen)
+    for data, here, faces in found:
+        chosen = np.zeros(len(here.polygons), dtype=np.bool_)
+        chosen[faces] = True
+        # In face selection mode, edit mode selects the edges and vertices of these faces by itself.
+        data.polygons.foreach_set("select", chosen)
     context.tool_settings.mesh_select_mode = (False, False, True)
 
 

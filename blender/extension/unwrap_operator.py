@@ -11,7 +11,7 @@ from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.util.arrays import count_of
 
 from . import unwrapping
-from .job import Work, Working
+from .job import Work, Working, find_objects
 
 
 class QHM_OT_unwrap(Working):
@@ -60,7 +60,7 @@ class QHM_OT_unwrap(Working):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         """Return the work that unwraps the objects."""
-        self._objects = self._find_objects(context)
+        self._objects = find_objects(context, self.mode, self.edited)
         self._parts = parts = unwrapping.read_parts(self._objects, edited=self.mode == "EDIT")
         options = {
             "max_stretch": self.max_stretch,
@@ -85,17 +85,17 @@ class QHM_OT_unwrap(Working):
         if inward:
             said = f"{count_of('closed part is', 'closed parts are', inward)} inside out: use Recalculate Outside"
             self.report({"WARNING"}, f"{self.bl_label}: {said}")
+        loops = [part.surface.loops[part.chosen] for part in self._parts]
+        pinned = sum(
+            np.count_nonzero(part.surface.pinned[np.unique(own)]) for part, own in zip(self._parts, loops, strict=True)
+        )
+        if pinned:
+            said = f"{count_of('pinned UV was', 'pinned UVs were', pinned)} not held. Flatten holds pins"
+            self.report({"WARNING"}, f"{self.bl_label}: {said}")
         changed = [thing.name for thing in self._objects if thing.modifiers]
         if changed:
             names = ", ".join(changed[:3]) + (", …" if len(changed) > 3 else "")
             self.report({"INFO"}, f"{self.bl_label}: the modifiers of {names} are ignored, the base mesh was unwrapped")
-
-    def _find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
-        """Return the mesh objects to unwrap, the active one first."""
-        active, things = context.active_object, self.edited
-        if self.mode != "EDIT":
-            things = context.selected_objects if active.select_get() else []
-        return [active, *(thing for thing in things if thing.type == "MESH" and thing != active)]
 
 
 def describe_unwrap(result: UnwrapResult, crossed: int) -> str:

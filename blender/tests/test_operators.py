@@ -343,3 +343,44 @@ def test_neither_matplotlib_nor_mkl_is_loaded():
     assert not [name for name in sys.modules if name.split(".")[0] in {"matplotlib", "mkl", "shapely", "PIL"}]
     maps = Path("/proc/self/maps")
     assert not maps.exists() or "mkl_" not in maps.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("edit", [False, True])
+def test_several_objects_are_changed_one_by_one(edit, said):
+    things = []
+    for seed in range(2):
+        thing = scenes.add_quads()
+        thing.name = f"thing {seed}"
+        tangled(thing, seed)
+        things.append(thing)
+    for thing in things:
+        thing.select_set(True)
+    if edit:
+        bpy.ops.object.mode_set(mode="EDIT")
+        bpy.ops.mesh.select_all(action="SELECT")
+    said()
+    for name in ("check", "repair", "reduce_stretch", "flatten"):
+        before = None if edit else [scenes.places(thing) for thing in things]
+        assert getattr(bpy.ops.uv, f"qhm_{name}")() == {"FINISHED"}
+        if before and name != "check":
+            assert not any(np.array_equal(scenes.places(t), uv) for t, uv in zip(things, before, strict=True)), name
+    told = said()
+    for thing in things:
+        assert f"Repair UVs: {thing.name}: " in told
+        assert f"Check UVs: {thing.name}: " in told
+    if edit:
+        bpy.ops.object.mode_set(mode="OBJECT")
+    assert all(scenes.verdict(thing).bijective for thing in things)
+
+
+def test_if_one_of_several_objects_is_refused_none_is_changed(said):
+    thing = scenes.add_quads()
+    scenes.move_vertex(thing, 24, [0.9, 0.9])
+    bare = scenes.add_quads()
+    bare.data.uv_layers.remove(bare.data.uv_layers.active)
+    for one in (bare, thing):
+        one.select_set(True)
+    before = scenes.places(thing)
+    with pytest.raises(RuntimeError, match="no UV map"):
+        bpy.ops.uv.qhm_repair()
+    assert np.array_equal(scenes.places(thing), before)

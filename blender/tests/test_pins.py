@@ -107,6 +107,30 @@ def test_fit_holds_pins():
     assert scenes.verdict(thing).bijective
 
 
+def test_unwrap_reports_pins(said):
+    thing = scenes.add_quads()
+    pin(thing, [0])
+    assert bpy.ops.uv.qhm_unwrap() == {"FINISHED"}
+    assert "1 pinned UV was not held" in said()
+
+
+def test_repair_holds_pins():
+    """The vertex beside the misplaced one is pinned, so that the repair cannot move it."""
+    thing = scenes.add_quads()
+    scenes.move_vertex(thing, 24, [0.9, 0.9])
+    at = scenes.vertices_of_loops(thing)
+    free = scenes.places(thing)
+    pin(thing, np.flatnonzero(np.isin(at, [16, 24])))
+    with_pins = scenes.places(thing)
+    bpy.ops.uv.qhm_repair()
+    assert np.array_equal(scenes.places(thing)[np.isin(at, [16, 24])], with_pins[np.isin(at, [16, 24])])
+    pin(thing, [])
+    scenes.set_places(thing, free)
+    assert bpy.ops.uv.qhm_repair() == {"FINISHED"}
+    assert not np.array_equal(scenes.places(thing)[at == 24], free[at == 24])
+    assert scenes.verdict(thing).bijective
+
+
 @pytest.mark.parametrize("free", [False, True])
 def test_reduce_stretch_holds_pins(free):
     thing = scenes.add_quads()

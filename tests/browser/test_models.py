@@ -86,6 +86,41 @@ def test_islands_are_listed_selected_and_changed(served_parts, opened, settled):
     assert "--islands 0" in page.inner_text("#command")
 
 
+def test_a_selected_island_is_dragged_and_rotated(served_parts, opened, settled):
+    page = opened(served_parts)
+    places = "Array.from(studio.view.scene.places, (value, i) => value + studio.view.scene.origin[i % 2])"
+    act(page, settled, lambda: page.locator("#islands button").first.click())
+    before, second = np.array(page.evaluate(places)), 2 * page.evaluate("studio.view.scene.starts[1]")
+    middle = page.evaluate("""() => {
+      const { scene, hands } = studio.view;
+      const corners = [0, 1, 2].map((k) => scene.placeOf(scene.triangles[k]));
+      return hands.plane.pointOf(...[0, 1].map((i) => (corners[0][i] + corners[1][i] + corners[2][i]) / 3));
+    }""")
+    box = page.locator("#view").bounding_box()
+    x, y = box["x"] + middle[0], box["y"] + middle[1]
+    page.evaluate("document.body.dataset.state = 'asked'")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for k in range(1, 6):
+        page.mouse.move(x + 8 * k, y)
+    page.mouse.up()
+    settled(page)
+    moved = np.array(page.evaluate(places)) - before
+    pixels = page.evaluate("studio.view.hands.plane.pixels")
+    assert np.allclose(moved[:second:2], 40 / pixels, atol=1e-3)
+    assert np.allclose(moved[1:second:2], 0, atol=1e-5)
+    assert np.allclose(moved[second:], 0, atol=1e-5)
+    assert page.evaluate("[...studio.view.scene.selected]") == [0]
+    size = np.ptp(np.array(page.evaluate(places))[:second].reshape(-1, 2), axis=0)
+    page.locator(".qhm-map").focus()
+    act(page, settled, lambda: page.keyboard.press("r"))
+    turned = np.ptp(np.array(page.evaluate(places))[:second].reshape(-1, 2), axis=0)
+    assert turned == pytest.approx(size[::-1], abs=1e-5)
+    for _ in range(2):
+        act(page, settled, lambda: page.keyboard.press("Control+z"))
+    assert np.allclose(page.evaluate(places), before, atol=1e-5)
+
+
 def test_unwrap_shows_seams_and_the_result_is_saved_and_opened_again(served_parts, opened, settled, models, tmp_path):
     page = opened(served_parts)
     act(page, settled, lambda: page.set_input_files("#open", models["closed"]))

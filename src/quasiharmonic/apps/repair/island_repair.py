@@ -39,7 +39,7 @@ _PATCH_ITERATIONS = 100
 
 
 class IslandRepair:
-    """The repair of one island of a mesh with vertices ``V``.
+    """The repair of one island of a mesh with vertices ``V``; the vertices ``fixed`` and the boundary stay unchanged.
 
     Attributes
     ----------
@@ -56,6 +56,7 @@ class IslandRepair:
         V: FloatArray,
         island: Island,
         *,
+        fixed: IntArray,
         max_iterations: int,
         linear_solver: str,
         callback: Callable[[Step], object] | None,
@@ -67,6 +68,7 @@ class IslandRepair:
         self._F, self._V = island.F, V[island.vertices]
         self._fixed = np.zeros(len(self.uv), dtype=np.bool_)
         self._fixed[boundary_edges(self._F, len(self.uv))] = True
+        self._fixed |= np.isin(island.vertices, fixed)
         self._max_iterations = max_iterations
         self._linear_solver = linear_solver
         self._callback = callback

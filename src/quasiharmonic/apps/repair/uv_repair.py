@@ -27,6 +27,7 @@ from quasiharmonic.util.arrays import (
     check_callback,
     check_integer,
     count_of,
+    index_array,
     names_of,
 )
 from quasiharmonic.util.outcome import Outcome
@@ -174,6 +175,7 @@ def repair(
     uv: ArrayLike,
     *,
     FT: ArrayLike | None = None,
+    fixed: ArrayLike | None = None,
     whole: bool = False,
     unmirror: bool = False,
     max_iterations: int = MAX_ITERATIONS,
@@ -197,6 +199,8 @@ def repair(
     FT : (f, 3) array of int, optional
         For a map with seams, the row of ``uv`` of each corner; ``F`` by default. Triangles with a corner of -1 have no
         position and are left unchanged. `quasiharmonic.io.seamed_mesh.SeamedMesh` defines seams.
+    fixed : (k,) array of int, optional
+        Interior vertices that also keep their positions, except in islands that ``unmirror`` reflects.
     whole : bool
         Map every island that has inverted triangles again as a whole, and polish it.
     unmirror : bool
@@ -238,13 +242,19 @@ def repair(
     check_bool("unmirror", unmirror)
     check_callback(callback)
     mesh = SeamedMesh(V, F, FT, uv)
+    held = _check_fixed(fixed, len(mesh.V))
     done = []
     for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         if mirrored:
             done.append(_report_mirrored(island, unmirror))
             continue
         one = IslandRepair(
-            mesh.V, island, max_iterations=max_iterations, linear_solver=linear_solver, callback=callback
+            mesh.V,
+            island,
+            fixed=held,
+            max_iterations=max_iterations,
+            linear_solver=linear_solver,
+            callback=callback,
         )
         before = island.triangles[one.inverted]
         if before.size:
@@ -268,6 +278,18 @@ def repair(
     repaired = mesh.with_places([new for new, _ in done])
     assert repaired.uv is not None
     return RepairResult(repaired.uv, repaired.FT, tuple(report for _, report in done))
+
+
+def _check_fixed(fixed: ArrayLike | None, n: int) -> IntArray:
+    """Return further fixed vertices as an array; ValueError if they are not indices of ``n`` vertices."""
+    if fixed is None:
+        return np.empty(0, dtype=np.int64)
+    held = index_array("fixed", fixed)
+    if held.ndim != 1:
+        raise ValueError(f"fixed must have shape (k,), not {held.shape}")
+    if held.size and not 0 <= held.min() <= held.max() < n:
+        raise ValueError(f"fixed must contain indices of the {n} vertices, from 0 to {n - 1}")
+    return held
 
 
 def _report_mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:

@@ -239,6 +239,27 @@ def pack_all(state: SessionState, resolution: int, padding: float) -> SessionSta
     return as_it_is(state, mesh, recipe, keep=True)
 
 
+def move_islands(state: SessionState, by: FloatArray, turn: float) -> SessionState:
+    """Move the selected islands together by a vector (2,), after a rotation by ``turn`` degrees around their centre."""
+    require_map(state)
+    places = [island.uv for island in state.mesh.islands]
+    low, high = (getattr(np.concatenate([places[k] for k in state.selected]), side)(axis=0) for side in ("min", "max"))
+    centre = (low + high) / 2
+    # Quarter turns are exact.
+    cos, sin = [(1, 0), (0, 1), (-1, 0), (0, -1)][int(turn // 90) % 4] if turn % 90 == 0 else _cos_sin(turn)
+    matrix = np.array([[cos, sin], [-sin, cos]])
+    for k in state.selected:
+        places[k] = (places[k] - centre) @ matrix + centre + by if turn else places[k] + by
+    mesh = state.mesh.with_places(places)
+    moved = as_it_is(state, mesh, saved_start(mesh), keep=True)
+    islands = tuple(one if k in state.selected else state.islands[k] for k, one in enumerate(moved.islands))
+    return replace(moved, islands=islands)
+
+
+def _cos_sin(degrees: float) -> tuple[float, float]:
+    return float(np.cos(np.radians(degrees))), float(np.sin(np.radians(degrees)))
+
+
 def is_flattenable(island: Island) -> bool:
     """Whether an island has a boundary and no handle."""
     found, n = edges(island.F, len(island.vertices)), len(island.vertices)

@@ -201,6 +201,14 @@ class Session:
         self._busy("unwrapping")
         self._keep(unwrap_model(self.state, options, self._step), fit=True)
 
+    def _place(self, frame: Frame) -> None:
+        """Move or rotate the selected islands."""
+        by, turn = validation.place(frame), validation.amount(frame, "turn", -360, 360, 0)
+        # The page has already moved them.
+        self._busy("moving the islands")
+        self._refuse_drawn()
+        self._keep(operations.move_islands(self.state, by, float(turn)))
+
     def _pack(self, frame: Frame) -> None:
         self._refuse_drawn()
         operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
@@ -414,6 +422,7 @@ class Session:
         "flatten": _flatten,
         "unwrap": _unwrap,
         "pack": _pack,
+        "place": _place,
         "pin": _pin,
         "unpin": _unpin,
         "grab": _grab,

@@ -6,8 +6,9 @@ const ZOOM = 1.0015;
 
 /** Pointer and keyboard input on both panes. Without `send` vertices cannot be dragged. */
 export class Hands {
-  constructor(element, { scene, plane, clock, space, send, redraw }) {
-    Object.assign(this, { scene, plane, clock, space, send, redraw });
+  constructor(element, { scene, plane, clock, space, send, redraw, lift }) {
+    Object.assign(this, { scene, plane, clock, space, send, redraw, lift });
+    this.lifted = null; // how far the selected islands are dragged
     this.tool = "move";
     this.seq = 0;
     this.inFlight = false;
@@ -74,7 +75,8 @@ export class Hands {
 
   /** End a drag with one finger when a second one comes. */
   #cancel() {
-    this.from = this.last = null;
+    if (this.lifted) this.lift([0, 0]);
+    this.from = this.last = this.lifted = null;
     this.#letGo();
   }
 
@@ -97,6 +99,7 @@ export class Hands {
     this.aimed = -1;
     this.inFlight = false;
     this.next = null;
+    this.lifted = null;
     this.seq = 0;
   }
 
@@ -184,20 +187,32 @@ export class Hands {
     const vertex = event.button === 0 ? this.handleAt(point) : -1;
     this.scene.chosen = vertex;
     if (vertex >= 0) this.#grab(vertex);
+    else if (event.button === 0 && this.#isMovable(point)) this.lifted = [0, 0];
     this.redraw();
   }
 
+  /** Return whether a drag from a point of the map moves islands: those selected, if others are not. */
+  #isMovable(point) {
+    const { scene } = this;
+    if (this.tool !== "move" || !this.send || !scene.places || scene.selected.size === scene.starts.length) return false;
+    return scene.selected.has(this.#islandAt(point));
+  }
+
   mapMove(event, point) {
-    if (this.held >= 0 && event.buttons) {
+    if (this.lifted && event.buttons && this.from) {
+      this.lifted = [0, 1].map((k) => ((k ? -1 : 1) * (point[k] - this.from[k])) / this.plane.pixels);
+      this.lift(this.lifted);
+    } else if (this.held >= 0 && event.buttons) {
       this.#moveTo(this.plane.placeOf(point));
     } else if (event.buttons && this.last) {
       this.plane.shiftBy(point[0] - this.last[0], point[1] - this.last[1]);
       this.redraw("plane");
     } else {
       const hovered = this.tool === "move" ? this.handleAt(point) : -1;
+      const free = this.#isMovable(point) ? "move" : "default";
+      this.panes[1].style.cursor = hovered >= 0 ? "grab" : this.tool === "draw" ? "crosshair" : free;
       if (hovered !== this.scene.hovered) {
         this.scene.hovered = hovered;
-        this.panes[1].style.cursor = hovered >= 0 ? "grab" : this.tool === "draw" ? "crosshair" : "default";
         this.redraw();
       }
     }
@@ -206,7 +221,10 @@ export class Hands {
 
   mapUp(event, point) {
     const clicked = this.from && Math.hypot(point[0] - this.from[0], point[1] - this.from[1]) < CLICK;
-    this.from = this.last = null;
+    const to = this.lifted;
+    this.from = this.last = this.lifted = null;
+    if (to && !clicked && event.type === "pointerup") this.send({ do: "place", to });
+    else if (to && !clicked) this.lift([0, 0]);
     if (this.held >= 0) this.#letGo();
     else if (clicked && event.type === "pointerup" && this.scene.places && this.send) {
       if (this.tool === "draw") this.#drawTo(point);
@@ -231,7 +249,11 @@ export class Hands {
     if (!scene.places) return false;
     const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     if (event.key === "n" || event.key === "b") this.#choose(event.key === "n" ? 1 : -1);
-    else if (event.key === "Escape") [scene.chosen, scene.sketch] = [-1, []];
+    else if (event.key === "Escape") {
+      [scene.chosen, scene.sketch] = [-1, []];
+      if (this.lifted) this.lift([0, 0]);
+      this.lifted = null;
+    } else if (event.key.toLowerCase() === "r" && this.send) this.send({ do: "place", to: [0, 0], turn: event.shiftKey ? 15 : 90 });
     else if (event.key === "Enter" && scene.sketch.length) this.closeSketch();
     else if (event.key === "Delete" && scene.pins.includes(scene.chosen)) this.send?.({ do: "unpin", vertex: scene.chosen });
     else if (event.key === "+" || event.key === "=") plane.zoomBy(1.15, this.#middle());

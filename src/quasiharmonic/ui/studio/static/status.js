@@ -75,6 +75,7 @@ export class Status {
       else if (header.drawn) text = "The seams have changed: press Flatten or Unwrap to cut the surface along them.";
       else if (header.pins.length) text = "Drag a purple pin or any point of the outline in the map.";
       else if (header.corners.length) text = "Drag an orange corner, or any point of the outline, in the map. Drag the surface to rotate it.";
+      else if (header.selected.length < header.count) text = "Drag a selected island to move it; R rotates it. Drag a point of its outline to bend it.";
       else if (header.count > 1) text = "Click an island to select it, with Shift several. Drag any point of an outline.";
       else text = "The boundary is free: drag any point of the outline, or pin a vertex and drag the pin.";
     }

@@ -2,7 +2,7 @@
 // and pass frames to `receive`.
 //
 // It handles the frames "surface", "map", "seams", "image" and "obstructions", and sends {do: "grab" | "drag" | "drop" |
-// "pin" | "unpin" | "corner" | "polygon" | "select" | "seam" | "erase"}; docs/development/page_protocol.md describes them.
+// "place" | "pin" | "unpin" | "corner" | "polygon" | "select" | "seam" | "erase"}; docs/development/page_protocol.md describes them.
 // Without `send` the view is read-only.
 
 import { coarsen } from "./coarse.js";
@@ -76,6 +76,7 @@ export function createView(element, options = {}) {
   let followed = 0; // maps since the surface was redrawn
   let resting = 0;
   let thinned = false; // whether the painter has the triangles for coarse pictures of this map
+  let unlifted = null; // positions before islands were dragged
   let transition = null; // the transition to the current map, while it runs
 
   element.classList.add("qhm-view");
@@ -207,7 +208,20 @@ export function createView(element, options = {}) {
     space: () => space,
     send: options.send,
     redraw,
+    lift,
   });
+
+  /** Show the selected islands moved by a vector from where the last map has them. */
+  function lift(by) {
+    unlifted ??= scene.places.slice();
+    for (const k of scene.selected) {
+      const end = 2 * (scene.starts[k + 1] ?? scene.places.length / 2);
+      for (let i = 2 * scene.starts[k]; i < end; i++) scene.places[i] = unlifted[i] + by[i % 2];
+    }
+    painter.setPlaces(scene.places);
+    redraw("plane");
+    if (++followed >= SURFACE_EVERY) redraw("space");
+  }
 
   function surface(header, arrays) {
     const { positions, triangles } = arrays;
@@ -234,6 +248,7 @@ export function createView(element, options = {}) {
     scene.numbers = header.numbers;
     scene.pins = header.pins;
     scene.selected = new Set(header.selected);
+    if (arrays.places) unlifted = null;
     if (arrays.places && header.start !== undefined && scene.places) {
       scene.places.set(arrays.places, 2 * header.start);
       painter.setSomePlaces(arrays.places, header.start);
