@@ -211,6 +211,7 @@ def test_a_reload_and_a_crash_lose_nothing(served_parts, opened, settled):
     assert page.evaluate("Array.from(studio.view.scene.places)") == shown
     kill_workers()
     page.wait_for_selector("body[data-state=restarting]")
+    assert "Restarting" in page.inner_text("#verdict")
     settled(page)
     assert page.evaluate("Array.from(studio.view.scene.places)") == shown
     act(page, settled, lambda: page.click("#undo"))
@@ -225,15 +226,22 @@ def test_a_reload_and_a_crash_lose_nothing(served_parts, opened, settled):
     assert asked == []
 
 
+def parent(process):
+    """Return the number of a process's parent."""
+    status = Path(f"/proc/{process}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in status if line.startswith("PPid:"))
+
+
 def kill_workers():
-    """Kill the processes of all pages."""
+    """Kill the workers of the servers that this process started."""
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:
                 words = (entry / "cmdline").read_bytes()
-            except OSError:
+                own = parent(parent(int(entry.name))) == os.getpid()
+            except (OSError, ValueError):
                 continue
-            if b"page_worker" in words and b"serve(*sys.argv" in words:
+            if own and b"page_worker" in words and b"serve(*sys.argv" in words:
                 os.kill(int(entry.name), signal.SIGKILL)
 
 

@@ -1,6 +1,7 @@
 // Pointer and keyboard input: rotate the surface, pan the map, drag vertices, select, pin, choose corners, seams, draw.
 
 const GRIP = 14; // distance in CSS pixels within which a handle is grabbed
+const NARROW = 7; // the same for boundary vertices of several islands
 const CLICK = 4; // maximum motion of a click in CSS pixels
 const ZOOM = 1.0015;
 
@@ -175,7 +176,9 @@ export class Hands {
     const { scene, plane } = this;
     if (!scene.places || !this.send) return -1;
     for (const some of [scene.pins, scene.corners, scene.boundary]) {
-      const vertex = plane.nearest(point, some, scene.places, GRIP);
+      // Among several islands, a drag inside of one moves it.
+      const within = some === scene.boundary && scene.starts.length > 1 ? NARROW : GRIP;
+      const vertex = plane.nearest(point, some, scene.places, within);
       if (vertex >= 0) return vertex;
     }
     return -1;

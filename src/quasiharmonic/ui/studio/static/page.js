@@ -39,14 +39,14 @@ class Page {
       else if (event.code === 4001) status.elsewhere();
       else if (event.code === 1006) status.disconnected();
       if (event.code !== 1009 && event.code !== 1011) return;
-      document.body.dataset.state = "restarting";
+      status.restarting();
       setTimeout(() => this.connect(), 1500);
     };
   }
 
   send(message, arrays) {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(encodeFrame(message, arrays));
-    else if (document.body.dataset.state !== "gone") this.panel.status.disconnected();
+    else if (!["gone", "restarting"].includes(document.body.dataset.state)) this.panel.status.disconnected();
   }
 
   receive(frame) {

@@ -145,6 +145,12 @@ export class Status {
     this.#gone("Disconnected", "The server has stopped. Restart it, then reload the page.");
   }
 
+  /** Report that the worker ended; a new one continues its session. */
+  restarting() {
+    document.body.dataset.state = "restarting";
+    this.#verdict("open", "…", "Restarting", "The computation ended unexpectedly. The session continues with its last map.");
+  }
+
   /** Report that the session continues in another tab. */
   elsewhere() {
     this.#gone("Opened elsewhere", "This session continues in another tab. Reload this page to continue here.");
