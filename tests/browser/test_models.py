@@ -228,7 +228,7 @@ def test_a_reload_and_a_crash_lose_nothing(served_parts, opened, settled):
 
 def parent(process):
     """Return the number of a process's parent."""
-    status = Path(f"/proc/{process}/status").read_text().splitlines()
+    status = Path(f"/proc/{process}/status").read_text("utf-8").splitlines()
     return next(int(line.split()[1]) for line in status if line.startswith("PPid:"))
 
 
