@@ -10,6 +10,7 @@ import pytest
 from quasiharmonic import BoundaryCurves, Status, boundary_loops, morph, surfaces
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.geometry.mesh.elements import rim
+from quasiharmonic.ui.plot.canvas import RED
 from shared.meshes import boundary_of
 from shared.simulation import channel, min_jacobian, quadrilaterals, second_order, turned
 
@@ -180,6 +181,30 @@ def test_quadrilaterals_inverted_by_the_boundary_are_named():
     assert not morphed.valid
     assert "Inverted for every position of the free nodes: quadrilateral 35" in morphed.summary()
     assert json.loads(json.dumps(morphed.to_dict()))["forbidden"] == [35]
+
+
+@pytest.mark.parametrize(
+    "kind", [surfaces.grid, quadrilaterals, lambda n, m: second_order(*surfaces.grid(n, m))], ids=["3", "4", "6"]
+)
+def test_figure_and_summary_of_the_element_quality(kind):
+    points, F = kind(4, 4)
+    upper = np.flatnonzero((points[:, 1] == 1) & np.isin(points[:, 0], (0.5, 0.75)))
+    # The two nodes change places.
+    morphed = morph(points, F, upper, points[upper[::-1]], max_iterations=20)
+    assert morphed.inverted.size
+    np.testing.assert_array_equal(morphed.points_before, points)
+    before, after, histogram = morphed.plot().axes
+    for ax, count in ((before, 0), (after, len(morphed.inverted))):
+        (shapes,) = ax.collections
+        assert len(shapes.get_paths()) == len(F)
+        assert (shapes.get_facecolor()[:, :3] == RED).all(axis=1).sum() == count
+    for at, patch in zip((before, after), (points, morphed.points), strict=True):
+        corners = np.concatenate([path.vertices for path in at.collections[0].get_paths()])
+        assert {tuple(row) for row in patch[F].reshape(-1, 2)} <= {tuple(row) for row in corners}
+    assert histogram.get_ylabel() == "elements"
+    words = f"worst {morphed.quality_before.min():.3g} before and {morphed.quality_after.min():.3g} after"
+    assert words in morphed.summary()
+    assert "<img" in morphed._repr_html_()
 
 
 # ---- second order ---------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,11 +13,15 @@ from quasiharmonic.geometry.mesh.elements import corner_triangles, name_elements
 from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
+from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Outcome
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MorphResult(Outcome):
+class MorphResult(Outcome, Displayable):
     """A planar mesh after its boundary has moved.
 
     Attributes
@@ -39,6 +43,8 @@ class MorphResult(Outcome):
     quality_before, quality_after : (f,) float64
         `quasiharmonic.apps.mesh_motion.quality.element_quality` of every element: 1 for an equilateral triangle or a
         square, 0 without area, negative if inverted.
+    points_before : (n, 2) float64
+        All nodes before the morph.
     """
 
     points: FloatArray
@@ -48,6 +54,7 @@ class MorphResult(Outcome):
     result: MapResult
     quality_before: FloatArray
     quality_after: FloatArray
+    points_before: FloatArray
     _one_step: Callable[[], FloatArray] = field(repr=False)
 
     @property
@@ -83,8 +90,9 @@ class MorphResult(Outcome):
 
     def summary(self) -> str:
         """Return a text that says whether the mesh is valid, and otherwise what is wrong."""
+        qualities = self._describe_quality()
         if self.valid:
-            return f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere."
+            return f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.\n{qualities}"
         lines = [f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}."]
         if self.forbidden.size:
             lines.append(
@@ -95,7 +103,30 @@ class MorphResult(Outcome):
             lines.append(self.result.status.value)
             if self.result.diagnosis is not None and self.result.diagnosis.obstructions:
                 lines.append(self.result.diagnosis.summary())
-        return "\n".join(lines)
+        return "\n".join([*lines, qualities])
+
+    def short_repr(self) -> str:
+        """Return the first line of `summary`."""
+        return self.message
+
+    def plot(self) -> Figure:
+        """Draw the mesh before and after, coloured by element quality, and histograms of the quality.
+
+        Returns
+        -------
+        matplotlib Figure
+            Inverted elements are red. Notebooks display the figure directly.
+        """
+        return self._draw("quality")
+
+    def _describe_quality(self) -> str:
+        before, after = self.quality_before, self.quality_after
+        if not len(after):
+            return "no elements"
+        return (
+            f"Element quality, 1 at best: worst {before.min():.3g} before and {after.min():.3g} after (element "
+            f"{int(after.argmin())}), mean {before.mean():.3g} before and {after.mean():.3g} after."
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""

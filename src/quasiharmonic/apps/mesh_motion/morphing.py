@@ -185,7 +185,7 @@ def morph(
     inverted = inverted_elements(F, after)
     forbidden = np.intersect1d(inverted, find_forbidden(F, after, fixed))
     before, now = element_quality(F, points), element_quality(F, after)
-    return MorphResult(after, F, inverted, forbidden, result, before, now, one_step)
+    return MorphResult(after, F, inverted, forbidden, result, before, now, points.copy(), one_step)
 
 
 class _MorphProblem(NamedTuple):

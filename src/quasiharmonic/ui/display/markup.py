@@ -7,6 +7,7 @@ from html import escape
 from io import BytesIO
 from typing import TYPE_CHECKING
 
+from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
 from quasiharmonic.energies.measures import Distortion
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.problem import Problem
@@ -64,6 +65,6 @@ def _triangles(shown: Displayable) -> int:
             return 0 if shown.V is None else len(shown.F)
         case Diagnosis():
             return 0 if shown.problem is None else len(shown.problem.F)
-        case Certificate() | Distortion() | Problem():
+        case Certificate() | Distortion() | MorphResult() | Problem():
             return len(shown.F)
     return 0

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
 from quasiharmonic.energies.measures import Distortion
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.problem import Problem
@@ -13,6 +14,7 @@ from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui import plot
 from quasiharmonic.ui.plot.canvas import RED, caption, new_figure, verdict
+from quasiharmonic.ui.plot.elements import elements_figure
 from quasiharmonic.ui.plot.maps import map_figure
 from quasiharmonic.util.display import Displayable
 
@@ -23,7 +25,7 @@ KINDS = ("map", "distortion", "texture", "convergence")
 
 
 def draw(shown: Displayable, kind: str, *, measure: str = "isometric") -> Figure:
-    """Draw a result, a problem, a certificate, a diagnosis or a distortion measurement.
+    """Draw a result, a morphed mesh, a problem, a certificate, a diagnosis or a distortion measurement.
 
     ``kind`` is one of `KINDS`, for a `MapResult` only; ``measure`` is that of a distortion. ValueError if the kind is
     unknown, or the object lacks the data to draw.
@@ -31,6 +33,9 @@ def draw(shown: Displayable, kind: str, *, measure: str = "isometric") -> Figure
     match shown:
         case MapResult():
             return _result(shown, kind, measure)
+        case MorphResult():
+            qualities = shown.quality_before, shown.quality_after
+            return elements_figure(shown.F, (shown.points_before, shown.points), qualities, shown.inverted)
         case Distortion():
             return plot.plot_distortion(shown.V, shown.F, shown.uv, measure)
         case Problem():
