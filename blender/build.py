@@ -113,6 +113,7 @@ def write(target: Path, wheels: list[Path], platform: str) -> None:
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("blender_manifest.toml", manifest)
         archive.write(HERE.parent / "LICENSE", "LICENSE")
+        archive.write(HERE.parent / "THIRD_PARTY.md", "THIRD_PARTY.md")
         for module in sorted(EXTENSION.glob("*.py")):
             archive.write(module, module.name)
         for wheel in wheels:
