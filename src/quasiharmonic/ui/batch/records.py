@@ -144,12 +144,17 @@ def clear(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for path in (folder / FILE, folder / _MAP, *folder.glob(".qhm-*.tmp")):
-            remove_file(path)
+        remove_results(folder)
     except FileInUseError:
         raise
     except OSError as error:
         raise OutputError(f"cannot write results to {folder}: {error.strerror or error}") from error
+
+
+def remove_results(folder: Path) -> None:
+    """Delete the results in a folder, the record first; OSError if that fails."""
+    for path in (folder / FILE, folder / _MAP, *folder.glob(".qhm-*.tmp")):
+        remove_file(path)
 
 
 def is_complete(folder: Path, record: Record) -> bool:

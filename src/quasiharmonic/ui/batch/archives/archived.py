@@ -78,6 +78,7 @@ class ArchivedProblems:
         self._lock = threading.RLock()  # `problems` runs in other threads than the other methods
         self._numbers = count()
         self._extracted: dict[str, _Extracted] = {}
+        self._free: list[Path] = []  # Folders of finished problems; a new one takes longer than a file
         self._opened: list[_OpenArchive] = []
         self._ready: list[Finished] = []
         self._failed: dict[str, str] = {}
@@ -139,9 +140,7 @@ class ArchivedProblems:
         self._outputs.adopt(name, self._present, stamp)
         if self._is_finished(name, stamp):
             return
-        copy = self._scratch / str(next(self._numbers)) if places.is_url(archive.location) else None
-        if copy is not None:
-            copy.mkdir()
+        copy = self._new_folder() if places.is_url(archive.location) else None
         path = places.fetch(archive.location, copy or self._scratch)
         self._outputs.bring(name)
         with self._lock:
@@ -193,14 +192,13 @@ class ArchivedProblems:
                 seconds = before.get("seconds") or 0.0
                 self._ready.append(Finished(names["problem"], before["outcome"], seconds, resumed=True))
                 return None
-            folder = self._scratch / str(next(self._numbers))
+            folder = self._free.pop() if self._free else self._new_folder()
             self._extracted[names["problem"]] = _Extracted(opened, sample.key, folder)
             opened.waiting += 1
         # The name of the member may be unsuitable for this system.
         mesh_path = folder / f"mesh.{mesh.rpartition('.')[2]}"
         fixed_path = None if fixed is None else folder / "fixed.txt"
         try:
-            folder.mkdir()
             mesh_path.write_bytes(sample.files[mesh])
             if fixed is not None and fixed_path is not None:
                 fixed_path.write_bytes(sample.files[fixed])
@@ -217,9 +215,22 @@ class ArchivedProblems:
             if record.get("error"):
                 record["error"] = record["error"].replace(str(folder), record["source"])
             path = records.map_path(folder)
-            opened.journal.add(key, record, path.read_bytes() if path.exists() else None)
-        shutil.rmtree(folder, ignore_errors=True)
+            data = path.read_bytes() if record.get("map_bytes") is not None and path.exists() else None
+            opened.journal.add(key, record, data)
         opened.waiting -= 1
+        try:
+            records.remove_results(folder)
+            self._free.append(folder)
+        except OSError:
+            pass  # in use by another program: the folder is not used again
+
+    def _new_folder(self) -> Path:
+        folder = self._scratch / str(next(self._numbers))
+        try:
+            folder.mkdir()
+        except OSError as error:
+            raise OutputError(f"cannot write to the folder for temporary files: {error}") from error
+        return folder
 
     def _finish(self, opened: _OpenArchive) -> None:
         self._opened.remove(opened)
