@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import re
 import shlex
+import warnings
 from importlib import import_module
 from inspect import ismodule
 from pathlib import Path
@@ -48,14 +49,11 @@ OPTIONAL = "no dependency, not even of the tests: .ci/optional installs it"
 @pytest.mark.slow
 @pytest.mark.parametrize("code", CASES)
 def test_block_runs(code, tmp_path, monkeypatch, capsys):
-    if "import SimpleITK" in code:
-        pytest.importorskip("SimpleITK", reason=OPTIONAL)
-    if "import nibabel" in code:
-        pytest.importorskip("nibabel", reason=OPTIONAL)
-    if "from nilearn" in code:
-        pytest.importorskip("nilearn", reason=OPTIONAL)
-    if "from skfem" in code:
-        pytest.importorskip("skfem", reason=OPTIONAL)
+    for name in ("SimpleITK", "nibabel", "nilearn", "skfem", "datasets", "ray"):
+        if re.search(rf"^(import|from) {name}\b", code, re.MULTILINE):
+            pytest.importorskip(name, reason=OPTIONAL)
+    if "import ray" in code:
+        warnings.simplefilter("ignore")  # Ray uses its own deprecated options
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "block", "exec"), {"__name__": "block"})
     printed = capsys.readouterr().out.splitlines()

@@ -30,8 +30,8 @@ _THREADS = "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "BLIS_N
 # Seconds between two checks of time and memory, and seconds that a process may take to import its libraries.
 _CHECK_INTERVAL = 0.05
 _START = 120.0
-#: Time limit in seconds for a group of small problems; each usually takes some hundredths.
-TOGETHER = 5.0
+#: Time limit in seconds for a group of small problems. It usually takes less than a second, and more on a busy machine.
+TOGETHER = 20.0
 
 
 class Finished(NamedTuple):
