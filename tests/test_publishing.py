@@ -9,6 +9,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -85,3 +86,20 @@ def test_licences_of_all_that_is_bundled_are_listed():
     records = [path for path in (ROOT / "benchmarks" / "records").iterdir() if path.suffix != ".md"]
     assert records
     assert "benchmarks/records" in listed
+
+
+def test_a_release_is_one_step(tmp_path):
+    prepare = runpy.run_path(str(ROOT / "scripts" / "prepare-release"))["prepare"]
+    names = "src/quasiharmonic/__init__.py", "CITATION.cff", "conda/recipe.yaml", "CHANGELOG.md"
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text(name), encoding="utf-8")
+    for version, date in (("7.8.9", "2031-02-03"), ("7.8.10", "2031-02-04")):
+        prepare(tmp_path, version, date)
+    for name in names:
+        assert "7.8.10" in (tmp_path / name).read_text("utf-8"), name
+    headings = re.findall("^## (.*)$", (tmp_path / "CHANGELOG.md").read_text("utf-8"), re.M)
+    assert headings[:3] == ["Unreleased", "7.8.10 (2031-02-04)", "7.8.9 (2031-02-03)"]
+    assert (tmp_path / "CITATION.cff").read_text("utf-8").count("date-released") == 1
+    with pytest.raises(SystemExit, match="no version"):
+        prepare(tmp_path, "8", "2031-02-05")
