@@ -63,14 +63,15 @@ def test_a_field_without_an_inverse(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["field.npy", "-o", "a.obj"], "fields are written as .npy"),
+        (["field.npy", "-o", "a.obj"], "supported: .npy, .nii, .nii.gz, .mha, .nrrd"),
         (["field.npy", "-o", "field.npy"], "would replace an input file"),
         (["field.npy", "-o", "a.npy", "--spacing", "0"], "field.npy: spacing must be a positive number"),
         (["lost.npy", "-o", "a.npy"], r"lost.npy: field is not finite at pixel (2, 3), row and column"),
-        (["words.npy", "-o", "a.npy"], "words.npy: not an array of numbers in NumPy's format .npy"),
+        (["words.npy", "-o", "a.npy"], "words.npy: is not an array of numbers in NumPy's format .npy"),
         (["none.npy", "-o", "a.npy"], "none.npy"),
+        (["lost.npy", "-o", "a.mha"], "a field of lost.npy cannot be written there; use .npy"),
         (["row.npy", "-o", "a.npy", "--fix-border"], "row.npy: field must have shape (height, width, 2)"),
-        (["several.npz", "-o", "a.npy"], "several.npz: not an array of numbers in NumPy's format .npy"),
+        (["several.npz", "-o", "a.npy"], "several.npz: is not a displacement field of a supported format"),
     ],
 )
 def test_invalid_calls(tmp_path, monkeypatch, field, capsys, arguments, message):

@@ -2,6 +2,8 @@
 
 from .errors import MeshFileError as MeshFileError
 from .errors import OutputError as OutputError
+from .fields import DisplacementField as DisplacementField
+from .fields import read_field as read_field
 from .formats.gltf.reader import read_gltf as read_gltf
 from .formats.gltf.writer import write_gltf as write_gltf
 from .formats.neuro import read_freesurfer as read_freesurfer

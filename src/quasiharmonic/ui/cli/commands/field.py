@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.io.fields import DisplacementField
     from quasiharmonic.ui.cli.arguments import Commands
 
 
@@ -20,31 +21,33 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "field",
         description="Make a displacement field invertible with the least change. Away from folds "
-        "the field is unchanged, bit for bit. It is an array .npy of shape (height, width, 2), displacements "
-        "along x, to the right, and y, down, in the unit of --spacing.",
+        "the field is unchanged, bit for bit. It is a .npy array of shape (height, width, 2), displacements "
+        "along x, to the right, and y, down, in the unit of --spacing; or a NIfTI file (.nii, .nii.gz; needs nibabel) "
+        "or a file of ITK (.mha, .nrrd; needs SimpleITK) of vectors along the axes of space, as ITK, ANTs and elastix "
+        "write them.",
         epilog="Exit status: 0 the written field is certified without folds; 1 written, but the inverse that "
         "--inverse requests does not exist, because the border overlaps itself; 2 wrong input or call, or no such "
         "field was found, nothing written; 3 written, but the report failed.",
         examples=(
             "qhm field field.npy -o field_without_folds.npy",
             "qhm field field.npy --inverse inverse.npy -o field_without_folds.npy",
+            "qhm field warp.nii.gz -o warp_without_folds.nii.gz",
         ),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help=".npy file")
-    parser.add_argument("-o", "--output", type=Path, required=True, help=".npy file to write")
+    parser.add_argument("input", type=Path, metavar="INPUT", help=".npy, .nii, .nii.gz, .mha or .nrrd file")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="file to write, of the same kind")
     parser.add_argument(
         "--inverse",
         type=Path,
         metavar="FILE",
-        help="also write the inverse of the new field, on the same grid, as .npy; NaN outside the field's image",
+        help="also write the inverse of the new field, of the same kind and grid; NaN outside the field's image",
     )
     parser.add_argument(
         "--spacing",
         type=float,
         nargs="+",
-        default=[1.0],
         metavar="LENGTH",
-        help="distance between pixels; or two, along x and along y (default: 1)",
+        help="for .npy: distance between pixels; or two, along x and along y (default: 1)",
     )
     parser.add_argument(
         "--min-jacobian",
@@ -60,25 +63,31 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, make invertible, write, report."""
-    from quasiharmonic.apps.displacement_fields.nearest import nearest_invertible
+    from quasiharmonic.apps.displacement_fields.nearest import fold_free, nearest_invertible
+    from quasiharmonic.io.fields import field_suffix, read_field
     from quasiharmonic.ui.cli import report
 
     outputs = {"-o": options.output, **({} if options.inverse is None else {"--inverse": options.inverse})}
-    for what, path in outputs.items():
-        if path.suffix.lower() != ".npy":
-            raise ValueError(f"{what} {path}: fields are written as .npy")
     report.check_new(outputs, options.json, inputs=(options.input,))
-    spacing = options.spacing if len(options.spacing) > 1 else options.spacing[0]
-    field = _read(options.input)
+    for path in outputs.values():
+        field_suffix(path)
+    given = read_field(options.input)
+    for path in outputs.values():
+        given.check_output(path)
+    field, spacing = given.field, _spacing(options, given)
     with report.about(options.input):
         held = _border(field) if options.fix_border else None
         try:
             repaired = nearest_invertible(field, spacing=spacing, min_jacobian=options.min_jacobian, fixed=held)
         except RuntimeError as error:
             raise ValueError(str(error)) from error
-    _write(options.output, repaired.field)
+    given.write(options.output, repaired.field)
     invertible = bool(repaired.certificate.bijective)
     with report.after_writing(options.output):
+        # Rotation to the axes of space rounds, so the file is verified.
+        written = read_field(options.output).field
+        if not fold_free(written, spacing=spacing).all():
+            raise ValueError("rounding has folded the field: give a larger --min-jacobian")
         facts: dict[str, Any] = {
             "injective": repaired.certificate.injective,
             "bijective": invertible,
@@ -92,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
         }
         lines = [f"wrote {options.output}: {repaired.summary()}"]
         if options.inverse is not None and invertible:
-            lines.append(_invert(options.inverse, repaired.field, spacing))
+            lines.append(_invert(options.inverse, given, written, spacing))
             facts["inverse"] = str(options.inverse)
         elif options.inverse is not None:
             lines.append(f"{options.inverse} is not written: the field has no inverse")
@@ -100,31 +109,22 @@ def run(options: argparse.Namespace) -> int:
     return 0 if invertible or options.inverse is None else 1
 
 
-def _read(path: Path) -> NDArray[Any]:
-    import numpy as np
-
-    with path.open("rb") as file:
-        try:
-            array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise ValueError(f"{path}: not an array of numbers in NumPy's format .npy: {error}") from error
-    return array
-
-
-def _write(path: Path, field: NDArray[np.float64]) -> None:
-    import numpy as np
-
-    from quasiharmonic.io import write_whole
-
-    write_whole(path, lambda file: np.save(file, field))
+def _spacing(options: argparse.Namespace, given: DisplacementField) -> float | list[float]:
+    """Return the distance between pixels."""
+    if options.input.suffix.lower() != ".npy":
+        if options.spacing is not None:
+            raise ValueError(f"--spacing is for .npy: {options.input} has its own")
+        return [float(length) for length in given.spacing]
+    lengths: list[float] = options.spacing or [1.0]
+    return lengths if len(lengths) > 1 else lengths[0]
 
 
-def _invert(path: Path, field: NDArray[np.float64], spacing: float | list[float]) -> str:
+def _invert(path: Path, given: DisplacementField, field: NDArray[np.float64], spacing: float | list[float]) -> str:
     """Write the inverse field, and return its summary."""
     from quasiharmonic.apps.displacement_fields.field_inversion import inverse_field
 
     back = inverse_field(field, spacing=spacing)
-    _write(path, back.field)
+    given.write(path, back.field)
     return f"wrote {path}: {back.summary()}"
 
 

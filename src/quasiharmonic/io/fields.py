@@ -1,0 +1,232 @@
+"""Read and write displacement fields of images: NumPy, NIfTI through nibabel, and ITK's formats through SimpleITK.
+
+In memory a field has displacements along the axes of its grid. In NIfTI and ITK files the components refer to the axes
+of space: those of ITK, which point left, posterior and superior (LPS). NIfTI fields that ITK, ANTs and elastix write
+have them too, with the intent VECTOR (1007). With the intent DISPVECT (1006) they are those of the NIfTI standard,
+right, anterior and superior (RAS).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.lowlevel.textual import read_bytes
+from quasiharmonic.util.arrays import FloatArray
+
+NIFTI = ".nii", ".nii.gz"
+ITK = ".mha", ".nrrd"
+#: The suffixes of displacement fields.
+FIELD_SUFFIXES = ".npy", *NIFTI, *ITK
+# The intent of NIfTI fields whose components are those of the standard.
+_DISPVECT = 1006
+# Largest cosine between the axes of a grid; files store directions in single precision.
+_SKEW = 1e-4
+# Largest displacement out of the plane, relative to the largest in it.
+_OUT_OF_PLANE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class DisplacementField:
+    """A displacement field of a two-dimensional image, and what is needed to write it again.
+
+    Attributes
+    ----------
+    field : (h, w, 2) float64
+        Displacements along the grid's axes, to the right and down, in the unit of ``spacing``, of the pixel in row y
+        and column x.
+    spacing : (2,) float64
+        Distance between pixels, along x and along y.
+    axes : (c, 2) float64
+        Directions of the grid's axes in the space of the file's components, as columns. The identity for ``.npy``.
+    source : str
+        The file that was read.
+    """
+
+    field: FloatArray
+    spacing: FloatArray
+    axes: FloatArray
+    source: str
+    _components: FloatArray = dataclasses.field(repr=False)  # (h, w, c): as in the file
+    _encode: Callable[[FloatArray, str], bytes] = dataclasses.field(repr=False)  # Bytes of a file with other components
+    _suffixes: tuple[str, ...] = dataclasses.field(repr=False)  # Suffixes that can be written
+
+    def check_output(self, path: str | os.PathLike[str]) -> None:
+        """Raise a MeshFileError if a path has the suffix of another kind of file."""
+        if field_suffix(path) not in self._suffixes:
+            raise MeshFileError(
+                path, f"a field of {self.source} cannot be written there", remedy=f"use {', '.join(self._suffixes)}"
+            )
+
+    def write(self, path: str | os.PathLike[str], field: ArrayLike) -> None:
+        """Write another field (h, w, 2) on the same grid, in double precision.
+
+        The header is that of the file that was read. Displacements that are equal to those read are written bitwise as
+        they were. MeshFileError as `check_output`; OutputError if the file cannot be written.
+        """
+        self.check_output(path)
+        new = np.asarray(field, dtype=np.float64)
+        if new.shape != self.field.shape:
+            raise ValueError(f"field must have shape {self.field.shape}, not {new.shape}")
+        same = (new == self.field).all(axis=2, keepdims=True)
+        data = self._encode(np.where(same, self._components, new @ self.axes.T), field_suffix(path))
+        write_whole(path, data)
+
+
+def field_suffix(path: str | os.PathLike[str]) -> str:
+    """Return the suffix of a displacement field in lower case; MeshFileError if it is none of `FIELD_SUFFIXES`."""
+    check_path("path", path)
+    name = Path(path).name.lower()
+    for suffix in FIELD_SUFFIXES:
+        if name.endswith(suffix):
+            return suffix
+    raise MeshFileError(
+        path, "is not a displacement field of a supported format", remedy=f"supported: {', '.join(FIELD_SUFFIXES)}"
+    )
+
+
+def read_field(path: str | os.PathLike[str]) -> DisplacementField:
+    """Read a displacement field of a two-dimensional image.
+
+    Parameters
+    ----------
+    path : str or path-like
+        ``.npy`` of shape (height, width, 2); NIfTI (``.nii``, ``.nii.gz``) of shape (width, height, 1, 1, 2) or without
+        the axes of length one; ``.mha`` or ``.nrrd`` of vectors. There may be a third component, which must be zero, or
+        all vectors lie in the plane of the image.
+
+    Returns
+    -------
+    DisplacementField
+
+    Raises
+    ------
+    MeshFileError
+        If the file is not valid, has another shape, has axes that are not perpendicular, or moves pixels out of the
+        plane.
+    ImportError
+        If nibabel or SimpleITK is needed and not installed.
+    """
+    suffix = field_suffix(path)
+    if suffix == ".npy":
+        return _read_npy(path)
+    return _read_nifti(path) if suffix in NIFTI else _read_itk(path)
+
+
+def _read_npy(path: str | os.PathLike[str]) -> DisplacementField:
+    with open(path, "rb") as file:
+        try:
+            array = np.lib.format.read_array(file, allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise MeshFileError(path, f"is not an array of numbers in NumPy's format .npy: {error}") from error
+
+    def encode(components: FloatArray, suffix: str) -> bytes:
+        from io import BytesIO
+
+        np.save(file := BytesIO(), components)
+        return file.getvalue()
+
+    return DisplacementField(array, np.ones(2), np.eye(2), os.fspath(path), array, encode, (".npy",))
+
+
+def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
+    try:
+        import nibabel
+    except ImportError as error:
+        raise ImportError(f"NIfTI files need nibabel ({error}): pip install nibabel") from error
+    read_bytes(path)  # Raises an error that names what is wrong with the path.
+    try:
+        # Damaged files cause errors of many types.
+        image: Any = nibabel.load(path)
+        data = np.asarray(image.dataobj, dtype=np.float64)
+        affine = np.asarray(image.affine, dtype=np.float64)
+        intent = int(image.header["intent_code"])
+    except Exception as error:
+        raise MeshFileError(path, f"is not valid NIfTI: {error}") from error
+    if data.ndim < 3 or data.shape[-1] not in (2, 3) or any(size != 1 for size in data.shape[2:-1]):
+        raise MeshFileError(
+            path, f"has shape {data.shape}, but a field of a plane image has (width, height, 1, 1, 2 or 3)"
+        )
+    count = data.shape[-1]
+    # NIfTI's affine refers to RAS.
+    columns = affine[:3, :2] * (1 if intent == _DISPVECT else np.array([[-1], [-1], [1]]))
+    if count == 2 and np.abs(columns[2]).max() > _SKEW * np.abs(columns).max():
+        raise MeshFileError(path, "has two components, but its plane is not that of the first two axes of space")
+
+    def encode(components: FloatArray, suffix: str) -> bytes:
+        values = components.transpose(1, 0, 2).reshape(data.shape)
+        made = type(image)(values, image.affine, image.header)
+        made.set_data_dtype(np.float64)
+        with TemporaryDirectory() as folder:
+            part = Path(folder, f"field{suffix}")
+            nibabel.save(made, part)
+            return part.read_bytes()
+
+    components = data.reshape(*data.shape[:2], count).transpose(1, 0, 2)
+    return _in_grid_axes(path, components, columns[:count], encode, NIFTI)
+
+
+def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
+    try:
+        import SimpleITK
+    except ImportError as error:
+        raise ImportError(f"ITK's files need SimpleITK ({error}): pip install SimpleITK") from error
+    read_bytes(path)
+    try:
+        image = SimpleITK.ReadImage(os.fspath(path))
+    except RuntimeError as error:
+        raise MeshFileError(path, f"SimpleITK cannot read it: {str(error).splitlines()[-1]}") from error
+    n, count = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
+    if any(size != 1 for size in image.GetSize()[2:]) or count != n or n not in (2, 3):
+        raise MeshFileError(
+            path, f"has size {image.GetSize()} and {count} components, but a field of a plane image has one slice"
+        )
+    array = SimpleITK.GetArrayFromImage(image).astype(np.float64)
+    columns = np.reshape(image.GetDirection(), (n, n))[:, :2] * image.GetSpacing()[:2]
+
+    def encode(components: FloatArray, suffix: str) -> bytes:
+        made = SimpleITK.GetImageFromArray(np.ascontiguousarray(components).reshape(array.shape), isVector=True)
+        made.CopyInformation(image)
+        for key in image.GetMetaDataKeys():
+            made.SetMetaData(key, image.GetMetaData(key))
+        with TemporaryDirectory() as folder:
+            part = Path(folder, f"field{suffix}")
+            SimpleITK.WriteImage(made, str(part))
+            return part.read_bytes()
+
+    return _in_grid_axes(path, array.reshape(*array.shape[-3:-1], count), columns, encode, ITK)
+
+
+def _in_grid_axes(
+    path: str | os.PathLike[str],
+    components: FloatArray,
+    columns: FloatArray,
+    encode: Callable[[FloatArray, str], bytes],
+    suffixes: tuple[str, ...],
+) -> DisplacementField:
+    """Return the field along the axes of the grid, whose steps in space are ``columns`` (c, 2)."""
+    spacing = np.linalg.norm(columns, axis=0)
+    if not (np.isfinite(spacing).all() and spacing.all()):
+        raise MeshFileError(path, "has a spacing of zero or that is not finite")
+    axes = columns / spacing
+    if abs(axes[:, 0] @ axes[:, 1]) > _SKEW:
+        raise MeshFileError(path, "has axes that are not perpendicular", remedy="resample it on a regular grid")
+    # Exactly orthonormal, so that the way back is the transpose.
+    left, _, right = np.linalg.svd(axes, full_matrices=False)
+    axes = left @ right
+    along = components @ axes
+    finite = np.isfinite(components).all(axis=2)
+    out = np.abs(along[finite] @ axes.T - components[finite]).max(initial=0.0)
+    if out > _OUT_OF_PLANE * np.abs(components[finite]).max(initial=0.0):
+        raise MeshFileError(path, f"moves pixels out of the plane of the image, by up to {out:.3g}")
+    return DisplacementField(along, spacing, axes, os.fspath(path), components, encode, suffixes)
