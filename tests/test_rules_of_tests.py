@@ -112,6 +112,15 @@ def test_packages_that_tests_skip_without_are_installed_somewhere():
     assert "install test scikit-fem" in gradients
     browser = (ROOT / ".ci" / "browser").read_text(encoding="utf-8")
     pages = re.findall(r"[a-z]+", re.search(r"install test,notebook (.*)", browser).group(1))
-    extra = [*extras["view"], *extras["cortex"], *extras["notebook"], *by_itself, *layers, *pages, "skfem"]
+    extra = [
+        *extras["view"],
+        *extras["cortex"],
+        *extras["notebook"],
+        *extras["remote"],
+        *by_itself,
+        *layers,
+        *pages,
+        "skfem",
+    ]
     known = f"{installed} quasiharmonic {' '.join(extra)}"
     assert not [name for name in wanted if name not in sys.stdlib_module_names and name.split(".")[0] not in known]
