@@ -229,7 +229,7 @@ LOST[1, 4, 0], LOST[3, 2, 1] = np.nan, np.inf
     [
         (LOST, {}, r"field is not finite at pixels \(1, 4\), \(3, 2\), row and column"),
         (np.zeros((2, 5, 6)), {}, r"not \(2, 5, 6\): pass numpy.moveaxis\(field, 0, -1\)"),
-        (np.zeros((4, 5, 6, 3)), {}, "fields on volumes are not supported"),
+        (np.zeros((4, 5, 6, 2)), {}, "field must have shape"),
         (np.zeros((1, 6, 2)), {}, "at least 2 × 2 pixels"),
         (WRONG + 1j, {}, "field must contain real numbers"),
         (WRONG, {"spacing": (1, 0)}, "spacing must be a positive number, or two"),

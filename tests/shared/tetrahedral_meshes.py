@@ -98,3 +98,17 @@ def random_tiny(rng):
     if rng.random() < 0.2:
         X = X * 10.0 ** rng.choice([-150, 150])
     return X, T
+
+
+def folded_volume(n, folds, seed=0):
+    """A smooth displacement field on n³ voxels with some bumps that fold, on separate cells of 12³ voxels."""
+    rng = np.random.default_rng(seed)
+    z, y, x = np.indices((n, n, n)) / n
+    field = 0.02 * n * np.stack([np.sin(3 * y + 2 * z), np.cos(2 * x + z), np.sin(2 * x + 3 * y)], axis=-1)
+    side = n // 12
+    for spot in rng.permutation(side**3)[:folds]:
+        centre = 12 * np.array(np.unravel_index(spot, (side,) * 3)) + 6 + rng.uniform(-1, 1, 3)
+        away = np.stack(np.indices((n, n, n)), axis=-1) - centre
+        way = rng.normal(size=3)
+        field += 3.2 * np.exp(-(away**2).sum(axis=-1) / 4)[..., None] * way / np.linalg.norm(way)
+    return field

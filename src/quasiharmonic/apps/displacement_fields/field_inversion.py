@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.displacement_fields.grid import Grid, check_field, check_grid, name_pixels
 from quasiharmonic.apps.displacement_fields.nearest import fold_free
+from quasiharmonic.apps.tetrahedra.voxel_fields import InverseVolume, inverse_volume
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
@@ -46,19 +47,19 @@ class InverseField:
         )
 
 
-def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField:
+def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField | InverseVolume:
     """Invert a displacement field that does not fold.
 
     Parameters
     ----------
-    field : (h, w, 2) array
-        Displacements along x and y; see `nearest_invertible`.
-    spacing : float or (float, float)
-        Distance between neighbouring pixels, along x and along y.
+    field : (h, w, 2) or (d, h, w, 3) array
+        Displacements; see `nearest_invertible`.
+    spacing : float, (float, float) or (float, float, float)
+        Distance between neighbouring pixels, along x, along y, and along z.
 
     Returns
     -------
-    InverseField
+    InverseField, or InverseVolume for voxels
         The inverse on the same grid.
 
     Raises
@@ -81,6 +82,8 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
     >>> back.field[2, 3].tolist(), bool(back.outside[:, 0].all())
     ([-1.0, 0.0], True)
     """
+    if np.ndim(field) == 4:
+        return inverse_volume(field, spacing)
     given = check_field(field)
     grid = check_grid(given.shape, spacing)
     wrong = ~fold_free(given, spacing=spacing)

@@ -100,7 +100,7 @@ def check_field(field: ArrayLike) -> FloatArray:
         if array.ndim == 3 and array.shape[0] == 2:
             advice = ": pass numpy.moveaxis(field, 0, -1)"
         elif array.ndim == 4 or (array.ndim == 3 and array.shape[2] == 3):
-            advice = "; fields on volumes are not supported"
+            advice = "; fields on volumes have shape (depth, height, width, 3)"
         raise ValueError(
             "field must have shape (height, width, 2), displacements along x and y for at least 2 × 2 "
             f"pixels, not {array.shape}{advice}"

@@ -18,6 +18,7 @@ from quasiharmonic.apps.displacement_fields.patches import (
     grow,
     label_patches,
 )
+from quasiharmonic.apps.tetrahedra.voxel_fields import InvertibleVolume, nearest_invertible_volume
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, count_of
@@ -88,7 +89,7 @@ def nearest_invertible(
     spacing: ArrayLike = 1.0,
     min_jacobian: float = 0.01,
     fixed: ArrayLike | None = None,
-) -> InvertibleField:
+) -> InvertibleField | InvertibleVolume:
     """Make a displacement field invertible with a minimum change.
 
     Between pixels the field is interpolated bilinearly. It folds at a cell, the square between four pixels, if the
@@ -97,21 +98,21 @@ def nearest_invertible(
 
     Parameters
     ----------
-    field : (h, w, 2) array
+    field : (h, w, 2) or (d, h, w, 3) array
         Displacements along x, to the right, and y, down, of the pixel in row y and column x, in the unit of
         ``spacing``. The pixel at position p is mapped to ``p + field``.
-    spacing : float or (float, float)
-        Distance between neighbouring pixels, along x and along y.
+    spacing : float, (float, float) or (float, float, float)
+        Distance between neighbouring pixels, along x, along y, and along z.
     min_jacobian : float
         Lower bound of the determinants at the four corners of each cell; at least 0 and less than 1. Cells below it
         count as folds. Smaller values than the rounding error of a determinant are raised to it. A field with
         determinants slightly above the bound stays without folds in single precision.
-    fixed : (h, w) array of bool, optional
+    fixed : (h, w) or (d, h, w) array of bool, optional
         Pixels that keep their displacements; none by default, so border pixels may also move.
 
     Returns
     -------
-    InvertibleField
+    InvertibleField, or InvertibleVolume for voxels
         The result. Away from folds the field is bitwise unchanged.
 
     Raises
@@ -125,6 +126,10 @@ def nearest_invertible(
 
     Notes
     -----
+    Fields on voxels (d, h, w, 3) have displacements along x, y and z in plane z, row y and column x. Each cell between
+    eight voxels is divided into six tetrahedra (`quasiharmonic.apps.tetrahedra.voxel_fields`), which must be positive.
+    In space no theorem says that a field is found: the result lists cells that still fold.
+
     With deep folds the distance has many local minima. The result depends on the start, a harmonic fill of patches
     around the folds (`quasiharmonic.apps.displacement_fields.patches`). If the field's border overlaps itself, which is
     not a fold, `Certificate.bijective` is False and the certificate reports where.
@@ -139,10 +144,12 @@ def nearest_invertible(
     (True, 8, True)
     """
     began = time.perf_counter()
-    given = check_field(field)
-    grid = check_grid(given.shape, spacing)
     if not isinstance(min_jacobian, Real) or not 0 <= min_jacobian < 1:
         raise ValueError(f"min_jacobian must be at least 0 and less than 1, not {min_jacobian!r}")
+    if np.ndim(field) == 4:
+        return nearest_invertible_volume(field, spacing, min_jacobian, fixed)
+    given = check_field(field)
+    grid = check_grid(given.shape, spacing)
     mask = _check_mask(fixed, grid)
     w = _map(grid, given)
     min_jacobian = max(min_jacobian, _bound_rounding(w))

@@ -67,7 +67,7 @@ class TetrahedraCertificate(ReadOnly):
         Boundary triangles, counterclockwise seen from outside.
     crossings : (k, 2) int64
         Pairs of boundary triangles, as rows of ``boundary``, that meet outside their common vertices and edges.
-        Degenerate boundary triangles are not compared.
+        Degenerate boundary triangles are not compared. At most 1000 are listed.
     multiply_covered : (k,) int64
         Boundary triangles, one for each part of the boundary, on whose outer side the winding number is not 0. Only
         computed if the mesh meets the other conditions.

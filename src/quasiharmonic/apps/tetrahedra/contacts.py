@@ -19,22 +19,30 @@ from quasiharmonic.geometry.exact.predicates import box_pairs, box_pairs_between
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
+#: Maximum number of pairs of triangles that are found.
+MAX_LISTED = 1000
 _SIDES = ((0, 1), (1, 2), (2, 0))
 _AXES = ((0, 1), (1, 2), (2, 0))
 
 
 def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
-    """Find pairs (k, 2) of triangles (f, 3), not degenerate, that meet outside their common vertices and edges."""
+    """Find pairs (k, 2) of triangles (f, 3), not degenerate, that meet outside their common vertices and edges.
+
+    The search ends after `MAX_LISTED` pairs.
+    """
     corners = X[F]
     lo, hi = corners.min(axis=1), corners.max(axis=1)
     order = _spatial_order(0.5 * lo + 0.5 * hi)
-    found = [np.empty((0, 2), dtype=np.int64)]
+    found, count = [np.empty((0, 2), dtype=np.int64)], 0
     for i, j in box_pairs(lo[order], hi[order]):
         heartbeat()
         one, other = order[i], order[j]
         meet = _meet(F[one], F[other], X, signs)
         found.append(np.sort(np.stack([one[meet], other[meet]], axis=1), axis=1))
-    pairs = np.concatenate(found)
+        count += int(np.count_nonzero(meet))
+        if count >= MAX_LISTED:
+            break
+    pairs = np.concatenate(found)[:MAX_LISTED]
     return pairs[np.lexsort(pairs.T[::-1])]
 
 

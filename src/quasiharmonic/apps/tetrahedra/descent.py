@@ -30,10 +30,15 @@ _MIN_EPSILON = 1e-14
 
 
 class Descent:
-    """Newton's method on the energy of a mesh with free vertices ``free`` (k,); ``X`` (n, 3) are the positions."""
+    """Newton's method on the energy of a mesh with free vertices ``free`` (k,); ``X`` (n, 3) are the positions.
 
-    def __init__(self, energy: ShapeEnergy, free: IntArray, X: FloatArray) -> None:
-        self.energy, self.free, self.X = energy, free, X.copy()
+    With ``anchor``, positions (n, 3) and a weight, half the weighted sum of squared distances from them is added.
+    """
+
+    def __init__(
+        self, energy: ShapeEnergy, free: IntArray, X: FloatArray, anchor: tuple[FloatArray, float] | None = None
+    ) -> None:
+        self.energy, self.free, self.X, self.anchor = energy, free, X.copy(), anchor
         self._blocks = BlockMatrix(energy.T, energy.n, free)
         self.iterations = 0
         self.converged = False
@@ -43,9 +48,9 @@ class Descent:
         """Lower the regularised energy; yield the least determinant after each step, and end when it is positive."""
         epsilon, repeated = _FIRST_EPSILON, 0
         for _ in range(max_steps):
-            before = self.energy.value(self.X, epsilon)
+            before = self._value(self.X, epsilon)
             after = self._step(epsilon)
-            least = float(self.energy.determinants(self.X).min())
+            least = float(self.energy.determinants(self.X).min()) - self.energy.floor
             yield least
             if least > 0 or (after is None and epsilon < _MIN_EPSILON):
                 return
@@ -57,7 +62,7 @@ class Descent:
 
     def polish(self, max_steps: int, tol: float) -> Iterator[float]:
         """Lower the energy of positive tetrahedra; yield it after each step, and end when it has converged."""
-        before = self.energy.value(self.X, 0.0)
+        before = self._value(self.X, 0.0)
         for _ in range(max_steps):
             after = self._step(0.0)
             if after is None:
@@ -69,12 +74,27 @@ class Descent:
                 return
             before = after
 
+    def _value(self, X: FloatArray, epsilon: float) -> float:
+        """The function that is lowered."""
+        value = self.energy.value(X, epsilon)
+        if self.anchor is not None:
+            away = X - self.anchor[0]
+            value += 0.5 * self.anchor[1] * float((away * away).sum())
+        return value
+
     def _step(self, epsilon: float) -> float | None:
         """Take a Newton step; return the energy after it, or None if no step lowers the energy."""
         heartbeat()
         value, gradient, blocks = self.energy.derivatives(self.X, epsilon)
+        data = self._blocks.assemble(blocks)
+        if self.anchor is not None:
+            places, weight = self.anchor
+            away = self.X - places
+            value += 0.5 * weight * float((away * away).sum())
+            gradient = gradient + weight * away
+            data[self._blocks.diagonal] += weight * np.eye(3)
         g = gradient[self.free].ravel()
-        p = self._direction(self._blocks.assemble(blocks), g)
+        p = self._direction(data, g)
         decrease = -float(g @ p)
         self.iterations += 1
         if not decrease > 0:
@@ -84,7 +104,7 @@ class Descent:
         def trial(t: float, bound: float) -> tuple[float, FloatArray | None]:
             X = self.X.copy()
             X[self.free] += t * direction
-            found = self.energy.value(X, epsilon)
+            found = self._value(X, epsilon)
             return found, X if found < bound else None
 
         accepted = backtrack(trial, value, decrease, tries=_TRIES)

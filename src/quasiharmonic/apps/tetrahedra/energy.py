@@ -70,12 +70,12 @@ def reduce_epsilon(epsilon: float, min_determinant: float, ratio: float) -> floa
 class ShapeEnergy:
     """The energy of meshes with tetrahedra ``T`` (t, 4), relative to rest positions (n, 3) with positive tetrahedra.
 
-    The energy is the sum of the densities, so that small tetrahedra count as much as large ones. Methods take positions
-    (n, 3).
+    The energy is the mean of the densities, so that small tetrahedra count as much as large ones. In χ, D is replaced
+    by ``D − floor``, so that determinants stay above ``floor``. Methods take positions (n, 3).
     """
 
-    def __init__(self, T: IntArray, rest: FloatArray) -> None:
-        self.T, self.n = T, len(rest)
+    def __init__(self, T: IntArray, rest: FloatArray, floor: float = 0.0) -> None:
+        self.T, self.n, self.floor = T, len(rest), floor
         u, v, w = (np.ascontiguousarray((rest[T[:, k]] - rest[T[:, 0]]).T) for k in (1, 2, 3))
         volume = _dot(u, _cross(v, w))
         # Gradients of the four linear basis functions.
@@ -106,9 +106,9 @@ class ShapeEnergy:
         """Return the energy per tetrahedron; infinite if ε is 0 and a tetrahedron is not positive."""
         J = self.jacobians(X)
         D = _dot(J[0], _cross(J[1], J[2]))
-        if epsilon == 0 and not D.min() > 0:
+        if epsilon == 0 and not D.min() > self.floor:
             return np.inf
-        chi = regularised(D, epsilon)
+        chi = regularised(D - self.floor, epsilon)
         t = np.einsum("abt,abt->t", J, J)
         density = (1 - _VOLUME_SHARE) / 3 * t * np.cbrt(chi) ** -2 + _VOLUME_SHARE / 2 * (D * D + 1) / chi
         value = float(density.mean())
@@ -123,8 +123,8 @@ class ShapeEnergy:
 
     def _density(self, J: FloatArray, D: FloatArray, epsilon: float) -> _Density:
         t = np.einsum("abt,abt->t", J, J)
-        chi = regularised(D, epsilon)
-        root = np.hypot(D, epsilon)
+        chi = regularised(D - self.floor, epsilon)
+        root = np.hypot(D - self.floor, epsilon)
         first = chi / root
         second = 0.5 * (epsilon / root) ** 2 / root
         a, b = (1 - _VOLUME_SHARE) / 3, _VOLUME_SHARE / 2

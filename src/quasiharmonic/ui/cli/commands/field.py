@@ -63,7 +63,7 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, make invertible, write, report."""
-    from quasiharmonic.apps.displacement_fields.nearest import fold_free, nearest_invertible
+    from quasiharmonic.apps.displacement_fields.nearest import InvertibleField, fold_free, nearest_invertible
     from quasiharmonic.io.fields import field_suffix, read_field
     from quasiharmonic.ui.cli import report
 
@@ -75,12 +75,15 @@ def run(options: argparse.Namespace) -> int:
     for path in outputs.values():
         given.check_output(path)
     field, spacing = given.field, _spacing(options, given)
+    if field.ndim == 4:
+        raise ValueError(f"{options.input} is a field on voxels: use `nearest_invertible` in Python")
     with report.about(options.input):
         held = _border(field) if options.fix_border else None
         try:
             repaired = nearest_invertible(field, spacing=spacing, min_jacobian=options.min_jacobian, fixed=held)
         except RuntimeError as error:
             raise ValueError(str(error)) from error
+    assert isinstance(repaired, InvertibleField)
     given.write(options.output, repaired.field)
     invertible = bool(repaired.certificate.bijective)
     with report.after_writing(options.output):

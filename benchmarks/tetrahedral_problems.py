@@ -1,0 +1,199 @@
+"""Generated problems for tetrahedra: maps onto a given boundary that exist by construction, and moving bodies.
+
+A fixed-boundary problem has a mesh and the boundary of a hidden map. The hidden map is a diffeomorphism whose strength
+is raised until it inverts a tetrahedron; the problem takes 95 % of the largest certified strength. So its worst
+tetrahedra are nearly flat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from scipy.spatial import Delaunay
+
+from quasiharmonic import certify_tetrahedra
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+FAMILIES = ("flow", "twist", "bend", "spin", "folded")
+
+
+@dataclass(frozen=True)
+class VolumeProblem:
+    """A mesh, its fixed boundary, a hidden injective map, and an initial mesh, None for the harmonic map."""
+
+    X: FloatArray
+    T: IntArray
+    fixed: IntArray
+    hidden: FloatArray
+    start: FloatArray | None
+
+    @property
+    def target(self) -> FloatArray:
+        """Target positions of the fixed vertices."""
+        return self.hidden[self.fixed]
+
+
+def box(k: int, jitter: float, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
+    """A cube of side 2 around the origin of 6 k³ tetrahedra, with jittered inner vertices."""
+    X = np.stack(np.meshgrid(*[2 * np.arange(k + 1) / k - 1] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    step = np.array([(k + 1) ** 2, k + 1, 1])
+    first = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) @ step
+    T = np.concatenate([first[:, None] + np.cumsum([0, *step[list(p)]]) for p in permutations(range(3))])
+    inner = (np.abs(X) < 1).all(axis=1)
+    X[inner] += jitter / k * rng.uniform(-1, 1, (inner.sum(), 3))
+    return X, _positive(T, X)
+
+
+def ball(points: int, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
+    """A Delaunay mesh of random points in a ball, with slivers."""
+    count = max(int(3.4 * points ** (2 / 3)), 30)
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    r = np.sqrt(1 - z * z)
+    surface = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    inside = rng.normal(size=(points, 3))
+    inside *= (0.93 * rng.random(points) ** (1 / 3) / np.linalg.norm(inside, axis=1))[:, None]
+    X = np.concatenate([surface, inside])
+    return X, _positive(Delaunay(X).simplices.astype(np.int64), X)
+
+
+def shell(k: int, rng: np.random.Generator) -> tuple[FloatArray, IntArray, IntArray]:
+    """A jittered cube with a cubic cavity of a third of its width, and the vertices of the cavity."""
+    X, T = box(k, 0.3, rng)
+    half = round(k / 6) * 2 / k if k % 2 == 0 else (2 * round((k / 3 - 1) / 2) + 1) / k
+    lattice = 2 * np.stack(np.meshgrid(*[np.arange(k + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) / k - 1
+    T = T[np.abs(lattice[T].mean(axis=1)).max(axis=1) > half]
+    cavity = np.flatnonzero(np.abs(np.abs(lattice).max(axis=1) - half) < 1e-9)
+    X[cavity] = lattice[cavity]
+    return X, T, cavity
+
+
+def make(family: str, seed: int, tetrahedra: int) -> VolumeProblem:
+    """Make a problem of a family with about this number of tetrahedra."""
+    rng = np.random.default_rng([FAMILIES.index(family), seed])
+    if family == "spin":
+        X, T, _ = shell(max(round((tetrahedra / 6) ** (1 / 3)), 7), rng)
+    elif seed % 3 == 0:
+        X, T = ball(max(tetrahedra // 7, 30), rng)
+    elif seed % 3 == 1:
+        X, T = box(max(round((tetrahedra / 6) ** (1 / 3)), 3), 0.5, rng)
+    else:
+        X, T, _ = shell(max(round((tetrahedra / 6) ** (1 / 3)), 5), rng)
+    move = _family(family, rng)
+    low, high = 0.0, 4.0
+    for _ in range(9):
+        strength = 0.5 * (low + high)
+        if _is_valid(T, move(X, strength)):
+            low = strength
+        else:
+            high = strength
+    hidden = move(X, 0.95 * low)
+    while not _is_valid(T, hidden):
+        low *= 0.9
+        hidden = move(X, low)
+    fixed = np.unique(certify_tetrahedra(T, X).boundary)
+    start = None
+    if family == "folded":
+        start = hidden + 0.5 * rng.normal(size=X.shape)
+    return VolumeProblem(X, T, fixed, hidden, start)
+
+
+def _is_valid(T: IntArray, X: FloatArray) -> bool:
+    positive = certify_tetrahedra(T, X, boundary=False).positive
+    return positive and bool(certify_tetrahedra(T, X).injective)
+
+
+def _family(family: str, rng: np.random.Generator) -> Callable[[FloatArray, float], FloatArray]:
+    if family == "twist":
+        axis = int(rng.integers(3))
+        return lambda X, s: _turn(X, 1.5 * s * X[:, axis], axis)
+    if family == "bend":
+
+        def bend(X: FloatArray, s: float) -> FloatArray:
+            angle, radius = s * X[:, 0], 1 / max(s, 1e-9) + 0.8 * X[:, 1]
+            return np.stack([radius * np.sin(angle), radius * np.cos(angle) - 1 / max(s, 1e-9), X[:, 2]], axis=1)
+
+        return bend
+    if family == "spin":
+        axis = int(rng.integers(3))
+
+        def spin(X: FloatArray, s: float) -> FloatArray:
+            return _turn(X, s * np.clip((1 - np.abs(X).max(axis=1)) / (2 / 3), 0, 1), axis)
+
+        return spin
+    waves, phases, ways = rng.normal(size=(6, 3)) * 1.5, rng.uniform(0, 6, 6), rng.normal(size=(6, 3))
+
+    def flow(X: FloatArray, s: float) -> FloatArray:
+        Y = X.copy()
+        for _ in range(16):
+            for wave, phase, way in zip(waves, phases, ways, strict=True):
+                # A shear: a displacement across the gradient of its phase.
+                across = np.cross(wave, way) / np.linalg.norm(wave)
+                Y = Y + s / 64 * np.sin(Y @ wave + phase)[:, None] * across
+        return Y
+
+    return flow
+
+
+def _turn(X: FloatArray, angle: FloatArray, axis: int) -> FloatArray:
+    """Rotate every point around an axis by its own angle."""
+    Y = X.copy()
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    Y[:, a] = np.cos(angle) * X[:, a] - np.sin(angle) * X[:, b]
+    Y[:, b] = np.sin(angle) * X[:, a] + np.cos(angle) * X[:, b]
+    return Y
+
+
+def _positive(T: IntArray, X: FloatArray) -> IntArray:
+    u, v, w = (X[T[:, k]] - X[T[:, 0]] for k in (1, 2, 3))
+    return np.where(((u * np.cross(v, w)).sum(axis=1) < 0)[:, None], T[:, [1, 0, 2, 3]], T)
+
+
+@dataclass(frozen=True)
+class VolumeScene:
+    """A cube whose inner or outer boundary moves; ``places(t)`` are the positions of ``body`` at ``t`` from 0."""
+
+    X: FloatArray
+    T: IntArray
+    body: IntArray
+    places: Callable[[float], FloatArray]
+    unit: str
+
+
+def scenes(k: int = 12) -> dict[str, VolumeScene]:
+    """Six scenes with a parameter that grows."""
+    rng = np.random.default_rng(0)
+    X, T, cavity = shell(k, rng)
+    C = X[cavity]
+    Y, S = box(k, 0.3, rng)
+    top = np.flatnonzero(Y[:, 2] >= 1)
+    B = Y * (0.25, 0.25, 1.5)
+    sides = np.flatnonzero((np.abs(Y) >= 1).any(axis=1))
+    return {
+        "turned cavity": VolumeScene(X, T, cavity, lambda t: _turn(C, np.full(len(C), t), 2), "rad"),
+        "turned about a diagonal": VolumeScene(X, T, cavity, lambda t: _about_diagonal(C, t), "rad"),
+        "pushed cavity": VolumeScene(X, T, cavity, lambda t: C + np.array([t, 0, 0]), "half widths"),
+        "swollen cavity": VolumeScene(X, T, cavity, lambda t: C * (1 + t), "size"),
+        "bent bar": VolumeScene(B, S, sides, lambda t: _bend(B[sides], t), "rad"),
+        "pinched channel": VolumeScene(Y, S, top, lambda t: _pinch(Y[top], t), "half widths"),
+    }
+
+
+def _about_diagonal(C: FloatArray, t: float) -> FloatArray:
+    axis = np.ones(3) / np.sqrt(3)
+    along = np.outer(C @ axis, axis)
+    return np.cos(t) * (C - along) + np.sin(t) * np.cross(axis, C) + along
+
+
+def _bend(B: FloatArray, t: float) -> FloatArray:
+    s = max(t, 1e-9) / 1.5
+    angle, radius = s * B[:, 2], 1 / s - B[:, 0]
+    return np.stack([1 / s - radius * np.cos(angle), B[:, 1], radius * np.sin(angle)], axis=1)
+
+
+def _pinch(P: FloatArray, t: float) -> FloatArray:
+    x, y, z = P.T
+    return np.stack([x, y, z - t * np.cos(np.pi * x / 2) ** 2 * np.cos(np.pi * y / 2) ** 2], axis=1)

@@ -1,0 +1,412 @@
+"""Displacement fields on grids of voxels: folds, the nearest field without folds, and inverses.
+
+A field maps the voxel in plane z, row y and column x, at position ``p = (x, y, z) · spacing``, to
+``p + field[z, y, x]``. A cell is the box between eight voxels. It is divided into six tetrahedra around its diagonal
+from the first voxel to the last one: each walks along the three axes in one of their six orders. On a tetrahedron the
+map is affine, and its determinant is the volume ratio. A cell *folds* if a determinant is not above a bound.
+Trilinear interpolation is another map, which can fold although the tetrahedra are positive.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quasiharmonic.apps.tetrahedra.contacts import find_contacts
+from quasiharmonic.apps.tetrahedra.descent import Descent
+from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
+from quasiharmonic.apps.tetrahedra.signs import ExactSigns
+from quasiharmonic.apps.tetrahedra.topology import inspect_faces
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, real_array
+from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.progress import heartbeat
+
+# Orders of the axes x, y, z, and the sign that makes the determinant of the steps positive at rest.
+_ORDERS = tuple((p, int(np.linalg.det(np.eye(3)[list(p)]).round())) for p in permutations(range(3)))
+# Distance in voxels around folded cells that becomes free; factor of it for patches that still fold; rounds.
+_MARGIN, _GROWTH, _MAX_ROUNDS = 2, 2, 5
+# Newton steps that untangle a patch, and that lower the distance for each weight of the energy.
+_UNTANGLING_STEPS, _STEPS = 200, 8
+# Weights of the energy relative to the squared distance, in voxels.
+_WEIGHTS = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
+# Voxels closer than this to their original position, in voxels, return to it.
+_RETURN_DISTANCE = 1e-3
+# Floating-point determinants below this, relative to a bound of their terms, are decided exactly.
+_SURE = 2.0**-48
+_UNDERFLOW = 2.0**-1000
+# Determinants aimed at, relative to the bound.
+_AIM = 1.05
+# Candidates per block of the inversion.
+_BLOCK = 1 << 16
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class InvertibleVolume(Outcome):
+    """A displacement field on voxels without folds, as near to the given one as was found.
+
+    Attributes
+    ----------
+    field : (d, h, w, 3) float64
+    moved_mask : (d, h, w) bool
+        Voxels whose displacement changed; the others are bitwise unchanged.
+    folds : int
+        Number of cells that the given field folds.
+    remaining : (d − 1, h − 1, w − 1) bool
+        Cells with a tetrahedron that is not positive in ``field``, decided exactly.
+    bijective : bool
+        Whether no cell folds and the surface of the grid does not cross itself, so that no point is covered twice.
+    patches : int
+        Number of separate regions that changed.
+    distance : float
+        Root mean square distance from the given field, over all voxels, in the field's unit.
+    seconds : float
+    """
+
+    field: FloatArray
+    moved_mask: BoolArray
+    folds: int
+    remaining: BoolArray
+    bijective: bool
+    patches: int
+    distance: float
+    seconds: float
+
+    @property
+    def success(self) -> bool:
+        """Whether every tetrahedron of every cell is positive, decided exactly."""
+        return not self.remaining.any()
+
+    @property
+    def message(self) -> str:
+        """The text of `summary`."""
+        return self.summary()
+
+    def summary(self) -> str:
+        """Describe the field in one or two sentences."""
+        left = int(np.count_nonzero(self.remaining))
+        cells = f"{count_of('cell', 'cells', self.folds)} folded, {left} of them or their neighbours still do"
+        moved = count_of("voxel", "voxels", int(np.count_nonzero(self.moved_mask)))
+        border = "" if self.bijective or left else " The surface of the grid crosses itself."
+        return f"{cells}; {moved} moved, root mean square change {self.distance:.3g}.{border}"
+
+
+@dataclass(frozen=True, eq=False)
+class InverseVolume:
+    """The inverse of a displacement field on voxels.
+
+    Attributes
+    ----------
+    field : (d, h, w, 3) float64
+        Displacement from the voxel at position q to its source ``q + field``; NaN for voxels without a source.
+    outside : (d, h, w) bool
+        Voxels outside the image of the given field.
+    """
+
+    field: FloatArray
+    outside: BoolArray
+
+    def summary(self) -> str:
+        """Describe the inverse in one sentence."""
+        return f"{100 * float(self.outside.mean()):.3g} % of the voxels lie outside"
+
+
+class VoxelGrid:
+    """A grid of voxels of a shape (d, h, w), with the spacings along x, y and z."""
+
+    def __init__(self, shape: tuple[int, ...], spacing: ArrayLike) -> None:
+        sides = real_array("spacing", spacing)
+        if sides.shape not in ((), (3,)) or not (np.isfinite(sides) & (sides > 0)).all():
+            raise ValueError(f"spacing must be a positive number, or three (along x, y and z), not {spacing!r}")
+        self.shape = shape
+        self.spacing: FloatArray = np.broadcast_to(sides, 3).copy()
+
+    def positions(self, field: FloatArray, begin: int = 0, stop: int | None = None) -> FloatArray:
+        """Positions of the mapped voxels of planes ``begin`` to ``stop``."""
+        stop = self.shape[0] if stop is None else stop
+        axes = [np.arange(count) * side for count, side in zip(self.shape[::-1], self.spacing, strict=True)]
+        p = field[begin:stop].copy()
+        p[..., 0] += axes[0]
+        p[..., 1] += axes[1][:, None]
+        p[..., 2] += axes[2][begin:stop, None, None]
+        return p
+
+    def tetrahedra(self, cells: IntArray) -> IntArray:
+        """The tetrahedra (6 k, 4) of cells given by their first voxels (k,), voxels counted plane by plane."""
+        steps = np.array([1, self.shape[2], self.shape[1] * self.shape[2]])
+        orders = []
+        for order, sign in _ORDERS:
+            row = np.cumsum([0, *steps[list(order)]])
+            orders.append(row if sign > 0 else row[[1, 0, 2, 3]])
+        return (cells[:, None, None] + np.array(orders)).reshape(-1, 4)
+
+
+def check_volume_field(field: ArrayLike) -> FloatArray:
+    """Check a displacement field on voxels, and return a copy as (d, h, w, 3) float64."""
+    array = real_array("field", field)
+    if array.ndim != 4 or array.shape[3] != 3 or min(array.shape[:3]) < 2:
+        advice = ": pass numpy.moveaxis(field, 0, -1)" if array.ndim == 4 and array.shape[0] == 3 else ""
+        raise ValueError(
+            "field must have shape (depth, height, width, 3), displacements along x, y and z for at least 2 × 2 × 2 "
+            f"voxels, not {array.shape}{advice}"
+        )
+    bad = ~np.isfinite(array).all(axis=3)
+    if bad.any():
+        raise ValueError(f"field is not finite at {_name_voxels(np.asarray(bad))}")
+    return array
+
+
+def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | None) -> BoolArray:
+    """Cells (d − 1, h − 1, w − 1) with a determinant that is not above a bound; None decides the sign exactly."""
+    d, h, w = (count - 1 for count in grid.shape)
+    folds = np.zeros((d, h, w), dtype=np.bool_)
+    # For the bound, a cell has volume 1. Exact signs are those of the positions as stored.
+    scale = np.ones((3, 1, 1, 1)) if min_jacobian is None else grid.spacing[:, None, None, None]
+    for z in range(d):
+        heartbeat()
+        p = np.moveaxis(grid.positions(field, z, z + 2), -1, 0)
+        steps = [np.diff(p, axis=axis) / scale for axis in (3, 2, 1)]
+        unsure = np.zeros((h, w), dtype=np.bool_)
+        for order, sign in _ORDERS:
+            at = [0, 0, 0]
+            edges = []
+            for axis in order:
+                edges.append(steps[axis][:, at[2], at[1] : at[1] + h, at[0] : at[0] + w])
+                at[axis] = 1
+            a, b, c = edges
+            terms = (
+                a[0] * (b[1] * c[2] - b[2] * c[1]),
+                a[1] * (b[2] * c[0] - b[0] * c[2]),
+                a[2] * (b[0] * c[1] - b[1] * c[0]),
+            )
+            D = sign * (terms[0] + terms[1] + terms[2])
+            if min_jacobian is not None:
+                folds[z] |= ~(min_jacobian < D)
+            else:
+                # Row sums bound the permanent, of which rounding is less than 2⁻⁴⁹; underflow loses less than the rest.
+                size = np.abs(a).sum(axis=0) * np.abs(b).sum(axis=0) * np.abs(c).sum(axis=0)
+                unsure |= ~(_SURE * size + _UNDERFLOW < D)
+        if unsure.any():
+            first = np.flatnonzero(np.pad(unsure, ((0, 1), (0, 1))))
+            T = VoxelGrid((2, *grid.shape[1:]), grid.spacing).tetrahedra(first)
+            flat = np.moveaxis(p, 0, -1).reshape(-1, 3)
+            wrong = (ExactSigns(flat)(T) <= 0).reshape(-1, 6).any(axis=1)
+            folds[z][np.nonzero(unsure)] = wrong
+    return folds
+
+
+def nearest_invertible_volume(
+    field: ArrayLike, spacing: ArrayLike, min_jacobian: float, fixed: ArrayLike | None
+) -> InvertibleVolume:
+    """`quasiharmonic.nearest_invertible` for fields on voxels (d, h, w, 3)."""
+    began = time.perf_counter()
+    given = check_volume_field(field)
+    grid = VoxelGrid(given.shape[:3], spacing)
+    still = np.zeros(grid.shape, dtype=np.bool_)
+    if fixed is not None:
+        still = np.asarray(fixed)
+        if still.shape != grid.shape or still.dtype != bool:
+            raise ValueError(
+                f"fixed must be a bool array of shape {grid.shape}, not {still.dtype} of shape {still.shape}"
+            )
+    wrong = find_folded_cells(grid, given, min_jacobian)
+    repaired = given.copy()
+    if wrong.any():
+        _repair(grid, repaired, wrong, still, min_jacobian)
+    moved = np.asarray((repaired != given).any(axis=3))
+    remaining = find_folded_cells(grid, repaired, None)
+    away = np.sqrt(((repaired - given) ** 2).sum(axis=3))
+    return InvertibleVolume(
+        field=repaired,
+        moved_mask=moved,
+        folds=int(np.count_nonzero(wrong)),
+        remaining=remaining,
+        bijective=not remaining.any() and not _surface_crosses(grid, repaired),
+        patches=_label(moved)[1],
+        distance=float(np.sqrt((away**2).mean())),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _label(mask: BoolArray) -> tuple[IntArray, int]:
+    from scipy.ndimage import label
+
+    labels, count = label(mask, structure=np.ones((3, 3, 3), dtype=bool))
+    return labels, int(count)
+
+
+def _grow(mask: BoolArray, steps: int) -> BoolArray:
+    from scipy.ndimage import maximum_filter
+
+    return np.asarray(maximum_filter(mask, 2 * steps + 1, mode="constant"))
+
+
+def _voxels_of(cells: BoolArray) -> BoolArray:
+    """The voxels of cells."""
+    voxels = np.zeros(tuple(count + 1 for count in cells.shape), dtype=np.bool_)
+    d, h, w = cells.shape
+    for z, y, x in np.ndindex(2, 2, 2):
+        voxels[z : z + d, y : y + h, x : x + w] |= cells
+    return voxels
+
+
+def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArray, min_jacobian: float) -> None:
+    """Change a field in place in patches around folded cells; patches that still fold grow."""
+    from scipy.ndimage import find_objects
+
+    given, margin = field.copy(), _MARGIN
+    free = _grow(_voxels_of(wrong), margin) & ~fixed
+    todo = free
+    for _ in range(_MAX_ROUNDS):
+        labels, _ = _label(free)
+        again = np.zeros(grid.shape, dtype=np.bool_)
+        wanted = set(np.unique(labels[todo & free]).tolist()) - {0}
+        for number, place in enumerate(find_objects(labels), start=1):
+            # One voxel more on each side, where the cells of the patch end.
+            around = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in place)
+            if number in wanted:
+                mask = labels[around] == number
+                if not _repair_patch(grid.spacing, field[around], given[around], mask, min_jacobian):
+                    again[around] |= mask
+        if not again.any():
+            return
+        margin *= _GROWTH
+        todo = _grow(again, margin) & ~fixed
+        if np.array_equal(todo | free, free):
+            return
+        free = todo | free
+
+
+def _repair_patch(
+    spacing: FloatArray, field: FloatArray, given: FloatArray, mask: BoolArray, min_jacobian: float
+) -> bool:
+    """Replace displacements of one patch by the nearest ones that were found without folds; return whether found.
+
+    ``field`` and ``given`` are parts of the new and the given field around the patch, and ``mask`` its voxels.
+    """
+    grid = VoxelGrid(mask.shape, spacing)
+    d, h, w = (count - 1 for count in grid.shape)
+    cells = np.zeros((d, h, w), dtype=np.bool_)
+    for z, y, x in np.ndindex(2, 2, 2):
+        cells |= mask[z : z + d, y : y + h, x : x + w]
+    where = np.argwhere(cells)
+    first = np.ravel_multi_index(tuple(where.T), grid.shape)
+    nodes, number = np.unique(grid.tetrahedra(np.asarray(first)), return_inverse=True)
+    T = number.reshape(-1, 4)
+    index = np.stack(np.unravel_index(nodes, grid.shape), axis=1)
+    unit = float(np.cbrt(np.prod(grid.spacing)))
+    corner = index.min(axis=0)
+    rest = (index - corner)[:, ::-1] * grid.spacing / unit
+    before = rest + given[tuple(index.T)] / unit
+    free = np.flatnonzero(mask[tuple(index.T)])
+    energy = ShapeEnergy(T, rest, floor=min(_AIM * min_jacobian + 1e-9, 0.99))
+    descent = Descent(energy, free, before, anchor=(before, 1.0 / len(T)))
+    with np.errstate(all="ignore"):
+        if not energy.determinants(before).min() > energy.floor:
+            for _ in descent.untangle(_UNTANGLING_STEPS):
+                pass
+        if not energy.determinants(descent.X).min() > energy.floor:
+            return False
+        for weight in _WEIGHTS:
+            descent.anchor = before, 1.0 / (weight * len(T))
+            for _ in descent.polish(_STEPS, 1e-4):
+                pass
+    X = descent.X
+    near = np.flatnonzero((np.abs(X - before) < _RETURN_DISTANCE).all(axis=1))
+    back = X.copy()
+    back[near] = before[near]
+    if energy.determinants(back).min() > min_jacobian:
+        X = back
+    changed = free[(X[free] != before[free]).any(axis=1)]
+    field[tuple(index.T)] = given[tuple(index.T)]
+    field[tuple(index[changed].T)] = (X[changed] - rest[changed]) * unit
+    return True
+
+
+def _surface_crosses(grid: VoxelGrid, field: FloatArray) -> bool:
+    """Whether triangles of the surface of the mapped grid meet outside their common vertices and edges."""
+    d, h, w = (count - 1 for count in grid.shape)
+    border = np.ones((d, h, w), dtype=np.bool_)
+    border[1:-1, 1:-1, 1:-1] = False
+    first = np.ravel_multi_index(tuple(np.argwhere(border).T), grid.shape)
+    voxel = np.ones(grid.shape, dtype=np.bool_)
+    voxel[1:-1, 1:-1, 1:-1] = False
+    F = inspect_faces(grid.tetrahedra(np.asarray(first)), int(np.prod(grid.shape))).boundary
+    F = F[voxel.ravel()[F].all(axis=1) & _on_one_side(grid, F)]
+    nodes, number = np.unique(F, return_inverse=True)
+    X = grid.positions(field).reshape(-1, 3)[nodes]
+    return len(find_contacts(number.reshape(-1, 3), X, ExactSigns(X))) > 0
+
+
+def _on_one_side(grid: VoxelGrid, F: IntArray) -> BoolArray:
+    """Whether the voxels of triangles (f, 3) lie on one side of the grid."""
+    index = np.stack(np.unravel_index(F, grid.shape), axis=-1)
+    last = np.array(grid.shape) - 1
+    return np.asarray(((index == 0).all(axis=1) | (index == last).all(axis=1)).any(axis=1))
+
+
+def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
+    """`quasiharmonic.inverse_field` for fields on voxels (d, h, w, 3), affine on the tetrahedra of each cell."""
+    given = check_volume_field(field)
+    grid = VoxelGrid(given.shape[:3], spacing)
+    wrong = find_folded_cells(grid, given, None)
+    if wrong.any():
+        raise ValueError(
+            f"the field folds, so it has no inverse: at the cells whose first voxels are {_name_voxels(wrong)}. "
+            "use `nearest_invertible` to get the nearest invertible field"
+        )
+    if _surface_crosses(grid, given):
+        raise ValueError("the field has no inverse: the surface of the grid crosses itself")
+    back = np.full((int(np.prod(grid.shape)), 3), np.nan)
+    best = np.full(len(back), -np.inf)
+    X = (grid.positions(given) / grid.spacing).reshape(-1, 3)
+    for tetrahedra, voxel, position in _candidates(grid, X):
+        p = X[tetrahedra]
+        edges = np.moveaxis(p[:, 1:] - p[:, :1], 1, 2)
+        weights = np.linalg.solve(edges, (position - p[:, 0])[..., None])[..., 0]
+        weights = np.column_stack([1 - weights.sum(axis=1), weights])
+        inside = weights.min(axis=1)
+        good = np.flatnonzero(inside >= -1e-9)
+        good = good[np.argsort(inside[good], kind="stable")]
+        good = good[inside[good] > best[voxel[good]]]
+        source = np.stack(np.unravel_index(tetrahedra[good], grid.shape), axis=-1)[..., ::-1]
+        best[voxel[good]] = inside[good]
+        back[voxel[good]] = (weights[good][..., None] * source).sum(axis=1) - position[good]
+    back *= grid.spacing
+    outside = np.isnan(back[:, 0])
+    return InverseVolume(back.reshape(given.shape), outside.reshape(grid.shape))
+
+
+def _candidates(grid: VoxelGrid, X: FloatArray) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
+    """Yield pairs of tetrahedra (k, 4) and voxels (k,) in their boxes, and the voxels' positions in voxels (k, 3)."""
+    d, h, w = (count - 1 for count in grid.shape)
+    last = np.array(grid.shape[::-1]) - 1
+    first = np.asarray(np.ravel_multi_index(tuple(np.indices((d, h, w)).reshape(3, -1)), grid.shape))
+    for start in range(0, len(first), _BLOCK // 6):
+        heartbeat()
+        T = grid.tetrahedra(first[start : start + _BLOCK // 6])
+        p = X[T]
+        low = np.clip(np.ceil(p.min(axis=1) - 1e-9), 0, last + 1).astype(np.int64)
+        high = np.clip(np.floor(p.max(axis=1) + 1e-9), -1, last).astype(np.int64)
+        size = np.maximum(high - low + 1, 0)
+        count = size.prod(axis=1)
+        of = np.repeat(np.arange(len(T)), count)
+        rank = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+        x = rank % size[of, 0]
+        y = rank // size[of, 0] % size[of, 1]
+        z = rank // (size[of, 0] * size[of, 1])
+        place = low[of] + np.stack([x, y, z], axis=1)
+        voxel = np.asarray(np.ravel_multi_index(tuple(place.T[::-1]), grid.shape))
+        yield T[of], voxel, place.astype(np.float64)
+
+
+def _name_voxels(mask: BoolArray, most: int = 5) -> str:
+    """Name the first voxels of a mask (d, h, w)."""
+    where = np.argwhere(mask)
+    listed = ", ".join(str(tuple(row)) for row in where[:most].tolist())
+    rest = f", … ({len(where)} in all)" if len(where) > most else ""
+    return f"{'voxel' if len(where) == 1 else 'voxels'} {listed}{rest}, plane, row and column"
