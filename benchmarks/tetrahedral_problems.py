@@ -79,7 +79,7 @@ def make(family: str, seed: int, tetrahedra: int) -> VolumeProblem:
     elif seed % 3 == 0:
         X, T = ball(max(tetrahedra // 7, 30), rng)
     elif seed % 3 == 1:
-        X, T = box(max(round((tetrahedra / 6) ** (1 / 3)), 3), 0.5, rng)
+        X, T = box(max(round((tetrahedra / 6) ** (1 / 3)), 3), 0.3, rng)
     else:
         X, T, _ = shell(max(round((tetrahedra / 6) ** (1 / 3)), 5), rng)
     move = _family(family, rng)
