@@ -374,3 +374,33 @@ def test_unsupported_formats(tmp_path, capsys):
     )
     assert main(["morph", str(path), "-o", str(path), "--field", "u"]) == 2
     assert "mesh.inp" in capsys.readouterr().err
+
+
+def test_mfem(tmp_path):
+    path, out = tmp_path / "in.mesh", tmp_path / "out.mesh"
+    text = (
+        "MFEM mesh v1.0\n\n# vertices\ndimension\n2\n\nelements # two kinds\n2\n1 3 0 1 4 3\n7 2 1 2 4\n\n"
+        "boundary\n1\n5 1 0 1\n\nvertices\n5\n2\n0 0\n1 0 # a corner\n2 0.50\n0 1\n1 1e0\n"
+    )
+    path.write_text(text)
+    mesh = read_fem(path)
+    assert mesh.points.tolist() == [[0, 0], [1, 0], [2, 0.5], [0, 1], [1, 1]]
+    assert mesh.F.tolist() == [[0, 1, 4, 3], [1, 2, 4, 4]]
+    moved = mesh.points.copy()
+    moved[1, 0] = 1.25
+    write_fem(out, mesh, moved)
+    assert out.read_text() == text.replace("1 0 # a corner", "1.25 0 # a corner")
+    (tmp_path / "positions.csv").write_text("2,3,0.5\n")
+    assert main(["morph", str(path), "--positions", str(tmp_path / "positions.csv"), "-o", str(out)]) == 0
+    assert read_fem(out).points[2].tolist() == [3, 0.5]
+    for wrong, message in (
+        (text.replace("v1.0", "v1.1"), "does not start with MFEM"),
+        (text + "nodes\nFiniteElementSpace\n", "curved elements"),
+        (text.replace("7 2 1 2 4", "7 2 1 2 9"), "refers to point 9"),
+        (text.replace("7 2 1 2 4", "7 9 1 2 4"), "unknown geometry 9"),
+        (text[: text.index("1 1e0")], "ends too early"),
+        (text.replace("vertices\n5", "vertice\n5"), "no section vertices"),
+    ):
+        path.write_text(wrong)
+        with pytest.raises(MeshFileError, match=message):
+            read_fem(path)

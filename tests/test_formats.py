@@ -46,7 +46,7 @@ def test_the_registry_is_consistent():
     # STL cannot store a map.
     assert set(io.suffixes("read")) - set(io.suffixes("write_map")) == {".stl"}
     assert io.suffixes("read", "seams") == (".obj", ".ply", ".glb", ".gltf")
-    assert io.suffixes("read_elements") == (".msh", ".vtk", ".vtu")
+    assert io.suffixes("read_elements") == (".msh", ".vtk", ".vtu", ".mesh")
     assert io.format_names("read") == ("OBJ, OFF, PLY, GLB, glTF, STL, GIFTI, FreeSurfer patch or FreeSurfer surface")
     assert io.format_names("encode_values", "seams") == "PLY"
 

@@ -175,6 +175,7 @@ FORMATS: tuple[Format, ...] = (
     Format(name="Gmsh (version 2 or 4)", suffix=".msh", read_elements=import_later("fem.gmsh", "read_gmsh")),
     Format(name="legacy VTK", suffix=".vtk", read_elements=import_later("fem.legacy_vtk", "read_legacy_vtk")),
     Format(name="VTU", suffix=".vtu", read_elements=import_later("fem.vtu", "read_vtu")),
+    Format(name="MFEM", suffix=".mesh", read_elements=import_later("fem.mfem", "read_mfem")),
     Format(name="CSV", suffix=".csv", encode_values=import_later("formats.per_triangle", "encode_csv")),
     Format(name="NPZ", suffix=".npz", encode_values=import_later("formats.per_triangle", "encode_npz")),
 )

@@ -1,0 +1,85 @@
+"""MFEM's mesh files (``MFEM mesh v1.0``, ``v1.2`` and ``v1.3``): text, with straight elements."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+
+import numpy as np
+
+from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers
+from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.vtk_cells import elements
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+_SECTION = re.compile(rb"^[ \t]*([a-z_]+)[ \t\r]*$", re.MULTILINE)
+# Number of vertices, and VTK's kind, of MFEM's geometries: point, segment, triangle, square, tetrahedron, cube, prism,
+# pyramid.
+_SIZES = 1, 2, 3, 4, 4, 8, 6, 5
+_KINDS = 1, 3, 5, 9, 10, 12, 13, 14
+
+
+def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
+    """Parse an MFEM mesh file, with its tetrahedra and hexahedra if ``solid``.
+
+    ValueError if the file is not such a file, is not conforming, has curved elements (``nodes``), or ends early.
+    """
+    head = data[:200].lstrip().split(b"\n", 1)[0].strip()
+    if not re.fullmatch(rb"MFEM mesh v1\.[023]", head):
+        raise ValueError("it does not start with MFEM mesh v1.0, v1.2 or v1.3")
+    # Comments become blanks, so that every number keeps its place.
+    plain = re.sub(rb"#[^\n]*", lambda found: b" " * len(found[0]), data)
+    sections = {found[1]: found.end() for found in _SECTION.finditer(plain)}
+    if b"nodes" in sections:
+        raise ValueError("it has curved elements (nodes): save it as a mesh of straight elements")
+    for name in b"elements", b"vertices":
+        if name not in sections:
+            raise ValueError(f"it has no section {name.decode()}")
+    begins = sorted(sections.values())
+
+    def span(name: bytes) -> tuple[int, int]:
+        begin = sections[name]
+        later = [_line_start(plain, other) for other in begins if other > begin]
+        return begin, later[0] if later else len(plain)
+
+    vertices = TableReader(plain, *span(b"vertices"), None)
+    count, axes = vertices.take("i8", 2).tolist()
+    if axes not in (2, 3):
+        raise ValueError(f"its vertices have {axes} coordinates, not two or three")
+    table = vertices.tables(count, ("f8", axes))[0]
+    points = np.zeros((count, 3))
+    points[:, :axes] = table.values
+    begin, end = span(b"elements")
+    F = elements(*_cells([int(word) for word in plain[begin:end].split()]), count, solid)
+    return MeshParts(points, F, np.dtype(np.float64), {}, partial(_replace, data, table, axes))
+
+
+def _line_start(data: bytes, position: int) -> int:
+    return data.rfind(b"\n", 0, position) + 1
+
+
+def _cells(numbers: list[int]) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the vertices of all cells, where each cell begins, and VTK's kinds.
+
+    The numbers are the count of cells, then for each its attribute, its geometry, and its corners.
+    """
+    connectivity: list[int] = []
+    starts, kinds, at = [0], [], 1
+    for _ in range(numbers[0]):
+        geometry = numbers[at + 1]
+        if not 0 <= geometry < len(_SIZES):
+            raise ValueError(f"an element has the unknown geometry {geometry}")
+        size = _SIZES[geometry]
+        corners = numbers[at + 2 : at + 2 + size]
+        if len(corners) < size:
+            raise ValueError("it ends too early")
+        connectivity += corners
+        starts.append(len(connectivity))
+        kinds.append(_KINDS[geometry])
+        at += 2 + size
+    return np.array(connectivity, dtype=np.int64), np.array(starts), np.array(kinds, dtype=np.int64)
+
+
+def _replace(data: bytes, table: Table, axes: int, points: FloatArray) -> bytes:
+    """Return the file with the first coordinates of its vertices replaced."""
+    return replace_numbers(data, table, points[:, :axes])
