@@ -32,11 +32,14 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic import atlas, clean, distortion, io, surfaces, unwrap
+from quasiharmonic.geometry.mesh.topology import components
 from quasiharmonic.plot import plot_texture
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from speed import machine
 
 RESOLUTION, PADDING = 1024, 4
+# Models side by side in the picture.
+_ACROSS = 2
 
 #: Texture coordinates in texels for every corner of every triangle, (f, 3, 2).
 Corners = FloatArray
@@ -157,26 +160,47 @@ def _orient(corners: Corners) -> Corners:
 
 
 def draw(path: Path, drawn: list[tuple[str, FloatArray, IntArray, dict[str, Corners]]]) -> None:
-    """Draw each model with a checkerboard, and its charts, for every program."""
+    """Draw each model with a checkerboard, and its charts in different colours, for every program."""
+    from matplotlib import colormaps
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
+    from PIL import Image
 
-    columns = 2 * max(len(layouts) for *_, layouts in drawn)
-    figure = Figure(figsize=(3 * columns, 3.2 * len(drawn)), layout="tight")
-    axes = figure.subplots(len(drawn), columns, squeeze=False)
-    for row_of_axes, (name, V, F, layouts) in zip(axes, drawn, strict=True):
+    panels = 2 * max(len(layouts) for *_, layouts in drawn)
+    rows = -(-len(drawn) // _ACROSS)
+    figure = Figure(figsize=(1.6 * panels * _ACROSS, 1.8 * rows), layout="tight")
+    axes = figure.subplots(rows, panels * _ACROSS, squeeze=False).reshape(-1, panels)
+    for row_of_axes, (name, V, F, layouts) in zip(axes, drawn, strict=False):
         for k, (way, corners) in enumerate(layouts.items()):
             surface, plane = row_of_axes[2 * k : 2 * k + 2]
-            surface.imshow(textured(V[F].reshape(-1, 3), corners.reshape(-1, 2)))
-            surface.set_title(name)
-            plane.add_collection(PolyCollection(corners, facecolors=(0.6, 0.75, 0.95), edgecolors="k", linewidths=0.05))
-            plane.set(xlim=(0, RESOLUTION), ylim=(0, RESOLUTION))
-            plane.set_title(way.strip("`"))
+            chart = charts_of(corners)
+            # Programs may mirror charts.
+            mirrored = np.bincount(chart, _twice_areas(corners))[chart] < 0
+            upright = np.where(mirrored[:, None, None], [RESOLUTION, 0] + corners * [-1, 1], corners)
+            surface.imshow(textured(V[F].reshape(-1, 3), upright.reshape(-1, 2)))
+            surface.set_title(name, fontsize=8)
+            colours = colormaps["tab20"](chart * 7 % 20)
+            plane.add_collection(PolyCollection(corners, facecolors=colours, antialiased=False))
+            low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+            side = (high - low).max()
+            plane.set(xlim=(low[0], low[0] + side), ylim=(low[1], low[1] + side))
+            plane.set_title(way.strip("`"), fontsize=8)
     for ax in axes.flat:
         ax.set_aspect("equal")
-        ax.set_axis_off()
+        ax.set_xticks([])
+        ax.set_yticks([])
+        ax.set_frame_on(False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    Image.open(buffer).convert("RGB").quantize(64).save(path, optimize=True)
+
+
+def charts_of(corners: Corners) -> IntArray:
+    """Return the chart of each triangle, from 0: triangles of a chart share places."""
+    _, place = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+    FT = place.reshape(-1, 3)
+    return np.unique(components(FT, int(FT.max()) + 1)[FT[:, 0]], return_inverse=True)[1]
 
 
 def textured(V: FloatArray, uv: FloatArray) -> FloatArray:
@@ -185,10 +209,14 @@ def textured(V: FloatArray, uv: FloatArray) -> FloatArray:
 
     F = np.arange(len(V)).reshape(-1, 3)
     buffer = BytesIO()
-    plot_texture(V, F, uv, squares=48).savefig(buffer, format="png", dpi=100)
+    plot_texture(V, F, uv, squares=32).savefig(buffer, format="png", dpi=100)
     buffer.seek(0)
-    picture = imread(buffer)
-    return np.asarray(picture[:, : picture.shape[1] // 2])
+    picture = np.asarray(imread(buffer))
+    # The right half is the plane, the top is the title.
+    picture = picture[picture.shape[0] // 10 :, : picture.shape[1] // 2, :3]
+    used = (picture < 1).any(axis=2)
+    rows, columns = (np.flatnonzero(used.any(axis=axis)) for axis in (1, 0))
+    return picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
 
 
 def default_models() -> Iterator[tuple[str, FloatArray, IntArray]]:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, find_cuts
-from quasiharmonic.apps.unwrapping.chart_maps import EvenStretch
+from quasiharmonic.apps.unwrapping.chart_maps import EvenStretch, WorkingChart
 from quasiharmonic.apps.unwrapping.charts import find_charts
+from quasiharmonic.apps.unwrapping.joining import join_small_charts
 from quasiharmonic.energies.derivatives import check_energy
-from quasiharmonic.surfaces import disk, starfish
+from quasiharmonic.surfaces import disk, grid, starfish
 from shared.closed_surfaces import torus
 
 
@@ -224,3 +225,34 @@ def test_a_callback_reports_phases_and_stops_the_search():
 
 def test_derivatives_of_the_even_stretch():
     assert check_energy(EvenStretch(1.3)).passed
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(25, 1), (55, 2)])
+def test_small_charts_are_joined_unless_they_overlap(degrees, expected):
+    """A fan of 330 degrees, and a further triangle at its end with or without room."""
+    around = np.radians([*55 * np.arange(7), 330 + degrees])
+    V = np.concatenate([[[0, 0, 0]], np.column_stack([np.cos(around), np.sin(around), 0 * around])])
+    F = np.array([[0, k, k + 1] for k in range(1, 8)])
+    charts = [
+        WorkingChart(np.arange(6), np.arange(8), V[:8], F[:6], np.ones((6, 3))),
+        WorkingChart(np.array([6]), np.array([0, 7, 8]), V[[0, 7, 8]], np.array([[0, 1, 2]]), np.ones((1, 3))),
+    ]
+    for chart in charts:
+        chart.use(chart.V[:, :2] @ [[0, 2], [-2, 0]])
+    joined = join_small_charts(charts, 1.3, 200.0, lambda: None)
+    assert len(joined) == expected
+    assert all(chart.bijective and chart.stretch.max() < 1 + 1e-12 for chart in joined)
+    if expected == 1:
+        np.testing.assert_array_equal(joined[0].vertices[joined[0].F], F)
+        assert len(joined[0].vertices) == 9
+
+
+def test_charts_are_not_joined_across_given_seams():
+    """The seams cut off a corner, which is not planar."""
+    V, F = grid(20, 20)
+    points = np.column_stack([V, 0.02 * np.random.default_rng(2).random(len(V))])
+    near = np.abs(V[F].mean(axis=1) - V[0]).max(axis=1) < np.ptp(V[:, 0]) / 20
+    sides, times = np.unique(np.sort(F[near][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True)
+    seams = sides[(times == 1) & ~(sides == 0).any(axis=1)]
+    assert len(seams) == 2
+    assert len(find_charts(points, F, uv_cuts=seams)) == 1 + len(find_charts(points, F))

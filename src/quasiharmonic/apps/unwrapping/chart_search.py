@@ -29,6 +29,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import (
     flatten_chart,
     guard_chart,
 )
+from quasiharmonic.apps.unwrapping.joining import join_small_charts
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
 from quasiharmonic.util.threads import HAS_THREADS, count_cores, make_executor
 
@@ -107,7 +108,13 @@ class Workers:
 
 
 def search_charts(
-    charts: Sequence[WorkingChart], bound: float, *, max_charts: int | None, total_area: float, workers: Workers
+    charts: Sequence[WorkingChart],
+    bound: float,
+    *,
+    max_charts: int | None,
+    total_area: float,
+    joinable: bool,
+    workers: Workers,
 ) -> list[WorkingChart]:
     """Flatten charts and cut them further until they keep a bound on stretch or the limits are reached.
 
@@ -120,6 +127,8 @@ def search_charts(
         Maximum number of charts; more only if a chart has no injective map otherwise.
     total_area : float
         Area of the surface, which may have further charts.
+    joinable : bool
+        Whether small charts may be joined to any neighbour.
     workers : Workers
 
     Returns
@@ -148,7 +157,7 @@ def search_charts(
                 break
     overlapping = [chart for chart in here if not chart.bijective]
     workers.map("separate", partial(guard_chart, check_wanted=workers.check_wanted), overlapping)
-    return here
+    return join_small_charts(here, aim, total_area, workers.check_wanted) if joinable else here
 
 
 class _Job(NamedTuple):

@@ -115,7 +115,9 @@ def find_charts(
     areas = [chart.surface_area for chart in working]
     total = sum(areas) + sum(float(signed_areas(chart.F, in_units(chart.uv, 0)).sum()) for chart in charts)
     divisible = None if max_charts is None else max_charts - len(charts)
-    found = search_charts(working, max_stretch, max_charts=divisible, total_area=total, workers=workers)
+    found = search_charts(
+        working, max_stretch, max_charts=divisible, total_area=total, joinable=not len(given), workers=workers
+    )
     return sorted(charts + _finish(found, max_stretch, total), key=lambda chart: int(chart.triangles[0]))
 
 

@@ -94,7 +94,8 @@ class Board:
         padded = np.ones((h * step, w * step), dtype=bool)
         padded[: self._cells.shape[0] - 1, : self._cells.shape[1] - 1] = self._cells[1:, 1:]
         coarse = Board(self.rows // step, self.columns // step, windows=False)
-        pooled = np.asarray(padded.reshape(h, step, w, step).any(axis=(1, 3)))
+        # Rows first: this is several times as fast as both axes at once.
+        pooled = np.asarray(padded.reshape(h, step, w * step).any(axis=1).reshape(h, w, step).any(axis=2))
         coarse._cells[1 : 1 + coarse.rows, 1 : 1 + coarse.columns] = pooled[: coarse.rows, : coarse.columns]
         found = coarse.find(Bitmaps(bitmaps.directions, [_enlarge_cells(bitmap, step) for bitmap in bitmaps.cells]))
         return None if found is None else Spot(found.direction, found.row * step, found.column * step)
