@@ -375,6 +375,23 @@ class TestRun:
         assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).outcomes == {"invalid": 2}
         assert "1 corner vertex for a contour with 4 corners" in record_of(tmp_path / "out", "a.obj")["error"]
 
+    def test_started_from_the_files_map_and_packed(self, tmp_path):
+        V, F = grid(4, 4)
+        V = np.column_stack([V, V[:, 0] * V[:, 1]])
+        uv = flatten(V, F).uv
+        V, F = np.concatenate([V, V + 9]), np.concatenate([F, F + len(V)])
+        (tmp_path / "set").mkdir()
+        io.write_map(tmp_path / "set/two.obj", io.MeshData(V, F), np.concatenate([uv, uv + 9]))
+        iterations = []
+        for start in (False, True):
+            settings = batch.Settings(flatten=True, start=start, pack=True)
+            assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).solved == 1
+            iterations.append(record_of(tmp_path / "out", "two.obj")["iterations"])
+        assert iterations[1] < iterations[0]
+        uv = io.read_mesh(tmp_path / "out/results/two.obj/map.obj").vt
+        assert uv.min() >= 0
+        assert 0.6 < uv.max() <= 1
+
     @pytest.mark.parametrize("options", [{"to": "letter:H", "refine": True}, {"flatten": True}])
     def test_surfaces_that_cannot_be_flattened_are_cut(self, tmp_path, options):
         """Cuts are seams: vertices and faces are unchanged. With an outline, a disk is not cut."""

@@ -45,10 +45,14 @@ class Settings:
         Turning angle in degrees from which a point of ``to`` is a corner.
     flatten : bool
         If True, problems are plain meshes with free boundaries. `quasiharmonic.flatten` maps them, and the result must
-        be bijective. Of the following settings only ``energy``, ``cut``, ``max_iterations`` and ``linear_solver``
-        apply.
+        be bijective. Of the following settings only ``energy``, ``start``, ``pack``, ``cut``, ``max_iterations``
+        and ``linear_solver`` apply.
     energy : str or None
         Energy of a flattening; see `quasiharmonic.flatten` for the names. None means ``"symmetric-dirichlet"``.
+    start : bool
+        Whether a flattening starts from the map in the texture coordinates of the file.
+    pack : bool
+        Whether the islands of a plain mesh are packed into the unit square; see `quasiharmonic.atlas.pack`.
     cut : bool
         Whether plain meshes, or the islands between the seams of their files, are cut along further seams so that they
         can be mapped.
@@ -81,6 +85,8 @@ class Settings:
     corner_angle: float = 20.0
     flatten: bool = False
     energy: str | None = None
+    start: bool = False
+    pack: bool = False
     cut: bool = False
     corners: str | None = None
     refine: bool = False
@@ -98,7 +104,7 @@ class Settings:
             given = getattr(self, name)
             if not isinstance(given, str | None) or given not in words:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {given!r}")
-        for name in ("flatten", "cut", "refine", "slide"):
+        for name in ("flatten", "start", "pack", "cut", "refine", "slide"):
             check_bool(name, getattr(self, name))
         for name in ("to", "font", "corners", "pieces"):
             if not isinstance(getattr(self, name), str | None):
@@ -119,11 +125,13 @@ class Settings:
                     )
         elif self.energy is not None:
             raise ValueError("energy applies only to flatten: set flatten, or give an energy by polish")
+        if self.start and (not self.flatten or self.cut):
+            raise ValueError("start applies only to flatten, and new seams discard the file's map: omit start, or cut")
         if self.slide and self.polish is None:
             raise ValueError("the boundary slides only while distortion is lowered: give an energy as well, by polish")
         if self.to is None:
-            for name in ("cut", "corners", "corner_angle", "font", "pieces"):
-                if name in changed and not (name == "cut" and self.flatten):
+            for name in ("cut", "pack", "corners", "corner_angle", "font", "pieces"):
+                if name in changed and not (name in ("cut", "pack") and self.flatten):
                     raise ValueError(f"{name} applies only to plain meshes with an outline: give the outline by to")
         elif self.pieces is not None and not self.slide:
             raise ValueError("pieces assigns vertices to sides of the outline: set slide as well")
@@ -139,7 +147,7 @@ class Settings:
 
         This requires QDLDL, whose result for a mesh does not depend on the other meshes of the group.
         """
-        alone = self.flatten or self.cut or self.refine or self.slide or self.polish is not None
+        alone = self.flatten or self.pack or self.cut or self.refine or self.slide or self.polish is not None
         by_qdldl = self.linear_solver in ("auto", "qdldl") and "qdldl" in available()
         return by_qdldl and not alone and self.reference in (None, "equilateral")
 

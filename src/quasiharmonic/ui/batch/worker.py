@@ -151,6 +151,8 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callabl
         mapped = mesh.with_places(found.mesh)
         if any(refined):
             mapped = merge_refined(mesh, surface.islands, refined, found.places())
+    if settings["pack"]:
+        mapped = mapped.with_places(atlas.pack(io.mapped(mapped)))
     with metadata.time_phase(record, "write"):
         record |= _write_map(records.map_path(folder), mapped, "bijective" if settings["flatten"] else "injective")
     with metadata.time_phase(record, "measure"):
@@ -227,6 +229,7 @@ def _flatten_islands(
         found = atlas.flatten(
             surface,
             energy=settings["energy"] or "symmetric-dirichlet",
+            start=settings["start"],
             max_iterations=settings["max_iterations"],
             linear_solver=settings["linear_solver"],
         )

@@ -141,6 +141,14 @@ def add_parser(commands: Commands) -> None:
         "--cut", action="store_true", help="with --to and --flatten: cut surfaces that cannot be flattened, along seams"
     )
     solver.add_argument(
+        "--start", action="store_true", help="for --flatten: start from the map in the files' texture coordinates"
+    )
+    solver.add_argument(
+        "--pack",
+        action="store_true",
+        help="with --to and --flatten: pack the islands into the unit square by their shapes",
+    )
+    solver.add_argument(
         "--corners",
         metavar="V,V,…",
         help="for --to: corners of the boundary, in every form of qhm map: auto, near:x,y,z, vertices, or a file",
@@ -198,6 +206,8 @@ def run(options: argparse.Namespace) -> int:
         corner_angle=options.corner_angle,
         flatten=options.flatten,
         energy=options.energy,
+        start=options.start,
+        pack=options.pack,
         cut=options.cut,
         corners=options.corners,
         refine=options.refine,
