@@ -428,6 +428,15 @@ def test_channel(example):
         assert sliding["corners off by"] == sliding["walls off by"] == 0
 
 
+def test_tetrahedra(example):
+    numbers = example("tetrahedra", size=8)
+    assert len(numbers) == 2
+    for row in numbers.values():
+        assert row["inverted"] > 20
+        assert row["success"]
+        assert row["worst quality"] > 0
+
+
 def test_cut(example):
     numbers = example("cut")
     assert [row["handles"] for row in numbers.values()] == [0, 1, 2]
