@@ -94,12 +94,17 @@ def test_a_release_is_one_step(tmp_path):
     for name in names:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text(name), encoding="utf-8")
-    for version, date in (("7.8.9", "2031-02-03"), ("7.8.10", "2031-02-04")):
+    changelog = tmp_path / "CHANGELOG.md"
+    first = "## Unreleased\n\n- A change.\n\n## 0.1.0\n"
+    changelog.write_text(first, encoding="utf-8")
+    for version, date in (("7.8.9", "2031-02-03"), ("7.8.9", "2031-02-04")):
         prepare(tmp_path, version, date)
+    assert changelog.read_text("utf-8") == first.replace("Unreleased", "7.8.9 (2031-02-04)")
+    changelog.write_text(first + changelog.read_text("utf-8"), encoding="utf-8")
+    prepare(tmp_path, "7.8.10", "2031-02-05")
     for name in names:
         assert "7.8.10" in (tmp_path / name).read_text("utf-8"), name
-    headings = re.findall("^## (.*)$", (tmp_path / "CHANGELOG.md").read_text("utf-8"), re.M)
-    assert headings[:3] == ["Unreleased", "7.8.10 (2031-02-04)", "7.8.9 (2031-02-03)"]
+    assert re.findall("^## (.*)$", changelog.read_text("utf-8"), re.M)[0] == "7.8.10 (2031-02-05)"
     assert (tmp_path / "CITATION.cff").read_text("utf-8").count("date-released") == 1
     with pytest.raises(SystemExit, match="no version"):
         prepare(tmp_path, "8", "2031-02-05")
