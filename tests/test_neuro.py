@@ -76,6 +76,7 @@ def test_a_patch_needs_its_surface(tmp_path, capsys):
     # The option holds for one command.
     with pytest.raises(io.MeshFileError, match="no surface"):
         io.read_mesh(patch)
+    assert "the list of triangles" in capsys.readouterr().err
     # A patch without a surface beside it is verified by the triangles that were mapped.
     assert main(["flatten", str(surface), "--cut", "-o", str(tmp_path / "rh.flat.patch.3d")]) == 0
     small = tmp_path / "small.off"

@@ -160,7 +160,7 @@ FORMATS: tuple[Format, ...] = (
         read=import_later("formats.neuro", "read_patch"),
         read_written=import_later("formats.neuro", "read_written_patch"),
         write_map=import_later("formats.neuro", "write_patch"),
-        list_losses=import_later("formats.neuro", "not_in_flat_surface"),
+        list_losses=import_later("formats.neuro", "not_in_patch"),
         single_file=False,
     ),
     Format(

@@ -196,6 +196,11 @@ def not_in_flat_surface(mesh: MeshData) -> list[str]:
     return lost
 
 
+def not_in_patch(mesh: MeshData) -> list[str]:
+    """Return descriptions of the mesh data that a patch will not contain."""
+    return [*not_in_flat_surface(mesh), "the list of triangles: readers take all of the surface between its vertices"]
+
+
 def single_precision(path: str | os.PathLike[str], V: FloatArray) -> NDArray[np.float32]:
     """Return positions in single precision; MeshFileError if one exceeds it."""
     with np.errstate(over="ignore"):
