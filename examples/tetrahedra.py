@@ -1,9 +1,8 @@
 """Tetrahedra around moved bodies
 ==============================
 
-Cuts through meshes of tetrahedra, coloured by quality (1 for a regular tetrahedron). Upper row: the cavity of a cube
-turns by 110°. Lower row: the top of a cube is pinched. Left: the mesh at rest. Middle: only the boundary has moved;
-inverted tetrahedra are red. Right: the result of ``morph``, certified.
+Cuts through meshes of tetrahedra, coloured by quality (1: regular): a cavity turns by 110°, and the top of a cube is
+pinched. Left: at rest; middle: only the boundary has moved, inverted tetrahedra red; right: ``morph``, certified.
 """
 
 from __future__ import annotations
