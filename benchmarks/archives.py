@@ -111,7 +111,10 @@ def interrupted(source: Path, output: Path, archives: list[Path], jobs: int) -> 
     process = subprocess.Popen(
         command(source, "-o", output, "-j", jobs), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    while finished_archives(output) < 0.4 * len(archives):
+    # Kill it within an archive, whose results so far are in a journal.
+    while finished_archives(output) < 0.4 * len(archives) or not any(
+        path.stat().st_size for path in output.rglob("*.part")
+    ):
         if process.poll() is not None:
             raise RuntimeError("the run ended before it was killed")
         time.sleep(0.05)
