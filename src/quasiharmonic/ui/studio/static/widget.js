@@ -35,8 +35,6 @@ export function render({ model, el }) {
   };
   const box = element("div", { height: `${model.get("height")}px`, background: COLOURS.paper, border: `1px solid ${COLOURS.line}` });
   for (const [name, value] of Object.entries(COLOURS)) box.style.setProperty(`--${name}`, value);
-  // In JupyterLab, keys for the view would also insert and delete cells.
-  box.dataset.lmSuppressShortcuts = "true";
   const line = element("div", { minHeight: "1.5em", font: "13px sans-serif", color: COLOURS.ink });
   line.setAttribute("role", "status");
   const bar = element("div", { display: "flex", flexWrap: "wrap", gap: "4px", padding: "4px 0" });
@@ -50,6 +48,8 @@ export function render({ model, el }) {
   let listed = "";
   const send = (message, arrays) => model.send({}, undefined, [encodeFrame(message, arrays)]);
   const view = createView(box, { send, pictured: (picture) => picture && colour("image") });
+  // In JupyterLab, keys in the view would also insert and delete cells.
+  for (const pane of view.hands.panes) pane.dataset.lmSuppressShortcuts = "true";
   const say = (text, tone) => {
     line.textContent = text;
     line.style.color = TONES[tone];
