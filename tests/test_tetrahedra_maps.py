@@ -128,6 +128,23 @@ def test_a_turned_cavity():
     np.testing.assert_array_equal(mesh.points, before)
 
 
+@pytest.mark.parametrize("while_inverted", [True, False])
+def test_ctrl_c_returns_the_best_mesh_so_far(while_inverted):
+    X, T, cavity = shell()
+    seen = []
+
+    def stop(step):
+        seen.append(step.inverted)
+        if step.iteration and (step.inverted > 0) == while_inverted:
+            raise KeyboardInterrupt
+
+    result = morph(X, T, cavity, turned(X[cavity], 150), callback=stop)
+    assert result.status is TetrahedraStatus.INTERRUPTED
+    assert not result.success
+    assert len(result.inverted) == min(seen)
+    assert result.valid == (not while_inverted)
+
+
 @pytest.mark.parametrize("scale", [1e-100, 1e100])
 def test_the_scale_does_not_matter(scale):
     X, T, cavity = shell(4)

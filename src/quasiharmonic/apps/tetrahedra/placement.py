@@ -121,7 +121,7 @@ def place_vertices(
         obstructions = find_obstructions(T, begin, is_fixed, mesh.faces.boundary if whole else None, sign)
         if obstructions:
             status = TetrahedraStatus.IMPOSSIBLE
-        elif status is not TetrahedraStatus.OUT_OF_ITERATIONS:
+        elif status not in (TetrahedraStatus.OUT_OF_ITERATIONS, TetrahedraStatus.INTERRUPTED):
             status = TetrahedraStatus.STALLED
     return TetrahedraResult(
         points=begin,
@@ -215,41 +215,59 @@ def extend_harmonically(energy: ShapeEnergy, X: FloatArray, fixed: IntArray, tar
 def _search(
     energy: ShapeEnergy, free: IntArray, X: FloatArray, settings: Settings
 ) -> tuple[FloatArray, TetrahedraStatus, int]:
-    """Untangle and polish; return the best positions, why the search ended, and the number of steps."""
+    """Untangle and polish; return the best positions, why the search ended, and the number of steps.
+
+    Ctrl-C ends the search, and a callback may raise KeyboardInterrupt.
+    """
     descent = Descent(energy, free, X)
+    best = [(len(energy.T) + 1, X)]
+    try:
+        with np.errstate(all="ignore"):
+            count = int(np.count_nonzero(~(energy.determinants(X) > 0)))
+            best[:] = [(count, X)]
+            _report(settings, descent, np.inf, count)
+            if count and free.size:
+                count = _untangle(descent, settings, best)
+            if count:
+                ended = descent.iterations >= settings.max_iterations
+                status = TetrahedraStatus.OUT_OF_ITERATIONS if ended else TetrahedraStatus.STALLED
+                return best[-1][1], status, descent.iterations
+            status = _polish(descent, settings)
+            return descent.X, status, descent.iterations
+    except KeyboardInterrupt:
+        positive = bool(energy.determinants(descent.X).min() > 0)
+        return descent.X if positive else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
 
-    def report(value: float, inverted: int) -> None:
-        if settings.callback is not None:
-            settings.callback(Step(descent.iterations, inverted, value))
 
-    with np.errstate(all="ignore"):
-        D = energy.determinants(X)
-        count, best = int(np.count_nonzero(~(D > 0))), (np.inf, X)
-        report(np.inf, count)
-        if count and free.size:
-            best = (count, X)
-            since, least = 0, float(D.min())
-            for now in descent.untangle(settings.max_iterations):
-                count = int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
-                report(np.inf, count)
-                since += 1
-                if count < best[0] or now > least + 0.05 * abs(least):
-                    since, least = 0, max(now, least)
-                if count < best[0]:
-                    best = (count, descent.X)
-                if since >= _PATIENCE:
-                    return best[1], TetrahedraStatus.STALLED, descent.iterations
-        if count:
-            ended = descent.iterations >= settings.max_iterations
-            status = TetrahedraStatus.OUT_OF_ITERATIONS if ended else TetrahedraStatus.STALLED
-            return best[1], status, descent.iterations
-        status = TetrahedraStatus.FIRST_VALID
-        if settings.polish and free.size:
-            status = TetrahedraStatus.STILL_FALLING
-            before, left = np.inf, settings.max_iterations - descent.iterations
-            for value in descent.polish(left, settings.tol):
-                report(value, 0)
-                before = value
-            if descent.converged and np.isfinite(before):
-                status = TetrahedraStatus.POLISHED
-    return descent.X, status, descent.iterations
+def _report(settings: Settings, descent: Descent, value: float, inverted: int) -> None:
+    """Call the callback."""
+    if settings.callback is not None:
+        settings.callback(Step(descent.iterations, inverted, value))
+
+
+def _untangle(descent: Descent, settings: Settings, best: list[tuple[int, FloatArray]]) -> int:
+    """Untangle until nothing is inverted or progress ends, and keep the best mesh; return how many stay inverted."""
+    energy = descent.energy
+    since, least = 0, float(energy.determinants(descent.X).min())
+    for now in descent.untangle(settings.max_iterations):
+        count = int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
+        since += 1
+        if count < best[-1][0] or now > least + 0.05 * abs(least):
+            since, least = 0, max(now, least)
+        if count < best[-1][0]:
+            best[:] = [(count, descent.X)]
+        _report(settings, descent, np.inf, count)
+        if since >= _PATIENCE:
+            break
+    return int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
+
+
+def _polish(descent: Descent, settings: Settings) -> TetrahedraStatus:
+    """Lower the energy of a valid mesh; return why this ended."""
+    if not settings.polish or not descent.free.size:
+        return TetrahedraStatus.FIRST_VALID
+    value = np.inf
+    for value in descent.polish(settings.max_iterations - descent.iterations, settings.tol):
+        _report(settings, descent, value, 0)
+    converged = descent.converged and np.isfinite(value)
+    return TetrahedraStatus.POLISHED if converged else TetrahedraStatus.STILL_FALLING

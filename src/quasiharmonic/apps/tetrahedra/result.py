@@ -26,6 +26,7 @@ class TetrahedraStatus(Enum):
         "a valid mesh, but this mesh and this target may still allow none."
     )
     OUT_OF_ITERATIONS = "Some tetrahedra were still inverted after the last iteration: allow more iterations."
+    INTERRUPTED = "Interrupted. This is the best mesh so far."
     IMPOSSIBLE = "No valid mesh with these fixed vertices exists. The obstructions are listed."
     CROSSING = "The target positions of the boundary cross themselves, so no valid mesh exists. Nothing was computed."
 
@@ -95,8 +96,8 @@ class TetrahedraResult(Outcome):
 
     @property
     def success(self) -> bool:
-        """Whether the mesh is certified injective: positive tetrahedra, and no point covered twice."""
-        return bool(self.certificate.injective)
+        """Whether the search ended and the mesh is certified injective: positive tetrahedra, no point covered twice."""
+        return bool(self.certificate.injective) and self.status is not TetrahedraStatus.INTERRUPTED
 
     @property
     def message(self) -> str:

@@ -60,7 +60,7 @@ def injective_tetrahedra(
     tol : float
         The distortion has converged if a step lowers it by less than this fraction.
     callback : callable, optional
-        Called with a `Step` at every iteration.
+        Called with a `Step` at every iteration. It may raise KeyboardInterrupt, which ends the search as Ctrl-C does.
 
     Returns
     -------
