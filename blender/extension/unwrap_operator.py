@@ -90,7 +90,7 @@ class QHM_OT_unwrap(Working):
             np.count_nonzero(part.surface.pinned[np.unique(own)]) for part, own in zip(self._parts, loops, strict=True)
         )
         if pinned:
-            said = f"{count_of('pinned UV was', 'pinned UVs were', pinned)} not held. Flatten holds pins"
+            said = f"{count_of('pinned UV was', 'pinned UVs were', pinned)} not kept. Flatten keeps pins"
             self.report({"WARNING"}, f"{self.bl_label}: {said}")
         changed = [thing.name for thing in self._objects if thing.modifiers]
         if changed:

@@ -111,7 +111,7 @@ def test_unwrap_reports_pins(said):
     thing = scenes.add_quads()
     pin(thing, [0])
     assert bpy.ops.uv.qhm_unwrap() == {"FINISHED"}
-    assert "1 pinned UV was not held" in said()
+    assert "1 pinned UV was not kept" in said()
 
 
 def test_repair_holds_pins():

@@ -38,7 +38,7 @@ _OUT_OF_PLANE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class DisplacementField:
-    """A displacement field of a two-dimensional image, and what is needed to write it again.
+    """A displacement field of a two-dimensional image, with the header to write fields on the same grid.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
         raise MeshFileError(path, f"is not valid NIfTI: {error}") from error
     if data.ndim < 3 or data.shape[-1] not in (2, 3) or any(size != 1 for size in data.shape[2:-1]):
         raise MeshFileError(
-            path, f"has shape {data.shape}, but a field of a plane image has (width, height, 1, 1, 2 or 3)"
+            path, f"has shape {data.shape}, but a field of a two-dimensional image has (width, height, 1, 1, 2 or 3)"
         )
     count = data.shape[-1]
     # NIfTI's affine refers to RAS.
@@ -189,7 +189,8 @@ def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
     n, count = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
     if any(size != 1 for size in image.GetSize()[2:]) or count != n or n not in (2, 3):
         raise MeshFileError(
-            path, f"has size {image.GetSize()} and {count} components, but a field of a plane image has one slice"
+            path,
+            f"has size {image.GetSize()} and {count} components, but a field of a two-dimensional image has one slice",
         )
     array = SimpleITK.GetArrayFromImage(image).astype(np.float64)
     columns = np.reshape(image.GetDirection(), (n, n))[:, :2] * image.GetSpacing()[:2]

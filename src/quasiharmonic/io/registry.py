@@ -68,11 +68,11 @@ class Format:
     companions : callable, optional
         Returns the paths of further files that ``write_map`` writes for a texture.
     single_file : bool
-        Whether a file that is read never refers to further files that are needed.
+        Whether a file contains all the data to read, and never refers to further files.
     requires : str, optional
-        Module of the extra ``neuro`` that reading and writing need.
+        Module of the extra ``neuro`` that is required for reading and writing.
     read_elements : callable, optional
-        Parses the bytes of a planar mesh of finite elements, or with a second argument True of one in space.
+        Parses the bytes of a planar mesh of finite elements, or, if the second argument is True, of a mesh in space.
     encode_values : callable, optional
         Returns the bytes of a file with ``V, F, uv`` and columns of values per triangle.
     """

@@ -1,4 +1,4 @@
-"""Threads where the system has them: Pyodide, Python in a browser, has none."""
+"""Pools of threads, and a replacement on systems without threads, such as Pyodide (Python in a browser)."""
 
 from __future__ import annotations
 

@@ -93,8 +93,8 @@ def morph(
         Target positions of the moved nodes.
     energy : str, Energy or None
         Energy that the placement minimises; see `quasiharmonic.polish`. The default preserves shapes and sizes of the
-        triangles, so a graded mesh stays graded. None returns the first valid mesh. Tetrahedra have one isotropic
-        energy, whatever the name.
+        triangles, so a graded mesh stays graded. None returns the first valid mesh. For tetrahedra every name
+        selects the same isotropic energy.
     max_iterations : int
         Maximum number of linear solves to find a valid mesh.
     linear_solver : str
@@ -130,7 +130,7 @@ def morph(
 
     Notes
     -----
-    Tetrahedra are untangled by a regularised energy, then the energy is lowered further. In space no theorem says
+    Tetrahedra are untangled by a regularised energy, then the energy is lowered further. It is not guaranteed
     that a valid mesh is found. If the moved boundary crosses itself, the result names the triangles, without a
     search.
 

@@ -164,7 +164,7 @@ class TetrahedraCertificate(ReadOnly):
 
 
 def certify_tetrahedra(T: ArrayLike, X: ArrayLike, *, boundary: bool = True) -> TetrahedraCertificate:
-    """Verify exactly whether a tetrahedral mesh is valid: positive tetrahedra, and no point covered twice.
+    """Verify exactly whether a tetrahedral mesh is injective: positive tetrahedra, and no point covered twice.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ _AXES = ((0, 1), (1, 2), (2, 0))
 
 
 def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
-    """Find pairs (k, 2) of triangles (f, 3), not degenerate, that meet outside their common vertices and edges.
+    """Find pairs (k, 2) of non-degenerate triangles (f, 3) that meet outside their common vertices and edges.
 
     The search ends after `MAX_LISTED` pairs.
     """
@@ -47,7 +47,7 @@ def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
 
 
 def edges_meeting_triangles(edges: IntArray, F: IntArray, X: FloatArray) -> IntArray:
-    """Find pairs (k, 2) of edges and triangles, not degenerate, that meet outside their common vertices."""
+    """Find pairs (k, 2) of edges and non-degenerate triangles that meet outside their common vertices."""
     ends, corners = X[edges], X[F]
     order, other_order = _spatial_order(0.5 * ends.sum(axis=1)), _spatial_order(corners.mean(axis=1))
     boxes = (

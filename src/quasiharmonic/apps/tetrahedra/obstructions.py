@@ -110,9 +110,10 @@ def _half_space(points: FloatArray, corner: int) -> tuple[_Vector, Fraction]:
 
 
 def _has_no_common_point(planes: list[tuple[_Vector, Fraction]]) -> bool:
-    """Whether open half-spaces have no common point, by weights y ≥ 0 with Σ y normal = 0 and Σ y offset ≥ 0 (Farkas).
+    """Return whether open half-spaces have no common point.
 
-    Only weights that are unique up to a factor are considered.
+    This holds if weights y ≥ 0 with Σ y normal = 0 and Σ y offset ≥ 0 exist (Farkas). Only weights that are unique up
+    to a factor are considered.
     """
     weights = _null_vector([normal for normal, _ in planes])
     if weights is None:

@@ -28,7 +28,7 @@ class TetrahedraStatus(Enum):
     OUT_OF_ITERATIONS = "Some tetrahedra were still inverted after the last iteration: allow more iterations."
     INTERRUPTED = "Interrupted. This is the best mesh so far."
     IMPOSSIBLE = "No valid mesh with these fixed vertices exists. The obstructions are listed."
-    CROSSING = "The target positions of the boundary cross themselves, so no valid mesh exists. Nothing was computed."
+    CROSSING = "The boundary crosses itself at its target positions, so no valid mesh exists. Nothing was computed."
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class TetrahedraResult(Outcome):
         The exact certificate of ``points``.
     status : TetrahedraStatus
     obstructions : tuple of TetrahedraObstruction
-        Reasons why no valid mesh exists, as far as they were found; at most 20.
+        Reasons that were found why no valid mesh exists; at most 20.
     forbidden : (k,) int64
         Inverted or degenerate tetrahedra whose four vertices are fixed.
     iterations : int

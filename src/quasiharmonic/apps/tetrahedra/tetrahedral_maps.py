@@ -65,7 +65,7 @@ def injective_tetrahedra(
     Returns
     -------
     TetrahedraResult
-        The mesh with its certificate, what is still inverted, and obstructions that were found.
+        The mesh, its certificate, the tetrahedra that are still inverted, and the obstructions that were found.
 
     Raises
     ------
@@ -75,8 +75,8 @@ def injective_tetrahedra(
 
     Notes
     -----
-    In space no theorem says that the search finds an existing map. A boundary that crosses itself is reported before
-    any search.
+    It is not guaranteed that the search finds a map that exists. A boundary that crosses itself is reported before any
+    search.
 
     Examples
     --------

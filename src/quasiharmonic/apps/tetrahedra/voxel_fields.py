@@ -1,10 +1,10 @@
 """Displacement fields on grids of voxels: folds, the nearest field without folds, and inverses.
 
-A field maps the voxel in plane z, row y and column x, at position ``p = (x, y, z) · spacing``, to
+A field maps the voxel in slice z, row y and column x, at position ``p = (x, y, z) · spacing``, to
 ``p + field[z, y, x]``. A cell is the box between eight voxels. It is divided into six tetrahedra around its diagonal
 from the first voxel to the last one: each walks along the three axes in one of their six orders. On a tetrahedron the
 map is affine, and its determinant is the volume ratio. A cell *folds* if a determinant is not above a bound.
-Trilinear interpolation is another map, which can fold although the tetrahedra are positive.
+Trilinear interpolation gives a different map, which can fold although the tetrahedra are positive.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True, eq=False, repr=False)
 class InvertibleVolume(Outcome):
-    """A displacement field on voxels without folds, as near to the given one as was found.
+    """The nearest displacement field on voxels without folds that was found.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class VoxelGrid:
         self.spacing: FloatArray = np.broadcast_to(sides, 3).copy()
 
     def positions(self, field: FloatArray, begin: int = 0, stop: int | None = None) -> FloatArray:
-        """Positions of the mapped voxels of planes ``begin`` to ``stop``."""
+        """Return the positions of the mapped voxels of slices ``begin`` to ``stop``."""
         stop = self.shape[0] if stop is None else stop
         axes = [np.arange(count) * side for count, side in zip(self.shape[::-1], self.spacing, strict=True)]
         p = field[begin:stop].copy()
@@ -136,7 +136,7 @@ class VoxelGrid:
         return p
 
     def tetrahedra(self, cells: IntArray) -> IntArray:
-        """The tetrahedra (6 k, 4) of cells given by their first voxels (k,), voxels counted plane by plane."""
+        """The tetrahedra (6 k, 4) of cells given by their first voxels (k,), voxels counted slice by slice."""
         steps = np.array([1, self.shape[2], self.shape[1] * self.shape[2]])
         orders = []
         for order, sign in _ORDERS:
@@ -284,7 +284,7 @@ def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArr
 def _repair_patch(
     spacing: FloatArray, field: FloatArray, given: FloatArray, mask: BoolArray, min_jacobian: float
 ) -> bool:
-    """Replace displacements of one patch by the nearest ones that were found without folds; return whether found.
+    """Replace the displacements of one patch by the nearest ones without folds; return whether any were found.
 
     ``field`` and ``given`` are parts of the new and the given field around the patch, and ``mask`` its voxels.
     """
@@ -409,4 +409,4 @@ def _name_voxels(mask: BoolArray, most: int = 5) -> str:
     where = np.argwhere(mask)
     listed = ", ".join(str(tuple(row)) for row in where[:most].tolist())
     rest = f", … ({len(where)} in all)" if len(where) > most else ""
-    return f"{'voxel' if len(where) == 1 else 'voxels'} {listed}{rest}, plane, row and column"
+    return f"{'voxel' if len(where) == 1 else 'voxels'} {listed}{rest}, slice, row and column"

@@ -74,19 +74,19 @@ def _is_small(chart: WorkingChart, total_area: float) -> bool:
 
 
 def _sides(chart: WorkingChart) -> tuple[IntArray, IntArray]:
-    """Start and end (k,) of the boundary edges, in the direction of the triangles."""
+    """Return the start and end vertices (k,) of the boundary edges, in the direction of the triangles."""
     loops = chart.piece.loops
     return np.concatenate(loops), np.concatenate([np.roll(loop, -1) for loop in loops])
 
 
 def _mesh_sides(chart: WorkingChart) -> list[tuple[int, int]]:
-    """The boundary edges by vertices of the mesh."""
+    """Return the boundary edges as pairs of vertices of the mesh."""
     tail, head = _sides(chart)
     return list(zip(chart.vertices[tail].tolist(), chart.vertices[head].tolist(), strict=True))
 
 
 def _positions(chart: WorkingChart) -> ComplexArray:
-    """The map (m,) in the surface's unit of length."""
+    """Return the map (m,) of a chart, as complex numbers in the surface's unit of length."""
     assert chart.uv is not None
     uv: FloatArray = np.ldexp(chart.uv, chart.piece.exponent)
     return uv[:, 0] + 1j * uv[:, 1]

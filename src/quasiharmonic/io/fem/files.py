@@ -1,6 +1,6 @@
 """Meshes of finite-element programs, in the plane and in space: Gmsh's MSH, VTK's legacy and XML files.
 
-Writing changes only the positions, in place. Every other byte is unchanged: cells, data, several times, physical groups
+Writing changes only the positions, in place. Every other byte is unchanged: cells, data, time steps, physical groups
 and their names, numbering.
 """
 

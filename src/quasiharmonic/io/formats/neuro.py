@@ -198,7 +198,8 @@ def not_in_flat_surface(mesh: MeshData) -> list[str]:
 
 def not_in_patch(mesh: MeshData) -> list[str]:
     """Return descriptions of the mesh data that a patch will not contain."""
-    return [*not_in_flat_surface(mesh), "the list of triangles: readers take all of the surface between its vertices"]
+    lost = "the list of triangles: readers use every triangle of the surface between its vertices"
+    return [*not_in_flat_surface(mesh), lost]
 
 
 def single_precision(path: str | os.PathLike[str], V: FloatArray) -> NDArray[np.float32]:
@@ -244,8 +245,8 @@ def find_parent_surface(path: str | os.PathLike[str]) -> Path | None:
 def read_patch(path: str | os.PathLike[str], surface: str | os.PathLike[str] | None = None) -> MeshData:
     """Read a patch of FreeSurfer, binary or text, such as ``lh.cortex.patch.3d`` or ``lh.cortex.patch.flat``.
 
-    A binary patch holds numbers and positions of vertices, but no triangles. Its triangles are those of the surface
-    whose three corners belong to the patch. A text patch holds its triangles.
+    A binary patch contains numbers and positions of vertices, but no triangles. Its triangles are those of the surface
+    whose three corners belong to the patch. A text patch contains its triangles.
 
     Parameters
     ----------

@@ -149,7 +149,7 @@ def run(
     table : {"csv", "parquet"}
         Format of the table of records.
     shard : str, optional
-        ``"i/n"``, with i from 1 to n: solve only one of n disjoint parts of the data set, chosen by a hash of the
+        ``"i/n"``, with i from 1 to n: solve only one of n disjoint shards of the data set, chosen by a hash of the
         problem's name. The table is then ``records-i-of-n.csv``. The n runs may have the same output folder at the same
         time. `quasiharmonic.batch.merge` joins their tables.
     scheduler : str, distributed.Client or cluster, optional

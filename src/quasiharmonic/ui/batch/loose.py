@@ -23,7 +23,7 @@ class LooseProblems:
     orders : Orders
         Parameters of the run.
     shard : Shard
-        The part of the data set to solve.
+        The shard of the data set to solve.
 
     Attributes
     ----------

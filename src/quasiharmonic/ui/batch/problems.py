@@ -42,7 +42,7 @@ class ProblemFiles:
     results : Path or None
         Absolute path of the folder for its map and record; by default ``results/NAME`` in the run's folder.
     source : str or None
-        What the record names as the source; by default ``mesh``.
+        Source of the problem for its record; by default ``mesh``.
     """
 
     name: str

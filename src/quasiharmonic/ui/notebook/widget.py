@@ -38,7 +38,7 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
     """View of a model and its map, as in ``qhm studio``: drag the outline, corners and pins, and the map follows.
 
     The buttons of the view unwrap, flatten and pack, draw seams, select islands, show an image, save and undo. The
-    attributes follow what is done there.
+    attributes are updated after each action.
 
     Parameters
     ----------

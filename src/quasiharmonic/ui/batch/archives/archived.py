@@ -109,7 +109,7 @@ class ArchivedProblems:
                 self._in_read = self._known
 
     def collect(self, item: Finished | None) -> list[Finished]:
-        """Move a finished problem's results from the scratch folder into the journal; return what is finished."""
+        """Move a finished problem's results from the scratch folder into the journal; return the finished items."""
         with self._lock:
             if item is not None:
                 self._journal(item)
@@ -120,7 +120,7 @@ class ArchivedProblems:
             return ready
 
     def finish(self) -> list[Finished]:
-        """Finish the remaining archives; return what is finished."""
+        """Finish the remaining archives; return the finished items."""
         return self.collect(None)
 
     def records(self) -> Iterator[records.Record]:

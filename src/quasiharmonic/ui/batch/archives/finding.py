@@ -78,12 +78,12 @@ def _archives_of(names: list[str]) -> list[str]:
 
 
 def _listed(path: Path) -> list[Archive]:
-    """Return the archives in a list; none if its first line is no archive."""
+    """Return the archives in a list; none if its first line is not an archive."""
     found: list[Archive] = []
     for number, text in list_lines(path):
         if not is_archive(text):
             if found:
-                raise ValueError(f"{path}: line {number}: {text[:100]!r} is no archive, but the lines before it are")
+                raise ValueError(f"{path}: line {number}: {text[:100]!r} is not an archive, unlike the lines before it")
             return []
         location = text if places.is_url(text) else os.path.abspath(path.parent / text)
         for one in _expand(location):

@@ -14,7 +14,7 @@ from quasiharmonic.ui.batch.archives import results
 from quasiharmonic.ui.batch.archives.tar_stream import Damage, pack_member, read_members
 from quasiharmonic.ui.batch.records import Record
 
-# What is kept of a record: whether it is still valid, and how the archive's statement counts it.
+# Keys of a record that are kept, to decide whether it is still valid, and to count it in the archive's metadata.
 _KEPT = "key", "outcome", "time_limit", "memory_limit", "seconds"
 
 
@@ -27,7 +27,7 @@ class _Entry(NamedTuple):
 class Journal:
     """Tar file to which results are appended, and which a killed process leaves behind.
 
-    What follows the last complete result is cut off when the journal is opened.
+    When the journal is opened, any bytes after the last complete result are cut off.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Journal:
             raise _cannot_write(self.part, error) from error
 
     def record(self, key: str) -> Record | None:
-        """Return what is kept of the newest record of a problem."""
+        """Return the kept values of the newest record of a problem; None if there is none."""
         entry = self.entries.get(key)
         return None if entry is None else entry.record
 
@@ -95,7 +95,7 @@ class Journal:
         self.entries[key] = _Entry(start, end, {name: record[name] for name in _KEPT if name in record})
 
     def _repair(self) -> None:
-        """Read the journal and cut off what follows the last complete result."""
+        """Read the journal and cut off the bytes after the last complete result."""
         if not self.part.exists():
             return
         with open(self.part, "r+b") as file:

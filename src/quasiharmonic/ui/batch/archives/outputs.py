@@ -1,4 +1,4 @@
-"""Where the archives of results are: in the run's folder, or by URL."""
+"""Locations of the archives of results: in the run's folder, or by URL."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Outputs:
     Parameters
     ----------
     folder : Path
-        The run's folder. If there is a URL, it has only what is not sent yet.
+        The run's folder. If there is a URL, it contains only archives that are not sent yet.
     url : str, optional
         Where finished archives are sent.
     """
@@ -33,7 +33,7 @@ class Outputs:
         return self._folder / name
 
     def about(self, name: str) -> dict[str, Any] | None:
-        """Return what the finished archive of results states about itself; None if there is none."""
+        """Return the metadata of a finished archive of results; None if there is none."""
         path = self.path(name)
         if self._url is None:
             return read_about(path)
@@ -71,8 +71,8 @@ class Outputs:
     def adopt(self, name: str, present: frozenset[str], stamp: str) -> None:
         """Use the results of an archive that was moved within the data set.
 
-        They are those of the same file name that belong to no archive of the data set, ``present``, and state the same
-        ``stamp``; unfinished results do not state one, but each record has the key of its problem.
+        These results have the same file name, belong to no archive of the data set (``present``), and have the same
+        ``stamp`` in their metadata. Unfinished results have no stamp, but each record has the key of its problem.
         """
         if self._url is not None or self.path(name).exists() or self.path(name + PART).exists():
             return

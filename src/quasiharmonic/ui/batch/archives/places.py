@@ -15,7 +15,7 @@ T = TypeVar("T")
 # Number of attempts, and seconds before the second one; each further pause is twice as long.
 ATTEMPTS = 5
 FIRST_PAUSE = 0.5
-# Errors that a further attempt does not mend.
+# Errors that a further attempt does not resolve.
 _FINAL = FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError
 
 

@@ -1,7 +1,7 @@
 """Archives of results: one for each archive of problems, with the same names in the same order.
 
 A tar file has ``NAME.obj``, the map, and ``NAME.json``, the record, for each problem. A Parquet file has the columns of
-the records and ``obj``. Both state for which input and settings they are complete.
+the records and ``obj``. The metadata of both identify the input and the settings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from quasiharmonic.ui.batch.records import Record, load_pyarrow
 PART = ".part"
 #: Extensions of map and record.
 MAP, RECORD = ".obj", ".json"
-#: Bytes at the start of a tar file with its statement.
+#: Bytes at the start of a tar file with its metadata.
 MAX_ABOUT = 1 << 16
 _MARK = b"quasiharmonic"
 _ROWS = 64
@@ -52,7 +52,7 @@ def is_parquet(path: Path) -> bool:
 
 
 def read_about(path: Path) -> dict[str, Any] | None:
-    """Return what an archive of results states about itself; None if it is missing or invalid."""
+    """Return the metadata of an archive of results; None if it is missing or invalid."""
     try:
         if is_parquet(path):
             with load_pyarrow().ParquetFile(path) as parquet:
@@ -66,7 +66,7 @@ def read_about(path: Path) -> dict[str, Any] | None:
 
 
 def parse_about(start: bytes) -> dict[str, Any] | None:
-    """Return what a tar file of results with these first bytes states about itself; None if it is invalid."""
+    """Return the metadata of a tar file of results with these first bytes; None if they are invalid."""
     return _parse(global_comment(start) or "")
 
 
@@ -79,7 +79,7 @@ def _parse(text: str) -> dict[str, Any] | None:
 
 
 def describe(found: Iterable[Record], stamp: str, settings: str) -> dict[str, Any]:
-    """Return the statement of an archive of results.
+    """Return the metadata of an archive of results.
 
     ``found`` are its records, ``stamp`` identifies the version of its archive of problems, and ``settings`` is their
     digest.
@@ -89,7 +89,7 @@ def describe(found: Iterable[Record], stamp: str, settings: str) -> dict[str, An
 
 
 def outcomes(about: dict[str, Any]) -> Iterator[tuple[Record, int]]:
-    """Yield outcome and limits of the records that a statement counts, and their numbers."""
+    """Yield outcome and limits of the records that the metadata count, and their numbers."""
     for outcome, time_limit, memory_limit, count in about["outcomes"]:
         yield {"outcome": outcome, "time_limit": time_limit, "memory_limit": memory_limit}, count
 

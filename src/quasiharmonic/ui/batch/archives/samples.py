@@ -62,14 +62,14 @@ def is_archive(name: str) -> bool:
 def read_samples(path: Path) -> Iterator[Sample]:
     """Read the problems of an archive, in order; constant memory.
 
-    Consecutive members of a tar file with the same name up to the first dot are one problem, as in WebDataset; members
-    ``input.obj`` and ``handles.txt`` of a folder are one, too. In a Parquet file each row is a problem: the columns are
+    Consecutive members of a tar file with the same name up to the first dot are one problem, as in WebDataset. So are
+    the members ``input.obj`` and ``handles.txt`` of a folder. In a Parquet file each row is a problem: the columns are
     named by the extensions, and the column ``__key__``, ``problem`` or ``name`` has the name.
 
     Yields
     ------
     Sample
-        What cannot be read is a sample with an error. OSError if the archive cannot be opened.
+        A problem that cannot be read has an ``error``. OSError if the archive cannot be opened.
     """
     seen: set[str] = set()
     for sample in _parquet_samples(path) if path.name.lower().endswith(PARQUET) else _tar_samples(path):
@@ -80,7 +80,7 @@ def read_samples(path: Path) -> Iterator[Sample]:
 
 
 def _check(sample: Sample, seen: set[str]) -> None:
-    """Note in a sample why it cannot be used."""
+    """Set the error of a sample that cannot be used."""
     meshes = [extension for extension in sample.files if _is_mesh(extension)]
     if sample.key in seen:
         sample.key, sample.error = _unused(sample.key, seen), f"the name {sample.key} is used twice in the archive"

@@ -17,7 +17,7 @@ _PREFIX = "qhm-batch-"
 def scratch_folder(output: Path, part: Shard, *, shared: bool) -> Iterator[Path]:
     """Make a folder for the block: in the run's folder if other machines must see it, else for temporary files.
 
-    The folder of a killed run of the same part is deleted first; a file in the run's folder has its path.
+    The folder of a killed run of the same shard is deleted first; a file in the run's folder has its path.
     """
     note = output / f"{_PREFIX}{part.label}.scratch"
     with suppress(OSError, ValueError):

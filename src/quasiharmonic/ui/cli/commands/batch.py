@@ -57,7 +57,7 @@ def add_parser(commands: Commands) -> None:
         type=_location,
         required=True,
         metavar="OUT",
-        help="folder for the results; for archives or a URL",
+        help="folder for the results; a URL is possible if the problems are in archives",
     )
     parser.add_argument(
         "--report",
@@ -82,14 +82,14 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--shard",
         metavar="I/N",
-        help="solve part I (1 to N) of N disjoint parts, for array jobs; parts may share OUT and run at the same time",
+        help="solve shard I (1 to N) of N disjoint shards, for array jobs; they may share OUT and run at the same time",
     )
     parser.add_argument(
         "--merge",
         type=Path,
         nargs="*",
         metavar="RUN",
-        help="join the tables of finished parts in the folders RUN (default: OUT) into OUT/records.csv",
+        help="join the tables of finished shards in the folders RUN (default: OUT) into OUT/records.csv",
     )
 
     work = parser.add_argument_group("workers and limits")
@@ -267,7 +267,7 @@ def _merge(options: argparse.Namespace) -> int:
         print(f"{merged.solved} of {merged.total} problems have a certified map\nwrote {table}", flush=True)
     if merged.missing:
         shown = ", ".join(merged.missing[:20]) + (", …" if len(merged.missing) > 20 else "")
-        tell(f"qhm batch: warning: no table of the shards {shown}: they are not finished, or in another folder")
+        tell(f"qhm batch: warning: shards {shown} have no table: they are not finished, or in another folder")
     if options.report:
         with report.after_writing(table):
             _write_report(options)

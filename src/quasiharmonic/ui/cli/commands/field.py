@@ -21,10 +21,10 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "field",
         description="Make a displacement field invertible with the least change. Away from folds "
-        "the field is unchanged, bit for bit. It is a .npy array of shape (height, width, 2), displacements "
-        "along x, to the right, and y, down, in the unit of --spacing; or a NIfTI file (.nii, .nii.gz; needs nibabel) "
-        "or a file of ITK (.mha, .nrrd; needs SimpleITK) of vectors along the axes of space, as ITK, ANTs and elastix "
-        "write them.",
+        "the field is unchanged, bit for bit. A .npy array has shape (height, width, 2), with displacements "
+        "along x (to the right) and y (down) in the unit of --spacing. NIfTI files (.nii, .nii.gz) need nibabel, ITK's "
+        "files (.mha, .nrrd) need SimpleITK; their vectors are along the axes of space, as ITK, ANTs and elastix write "
+        "them.",
         epilog="Exit status: 0 the written field is certified without folds; 1 written, but the inverse that "
         "--inverse requests does not exist, because the border overlaps itself; 2 wrong input or call, or no such "
         "field was found, nothing written; 3 written, but the report failed.",
@@ -47,7 +47,7 @@ def add_parser(commands: Commands) -> None:
         type=float,
         nargs="+",
         metavar="LENGTH",
-        help="for .npy: distance between pixels; or two, along x and along y (default: 1)",
+        help="for .npy: distance between pixels, or two distances, along x and along y (default: 1)",
     )
     parser.add_argument(
         "--min-jacobian",

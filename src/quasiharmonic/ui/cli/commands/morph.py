@@ -33,8 +33,8 @@ def add_parser(commands: Commands) -> None:
         "morph",
         description="Move some nodes of a mesh and place the others such that no element is inverted: planar triangles "
         "of three or six nodes, quadrilaterals of four, or tetrahedra of four. Boundary nodes without a displacement "
-        "stay fixed; mid-side nodes move with their sides. Only positions change in the file; data, times and physical "
-        "groups stay byte for byte.",
+        "stay fixed; mid-side nodes move with their sides. Only positions change in the file; data, time steps and "
+        "physical groups stay unchanged.",
         epilog="Exit status: 0 no element of the written mesh is inverted, verified exactly; 1 some are; 2 wrong "
         "input or call, nothing written; 3 written, but the report failed.",
         examples=(

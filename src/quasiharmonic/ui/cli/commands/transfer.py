@@ -37,7 +37,7 @@ def add_parser(commands: Commands) -> None:
         "transfer",
         description="Transfer positions, values and landmarks from one surface to another. Points that the maps of "
         "both surfaces send to the same position correspond. Both maps must be bijective, which is certified exactly, "
-        "so no two points have the same partner. For maps onto one outline, call qhm map --to with the same outline "
+        "so the correspondence is one to one. For maps onto one outline, call qhm map --to with the same outline "
         "for both.",
         epilog="Exit status: 0 both maps are certified bijective, and the files are written; 2 wrong input or call, or "
         "a map is not bijective, nothing written; 3 written, but the report failed.",
@@ -55,8 +55,8 @@ def add_parser(commands: Commands) -> None:
         "--output",
         type=Path,
         metavar="FILE",
-        help="write the target with its vertices moved to their partners on the source: its triangles, and the "
-        f"source's shape; as {format_names('write_map', 'seams')}",
+        help="write the target with its vertices moved to the corresponding points of the source: its triangles, and "
+        f"the source's shape; as {format_names('write_map', 'seams')}",
     )
     parser.add_argument(
         "--values",
@@ -69,7 +69,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--per",
         choices=("vertex", "triangle"),
-        help="for --values: what the rows belong to (default: vertex)",
+        help="for --values: whether rows belong to vertices or to triangles (default: vertex)",
     )
     parser.add_argument(
         "--landmarks",
@@ -83,7 +83,8 @@ def add_parser(commands: Commands) -> None:
         "--outside",
         choices=("nearest", "nan"),
         default="nearest",
-        help="for points without a partner: the nearest point of the other map's boundary, or nan (default: nearest)",
+        help="for points without a corresponding point: the nearest point of the other map's boundary, or nan "
+        "(default: nearest)",
     )
     arguments.add_report(parser)
     parser.set_defaults(run=run)
@@ -127,8 +128,9 @@ def run(options: argparse.Namespace) -> int:
         V = between.transfer(source.inverse.V, outside=options.outside)[:n]
         if np.isnan(V[used]).any():
             raise ValueError(
-                f"{count_of('vertex', 'vertices', outside)} of {options.target} have no partner on {options.source}, "
-                "so -o has no positions for them: omit --outside nan, or map both onto the same outline"
+                f"{count_of('vertex', 'vertices', outside)} of {options.target} have no corresponding point on "
+                f"{options.source}, so -o has no positions for them: omit --outside nan, or map both onto the same "
+                "outline"
             )
         V[~used] = target.mesh.V[~used]
         with_map = target.mesh.with_places(io.mapped(target.mesh))
@@ -149,7 +151,7 @@ def run(options: argparse.Namespace) -> int:
             f"wrote {', '.join(written)}",
             "Both maps are bijective, verified exactly: "
             f"{count_of('vertex', 'vertices', int(used.sum()) - outside)} of the target "
-            "have a partner on the source, and no two the same.",
+            "correspond one to one to points of the source.",
         ]
         if outside:
             lines.append(f"{count_of('vertex', 'vertices', outside)} outside the source's map: {instead}")
@@ -221,7 +223,7 @@ def _unused(surface: InverseMap) -> NDArray[np.bool_]:
 
 
 def _landmarks(options: argparse.Namespace, source: _MappedFile, target: _MappedFile, between: SurfaceMap) -> bytes:
-    """Return a table of the landmarks' partners on the target, as CSV."""
+    """Return a table of the points of the target that correspond to the landmarks, as CSV."""
     import numpy as np
 
     from quasiharmonic import io

@@ -91,7 +91,10 @@ def write_script(lines: Sequence[str], *, names: Sequence[str] = (), modules: Se
 
 
 def map_script(source: Source, only: Sequence[int] | None, smoothed: Sequence[int] | None, fixed: str | None) -> str:
-    """Return a script that maps islands again with their fixed vertices in place, and smooths some; None means all."""
+    """Return a script that maps the islands ``only`` again and keeps their fixed vertices; None means all islands.
+
+    The script then smooths the islands ``smoothed``; None means all.
+    """
     read = read_indices(fixed)
     lines = [f"result = atlas.injective_map({source.name!r}{arguments(fixed=read, islands=only)})"]
     if smoothed is None or len(smoothed):
