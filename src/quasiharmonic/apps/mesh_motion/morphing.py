@@ -130,9 +130,8 @@ def morph(
 
     Notes
     -----
-    Tetrahedra are untangled by a regularised energy, then the energy is lowered further. It is not guaranteed
-    that a valid mesh is found. If the moved boundary crosses itself, the result names the triangles, without a
-    search.
+    Tetrahedra are untangled by a regularised energy, then the energy is lowered further. The search can fail although a
+    valid mesh exists. If the moved boundary crosses itself, the result names the triangles, without a search.
 
     Triangles are searched as any map. For quadrilaterals the search uses the triangles on either side of a diagonal;
     then the triangles at all four corners are untangled and their energy is lowered.

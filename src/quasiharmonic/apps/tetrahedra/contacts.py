@@ -163,7 +163,7 @@ def _plane_signs(F: IntArray, points: IntArray, signs: ExactSigns) -> SignArray:
 def _edge_meets(
     edge: IntArray, F: IntArray, p_side: SignArray, q_side: SignArray, X: FloatArray, signs: ExactSigns
 ) -> BoolArray:
-    """Whether closed edges (k, 2) meet closed triangles (k, 3), given the sides of the planes of their ends."""
+    """Whether closed edges (k, 2) meet closed triangles (k, 3), given on which sides of the planes their ends lie."""
     meet = np.zeros(len(edge), dtype=np.bool_)
     flat = (p_side == 0) & (q_side == 0)
     if flat.any():

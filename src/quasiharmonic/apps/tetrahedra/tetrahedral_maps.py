@@ -75,8 +75,7 @@ def injective_tetrahedra(
 
     Notes
     -----
-    It is not guaranteed that the search finds a map that exists. A boundary that crosses itself is reported before any
-    search.
+    The search can fail although a map exists. A boundary that crosses itself is reported before any search.
 
     Examples
     --------

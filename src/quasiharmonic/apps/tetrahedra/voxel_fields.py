@@ -161,7 +161,7 @@ def check_volume_field(field: ArrayLike) -> FloatArray:
 
 
 def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | None) -> BoolArray:
-    """Cells (d − 1, h − 1, w − 1) with a determinant that is not above a bound; None decides the sign exactly."""
+    """Cells (d − 1, h − 1, w − 1) with a determinant not above a bound; for None, not positive, decided exactly."""
     d, h, w = (count - 1 for count in grid.shape)
     folds = np.zeros((d, h, w), dtype=np.bool_)
     # For the bound, a cell has volume 1. Exact signs are those of the positions as stored.

@@ -154,8 +154,8 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
     """Return the surfaces that any triangles form; every defect is cut open, oriented or listed.
 
     Degenerate and repeated triangles are excluded. Each gets a substitute, so that no triangle of the model lacks
-    texture coordinates. A triangle with three positions on a line stays if it joins others: a vertex of it is moved a
-    little. At an edge of three or more triangles, pairs stay joined: those that share vertices in the
+    texture coordinates. A triangle with three positions on a line stays if it connects others: one of its vertices is
+    moved slightly. At an edge of three or more triangles, pairs stay joined: those that share vertices in the
     model first, then those whose orientations agree, then those that meet at the flattest angle. Other triangles are
     separated there. Triangles are reversed so that each component is consistently oriented; the larger part by area
     keeps its orientation. A surface that cannot be oriented, such as a Möbius band, is cut. Vertices where surfaces

@@ -105,8 +105,8 @@ def count_turns(F: IntArray, uv: FloatArray, turns: IntArray) -> None:
 def find_overlapping(F: IntArray, uv: FloatArray) -> IntArray:
     """Find the triangles that overlap another one with positive area, (k,) int64 ascending; all are counterclockwise.
 
-    Two convex sets have no common area if and only if a line separates them. For two triangles a side of one of them
-    then does. Triangles that only touch do not count.
+    Two convex sets have no common area if and only if a line separates them. For two triangles, the line through a
+    side of one of them then does. Triangles that only touch do not count.
 
     Examples
     --------

@@ -109,7 +109,7 @@ def read_fem(path: str | os.PathLike[str]) -> FemMesh:
 
 
 def read_volume(path: str | os.PathLike[str]) -> VolumeMesh:
-    """Read the tetrahedra and hexahedra of a file as for `read_fem`; there may be none, and cells without volume.
+    """Read the tetrahedra and hexahedra of a file as for `read_fem`; cells without volume are allowed.
 
     MeshFileError if the format is not supported, the file cannot be read, or it has other cells with volume.
     """

@@ -22,7 +22,8 @@ _KINDS = 1, 3, 5, 9, 10, 12, 13, 14
 def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
     """Parse an MFEM mesh file, with its tetrahedra and hexahedra if ``solid``.
 
-    ValueError if the file is not such a file, is not conforming, has curved elements (``nodes``), or ends early.
+    ValueError if the file is not an MFEM mesh file or ends early, or the mesh is not conforming or has curved elements
+    (``nodes``).
     """
     head = data[:200].lstrip().split(b"\n", 1)[0].strip()
     if not re.fullmatch(rb"MFEM mesh v1\.[023]", head):
