@@ -55,7 +55,7 @@ def main(output: Path, size: int = 40) -> dict[str, Any]:
         "triangles": [len(cat.F), len(egg.F)],
         "bijective": [bool(mapped.certificate.bijective) for mapped in (cat, egg)],
         "onto": to_cat.onto,
-        "vertices without a partner": int(np.isnan(remeshed).any(axis=1).sum()),
+        "vertices without a corresponding point": int(np.isnan(remeshed).any(axis=1).sum()),
         "there and back": float(np.abs(cat.surface(back) - cat.V).max() / np.ptp(cat.V)),
     }
 

@@ -253,7 +253,7 @@ def test_transfer(example):
     numbers = example("transfer", size=16)
     assert numbers["onto"]
     assert numbers["bijective"] == [True, True]
-    assert numbers["vertices without a partner"] == 0
+    assert numbers["vertices without a corresponding point"] == 0
     assert numbers["there and back"] < 1e-13
 
 
