@@ -267,7 +267,7 @@ def _merge(options: argparse.Namespace) -> int:
         print(f"{merged.solved} of {merged.total} problems have a certified map\nwrote {table}", flush=True)
     if merged.missing:
         shown = ", ".join(merged.missing[:20]) + (", …" if len(merged.missing) > 20 else "")
-        tell(f"qhm batch: warning: shards {shown} have no table: they are not finished, or in another folder")
+        tell(f"qhm batch: warning: no table of the shards {shown}: they are not finished, or in another folder")
     if options.report:
         with report.after_writing(table):
             _write_report(options)
