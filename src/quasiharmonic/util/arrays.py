@@ -169,12 +169,18 @@ def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = 
     return array
 
 
+def vertex_indices(name: str, vertices: ArrayLike, n: int) -> IntArray:
+    """Convert indices of some of ``n`` vertices to (k,) int64; returns a copy."""
+    array = index_array(name, vertices)
+    if array.ndim != 1:
+        raise ValueError(f"{name} must have shape (k,), not {array.shape}")
+    check_range(name, array, n)
+    return array
+
+
 def fixed_vertices(fixed: ArrayLike, n: int) -> IntArray:
     """Convert indices of fixed vertices among ``n`` vertices to (k,) int64 without repetition; returns a copy."""
-    array = index_array("fixed", fixed)
-    if array.ndim != 1:
-        raise ValueError(f"fixed must have shape (k,), not {array.shape}")
-    check_range("fixed", array, n)
+    array = vertex_indices("fixed", fixed, n)
     times = np.bincount(array, minlength=n)
     if times.max(initial=0) > 1:
         raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")

@@ -51,10 +51,9 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_finite,
     check_integer,
-    check_range,
-    index_array,
     map_array,
     names_of,
+    vertex_indices,
 )
 from quasiharmonic.util.progress import reports_progress
 
@@ -333,10 +332,7 @@ def _find_fixed(
     points: FloatArray, F: IntArray, moved_vertices: ArrayLike, target: ArrayLike
 ) -> tuple[IntArray, FloatArray]:
     """Return the fixed nodes (moved nodes and the rest of the boundary) and their target positions."""
-    given = index_array("moved_vertices", moved_vertices)
-    if given.ndim != 1:
-        raise ValueError(f"moved_vertices must have shape (k,), not {given.shape}")
-    check_range("moved_vertices", given, len(points))
+    given = vertex_indices("moved_vertices", moved_vertices, len(points))
     positions = map_array("target", target, len(given), finite=False)
     check_finite("target", "row", "rows", positions)
     idle = given[~np.isin(given, F)]

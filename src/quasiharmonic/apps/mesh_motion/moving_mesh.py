@@ -31,11 +31,10 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_finite,
     check_integer,
-    check_range,
-    index_array,
     map_array,
     names_of,
     triangle_array,
+    vertex_indices,
 )
 
 # Minimum decrease, relative to the energy, that a step must predict.
@@ -145,10 +144,7 @@ class MovingMesh:
             raise ValueError(f"{names_of('triangle', 'triangles', flat)} degenerate: repair the mesh first")
         F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
         check_spread(F, len(self._points))
-        self._moved = index_array("moved_vertices", moved_vertices)
-        if self._moved.ndim != 1:
-            raise ValueError(f"moved_vertices must have shape (k,), not {self._moved.shape}")
-        check_range("moved_vertices", self._moved, len(self._points))
+        self._moved = vertex_indices("moved_vertices", moved_vertices, len(self._points))
         check_bool("slide", slide)
         self._energy, self._slide = find_energy(energy), slide
         check_integer("settle", settle, minimum=1 if slide else 0)

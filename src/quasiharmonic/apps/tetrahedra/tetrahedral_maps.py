@@ -18,10 +18,9 @@ from quasiharmonic.util.arrays import (
     check_callback,
     check_integer,
     check_positive,
-    check_range,
     fixed_vertices,
-    index_array,
     names_of,
+    vertex_indices,
 )
 from quasiharmonic.util.progress import reports_progress
 
@@ -121,10 +120,7 @@ def find_fixed(
     mesh: RestMesh, points: FloatArray, moved_vertices: ArrayLike, target: ArrayLike
 ) -> tuple[IntArray, FloatArray]:
     """Return the fixed vertices, moved ones first and then the rest of the boundary, and their target positions."""
-    moved = index_array("moved_vertices", moved_vertices)
-    if moved.ndim != 1:
-        raise ValueError(f"moved_vertices must have shape (k,), not {moved.shape}")
-    check_range("moved_vertices", moved, len(points))
+    moved = vertex_indices("moved_vertices", moved_vertices, len(points))
     if np.bincount(moved, minlength=1).max() > 1:
         raise ValueError("moved_vertices has a vertex twice")
     goal = space_array("target", target, moved.size)
