@@ -84,3 +84,33 @@ def test_invalid_calls(tmp_path, monkeypatch, field, capsys, arguments, message)
     assert main(["field", *arguments]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "a.npy").exists()
+
+
+def test_a_field_on_voxels_and_its_inverse(tmp_path, capsys):
+    z, y, x = np.mgrid[:9, :10, :12]
+    field = np.zeros((9, 10, 12, 3))
+    field[..., 0] = 4 * np.exp(-((x - 5) ** 2 + (y - 5) ** 2 + (z - 4) ** 2) / 4)
+    paths = [str(tmp_path / name) for name in ("field.npy", "mended.npy", "back.npy")]
+    np.save(paths[0], field)
+    spacing = ["--spacing", "1", "2", "1.5", "--fix-border"]
+    report = tmp_path / "report.json"
+    assert main(["field", paths[0], "-o", paths[1], "--inverse", paths[2], *spacing, "--json", str(report)]) == 0
+    border = np.ones(field.shape[:3], dtype=bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    mended = nearest_invertible(field, spacing=(1, 2, 1.5), fixed=border)
+    assert mended.folds > 0
+    assert np.array_equal(np.load(paths[1]), mended.field)
+    assert np.array_equal(mended.field[border], field[border])
+    assert np.array_equal(np.load(paths[2]), inverse_field(mended.field, spacing=(1, 2, 1.5)).field, equal_nan=True)
+    assert json.loads(report.read_text())["folds"] == mended.folds
+    assert f"{mended.folds} cells folded" in capsys.readouterr().out
+
+
+def test_a_volume_that_cannot_be_mended_is_not_written(tmp_path, capsys):
+    field = np.zeros((4, 4, 4, 3))
+    field[0, 0, 0] = 5.0
+    np.save(tmp_path / "field.npy", field)
+    fixed = ["field", f"{tmp_path}/field.npy", "-o", f"{tmp_path}/mended.npy", "--fix-border"]
+    assert main(fixed) == 2
+    assert not (tmp_path / "mended.npy").exists()
+    assert "fold" in capsys.readouterr().err

@@ -80,7 +80,8 @@ def test_wrong_files_are_rejected(tmp_path):
     path = tmp_path / "f.nii"
     for data, affine, message in (
         (np.zeros((4, 5, 6)), np.eye(4), "has shape"),
-        (np.zeros((4, 5, 3, 1, 3)), np.eye(4), "has shape"),
+        (np.zeros((4, 5, 3, 1, 2)), np.eye(4), "has shape"),
+        (np.zeros((4, 5, 3, 2, 3)), np.eye(4), "has shape"),
         (np.ones((4, 5, 1, 1, 3)), np.eye(4), "out of the plane"),
         (np.zeros((4, 5, 2)), np.eye(4)[[0, 2, 1, 3]], "its plane is not"),
         (np.zeros((4, 5, 2)), np.eye(4) + 0.3 * np.eye(4, k=1), "not perpendicular"),
@@ -95,3 +96,55 @@ def test_wrong_files_are_rejected(tmp_path):
     with pytest.raises(io.MeshFileError, match="SimpleITK cannot read it"):
         io.read_field(tmp_path / "f.mha")
     assert main(["field", str(path), "--spacing", "2", "-o", str(tmp_path / "g.nii")]) == 2
+
+
+def folded_volume(d=9, h=10, w=12):
+    """A field on voxels along the axes of the grid, with folds."""
+    z, y, x = np.mgrid[:d, :h, :w]
+    bump = 4 * np.exp(-((x - 5) ** 2 + (y - 5) ** 2 + (z - 4) ** 2) / 4)
+    return np.stack([bump + 0.1 * z, 0.3 * bump, -0.2 * bump], axis=-1)
+
+
+@pytest.mark.parametrize("name", ["f.mha", "f.nrrd", "f.nii", "f.nii.gz"])
+@pytest.mark.parametrize("reflect", [1, -1])
+def test_simpleitk_applies_the_written_volume(name, reflect, tmp_path):
+    source, out = str(tmp_path / name), str(tmp_path / f"out_{name}")
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, reflect]])
+    image = sitk.GetImageFromArray(folded_volume() @ turn.T, isVector=True)
+    image.SetSpacing((1.0, 2.0, 1.5))
+    image.SetOrigin((-20.0, 35.0, 7.0))
+    image.SetDirection(turn.ravel().tolist())
+    sitk.WriteImage(image, source)
+    read = io.read_field(source)
+    np.testing.assert_allclose(read.field, folded_volume(), atol=1e-6)
+    np.testing.assert_allclose(read.spacing, (1, 2, 1.5), rtol=1e-7)
+    assert main(["field", source, "-o", out]) == 0
+    field = io.read_field(out).field
+    changed = (field != read.field).any(axis=3)
+    assert 0 < changed.sum() < 500
+    image, before = sitk.ReadImage(out), sitk.ReadImage(source)
+    assert (sitk.GetArrayFromImage(image) == sitk.GetArrayFromImage(before))[~changed].all()
+    assert image.GetOrigin() == before.GetOrigin()
+    assert image.GetDirection() == before.GetDirection()
+    transform = sitk.DisplacementFieldTransform(sitk.Cast(image, sitk.sitkVectorFloat64))
+    for x, y, z in ((5, 5, 4), (6, 5, 4), (11, 9, 8), (0, 3, 2)):
+        start = before.TransformIndexToPhysicalPoint((x, y, z))
+        moved = np.array([x, y, z]) + field[z, y, x] / (1.0, 2.0, 1.5)
+        expected = before.TransformContinuousIndexToPhysicalPoint(moved.tolist())
+        np.testing.assert_allclose(transform.TransformPoint(start), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("intent", "sign"), [(1006, (1, 1, 1)), (1007, (-1, -1, 1))])
+@pytest.mark.parametrize("middle", [(), (1,)])
+def test_intents_of_nifti_volumes(intent, sign, middle, tmp_path):
+    path, field = tmp_path / "f.nii", folded_volume(3, 4, 6)
+    data = field.transpose(2, 1, 0, 3).reshape(6, 4, 3, *middle, 3).astype(np.float32)
+    image = nibabel.Nifti1Image(data, np.diag([2.0, 3.0, 1.5, 1.0]))
+    image.header["intent_code"] = intent
+    nibabel.save(image, path)
+    read = io.read_field(path)
+    np.testing.assert_allclose(read.field, field * sign, rtol=1e-6)
+    np.testing.assert_array_equal(read.spacing, (2, 3, 1.5))
+    read.write(tmp_path / "g.nii.gz", 2 * read.field)
+    again = nibabel.load(tmp_path / "g.nii.gz")
+    np.testing.assert_array_equal(again.get_fdata(), 2 * data.astype(float))

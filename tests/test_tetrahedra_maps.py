@@ -256,8 +256,6 @@ def test_needles_and_malformed_meshes():
         morph(X, T, cavity, np.full((len(cavity), 3), np.inf))
     with pytest.raises(ValueError, match="a vertex twice"):
         morph(X, T, [0, 0], X[[0, 0]])
-    with pytest.raises(ValueError, match="slide is not supported"):
-        morph(X, T, cavity, X[cavity], slide=True)
 
 
 def test_quality():
@@ -308,4 +306,4 @@ def test_qhm_morph_keeps_everything_but_positions(suffix, tmp_path, capsys):
     table = tmp_path / "positions.csv"
     table.write_text("".join(f"{v},{x},{y},{z}\n" for v, (x, y, z) in zip(cavity, X[cavity], strict=True)))
     assert main(["morph", str(path), "--positions", str(table), "-o", str(out)]) == 0
-    assert main(["morph", str(path), "--positions", str(table), "--slide", "-o", str(out)]) == 2
+    assert main(["morph", str(path), "--positions", str(table), "--energy", "mips", "-o", str(out)]) == 2

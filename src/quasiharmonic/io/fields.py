@@ -38,16 +38,16 @@ _OUT_OF_PLANE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class DisplacementField:
-    """A displacement field of a two-dimensional image, with the header to write fields on the same grid.
+    """A displacement field of an image, with the header to write fields on the same grid.
 
     Attributes
     ----------
-    field : (h, w, 2) float64
-        Displacements along the grid's axes, to the right and down, in the unit of ``spacing``, of the pixel in row y
-        and column x.
-    spacing : (2,) float64
-        Distance between pixels, along x and along y.
-    axes : (c, 2) float64
+    field : (h, w, 2) or (d, h, w, 3) float64
+        Displacements along the grid's axes in the unit of ``spacing``: to the right, down, and along z for volumes, of
+        the pixel in slice z, row y and column x.
+    spacing : (2,) or (3,) float64
+        Distance between pixels, along x, along y, and along z.
+    axes : (c, 2) or (3, 3) float64
         Directions of the grid's axes in the space of the file's components, as columns. The identity for ``.npy``.
     source : str
         The file that was read.
@@ -57,7 +57,7 @@ class DisplacementField:
     spacing: FloatArray
     axes: FloatArray
     source: str
-    _components: FloatArray = dataclasses.field(repr=False)  # (h, w, c): as in the file
+    _components: FloatArray = dataclasses.field(repr=False)  # (…, c): as in the file
     _encode: Callable[[FloatArray, str], bytes] = dataclasses.field(repr=False)  # Bytes of a file with other components
     _suffixes: tuple[str, ...] = dataclasses.field(repr=False)  # Suffixes that can be written
 
@@ -69,7 +69,7 @@ class DisplacementField:
             )
 
     def write(self, path: str | os.PathLike[str], field: ArrayLike) -> None:
-        """Write another field (h, w, 2) on the same grid, in double precision.
+        """Write another field of the same shape on the same grid, in double precision.
 
         The header is that of the file that was read. Displacements that are equal to those read are written bitwise as
         they were. MeshFileError as `check_output`; OutputError if the file cannot be written.
@@ -78,7 +78,7 @@ class DisplacementField:
         new = np.asarray(field, dtype=np.float64)
         if new.shape != self.field.shape:
             raise ValueError(f"field must have shape {self.field.shape}, not {new.shape}")
-        same = (new == self.field).all(axis=2, keepdims=True)
+        same = (new == self.field).all(axis=-1, keepdims=True)
         data = self._encode(np.where(same, self._components, new @ self.axes.T), field_suffix(path))
         write_whole(path, data)
 
@@ -96,14 +96,15 @@ def field_suffix(path: str | os.PathLike[str]) -> str:
 
 
 def read_field(path: str | os.PathLike[str]) -> DisplacementField:
-    """Read a displacement field of a two-dimensional image.
+    """Read a displacement field of an image in two or three dimensions.
 
     Parameters
     ----------
     path : str or path-like
-        ``.npy`` of shape (height, width, 2); NIfTI (``.nii``, ``.nii.gz``) of shape (width, height, 1, 1, 2) or without
-        the axes of length one; ``.mha`` or ``.nrrd`` of vectors. There may be a third component, which must be zero, or
-        all vectors lie in the plane of the image.
+        ``.npy`` of shape (height, width, 2) or (depth, height, width, 3); NIfTI (``.nii``, ``.nii.gz``) of shape
+        (width, height, 1, 1, 2) or (width, height, depth, 1, 3), also without the axes of length one; ``.mha`` or
+        ``.nrrd`` of vectors. A field of one slice may have a third component, which must be zero, or all vectors lie in
+        the plane of the image.
 
     Returns
     -------
@@ -136,7 +137,8 @@ def _read_npy(path: str | os.PathLike[str]) -> DisplacementField:
         np.save(file := BytesIO(), components)
         return file.getvalue()
 
-    return DisplacementField(array, np.ones(2), np.eye(2), os.fspath(path), array, encode, (".npy",))
+    axes = 3 if array.ndim == 4 else 2
+    return DisplacementField(array, np.ones(axes), np.eye(axes), os.fspath(path), array, encode, (".npy",))
 
 
 def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
@@ -153,18 +155,21 @@ def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
         intent = int(image.header["intent_code"])
     except Exception as error:
         raise MeshFileError(path, f"is not valid NIfTI: {error}") from error
-    if data.ndim < 3 or data.shape[-1] not in (2, 3) or any(size != 1 for size in data.shape[2:-1]):
-        raise MeshFileError(
-            path, f"has shape {data.shape}, but a field of a two-dimensional image has (width, height, 1, 1, 2 or 3)"
-        )
+    volume = data.ndim > 3 and data.shape[2] > 1
     count = data.shape[-1]
+    if data.ndim < 3 or count not in ((3,) if volume else (2, 3)) or any(n != 1 for n in data.shape[2 + volume : -1]):
+        raise MeshFileError(
+            path,
+            f"has shape {data.shape}, but a field has (width, height, 1, 1, 2 or 3) or, on a volume, "
+            "(width, height, depth, 1, 3)",
+        )
     # NIfTI's affine refers to RAS.
-    columns = affine[:3, :2] * (1 if intent == _DISPVECT else np.array([[-1], [-1], [1]]))
+    columns = affine[:3, : 2 + volume] * (1 if intent == _DISPVECT else np.array([[-1], [-1], [1]]))
     if count == 2 and np.abs(columns[2]).max() > _SKEW * np.abs(columns).max():
         raise MeshFileError(path, "has two components, but its plane is not that of the first two axes of space")
 
     def encode(components: FloatArray, suffix: str) -> bytes:
-        values = components.transpose(1, 0, 2).reshape(data.shape)
+        values = np.moveaxis(components.T, 0, -1).reshape(data.shape)
         made = type(image)(values, image.affine, image.header)
         made.set_data_dtype(np.float64)
         with TemporaryDirectory() as folder:
@@ -172,7 +177,7 @@ def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
             nibabel.save(made, part)
             return part.read_bytes()
 
-    components = data.reshape(*data.shape[:2], count).transpose(1, 0, 2)
+    components = np.moveaxis(data.reshape(*data.shape[: 2 + volume], count).T, 0, -1)
     return _in_grid_axes(path, components, columns[:count], encode, NIFTI)
 
 
@@ -187,13 +192,14 @@ def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
     except RuntimeError as error:
         raise MeshFileError(path, f"SimpleITK cannot read it: {str(error).splitlines()[-1]}") from error
     n, count = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
-    if any(size != 1 for size in image.GetSize()[2:]) or count != n or n not in (2, 3):
+    if count != n or n not in (2, 3):
         raise MeshFileError(
             path,
-            f"has size {image.GetSize()} and {count} components, but a field of a two-dimensional image has one slice",
+            f"has size {image.GetSize()} and {count} components, but a field has one component for each of 2 or 3 axes",
         )
+    axes = 3 if image.GetSize()[2:] > (1,) else 2
     array = SimpleITK.GetArrayFromImage(image).astype(np.float64)
-    columns = np.reshape(image.GetDirection(), (n, n))[:, :2] * image.GetSpacing()[:2]
+    columns = np.reshape(image.GetDirection(), (n, n))[:, :axes] * image.GetSpacing()[:axes]
 
     def encode(components: FloatArray, suffix: str) -> bytes:
         made = SimpleITK.GetImageFromArray(np.ascontiguousarray(components).reshape(array.shape), isVector=True)
@@ -205,7 +211,7 @@ def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
             SimpleITK.WriteImage(made, str(part))
             return part.read_bytes()
 
-    return _in_grid_axes(path, array.reshape(*array.shape[-3:-1], count), columns, encode, ITK)
+    return _in_grid_axes(path, array.reshape(*array.shape[-1 - axes : -1], count), columns, encode, ITK)
 
 
 def _in_grid_axes(
@@ -215,18 +221,18 @@ def _in_grid_axes(
     encode: Callable[[FloatArray, str], bytes],
     suffixes: tuple[str, ...],
 ) -> DisplacementField:
-    """Return the field along the axes of the grid, whose steps in space are ``columns`` (c, 2)."""
+    """Return the field along the axes of the grid, whose steps in space are ``columns`` (c, k)."""
     spacing = np.linalg.norm(columns, axis=0)
     if not (np.isfinite(spacing).all() and spacing.all()):
         raise MeshFileError(path, "has a spacing of zero or that is not finite")
     axes = columns / spacing
-    if abs(axes[:, 0] @ axes[:, 1]) > _SKEW:
+    if np.abs(axes.T @ axes - np.eye(axes.shape[1])).max() > _SKEW:
         raise MeshFileError(path, "has axes that are not perpendicular", remedy="resample it on a regular grid")
     # Exactly orthonormal, so that the way back is the transpose.
     left, _, right = np.linalg.svd(axes, full_matrices=False)
     axes = left @ right
     along = components @ axes
-    finite = np.isfinite(components).all(axis=2)
+    finite = np.isfinite(components).all(axis=-1)
     out = np.abs(along[finite] @ axes.T - components[finite]).max(initial=0.0)
     if out > _OUT_OF_PLANE * np.abs(components[finite]).max(initial=0.0):
         raise MeshFileError(path, f"moves pixels out of the plane of the image, by up to {out:.3g}")

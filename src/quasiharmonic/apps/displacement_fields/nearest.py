@@ -18,7 +18,13 @@ from quasiharmonic.apps.displacement_fields.patches import (
     grow,
     label_patches,
 )
-from quasiharmonic.apps.tetrahedra.voxel_fields import InvertibleVolume, nearest_invertible_volume
+from quasiharmonic.apps.tetrahedra.voxel_fields import (
+    InvertibleVolume,
+    VoxelGrid,
+    check_volume_field,
+    find_folded_cells,
+    nearest_invertible_volume,
+)
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, count_of
@@ -179,11 +185,15 @@ def nearest_invertible(
 
 
 def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> BoolArray:
-    """Decide exactly for each cell of a displacement field (h, w, 2) whether it does not fold; (h − 1, w − 1) bool.
+    """Decide exactly for each cell of a displacement field whether it does not fold; (h − 1, w − 1) bool.
 
-    All four corner triangles of the mapped pixels, as stored in doubles, must be positive. Arguments and errors are
+    All four corner triangles of the mapped pixels, as stored in doubles, must be positive. On voxels (d, h, w, 3) all
+    six tetrahedra of a cell must be positive, and the result has shape (d − 1, h − 1, w − 1). Arguments and errors are
     those of `nearest_invertible`.
     """
+    if np.ndim(field) == 4:
+        volume = check_volume_field(field)
+        return ~find_folded_cells(VoxelGrid(volume.shape[:3], spacing), volume, None)
     given = check_field(field)
     return _is_fold_free(check_grid(given.shape, spacing), given)
 

@@ -70,7 +70,7 @@ def morph(
     max_iterations: int = MAX_ITERATIONS,
     linear_solver: str = "auto",
     callback: Callable[[Step], object] | None = None,
-    slide: bool | BoundaryCurves = False,
+    slide: bool | BoundaryCurves | ArrayLike = False,
     rest: ArrayLike | None = None,
     start: ArrayLike | None = None,
     tol: float = 1e-8,
@@ -101,11 +101,12 @@ def morph(
     callback : callable, optional
         Called with a `Step` at every iteration, and with the last one again at least every half second in between, but
         not within a single factorisation.
-    slide : bool or BoundaryCurves
+    slide : bool, BoundaryCurves or (m, 4) array
         Let the boundary vertices that are not moved slide along their outline, with fixed corners, like nodes on the
         walls of a channel. With `quasiharmonic.geometry.curves.BoundaryCurves` they slide along these curves, with True
-        along the boundary polygon. Moved vertices slide only if ``BoundaryCurves`` assigns them a curve. Not
-        supported for tetrahedra.
+        along the boundary polygon. Moved vertices slide only if ``BoundaryCurves`` assigns them a curve. For
+        tetrahedra, True lets them slide along all flat parts of the boundary and along the edges between these, and an
+        array of planes ``(a, b, c, d)`` with ``a x + b y + c z = d`` along those on the planes.
     rest : array of the shape of ``points``, optional
         The mesh against which distortion is measured; default ``points``. In a chain of steps use the first mesh, so
         that the chain does not drift (`MorphResult.drift`).
@@ -156,11 +157,16 @@ def morph(
     (True, True)
     """
     if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
-        if slide is not False:
-            raise ValueError("slide is not supported for tetrahedra")
+        if isinstance(slide, BoundaryCurves):
+            raise ValueError("slide must be a bool or an array of planes for tetrahedra, not BoundaryCurves")
         check_integer("max_iterations", max_iterations, minimum=0)
         options = Settings(energy is not None, max_iterations, tol, callback)
-        return morph_tetrahedra(points, F, moved_vertices, target, rest=rest, start=start, settings=options)
+        return morph_tetrahedra(
+            points, F, moved_vertices, target, rest=rest, start=start, settings=options, slide=slide
+        )
+    if not isinstance(slide, bool | np.bool_ | BoundaryCurves):
+        raise ValueError(f"slide must be a bool or BoundaryCurves for planar meshes, not {slide!r}")
+    curves = slide if isinstance(slide, BoundaryCurves) else bool(slide)
     points = map_array("points", points, finite=False)
     F = element_array(F, len(points))
     used = np.unique(F)
@@ -172,7 +178,7 @@ def morph(
     fixed, goal = _find_fixed(points, F, moved_vertices, target)
     given = _MorphProblem(F, first, fixed, nets_of(F))
     settings = _Settings(energy, max_iterations, linear_solver, callback, tol)
-    after, result = _place_nodes(given, points, goal, begin, (slide, np.asarray(moved_vertices)), settings)
+    after, result = _place_nodes(given, points, goal, begin, (curves, np.asarray(moved_vertices)), settings)
 
     def one_step() -> FloatArray:
         # Fix the boundary at the positions to which it has slid.
@@ -362,8 +368,8 @@ def _select_curves(
     own_fixed = np.searchsorted(used, moved)
     if isinstance(slide, BoundaryCurves):
         return slide.among(used).holding(own_fixed)
-    if slide is not True:
-        return slide
+    if not slide:
+        return False
     positions = np.zeros((problem.n, 2))
     positions[problem.fixed] = problem.target
     return BoundaryCurves.around(problem.domain.loops, positions, fixed=own_fixed)

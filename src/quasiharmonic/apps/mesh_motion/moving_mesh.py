@@ -63,11 +63,11 @@ class MovingMesh:
         Tetrahedra have one isotropic energy.
     settle : int
         Newton steps down the energy after each move. With 0 the mesh is also valid, and a step is faster.
-    slide : bool
+    slide : bool or (m, 4) array
         Let the boundary vertices that are not moved slide along their outline, with fixed corners; needs ``settle`` of
         at least 1. They lag one step behind the mesh, so moved vertices that arrive along the same wall are blocked by
-        them. `morph` does not have this limitation. Not
-        supported for tetrahedra.
+        them. `morph` does not have this limitation. Vertices of tetrahedra slide at once, as in `morph`, along
+        the flat parts of the first mesh's boundary or along those on the given planes.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 
@@ -103,7 +103,7 @@ class MovingMesh:
         *,
         energy: str | Energy = "blend",
         settle: int = 1,
-        slide: bool = False,
+        slide: bool | ArrayLike = False,
         linear_solver: str = "auto",
     ) -> None: ...
     @overload
@@ -114,7 +114,7 @@ class MovingMesh:
         *,
         energy: str | Energy = "blend",
         settle: int = 1,
-        slide: bool = False,
+        slide: bool | ArrayLike = False,
         linear_solver: str = "auto",
     ) -> None: ...
     @init_accepts_planar_mesh
@@ -126,15 +126,13 @@ class MovingMesh:
         *,
         energy: str | Energy = "blend",
         settle: int = 1,
-        slide: bool = False,
+        slide: bool | ArrayLike = False,
         linear_solver: str = "auto",
     ) -> None:
         self._volume: MovingTetrahedra | None = None
         if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
-            if slide is not False:
-                raise ValueError("slide is not supported for tetrahedra")
             check_integer("settle", settle, minimum=0)
-            self._volume = MovingTetrahedra(points, F, moved_vertices, settle)
+            self._volume = MovingTetrahedra(points, F, moved_vertices, settle, slide)
             return
         self._points = map_array("points", points)
         F = triangle_array(F, len(self._points))
@@ -146,7 +144,7 @@ class MovingMesh:
         check_spread(F, len(self._points))
         self._moved = vertex_indices("moved_vertices", moved_vertices, len(self._points))
         check_bool("slide", slide)
-        self._energy, self._slide = find_energy(energy), slide
+        self._energy, self._slide = find_energy(energy), bool(slide)
         check_integer("settle", settle, minimum=1 if slide else 0)
         self._settle = settle
         rest = np.setdiff1d(boundary_edges(F, len(self._points)), self._moved)

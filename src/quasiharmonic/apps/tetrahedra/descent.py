@@ -33,12 +33,19 @@ class Descent:
     """Newton's method on the energy of a mesh with free vertices ``free`` (k,); ``X`` (n, 3) are the positions.
 
     With ``anchor``, positions (n, 3) and a weight, half the weighted sum of squared distances from them is added.
+    ``projections`` (k, 3, 3), if given, restrict the directions in which free vertices move.
     """
 
     def __init__(
-        self, energy: ShapeEnergy, free: IntArray, X: FloatArray, anchor: tuple[FloatArray, float] | None = None
+        self,
+        energy: ShapeEnergy,
+        free: IntArray,
+        X: FloatArray,
+        anchor: tuple[FloatArray, float] | None = None,
+        projections: FloatArray | None = None,
     ) -> None:
         self.energy, self.free, self.X, self.anchor = energy, free, X.copy(), anchor
+        self.projections = projections
         self._blocks = BlockMatrix(energy.T, energy.n, free)
         self.iterations = 0
         self.converged = False
@@ -93,7 +100,7 @@ class Descent:
             value += 0.5 * weight * float((away * away).sum())
             gradient = gradient + weight * away
             data[self._blocks.diagonal] += weight * np.eye(3)
-        g = gradient[self.free].ravel()
+        g = self._project(gradient[self.free].ravel())
         p = self._direction(data, g)
         decrease = -float(g @ p)
         self.iterations += 1
@@ -119,23 +126,33 @@ class Descent:
         diagonal = data[self._blocks.diagonal]
         scale = np.trace(diagonal, axis1=1, axis2=2)
         shift = 1e-12 * np.where(scale > 0, scale, 1.0)
+        if self.projections is not None:
+            # Directions in which a vertex cannot move get a unit of the block's own size.
+            P = self.projections
+            diagonal = P @ diagonal @ P + scale[:, None, None] * (np.eye(3) - P)
         inverse = np.linalg.inv(diagonal + shift[:, None, None] * np.eye(3))
         x, r = np.zeros_like(g), -g
-        z = np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3)).ravel()
+        z = self._project(np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3)).ravel())
         p, rz = z.copy(), float(r @ z)
         first = rz
         for _ in range(_MAX_CONJUGATE_STEPS):
             if not rz > _RESIDUAL**2 * first:
                 break
-            Ap = matrix @ p
+            Ap = self._project(matrix @ p)
             curvature = float(p @ Ap)
             if not curvature > 0:
                 break
             alpha = rz / curvature
             x += alpha * p
             r -= alpha * Ap
-            z = np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3)).ravel()
+            z = self._project(np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3)).ravel())
             rz, old = float(r @ z), rz
             p = z + (rz / old) * p
             self.conjugate_steps += 1
         return x if x.any() else z
+
+    def _project(self, x: FloatArray) -> FloatArray:
+        """Project directions (3 k,) of the free vertices to those in which they move."""
+        if self.projections is None:
+            return x
+        return np.asarray(np.einsum("iab,ib->ia", self.projections, x.reshape(-1, 3)).ravel())

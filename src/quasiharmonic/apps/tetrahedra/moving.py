@@ -9,7 +9,8 @@ from quasiharmonic.apps.tetrahedra.certificate import space_array
 from quasiharmonic.apps.tetrahedra.descent import Descent
 from quasiharmonic.apps.tetrahedra.placement import check_rest, extend_harmonically, make_energy
 from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
-from quasiharmonic.apps.tetrahedra.tetrahedral_maps import find_fixed
+from quasiharmonic.apps.tetrahedra.sliding import find_sliding
+from quasiharmonic.apps.tetrahedra.tetrahedral_maps import find_moved, find_still
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Maximum number of Newton steps to untangle the mesh after one move.
@@ -20,20 +21,24 @@ class MovingTetrahedra:
     """The part of `quasiharmonic.MovingMesh` for tetrahedra.
 
     Each move adds the harmonic extension of the displacement. If tetrahedra are then inverted, they are untangled.
-    ``settle`` Newton steps lower the isotropic energy relative to the first mesh.
+    ``settle`` Newton steps lower the isotropic energy relative to the first mesh. ``slide`` as in `find_sliding`; it
+    refers to the first mesh.
     """
 
-    def __init__(self, points: ArrayLike, T: ArrayLike, moved_vertices: ArrayLike, settle: int) -> None:
+    def __init__(
+        self, points: ArrayLike, T: ArrayLike, moved_vertices: ArrayLike, settle: int, slide: bool | ArrayLike = False
+    ) -> None:
         self.points = space_array("points", points)
         self._mesh = check_rest(T, self.points)
         self._settle = settle
-        moved = np.asarray(moved_vertices)
-        zeros = np.zeros((moved.size, 3))
-        self._fixed, _ = find_fixed(self._mesh, self.points, moved_vertices, zeros)
-        self._moved = self._fixed[: moved.size]
+        zeros = np.zeros((np.asarray(moved_vertices).size, 3))
+        self._moved, _ = find_moved(self._mesh, self.points, moved_vertices, zeros)
+        sliding = find_sliding(self._mesh.faces.boundary, self.points, self._moved, slide)
+        self._fixed = np.concatenate([self._moved, find_still(self._mesh, self._moved, sliding)])
         self._free = np.setdiff1d(np.unique(self._mesh.T), self._fixed)
+        self._projections = sliding.restrict(self._free)
         self._energy, scaled, self._exponent = make_energy(self._mesh, self.points, False)
-        self._descent = Descent(self._energy, self._free, scaled)
+        self._descent = Descent(self._energy, self._free, scaled, projections=self._projections)
 
     @property
     def T(self) -> IntArray:
@@ -50,7 +55,7 @@ class MovingTetrahedra:
         places = before[self._fixed]
         places[: self._moved.size] = np.ldexp(goal, -self._exponent)
         with np.errstate(all="ignore"):
-            descent.X = extend_harmonically(self._energy, before, self._fixed, places)
+            descent.X = extend_harmonically(self._energy, before, self._fixed, places, self._projections)
             descent.X[self._fixed] = places
             if not self._energy.determinants(descent.X).min() > 0:
                 for _ in descent.untangle(_MAX_STEPS):

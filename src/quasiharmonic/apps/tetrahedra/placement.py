@@ -20,6 +20,7 @@ from quasiharmonic.apps.tetrahedra.result import (
     tetrahedron_quality,
 )
 from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
+from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding
 from quasiharmonic.apps.tetrahedra.topology import FaceReport, inspect_faces
 from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
@@ -89,6 +90,7 @@ def place_vertices(
     target: FloatArray,
     start: FloatArray | None,
     settings: Settings,
+    sliding: Sliding = NO_SLIDING,
 ) -> TetrahedraResult:
     """Find positions of the free vertices such that every tetrahedron is positive, then lower the distortion.
 
@@ -100,16 +102,17 @@ def place_vertices(
     begin = points.copy()
     begin[fixed] = target
     free = np.setdiff1d(np.unique(T), fixed)
+    projections = sliding.restrict(free)
     whole = bool(np.isin(mesh.boundary_vertices, fixed).all())
-    obstructions = _find_crossings(mesh, begin) if whole else ()
+    obstructions = _find_crossings(mesh, begin, fixed)
     status, iterations = TetrahedraStatus.CROSSING, 0
     energy, X, exponent = make_energy(mesh, begin, whole)
     if not obstructions:
         if start is not None:
             X[free] = np.ldexp(start[free], -exponent)
         else:
-            X = extend_harmonically(energy, np.ldexp(points, -exponent), fixed, X[fixed])
-        X, status, iterations = _search(energy, free, X, settings)
+            X = extend_harmonically(energy, np.ldexp(points, -exponent), fixed, X[fixed], projections)
+        X, status, iterations = _search(Descent(energy, free, X, projections=projections), settings)
         after = np.ldexp(X, exponent)
         begin[free] = after[free]
     certificate = certify_arrays(T, begin, faces=mesh.faces)
@@ -138,9 +141,10 @@ def place_vertices(
     )
 
 
-def _find_crossings(mesh: RestMesh, X: FloatArray) -> tuple[TetrahedraObstruction, ...]:
-    """Describe pairs of boundary triangles that meet at target positions."""
+def _find_crossings(mesh: RestMesh, X: FloatArray, fixed: IntArray) -> tuple[TetrahedraObstruction, ...]:
+    """Describe pairs of boundary triangles of fixed vertices that meet at target positions."""
     F = mesh.faces.boundary
+    F = F[np.isin(F, fixed).all(axis=1)]
     pairs = F[find_boundary_contacts(F, X)]
     rest = f" (first of {len(pairs)} pairs)" if len(pairs) > 1 else ""
     return tuple(
@@ -181,10 +185,15 @@ def _volume(F: IntArray, X: FloatArray) -> float:
     return float((a * np.cross(b, c)).sum())
 
 
-def extend_harmonically(energy: ShapeEnergy, X: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
-    """Add to positions (n, 3) the harmonic extension of the displacement of the fixed vertices to ``target`` (k, 3)."""
-    from scipy.sparse import coo_array, dia_array
-    from scipy.sparse.linalg import cg
+def extend_harmonically(
+    energy: ShapeEnergy, X: FloatArray, fixed: IntArray, target: FloatArray, projections: FloatArray | None = None
+) -> FloatArray:
+    """Add to positions (n, 3) the harmonic extension of the displacement of the fixed vertices to ``target`` (k, 3).
+
+    ``projections`` (m, 3, 3), if given, restrict the displacements of the other vertices of the mesh, ascending.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.linalg import LinearOperator, cg
 
     T, G = energy.T, energy.gradients
     n = len(X)
@@ -199,34 +208,48 @@ def extend_harmonically(energy: ShapeEnergy, X: FloatArray, fixed: IntArray, tar
     where = (np.concatenate(rows), np.concatenate(columns))
     matrix = coo_array((np.concatenate(values), where), shape=(n, n)).tocsr()
     free = np.setdiff1d(np.unique(T), fixed)
-    if not free.size:
-        return X + displacement
     own = matrix[free][:, free]
     load = -(matrix[free] @ displacement)
     diagonal = own.diagonal()
-    inverse = dia_array((1.0 / np.where(diagonal > 0, diagonal, 1.0)[None], [0]), shape=own.shape)
-    for axis in range(3):
-        if load[:, axis].any():
-            displacement[free, axis] = cg(own, load[:, axis], rtol=1e-6, maxiter=2000, M=inverse)[0]
+    inverse = 1.0 / np.where(diagonal > 0, diagonal, 1.0)
+
+    def project(x: FloatArray) -> FloatArray:
+        return x if projections is None else np.asarray(np.einsum("iab,ib->ia", projections, x))
+
+    def apply(x: FloatArray) -> FloatArray:
+        return np.asarray(project(own @ x.reshape(-1, 3))).ravel()
+
+    def precondition(x: FloatArray) -> FloatArray:
+        return np.asarray(inverse[:, None] * x.reshape(-1, 3)).ravel()
+
+    load = project(load).ravel()
+    if load.any():
+        size = (load.size, load.size)
+        solved = cg(
+            LinearOperator(size, matvec=apply, dtype=np.float64),
+            load,
+            rtol=1e-6,
+            maxiter=2000,
+            M=LinearOperator(size, matvec=precondition, dtype=np.float64),
+        )[0]
+        displacement[free] = project(solved.reshape(-1, 3))
     there = X + displacement
     return there if np.isfinite(there).all() else X
 
 
-def _search(
-    energy: ShapeEnergy, free: IntArray, X: FloatArray, settings: Settings
-) -> tuple[FloatArray, TetrahedraStatus, int]:
+def _search(descent: Descent, settings: Settings) -> tuple[FloatArray, TetrahedraStatus, int]:
     """Untangle and polish; return the best positions, why the search ended, and the number of steps.
 
     Ctrl-C ends the search, and a callback may raise KeyboardInterrupt.
     """
-    descent = Descent(energy, free, X)
+    energy, X = descent.energy, descent.X
     best = [(len(energy.T) + 1, X)]
     try:
         with np.errstate(all="ignore"):
             count = int(np.count_nonzero(~(energy.determinants(X) > 0)))
             best[:] = [(count, X)]
             _report(settings, descent, np.inf, count)
-            if count and free.size:
+            if count and descent.free.size:
                 count = _untangle(descent, settings, best)
             if count:
                 ended = descent.iterations >= settings.max_iterations

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.tetrahedra.certificate import space_array
 from quasiharmonic.apps.tetrahedra.placement import RestMesh, Settings, check_rest, place_vertices
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
+from quasiharmonic.apps.tetrahedra.sliding import Sliding, find_sliding
 from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -106,20 +107,27 @@ def morph_tetrahedra(
     rest: ArrayLike | None = None,
     start: ArrayLike | None = None,
     settings: Settings | None = None,
+    slide: bool | ArrayLike = False,
 ) -> TetrahedraResult:
-    """`quasiharmonic.morph` for points (n, 3) and tetrahedra (t, 4); boundary vertices that are not moved are fixed."""
+    """`quasiharmonic.morph` for points (n, 3) and tetrahedra (t, 4).
+
+    Boundary vertices that are neither moved nor slide are fixed; ``slide`` as in `find_sliding`.
+    """
     points = space_array("points", points, finite=False)
     first = points if rest is None else space_array("rest", rest, len(points), finite=False)
     mesh = check_rest(T, first)
-    fixed, goal = find_fixed(mesh, points, moved_vertices, target)
+    moved, goal = find_moved(mesh, points, moved_vertices, target)
+    sliding = find_sliding(mesh.faces.boundary, points, moved, slide)
+    still = find_still(mesh, moved, sliding)
     begin = (None if rest is None else points) if start is None else space_array("start", start, len(points))
-    return place_vertices(mesh, points, fixed, goal, begin, settings or Settings())
+    fixed, goal = np.concatenate([moved, still]), np.concatenate([goal, points[still]])
+    return place_vertices(mesh, points, fixed, goal, begin, settings or Settings(), sliding)
 
 
-def find_fixed(
+def find_moved(
     mesh: RestMesh, points: FloatArray, moved_vertices: ArrayLike, target: ArrayLike
 ) -> tuple[IntArray, FloatArray]:
-    """Return the fixed vertices, moved ones first and then the rest of the boundary, and their target positions."""
+    """Check the moved vertices and their target positions."""
     moved = vertex_indices("moved_vertices", moved_vertices, len(points))
     if np.bincount(moved, minlength=1).max() > 1:
         raise ValueError("moved_vertices has a vertex twice")
@@ -129,5 +137,9 @@ def find_fixed(
         raise ValueError(
             f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, but no tetrahedron uses them"
         )
-    still = np.setdiff1d(mesh.boundary_vertices, moved)
-    return np.concatenate([moved, still]), np.concatenate([goal, points[still]])
+    return moved, goal
+
+
+def find_still(mesh: RestMesh, moved: IntArray, sliding: Sliding) -> IntArray:
+    """Return the boundary vertices that neither move nor slide."""
+    return np.setdiff1d(mesh.boundary_vertices, np.concatenate([moved, sliding.vertices]))

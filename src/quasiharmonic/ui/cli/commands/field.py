@@ -22,9 +22,9 @@ def add_parser(commands: Commands) -> None:
         "field",
         description="Make a displacement field invertible with the least change. Away from folds "
         "the field is unchanged, bit for bit. A .npy array has shape (height, width, 2), with displacements "
-        "along x (to the right) and y (down) in the unit of --spacing. NIfTI files (.nii, .nii.gz) need nibabel, ITK's "
-        "files (.mha, .nrrd) need SimpleITK; their vectors are along the axes of space, as ITK, ANTs and elastix write "
-        "them.",
+        "along x (to the right) and y (down) in the unit of --spacing, or (depth, height, width, 3) on a volume. NIfTI "
+        "files (.nii, .nii.gz) need nibabel, ITK's files (.mha, .nrrd) need SimpleITK; their vectors are along the "
+        "axes of space, as ITK, ANTs and elastix write them.",
         epilog="Exit status: 0 the written field is certified without folds; 1 written, but the inverse that "
         "--inverse requests does not exist, because the border overlaps itself; 2 wrong input or call, or no such "
         "field was found, nothing written; 3 written, but the report failed.",
@@ -47,7 +47,7 @@ def add_parser(commands: Commands) -> None:
         type=float,
         nargs="+",
         metavar="LENGTH",
-        help="for .npy: distance between pixels, or two distances, along x and along y (default: 1)",
+        help="for .npy: distance between pixels, or distances along x, along y, and along z (default: 1)",
     )
     parser.add_argument(
         "--min-jacobian",
@@ -75,24 +75,23 @@ def run(options: argparse.Namespace) -> int:
     for path in outputs.values():
         given.check_output(path)
     field, spacing = given.field, _spacing(options, given)
-    if field.ndim == 4:
-        raise ValueError(f"{options.input} is a field on voxels: use `nearest_invertible` in Python")
     with report.about(options.input):
         held = _border(field) if options.fix_border else None
         try:
             repaired = nearest_invertible(field, spacing=spacing, min_jacobian=options.min_jacobian, fixed=held)
         except RuntimeError as error:
             raise ValueError(str(error)) from error
-    assert isinstance(repaired, InvertibleField)
+    if not repaired.success:
+        raise ValueError(f"no field without folds was found. {repaired.summary()}")
     given.write(options.output, repaired.field)
-    invertible = bool(repaired.certificate.bijective)
+    invertible = bool(repaired.certificate.bijective if isinstance(repaired, InvertibleField) else repaired.bijective)
     with report.after_writing(options.output):
         # Rotation to the axes of space rounds, so the file is verified.
         written = read_field(options.output).field
         if not fold_free(written, spacing=spacing).all():
             raise ValueError("rounding has folded the field: give a larger --min-jacobian")
         facts: dict[str, Any] = {
-            "injective": repaired.certificate.injective,
+            "injective": repaired.success,
             "bijective": invertible,
             "folds": repaired.folds,
             "moved": int(repaired.moved_mask.sum()),
@@ -135,6 +134,6 @@ def _border(field: NDArray[Any]) -> NDArray[np.bool_]:
     """Return a mask of the border's pixels."""
     import numpy as np
 
-    border = np.ones(field.shape[:2], dtype=bool)
+    border = np.ones(field.shape[:-1], dtype=bool)
     border[(slice(1, -1),) * border.ndim] = False
     return border

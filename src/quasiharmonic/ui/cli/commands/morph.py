@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
     from quasiharmonic.io.fem.files import FemMesh, VolumeMesh
     from quasiharmonic.ui.cli.arguments import Commands
-    from quasiharmonic.util.arrays import FloatArray
+    from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Name of the quality measure by the number of nodes per element.
 _QUALITY = {
@@ -70,7 +70,17 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--slide",
         action="store_true",
-        help="let boundary vertices without a displacement slide along the boundary; its corners stay fixed",
+        help="let boundary vertices without a displacement slide along the boundary, its corners stay fixed; in space "
+        "along all flat parts of the boundary",
+    )
+    parser.add_argument(
+        "--slide-plane",
+        type=float,
+        nargs=4,
+        action="append",
+        metavar=("A", "B", "C", "D"),
+        help="for tetrahedra: let boundary vertices without a displacement slide on the plane A x + B y + C z = D; "
+        "repeat for several planes",
     )
     parser.add_argument(
         "--rest",
@@ -100,14 +110,15 @@ def run(options: argparse.Namespace) -> int:
     volume = read_volume(options.input)
     if len(volume.parts.F):
         return _run_volume(options, volume)
+    if options.slide_plane is not None:
+        raise ValueError("--slide-plane is for tetrahedra: use --slide for planar meshes")
     mesh = read_fem(options.input)
     rest = None if options.rest is None else _rest(options.rest, mesh)
     if options.field is not None:
         moved = rim(mesh.F)
         positions = mesh.points[moved] + mesh.point_field(options.field, moved)
         if options.slide:
-            goes = (positions != mesh.points[moved]).any(axis=1)
-            moved, positions = moved[goes], positions[goes]
+            moved, positions = _drop_idle(mesh.points, moved, positions)
     else:
         moved, positions = _positions(options.positions, len(mesh.points), 2)
     with report.about(options.input), progress_line.line() as show:
@@ -156,8 +167,11 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
 
     if len(mesh.H):
         raise MeshFileError(options.input, "has hexahedra", remedy="split them into tetrahedra")
-    if options.slide or options.energy is not None:
-        raise ValueError("--slide and --energy are for planar meshes: omit them for tetrahedra")
+    if options.energy is not None:
+        raise ValueError("--energy is for planar meshes: omit it for tetrahedra")
+    if options.slide and options.slide_plane is not None:
+        raise ValueError("--slide includes all planes: omit it, or --slide-plane")
+    slide = options.slide_plane or options.slide
     rest = None
     if options.rest is not None:
         first = read_volume(options.rest)
@@ -169,6 +183,8 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
     if options.field is not None:
         moved = np.unique(inspect_faces(mesh.T, len(mesh.points)).boundary)
         positions = mesh.points[moved] + mesh.point_field(options.field, moved)
+        if slide:
+            moved, positions = _drop_idle(mesh.points, moved, positions)
     else:
         moved, positions = _positions(options.positions, len(mesh.points), 3)
     with report.about(options.input), progress_line.line() as show:
@@ -180,6 +196,7 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
             energy=None if options.no_polish else "symmetric-dirichlet",
             max_iterations=options.max_iterations,
             callback=show,
+            slide=slide,
             rest=rest,
         )
     assert isinstance(morphed, TetrahedraResult)
@@ -203,6 +220,12 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
             lines.append(f"mean-ratio quality {name}: {worst}, mean {quality.mean():.3g}")
         report.emit(facts, options.json, "\n".join(lines))
     return 0 if certificate.injective else 1
+
+
+def _drop_idle(points: FloatArray, moved: IntArray, positions: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Drop the vertices that stay where they are."""
+    goes = (positions != points[moved]).any(axis=1)
+    return moved[goes], positions[goes]
 
 
 def _rest(path: Path, mesh: FemMesh) -> FloatArray:
