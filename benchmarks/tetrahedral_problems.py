@@ -1,8 +1,8 @@
 """Generated problems for tetrahedra: maps onto a given boundary that exist by construction, and moving bodies.
 
-A fixed-boundary problem has a mesh and the boundary of a hidden map. The hidden map is a diffeomorphism whose strength
-is raised until it inverts a tetrahedron; the problem takes 95 % of the largest certified strength. So its worst
-tetrahedra are nearly flat.
+A fixed-boundary problem has a mesh and the boundary of a hidden map. Both are made from one mesh: the rest mesh by a
+diffeomorphism, the hidden map by its mirror image. The strength of each is raised until a tetrahedron is inverted, and
+the problem takes 95 % of the largest certified strength. So the worst tetrahedra are nearly flat in both.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from quasiharmonic import certify_tetrahedra
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 FAMILIES = ("flow", "twist", "bend", "spin", "folded")
+#: Positions (n, 3) after a deformation of positions (n, 3) with a strength.
+Move = Callable[[FloatArray, float], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -83,17 +85,9 @@ def make(family: str, seed: int, tetrahedra: int) -> VolumeProblem:
     else:
         X, T, _ = shell(max(round((tetrahedra / 6) ** (1 / 3)), 5), rng)
     move = _family(family, rng)
-    low, high = 0.0, 4.0
-    for _ in range(9):
-        strength = 0.5 * (low + high)
-        if _is_valid(T, move(X, strength)):
-            low = strength
-        else:
-            high = strength
-    hidden = move(X, 0.95 * low)
-    while not _is_valid(T, hidden):
-        low *= 0.9
-        hidden = move(X, low)
+    mirror = np.array([1, -1, 1])
+    hidden = _deform(X, T, move)
+    X = _deform(X, T, lambda Y, s: move(Y * mirror, s) * mirror)
     fixed = np.unique(certify_tetrahedra(T, X).boundary)
     start = None
     if family == "folded":
@@ -101,15 +95,31 @@ def make(family: str, seed: int, tetrahedra: int) -> VolumeProblem:
     return VolumeProblem(X, T, fixed, hidden, start)
 
 
+def _deform(X: FloatArray, T: IntArray, move: Move) -> FloatArray:
+    """Deform a mesh by 95 % of the largest strength that keeps it injective."""
+    low, high = 0.0, 4.0
+    for _ in range(9):
+        strength = 0.5 * (low + high)
+        if _is_valid(T, move(X, strength)):
+            low = strength
+        else:
+            high = strength
+    there = move(X, 0.95 * low)
+    while not _is_valid(T, there):
+        low *= 0.9
+        there = move(X, low)
+    return there
+
+
 def _is_valid(T: IntArray, X: FloatArray) -> bool:
     positive = certify_tetrahedra(T, X, boundary=False).positive
     return positive and bool(certify_tetrahedra(T, X).injective)
 
 
-def _family(family: str, rng: np.random.Generator) -> Callable[[FloatArray, float], FloatArray]:
+def _family(family: str, rng: np.random.Generator) -> Move:
     if family == "twist":
         axis = int(rng.integers(3))
-        return lambda X, s: _turn(X, 1.5 * s * X[:, axis], axis)
+        return lambda X, s: turn(X, 1.5 * s * X[:, axis], axis)
     if family == "bend":
 
         def bend(X: FloatArray, s: float) -> FloatArray:
@@ -121,7 +131,7 @@ def _family(family: str, rng: np.random.Generator) -> Callable[[FloatArray, floa
         axis = int(rng.integers(3))
 
         def spin(X: FloatArray, s: float) -> FloatArray:
-            return _turn(X, s * np.clip((1 - np.abs(X).max(axis=1)) / (2 / 3), 0, 1), axis)
+            return turn(X, s * np.clip((1 - np.abs(X).max(axis=1)) / (2 / 3), 0, 1), axis)
 
         return spin
     waves, phases, ways = rng.normal(size=(6, 3)) * 1.5, rng.uniform(0, 6, 6), rng.normal(size=(6, 3))
@@ -138,7 +148,7 @@ def _family(family: str, rng: np.random.Generator) -> Callable[[FloatArray, floa
     return flow
 
 
-def _turn(X: FloatArray, angle: FloatArray, axis: int) -> FloatArray:
+def turn(X: FloatArray, angle: FloatArray, axis: int) -> FloatArray:
     """Rotate every point around an axis by its own angle."""
     Y = X.copy()
     a, b = (axis + 1) % 3, (axis + 2) % 3
@@ -173,7 +183,7 @@ def scenes(k: int = 12) -> dict[str, VolumeScene]:
     B = Y * (0.25, 0.25, 1.5)
     sides = np.flatnonzero((np.abs(Y) >= 1).any(axis=1))
     return {
-        "turned cavity": VolumeScene(X, T, cavity, lambda t: _turn(C, np.full(len(C), t), 2), "rad"),
+        "turned cavity": VolumeScene(X, T, cavity, lambda t: turn(C, np.full(len(C), t), 2), "rad"),
         "turned about a diagonal": VolumeScene(X, T, cavity, lambda t: _about_diagonal(C, t), "rad"),
         "pushed cavity": VolumeScene(X, T, cavity, lambda t: C + np.array([t, 0, 0]), "half widths"),
         "swollen cavity": VolumeScene(X, T, cavity, lambda t: C * (1 + t), "size"),

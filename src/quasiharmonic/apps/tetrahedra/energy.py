@@ -148,23 +148,18 @@ class ShapeEnergy:
             by_d_d=np.maximum(by_d_d, 8 / 9 * shape * t * slope**2),
         )
 
+    def gradient(self, X: FloatArray, epsilon: float) -> tuple[float, FloatArray]:
+        """Return the energy per tetrahedron and its gradient (n, 3)."""
+        d, along, across = self._parts(X, epsilon)
+        return float(d.value.mean()), self._sum_forces(d, along, across)
+
     def derivatives(self, X: FloatArray, epsilon: float) -> tuple[float, FloatArray, FloatArray]:
         """Return the energy per tetrahedron, its gradient (n, 3), and blocks of its approximate second derivatives.
 
         The blocks (10, 3, 3, t) belong to the pairs (i, j), i ≤ j, of vertices of every tetrahedron.
         """
-        J = self.jacobians(X)
-        C = np.stack([_cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])])
-        D = _dot(J[0], C[0])
-        d = self._density(J, D, epsilon)
-        count = len(self.T)
-        G = self.gradients
-        along = np.einsum("abt,ibt->iat", J, G)
-        across = np.einsum("abt,ibt->iat", C, G)
-        force = (2 * d.by_t * along + d.by_d * across) / count
-        gradient: FloatArray = np.stack(
-            [np.bincount(self.T.T.ravel(), force[:, a].ravel(), minlength=self.n) for a in range(3)], axis=1
-        )
+        d, along, across = self._parts(X, epsilon)
+        count, G = len(self.T), self.gradients
         blocks = np.empty((len(_PAIRS), 3, 3, count))
         mixed = 2 * d.by_t_d / count * along + 0.5 * d.by_d_d / count * across
         for k, (i, j) in enumerate(_PAIRS):
@@ -174,7 +169,21 @@ class ShapeEnergy:
                     np.multiply(mixed[i, a], across[j, b], out=blocks[k, a, b])
                     blocks[k, a, b] += across[i, a] * mixed[j, b]
                 blocks[k, a, a] += diagonal
-        return float(d.value.mean()), gradient, blocks
+        return float(d.value.mean()), self._sum_forces(d, along, across), blocks
+
+    def _parts(self, X: FloatArray, epsilon: float) -> tuple[_Density, FloatArray, FloatArray]:
+        """The density with its derivatives, and the products of J and its cofactors with the gradients, (4, 3, t)."""
+        J = self.jacobians(X)
+        C = np.stack([_cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])])
+        d = self._density(J, _dot(J[0], C[0]), epsilon)
+        return d, np.einsum("abt,ibt->iat", J, self.gradients), np.einsum("abt,ibt->iat", C, self.gradients)
+
+    def _sum_forces(self, d: _Density, along: FloatArray, across: FloatArray) -> FloatArray:
+        """The gradient (n, 3) of the energy per tetrahedron."""
+        force = (2 * d.by_t * along + d.by_d * across) / len(self.T)
+        return np.stack(
+            [np.bincount(self.T.T.ravel(), force[:, a].ravel(), minlength=self.n) for a in range(3)], axis=1
+        )
 
 
 class BlockMatrix:
