@@ -1,8 +1,8 @@
 """Generated problems for tetrahedra: maps onto a given boundary that exist by construction, and moving bodies.
 
-A fixed-boundary problem has a mesh and the boundary of a hidden map. Both are made from one mesh: the rest mesh by a
-diffeomorphism, the hidden map by its mirror image. The strength of each is raised until a tetrahedron is inverted, and
-the problem takes 95 % of the largest certified strength. So the worst tetrahedra are nearly flat in both.
+A fixed-boundary problem has a mesh and the boundary of a hidden map. Both are made from one mesh: the hidden map by a
+diffeomorphism, the rest mesh by the same with a negative strength. Each strength is raised until a tetrahedron is
+inverted, and the problem takes 95 % of the largest certified one. So the worst tetrahedra are nearly flat in both.
 """
 
 from __future__ import annotations
@@ -85,9 +85,8 @@ def make(family: str, seed: int, tetrahedra: int) -> VolumeProblem:
     else:
         X, T, _ = shell(max(round((tetrahedra / 6) ** (1 / 3)), 5), rng)
     move = _family(family, rng)
-    mirror = np.array([1, -1, 1])
     hidden = _deform(X, T, move)
-    X = _deform(X, T, lambda Y, s: move(Y * mirror, s) * mirror)
+    X = _deform(X, T, lambda Y, s: move(Y, -s))
     fixed = np.unique(certify_tetrahedra(T, X).boundary)
     start = None
     if family == "folded":
@@ -123,8 +122,8 @@ def _family(family: str, rng: np.random.Generator) -> Move:
     if family == "bend":
 
         def bend(X: FloatArray, s: float) -> FloatArray:
-            angle, radius = s * X[:, 0], 1 / max(s, 1e-9) + 0.8 * X[:, 1]
-            return np.stack([radius * np.sin(angle), radius * np.cos(angle) - 1 / max(s, 1e-9), X[:, 2]], axis=1)
+            angle, radius = s * X[:, 0], 1 / s + 0.8 * X[:, 1]
+            return np.stack([radius * np.sin(angle), radius * np.cos(angle) - 1 / s, X[:, 2]], axis=1)
 
         return bend
     if family == "spin":

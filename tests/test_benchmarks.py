@@ -15,7 +15,8 @@ import lbfgs_only
 import problems
 import small_problems
 import speed
-from quasiharmonic import Problem, boundary_loops, certify, solve
+import tetrahedral_problems
+from quasiharmonic import Problem, boundary_loops, certify, certify_tetrahedra, injective_tetrahedra, solve
 from quasiharmonic.solver.search.strategy import stages_of
 from quasiharmonic.util import kernels
 
@@ -48,6 +49,19 @@ def test_the_name_determines_a_problem(family):
     for one, other in zip(first[:4], again[:4], strict=True):
         np.testing.assert_array_equal(one, other)
     assert not np.array_equal(first.target, problems.make(family, 6, 0.7, triangles=100).target)
+
+
+@pytest.mark.parametrize("family", tetrahedral_problems.FAMILIES)
+def test_a_problem_of_tetrahedra_has_its_known_solution(family):
+    case = tetrahedral_problems.make(family, 1, 300)
+    for points in (case.X, case.hidden):
+        certificate = certify_tetrahedra(case.T, points)
+        assert certificate.injective
+        assert np.array_equal(case.fixed, np.unique(certificate.boundary))
+    begin = case.X.copy()
+    begin[case.fixed] = case.target
+    assert len(certify_tetrahedra(case.T, begin, boundary=False).inverted)
+    assert injective_tetrahedra(case.X, case.T, case.fixed, case.target, start=case.start, polish=False).success
 
 
 def test_pins_are_interior_vertices():
