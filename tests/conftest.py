@@ -63,6 +63,18 @@ def rng():
 
 
 @pytest.fixture
+def put(tmp_path):
+    """Write a file and return its path."""
+
+    def write(text, name="mesh.obj"):
+        path = tmp_path / name
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        return path
+
+    return write
+
+
+@pytest.fixture
 def failing_worker(monkeypatch):
     """Solve data sets in a process that fails or hangs as the names of the problems say."""
     from quasiharmonic.ui.batch import supervisor
