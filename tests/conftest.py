@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -10,12 +12,18 @@ import pytest
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
+# Without bytecode, each process that a test starts would compile the package again, which takes longer than most tests.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # A process that a script starts in the background ignores interrupts, and so would the commands that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # These scripts limit the resources of processes, which Windows cannot.
 collect_ignore = ["test_benchmarks.py", "test_damaged_files.py"] if os.name == "nt" else []
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
 
 # Beyond this number, a worker's start and its memory (half a gigabyte) cost more than it saves.
 MOST_WORKERS = 8
@@ -72,6 +80,69 @@ def put(tmp_path):
         return path
 
     return write
+
+
+@pytest.fixture
+def star(tmp_path):
+    """The mesh file of a problem with a star as its target, and its fixed vertices beside it."""
+    from shared.commands import write_input
+    from shared.solvable_problems import star_problem
+
+    return write_input(tmp_path, *star_problem())
+
+
+@pytest.fixture
+def stars(tmp_path):
+    """Four problems at several folder depths."""
+    from shared.datasets import write_stars
+
+    return write_stars(tmp_path / "set", ["a", "b/c", "b/d/e", "z"])
+
+
+@pytest.fixture(scope="session")
+def flat():
+    """A planar mesh of irregular triangles."""
+    from quasiharmonic import surfaces
+
+    return surfaces.random_delaunay(400, seed=2)
+
+
+@pytest.fixture(scope="session")
+def dome():
+    """A part of a sphere."""
+    from shared.distances import make_dome
+
+    return make_dome()
+
+
+@pytest.fixture
+def example(tmp_path, monkeypatch):
+    """Run the ``main`` of one script in a new folder; return its numbers."""
+    import importlib
+    import json
+
+    from matplotlib.image import imread
+
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+
+    def run(name, **options):
+        numbers = importlib.import_module(name).main(tmp_path, **options)
+        picture = imread(tmp_path / f"{name}.png")
+        assert picture.shape[0] > 300
+        assert picture[..., :3].std() > 0.05
+        json.dumps(numbers)
+        return numbers
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    """A studio server of a small surface, which takes few bytes."""
+    from shared.studio_server import serve_small_surface
+
+    with serve_small_surface(tmp_path_factory.mktemp("studio")) as server:
+        yield server
 
 
 @pytest.fixture
