@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -143,6 +144,27 @@ def running(tmp_path_factory):
 
     with serve_small_surface(tmp_path_factory.mktemp("studio")) as server:
         yield server
+
+
+@pytest.fixture(scope="session")
+def forks():
+    """Workers of data sets that start without importing the library again."""
+    from quasiharmonic.ui.batch import supervisor
+    from shared.commands import FAILING_WORKER
+    from shared.forked_workers import Forks
+
+    made = Forks([(supervisor.COMMAND, ""), (FAILING_WORKER, FAILING_WORKER[-1])])
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def quick_workers(forks, monkeypatch):
+    """Solve data sets in processes that start quickly, where it is safe to copy processes."""
+    from quasiharmonic.ui.batch import supervisor
+
+    if sys.platform == "linux":
+        monkeypatch.setattr(supervisor, "subprocess", SimpleNamespace(Popen=forks.open, PIPE=forks.PIPE))
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 from quasiharmonic.ui.cli import main
 from shared.datasets import write_stars
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_workers")]
 
 
 class TestCommand:

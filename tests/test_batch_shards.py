@@ -46,6 +46,7 @@ class TestShards:
             pass
 
 
+@pytest.mark.usefixtures("quick_workers")
 @pytest.mark.slow
 class TestArray:
     def test_out_of_order_and_merged(self, tmp_path, capsys):
@@ -138,7 +139,7 @@ class TestSlots:
 
 @pytest.mark.slow
 @linux
-def test_a_problem_that_was_killed_is_solved_again_alone(tmp_path, failing_worker):
+def test_a_problem_that_was_killed_is_solved_again_alone(tmp_path, failing_worker, quick_workers):
     """As when other processes took the memory that it needs."""
     source = write_stars(tmp_path / "set", ["a", "revived", "x_killed", "z"], rings=4)
     progress = batch.run(source, tmp_path / "out", jobs=2)
