@@ -1,7 +1,7 @@
 """Worker processes of data sets that start quickly: copies of a process that has imported the library.
 
-`Forks.open` replaces `subprocess.Popen` in `quasiharmonic.ui.batch.supervisor`. A worker is still a process with the same
-pipes and the same function; only its imports are saved, which take most of the time of a small problem.
+`Forks.open` replaces `subprocess.Popen` in `quasiharmonic.ui.batch.supervisor`. A worker is still a process with the
+same pipes and the same function. Only its imports are saved, which take most of the time of a small problem.
 """
 
 from __future__ import annotations
