@@ -39,10 +39,12 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     """Let Hypothesis generate the same examples in every run, and new ones only with `--nightly`."""
     try:
-        from hypothesis import settings
+        from hypothesis import Phase, settings
     except ImportError:  # the tests of a wheel and of the Blender extension install little
         return
-    settings.register_profile("repeatable", derandomize=True, database=None, deadline=None)
+    # A mutant (.ci/mutants) is killed by any failing example; to shorten the example would take minutes.
+    phases = [Phase.explicit, Phase.generate] if "MUTANT_UNDER_TEST" in os.environ else list(Phase)
+    settings.register_profile("repeatable", derandomize=True, database=None, deadline=None, phases=phases)
     settings.register_profile("exploring", print_blob=True, deadline=None)
     settings.load_profile("exploring" if config.getoption("nightly") else "repeatable")
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from quasiharmonic.geometry.exact.predicates import (
     orientation,
     orientation_or_nonfinite,
     segment_relation,
+    twice_area,
 )
 from shared.exact import exact_orientation, exact_relation
 
@@ -92,6 +94,18 @@ def test_products_that_underflow_to_the_wrong_order():
     assert orientation(a, b, c)[0] == exact_orientation(a[0], b[0], c[0]) == -1
 
 
+def test_triples_over_more_than_130_orders_of_magnitude():
+    """They are decided in integers: on a line, and with a determinant of one unit."""
+    for far in (2.0**450, 2.0**1000):
+        for turn in ([[1, 0], [0, 1]], [[0, 1], [-1, 0]]):
+            a, b, c = np.array([[1.0, 1.0], [far, far], [-2 * far, -2 * far]]) @ turn
+            agrees([a, b, c], [b, c, b], [c, a, a])
+            assert orientation(a, b, c) == 0
+            # (far − 1)(−2) − (−1)(2 far − 1) = 1
+            a, b, c = np.array([[far, -1], [2 * far, -2], [1, 0]]) @ turn
+            assert [int(orientation(*corners)) for corners in ((a, b, c), (b, a, c))] == [1, -1]
+
+
 def test_a_hundred_thousand_exactly_collinear_triples(rng):
     x = rng.random((3, 100_000)) + 0.1
     # With a slope of one and no rounding, the points lie on the diagonal, even with inexact differences.
@@ -131,6 +145,25 @@ def test_numbers_that_are_not_finite_are_rejected_or_named():
     np.testing.assert_array_equal(nonfinite, [1, 2, 4])
     with pytest.raises(ValueError, match=r"triple 1 \(3 in all\)"):
         orientation(a, b, c)
+
+
+def test_twice_the_area_has_48_bits_even_if_triangles_are_thin(rng):
+    a, b = rng.random((2, 300, 2))
+    t = rng.random((300, 1))
+    # The third corner is on the line through the other two, or beside it by a few units in the last place, or anywhere.
+    c = np.concatenate([(a * (1 - t) + b * t)[:100], (a + 3 * (b - a))[100:200], rng.random((100, 2))])
+    c[50:100] = a[50:100]
+    found = twice_area(a, b, c)
+    exact = []
+    for corners in zip(a, b, c, strict=True):
+        (ax, ay), (bx, by), (cx, cy) = ([Fraction(float(x)) for x in corner] for corner in corners)
+        exact.append((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
+    assert all(abs(Fraction(float(x)) - y) <= abs(y) / 2**48 for x, y in zip(found, exact, strict=True))
+    assert not found[50:100].any()
+    assert len({x > 0 for x in exact[:50]}) == len({x > 0 for x in exact[200:]}) == 2
+    # Many triangles are processed in blocks.
+    many = np.resize(np.arange(300), 30_000)
+    np.testing.assert_array_equal(twice_area(a[many], b[many], c[many]), found[many])
 
 
 lattice_segments = st.lists(st.tuples(*[st.tuples(st.integers(0, 4), st.integers(0, 4))] * 4), min_size=1, max_size=30)
