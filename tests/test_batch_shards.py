@@ -43,7 +43,8 @@ class TestShards:
     def test_each_shard_has_its_lock(self, tmp_path):
         locks = [lock_name(read_shard(text)) for text in (None, "1/2", "2/2")]
         with lock_folder(tmp_path, locks[0]), lock_folder(tmp_path, locks[1]), lock_folder(tmp_path, locks[2]):
-            pass
+            assert {file.name for file in tmp_path.iterdir()} == set(locks)
+        assert len(set(locks)) == 3
 
 
 @pytest.mark.slow
