@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,12 +13,18 @@ import pytest
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
+# Without bytecode, each process that a test starts would compile the package again, which takes longer than most tests.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # A process that a script starts in the background ignores interrupts, and so would the commands that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # These scripts limit the resources of processes, which Windows cannot.
 collect_ignore = ["test_benchmarks.py", "test_damaged_files.py"] if os.name == "nt" else []
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
 
 # Beyond this number, a worker's start and its memory (half a gigabyte) cost more than it saves.
 MOST_WORKERS = 8
@@ -39,10 +48,12 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     """Let Hypothesis generate the same examples in every run, and new ones only with `--nightly`."""
     try:
-        from hypothesis import settings
+        from hypothesis import Phase, settings
     except ImportError:  # the tests of a wheel and of the Blender extension install little
         return
-    settings.register_profile("repeatable", derandomize=True, database=None, deadline=None)
+    # A mutant (.ci/mutants) is killed by any failing example; to shorten the example would take minutes.
+    phases = [Phase.explicit, Phase.generate] if "MUTANT_UNDER_TEST" in os.environ else list(Phase)
+    settings.register_profile("repeatable", derandomize=True, database=None, deadline=None, phases=phases)
     settings.register_profile("exploring", print_blob=True, deadline=None)
     settings.load_profile("exploring" if config.getoption("nightly") else "repeatable")
 
@@ -60,6 +71,102 @@ def rng():
     import numpy as np
 
     return np.random.default_rng(20231)
+
+
+@pytest.fixture
+def put(tmp_path):
+    """Write a file and return its path."""
+
+    def write(text, name="mesh.obj"):
+        path = tmp_path / name
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        return path
+
+    return write
+
+
+@pytest.fixture
+def star(tmp_path):
+    """The mesh file of a problem with a star as its target, and its fixed vertices beside it."""
+    from shared.commands import write_input
+    from shared.solvable_problems import star_problem
+
+    return write_input(tmp_path, *star_problem())
+
+
+@pytest.fixture
+def stars(tmp_path):
+    """Four problems at several folder depths."""
+    from shared.datasets import write_stars
+
+    return write_stars(tmp_path / "set", ["a", "b/c", "b/d/e", "z"])
+
+
+@pytest.fixture(scope="session")
+def flat():
+    """A planar mesh of irregular triangles."""
+    from quasiharmonic import surfaces
+
+    return surfaces.random_delaunay(400, seed=2)
+
+
+@pytest.fixture(scope="session")
+def dome():
+    """A part of a sphere."""
+    from shared.distances import make_dome
+
+    return make_dome()
+
+
+@pytest.fixture
+def example(tmp_path, monkeypatch):
+    """Run the ``main`` of one script in a new folder; return its numbers."""
+    import importlib
+    import json
+
+    from matplotlib.image import imread
+
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+
+    def run(name, **options):
+        numbers = importlib.import_module(name).main(tmp_path, **options)
+        picture = imread(tmp_path / f"{name}.png")
+        assert picture.shape[0] > 300
+        assert picture[..., :3].std() > 0.05
+        json.dumps(numbers)
+        return numbers
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    """A studio server of a small surface, which takes few bytes."""
+    from shared.studio_server import serve_small_surface
+
+    with serve_small_surface(tmp_path_factory.mktemp("studio")) as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def forks():
+    """Workers of data sets that start without importing the library again."""
+    from quasiharmonic.ui.batch import supervisor
+    from shared.commands import FAILING_WORKER
+    from shared.forked_workers import Forks
+
+    made = Forks([(supervisor.COMMAND, ""), (FAILING_WORKER, FAILING_WORKER[-1])])
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def quick_workers(forks, monkeypatch):
+    """Solve data sets in processes that start quickly, where it is safe to copy processes."""
+    from quasiharmonic.ui.batch import supervisor
+
+    if sys.platform == "linux":
+        monkeypatch.setattr(supervisor, "subprocess", SimpleNamespace(Popen=forks.open, PIPE=forks.PIPE))
 
 
 @pytest.fixture

@@ -206,6 +206,7 @@ def strip(record):
     return {name: value for name, value in kept.items() if name not in ("problem", "source", "versions")}
 
 
+@pytest.mark.usefixtures("quick_workers")
 @pytest.mark.slow
 class TestRun:
     def test_as_from_folders(self, tmp_path, stars):
@@ -328,6 +329,7 @@ class TestPlaces:
             batch.run("memory://nothing", tmp_path / "out")
 
 
+@pytest.mark.usefixtures("quick_workers")
 @pytest.mark.slow
 class TestUrls:
     @pytest.mark.parametrize("kind", ["memory", "file", "s3"])

@@ -18,6 +18,7 @@ from shared.datasets import lasting, record_of, star_of, write_problem, write_st
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.usefixtures("quick_workers"),
     pytest.mark.skipif("qdldl" not in available(), reason="where there is no QDLDL, each problem is solved by itself"),
 ]
 

@@ -43,9 +43,11 @@ class TestShards:
     def test_each_shard_has_its_lock(self, tmp_path):
         locks = [lock_name(read_shard(text)) for text in (None, "1/2", "2/2")]
         with lock_folder(tmp_path, locks[0]), lock_folder(tmp_path, locks[1]), lock_folder(tmp_path, locks[2]):
-            pass
+            assert {file.name for file in tmp_path.iterdir()} == set(locks)
+        assert len(set(locks)) == 3
 
 
+@pytest.mark.usefixtures("quick_workers")
 @pytest.mark.slow
 class TestArray:
     def test_out_of_order_and_merged(self, tmp_path, capsys):
@@ -138,7 +140,7 @@ class TestSlots:
 
 @pytest.mark.slow
 @linux
-def test_a_problem_that_was_killed_is_solved_again_alone(tmp_path, failing_worker):
+def test_a_problem_that_was_killed_is_solved_again_alone(tmp_path, failing_worker, quick_workers):
     """As when other processes took the memory that it needs."""
     source = write_stars(tmp_path / "set", ["a", "revived", "x_killed", "z"], rings=4)
     progress = batch.run(source, tmp_path / "out", jobs=2)

@@ -27,6 +27,71 @@ def test_the_three_verdicts_on_a_triangle():
     assert said in c.summary()
 
 
+@pytest.mark.parametrize(
+    ("triangle", "kind", "further", "loops", "said", "crossings"),
+    [
+        ((0, 1, 2), None, None, [], "Injective: the only triangle is positive. Bijective: ", []),
+        (
+            (0, 3, 1),
+            "degenerate",
+            "self-intersection",
+            [0],
+            "boundary loop 0 meets itself (0→3 with 1→0, 3→1 with 1→0)",
+            [[0, 3, 1, 0], [3, 1, 1, 0]],
+        ),
+        ((0, 2, 1), "inverted", "winding", [0], "boundary loop 0 runs clockwise and no other loop is around it", []),
+        ((0, 1, 4), "not finite", None, [], "Not injective: of 1 triangles, 1 is not finite (0).", []),
+    ],
+)
+def test_every_field_of_the_certificate_of_one_triangle(triangle, kind, further, loops, said, crossings):
+    F, uv = np.array([triangle]), np.array([[0.0, 0], [2, 0], [0, 1], [1, 0], [np.nan, 1]])
+    c = certify(F, uv)
+    positive = kind is None
+    assert is_injective(F, uv) == positive
+    assert inverted_triangles(F, uv).tolist() == [0] * (not positive)
+    wrong = f"of 1 triangles, 1 is {kind} (0)"
+    reasons = [] if positive else [{"kind": "not injective", "text": wrong, "loops": []}]
+    if further:
+        reasons.append({"kind": further, "text": said, "loops": loops})
+        said = f"Not injective: {wrong}. Not bijective either: {said}."
+    if positive:
+        said += "the boundary does not meet itself, and no point is covered twice."
+    assert c.to_dict() == {
+        "injective": positive,
+        "bijective": positive,
+        "triangles": 1,
+        "inverted": [0] * (kind == "inverted"),
+        "degenerate": [0] * (kind == "degenerate"),
+        "nonfinite": [0] * (kind == "not finite"),
+        "reasons": reasons,
+        "loops": [{"start": triangle[0], "length": 3}],
+        "crossings": crossings,
+        "multiply_wound": [],
+        "summary": said,
+    }
+    verdict = "injective and bijective, 1 triangle" if positive else "not injective, 1 of 1 triangle not positive"
+    assert c.short_repr() == verdict
+    assert certify(F, uv, boundary=False).short_repr() == verdict.replace(" and bijective", "")
+
+
+def test_three_reasons_are_listed_and_the_others_counted():
+    for count, rest in ((2, ""), (3, ""), (4, "; and 1 more"), (6, "; and 3 more")):
+        F, uv = together(*(square(3 * k, 0, 1) for k in range(count)))
+        c = certify(F, uv * [-1, 1])
+        assert [r.loops for r in c.reasons[1:]] == [(k,) for k in range(count)]
+        texts = [f"boundary loop {k} runs clockwise and no other loop is around it" for k in range(min(count, 3))]
+        assert c.summary().endswith(f"). Not bijective either: {'; '.join(texts)}{rest}.")
+    c = certify(*together(*(square(k / 2, 0, 1) for k in range(2))))
+    assert c.summary().startswith("Injective: all 4 triangles are positive. Not bijective: boundary loops 0 and 1 meet")
+    assert c.short_repr() == "injective, not bijective, 4 triangles"
+    c = certify(np.empty((0, 3), int), CORNERS)
+    assert c.short_repr() == "not injective, 0 of 0 triangles not positive"
+    assert c.to_dict()["reasons"] == [{"kind": "no triangles", "text": "there are no triangles", "loops": []}]
+    assert certify(np.tile(SQUARE[:, ::-1], (600, 1)), CORNERS, boundary=False).short_repr() == (
+        "not injective, 1200 of 1200 triangles not positive"
+    )
+
+
 def test_predicate_and_locator_agree_with_the_certificate(rng, monkeypatch):
     monkeypatch.setattr("quasiharmonic.geometry.exact.triangles.TRIANGLE_CHUNK", 7)
     F = strip(6, rows=5)

@@ -372,11 +372,13 @@ class TestSheet:
         V, F = without_inner_vertices(rng, 20) if seed % 2 else disk(3)
         sheet = Sheet(F, len(V))
         place = (V @ np.array([1, 1j])).tolist()
+        cuts = 0
         for pieces in range(2, 8):
             loop = max(sheet.loops(), key=len)
             i, j = sorted(rng.choice(len(loop), 2, replace=False).tolist())
             if j - i < 2 or j - i > len(loop) - 2:
                 continue
+            cuts += 1
             before = len(sheet.loops())
             way = walk(sheet, place, loop[i], loop[j])
             assert not any(sheet.is_fixed(copy) for copy in way[1:-1])
@@ -392,6 +394,7 @@ class TestSheet:
             assert {tuple(edge) for edge in kinds.boundary.tolist()} == set(sheet.following.items())
             euler = len(np.unique(rows)) - len(kinds.interior) - len(kinds.boundary) + len(rows)
             assert euler == len(np.unique(components(rows, len(sheet.vertex))[np.unique(rows)])) == before + 1
+        assert cuts >= 3
 
     def test_link(self):
         V, F = disk(2)

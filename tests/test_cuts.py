@@ -5,72 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import crease_costs, find_cuts, flatten, surfaces
-from quasiharmonic.geometry.coarsening.levels import coarsen
+from quasiharmonic import crease_costs, find_cuts, surfaces
 from quasiharmonic.geometry.mesh.fans import open_along
-from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edge_keys, edges
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys, edges
 from quasiharmonic.targets.cuts.graph import edge_graph
-from quasiharmonic.targets.cuts.levels import insert_vertices
 from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches
 from quasiharmonic.targets.cuts.shrinking import Shrinking
-from quasiharmonic.targets.cuts.topological import opening_cuts, without_loose_ends
+from quasiharmonic.targets.cuts.topological import opening_cuts
 from shared.closed_surfaces import TETRAHEDRON, blocks, double_torus, torus
-from shared.meshes import lift
-
-
-def parts(V, F, cut):
-    """Return the Euler number and the number of loops of every part, computed independently."""
-    FT, origin = open_along(F, cut, len(V))
-    assert np.array_equal(origin[FT], F)
-    label = components(FT, len(origin))[FT[:, 0]]
-    found = []
-    for one in np.unique(label):
-        used, T = np.unique(FT[label == one], return_inverse=True)
-        T = T.reshape(-1, 3)
-        there = edges(T, used.size)
-        assert not there.nonmanifold.size
-        assert not there.inconsistent.size
-        sides = len(there.interior) + len(there.boundary)
-        found.append((used.size - sides + len(T), len(boundary_loops(T, used.size))))
-    return found
-
-
-def length_of(V, cut):
-    return float(np.linalg.norm(V[cut[:, 0]] - V[cut[:, 1]], axis=1).sum())
-
-
-def energy_of(V, F, cut):
-    """Return the mean symmetric Dirichlet energy of the map."""
-    FT, origin = open_along(F, cut, len(V))
-    return flatten(V[origin], FT).history[-1].energy
-
-
-def jittered(V, seed=0, size=2e-3):
-    """Perturb vertices so that no two lengths are equal and rounding does not matter."""
-    return V + size * np.random.default_rng(seed).standard_normal(V.shape)
-
-
-def without(F, *rows):
-    return np.delete(F, rows, axis=0)
-
-
-TORUS = torus()
-CUBE = blocks(np.ones((1, 1, 1)), rounds=0)
-SURFACES = {
-    "tetrahedron": TETRAHEDRON,
-    "cube": CUBE,
-    "two triangles": (np.eye(3), np.array([[0, 1, 2], [0, 2, 1]])),
-    "starfish": surfaces.starfish(3, 12),
-    "torus": TORUS,
-    "smallest torus": torus(3, 3),
-    "torus with a hole": (TORUS[0], without(TORUS[1], 7)),
-    "torus with holes": (TORUS[0], without(TORUS[1], 7, 200, 201, 400)),
-    "two handles": double_torus(),
-    "annulus": surfaces.annulus(12),
-    "curved annulus": (lift(surfaces.annulus(12)[0]), surfaces.annulus(12)[1]),
-    "disk": surfaces.disk(5),
-    "cat": surfaces.cat(15),
-}
+from shared.cuts import SURFACES, TORUS, energy_of, jittered, length_of, parts, random_cut
 
 
 class TestDisks:
@@ -183,39 +126,6 @@ class TestShortest:
         assert graph.cost[number].sum() < 0.9 * graph.length[number].sum()
 
 
-def random_cut(graph, seed):
-    """Return the edges that a random tree of triangles does not cross, without most loose ends."""
-    rng = np.random.default_rng(seed)
-    order, joined, root = rng.permutation(len(graph.ends)), np.arange(len(graph.F)), {}
-    for t, numbers in enumerate(graph.side.T.tolist()):
-        for number in numbers:
-            root.setdefault(number, []).append(t)
-
-    def find(t):
-        while joined[t] != t:
-            t = joined[t]
-        return t
-
-    cut = ~graph.rim
-    for number in order.tolist():
-        if len(root[number]) == 2:
-            one, other = (find(t) for t in root[number])
-            if one != other:
-                joined[one] = other
-                cut[number] = False
-    bare = without_loose_ends(graph, cut)
-    if bare.any():
-        return bare
-    # On a sphere all edges are loose ends; a path and a branch of the tree remain.
-    for _ in range(12):
-        degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
-        loose = cut & (degree == 1)[graph.ends].any(axis=1)
-        if loose.sum() + 2 > cut.sum():
-            break
-        cut = cut & ~loose
-    return cut
-
-
 class TestGain:
     def test_cap_agrees_with_stereographic_projection(self):
         """On a sphere, e⁻ʷ is (1 + cos θ₀) / (1 + cos θ) if lengths are unchanged at θ₀."""
@@ -286,84 +196,6 @@ class TestGain:
         rotation = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
         rotation *= np.linalg.det(rotation)
         assert np.array_equal(cut, find_cuts(1000.3 * V @ rotation.T + (5, -700, 30), F))
-
-
-class TestLevels:
-    """Large surfaces are cut on a coarse mesh; the cuts are carried to the fine one."""
-
-    @pytest.mark.parametrize("seed", range(3))
-    @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
-    def test_cuts_keep_their_topology_when_vertices_are_inserted(self, name, seed):
-        V, F = SURFACES[name]
-        FT, origin = open_along(F, np.zeros((0, 2), dtype=np.int64), len(V))
-        V, F = V[origin], FT
-        fixed = np.zeros(len(V), dtype=bool)
-        fixed[edges(F, len(V)).boundary] = True
-        coarsening = coarsen(F, len(V), fixed, 60)
-        vertices, coarse = np.unique(coarsening.F, return_inverse=True)
-        graph = edge_graph(V[vertices], coarse.reshape(-1, 3))
-        cut = vertices[graph.ends[random_cut(graph, seed)]]
-        ends = (np.bincount(cut.ravel()) == 1).sum()
-        assert len(coarsening.rounds) > 1
-        for k in reversed(range(len(coarsening.rounds))):
-            cut = insert_vertices(cut, coarsening.rounds[k], len(V))
-            assert np.array_equal(cut, np.sort(cut, axis=1))
-            assert (np.bincount(cut.ravel()) == 1).sum() == ends
-            if k in coarsening.levels:
-                assert parts(V, coarsening.levels[k], cut) == [(1, 1)]
-        assert parts(V, F, cut) == [(1, 1)]
-
-    @pytest.mark.parametrize("seed", range(3))
-    @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
-    def test_shortening_close_to_cuts(self, name, seed):
-        V, F = SURFACES[name]
-        graph = edge_graph(V, F)
-        cut = random_cut(graph, seed)
-        better = shorten_cuts(graph, cut, rings=3)
-        assert parts(V, F, graph.ends[better]) == [(1, 1)]
-        assert graph.cost[better].sum() < 0.9 * graph.cost[cut].sum()
-
-    def test_a_part_of_a_graph_has_the_same_edges(self):
-        V, F = SURFACES["torus with holes"]
-        graph = edge_graph(V, F)
-        part, own = graph.part_near(np.array([3]), 2)
-        ring = np.unique(F[(F == 3).any(axis=1)])
-        near = np.isin(F, ring).any(axis=1)
-        assert np.array_equal(np.sort(part.V[part.F], axis=1), np.sort(graph.V[F[near]], axis=1))
-        assert np.array_equal(part.V[part.ends], graph.V[graph.ends[own]])
-        assert np.array_equal(
-            part.ends[part.side], np.sort(np.stack([part.F, np.roll(part.F, -1, 1)], 2), 2).swapaxes(0, 1)
-        )
-        assert np.array_equal(part.rim, graph.rim[own])
-        # Costs are infinite exactly at vertices outside the first ring.
-        outer = ~np.isin(graph.ends[own], ring).all(axis=1)
-        assert np.array_equal(np.isinf(part.cost), outer)
-
-    @pytest.mark.slow
-    def test_a_large_torus(self):
-        """The inner equator and a ring are nearly the shortest cuts."""
-        V, F = torus(240, 80, radius=3)
-        cut = find_cuts(V, F, min_gain=np.inf)
-        assert parts(V, F, cut) == [(1, 1)]
-        assert length_of(V, cut) < 1.03 * 2 * np.pi * (1 + 2)
-        assert np.array_equal(cut, find_cuts(V, F, min_gain=np.inf))
-
-    def test_a_large_surface_avoids_diagonals(self):
-        V, F = torus(240, 80, radius=3)
-        diagonals = F[: len(F) // 2, [0, 2]]
-        cut = find_cuts(V, F, forbidden_edges=diagonals, min_gain=np.inf)
-        assert parts(V, F, cut) == [(1, 1)]
-        assert not np.isin(edge_keys(*cut.T, len(V)), edge_keys(*diagonals.T, len(V))).any()
-
-    @pytest.mark.slow
-    def test_large_arms(self):
-        """On a fine mesh, cuts are about as long as on a coarse one, which reach all arms."""
-        V, F = surfaces.starfish(5, 24)
-        few = find_cuts(V, F)
-        V, F = surfaces.starfish(5, 64)
-        cut = find_cuts(V, F)
-        assert parts(V, F, cut) == [(1, 1)]
-        assert length_of(V, cut) < 1.2 * length_of(*surfaces.starfish(5, 24)[:1], few)
 
 
 class TestCosts:

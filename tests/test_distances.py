@@ -12,18 +12,7 @@ from scipy.optimize import minimize_scalar
 from quasiharmonic import distortion, surfaces
 from quasiharmonic.energies.distances import surface_distances
 from quasiharmonic.geometry.mesh.geodesics import straight_segments
-from shared.distances import make_dome, rolled, spherical, turned
-
-
-@pytest.fixture(scope="module")
-def flat():
-    return surfaces.random_delaunay(400, seed=2)
-
-
-@pytest.fixture(scope="module")
-def dome():
-    return make_dome()
-
+from shared.distances import rolled, spherical, turned
 
 # --- along the surface
 

@@ -8,6 +8,7 @@ import pytest
 from quasiharmonic import Problem, solve
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
+from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.passes import own_sweep
@@ -159,6 +160,33 @@ class TestSettings:
         result = solve(posed(V, F), strategy=[LBFGS(functional="logarithm", iterations=300)])
         assert result.injective
         assert result.stages[0].name == "l-bfgs, tanh, logarithm"
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_value_and_gradient_share_one_more_factorisation_by_the_same_solver(self, monkeypatch, name):
+        further = 0 if name in ("neumann", "dirichlet") else 1
+        made, factored = [], []
+
+        class Recorded(Laplacian):
+            def __init__(self, F, n, fixed, linear_solver):
+                super().__init__(F, n, fixed, linear_solver)
+                made.append((len(fixed), linear_solver))
+
+            def factor(self, stiffness):
+                factored.append(stiffness)
+                return super().factor(stiffness)
+
+        monkeypatch.setattr("quasiharmonic.solver.field.functionals.Laplacian", Recorded)
+        _, V, F = MESHES[0]
+        problem = posed(V, F)
+        objective = Objective(problem, name, linear_solver="superlu")
+        for seed in (1, 2):
+            at = objective.evaluate(random_xi(F, 0.3, seed))
+            assert np.isfinite(at.value)
+            assert np.abs(at.gradient).max() > 0
+        assert made == [(1, "superlu")] * further
+        assert len(factored) == 2 * further
+        assert objective.functional.problem is problem
+        assert objective.functional.mesh is objective.mesh
 
     @pytest.mark.parametrize("setting", ["functional", "parameterisation", "reference"])
     @pytest.mark.parametrize("word", ["v3", None, ["tanh"]])

@@ -20,19 +20,8 @@ from quasiharmonic.apps.flattening.piece import Piece, Settings
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
 from quasiharmonic.energies.distances import surface_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from shared.distances import make_dome, rolled, spherical, turned
+from shared.distances import rolled, spherical, turned
 from shared.distinct_steps import DistinctSteps
-
-
-@pytest.fixture(scope="module")
-def flat():
-    return surfaces.random_delaunay(400, seed=2)
-
-
-@pytest.fixture(scope="module")
-def dome():
-    return make_dome()
-
 
 # --- the energy and its descent
 

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from quasiharmonic import Problem, certify, solve
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.solver.field.functionals import neumann_target
+from quasiharmonic.solver.field.functionals import beltrami_energy, beltrami_gradient, neumann_target
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.solver.methods import LBFGS, Newton
@@ -245,6 +245,29 @@ class TestTheorems:
         assert v3 > 0.1 * area
         assert v1 >= 2 * v3**2 / np.linalg.norm(held - held.mean()) ** 2
         assert v2 >= v3**2 / (v3 + area)
+
+
+def test_v3_of_any_map_is_the_energy_of_its_beltrami_residual():
+    """The map need not be the quasi-harmonic map of the tensors; the gradient is for a fixed map."""
+    _, V, F = MESHES[0]
+    problem = posed(V, F)
+    mesh = problem.domain.mesh("equilateral")
+    rng = np.random.default_rng(5)
+    dw = mesh.derivatives(rng.standard_normal(len(V)) + 1j * rng.standard_normal(len(V)))
+    xi = random_xi(F)
+
+    def energy(mu):
+        return 2 * mesh.m * np.abs(dw.q - mu * dw.p) ** 2 / (1 - np.abs(mu) ** 2)
+
+    field = TANH.field(xi)
+    value, gradient = beltrami_gradient(mesh, field, dw)
+    assert value == beltrami_energy(mesh, field, dw) == pytest.approx(energy(field.mu).sum(), rel=1e-12)
+    h = 1e-6
+    for direction in (1, 1j):
+        slope = (energy(field.mu + h * direction) - energy(field.mu - h * direction)) / (2 * h)
+        np.testing.assert_allclose(
+            (np.conj(gradient) * direction).real, slope, rtol=1e-6, atol=1e-7 * np.abs(gradient).max()
+        )
 
 
 def test_v4_can_be_negative():

@@ -121,6 +121,10 @@ def test_any_triangles_are_accepted_and_clean_ones_are_surfaces(n, f, seed):
 
     report = inspect_mesh(V, F)
     assert report.genus >= 0
+    if report.clean:
+        sides = np.unique(np.sort(np.concatenate([F[:, (0, 1)], F[:, (1, 2)], F[:, (2, 0)]]), axis=1), axis=0)
+        euler = len(np.unique(F)) - len(sides) + f
+        assert euler == 2 * (report.components - report.genus) - report.loops
     if report.clean and report.components == 1 and report.loops:
         assert make_problem().n == n
     else:

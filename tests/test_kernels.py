@@ -26,7 +26,7 @@ from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.surfaces import disk
 from quasiharmonic.util import kernels
 from quasiharmonic.util.kernels.constants import shared_constants
-from shared.kernels import ARGUMENTS
+from shared.kernel_arguments import ARGUMENTS
 
 # Packages that require extras and have no kernels.
 _WITHOUT = "torch", "jax", "notebook", "studio", "batch", "report"

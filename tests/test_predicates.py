@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from quasiharmonic.geometry.exact.predicates import (
     orientation,
     orientation_or_nonfinite,
     segment_relation,
+    sure_orientation,
+    twice_area,
 )
 from shared.exact import exact_orientation, exact_relation
 
@@ -92,6 +95,34 @@ def test_products_that_underflow_to_the_wrong_order():
     assert orientation(a, b, c)[0] == exact_orientation(a[0], b[0], c[0]) == -1
 
 
+def test_triples_over_more_than_130_orders_of_magnitude():
+    """They are decided in integers: on a line, and with a determinant of one unit."""
+    for far in (2.0**450, 2.0**1000):
+        for turn in ([[1, 0], [0, 1]], [[0, 1], [-1, 0]]):
+            a, b, c = np.array([[1.0, 1.0], [far, far], [-2 * far, -2 * far]]) @ turn
+            agrees([a, b, c], [b, c, b], [c, a, a])
+            assert orientation(a, b, c) == 0
+            # (far − 1)(−2) − (−1)(2 far − 1) = 1
+            a, b, c = np.array([[far, -1], [2 * far, -2], [1, 0]]) @ turn
+            assert [int(orientation(*corners)) for corners in ((a, b, c), (b, a, c))] == [1, -1]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-310, 1e-162, 1e200, 1.7e308])
+def test_signs_that_floating_point_is_sure_of_are_exact(rng, scale):
+    a, b, c = rng.uniform(-1, 1, (3, 300, 2)) * scale
+    c[:50] = a[:50] / 2 + b[:50] / 2
+    c[50:60], c[60:70, 1] = np.nan, -np.inf
+    sure, exact = sure_orientation(a, b, c), orientation_or_nonfinite(a, b, c)[0]
+    assert sure.dtype == np.int8
+    assert not (sure * exact < 0).any()
+    assert not sure[exact == 0].any()
+    # Products that overflow or underflow leave signs open.
+    assert (np.mean(sure[70:] == exact[70:]) > 0.99) == (scale == 1.0)
+    np.testing.assert_array_equal(sure_orientation(a[70], b[70:], c[70:]), sure_orientation(a[70:71], b[70:], c[70:]))
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    assert [int(sure_orientation(*corners[k])) for k in ([0, 1, 2], [2, 0, 1], [0, 2, 1])] == [1, 1, -1]
+
+
 def test_a_hundred_thousand_exactly_collinear_triples(rng):
     x = rng.random((3, 100_000)) + 0.1
     # With a slope of one and no rounding, the points lie on the diagonal, even with inexact differences.
@@ -133,6 +164,25 @@ def test_numbers_that_are_not_finite_are_rejected_or_named():
         orientation(a, b, c)
 
 
+def test_twice_the_area_has_48_bits_even_if_triangles_are_thin(rng):
+    a, b = rng.random((2, 300, 2))
+    t = rng.random((300, 1))
+    # The third corner is on the line through the other two, or beside it by a few units in the last place, or anywhere.
+    c = np.concatenate([(a * (1 - t) + b * t)[:100], (a + 3 * (b - a))[100:200], rng.random((100, 2))])
+    c[50:100] = a[50:100]
+    found = twice_area(a, b, c)
+    exact = []
+    for corners in zip(a, b, c, strict=True):
+        (ax, ay), (bx, by), (cx, cy) = ([Fraction(float(x)) for x in corner] for corner in corners)
+        exact.append((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
+    assert all(abs(Fraction(float(x)) - y) <= abs(y) / 2**48 for x, y in zip(found, exact, strict=True))
+    assert not found[50:100].any()
+    assert len({x > 0 for x in exact[:50]}) == len({x > 0 for x in exact[200:]}) == 2
+    # Many triangles are processed in blocks.
+    many = np.resize(np.arange(300), 30_000)
+    np.testing.assert_array_equal(twice_area(a[many], b[many], c[many]), found[many])
+
+
 lattice_segments = st.lists(st.tuples(*[st.tuples(st.integers(0, 4), st.integers(0, 4))] * 4), min_size=1, max_size=30)
 
 
@@ -141,7 +191,9 @@ lattice_segments = st.lists(st.tuples(*[st.tuples(st.integers(0, 4), st.integers
 def test_segment_relation_is_exact(segments, scale, offset):
     p, q, r, s = ((np.array(segments) + offset) * scale).transpose(1, 0, 2)
     expected = [exact_relation(*ends) for ends in zip(p, q, r, s, strict=True)]
-    np.testing.assert_array_equal(segment_relation(p, q, r, s), expected)
+    found = segment_relation(p, q, r, s)
+    assert found.dtype == np.int8
+    np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(segment_relation(s, r, p, q), expected)
 
 
@@ -153,10 +205,13 @@ def test_segments_that_miss_each_other_by_rounding():
     assert segment_relation(p, q, q / 2, away)[0] == SegmentRelation.TOUCHING
 
 
-def test_box_pairs_within_groups(rng):
-    starts = np.array([0, 5, 5, 6, 30, 63])
-    lo = rng.random((63, 2))
-    hi = lo + rng.random((63, 2)) * 0.3
+@pytest.mark.parametrize(
+    ("starts", "least"), [([0, 5, 5, 6, 30, 63], 20), ([0, 4, 8, 12, 16], 5), ([0, 9, 10], 5), ([0, 0], 0), ([0], 0)]
+)
+def test_box_pairs_within_groups(rng, starts, least):
+    starts = np.array(starts)
+    lo = rng.random((starts[-1], 2))
+    hi = lo + rng.random((starts[-1], 2)) * (0.3 if starts[-1] > 20 else 0.7)
     found = {pair for i, j in box_pairs_within(lo, hi, starts) for pair in zip(i.tolist(), j.tolist(), strict=True)}
     meeting = set()
     for first, last in itertools.pairwise(starts.tolist()):
@@ -164,15 +219,15 @@ def test_box_pairs_within_groups(rng):
             if (lo[i] <= hi[j]).all() and (lo[j] <= hi[i]).all():
                 meeting.add((i, j))
     assert found == meeting
-    assert len(meeting) > 20
+    assert len(meeting) >= least
 
 
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_are_those_that_intersect(rng, monkeypatch, chunk):
     monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
-    for count in (0, 1, 2, 3, 8, 57):
-        lo = rng.integers(0, 20, (count, 2)).astype(float)
-        hi = lo + rng.integers(0, 5, (count, 2))
+    for count, dimension in itertools.product((0, 1, 2, 3, 8, 9, 57, 150), (2, 3)):
+        lo = rng.integers(0, 20, (count, dimension)).astype(float)
+        hi = lo + rng.integers(0, 5, (count, dimension))
         found = [pair for i, j in box_pairs(lo, hi) for pair in zip(i.tolist(), j.tolist(), strict=True)]
         expected = {
             (i, j)
@@ -187,9 +242,10 @@ def test_box_pairs_are_those_that_intersect(rng, monkeypatch, chunk):
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_between_two_groups(rng, monkeypatch, chunk):
     monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
-    for count, other in ((0, 3), (1, 1), (5, 0), (3, 40), (57, 8)):
-        lo, low = rng.integers(0, 20, (count, 2)).astype(float), rng.integers(0, 20, (other, 2)).astype(float)
-        hi, high = lo + rng.integers(0, 5, (count, 2)), low + rng.integers(0, 5, (other, 2))
+    sizes = ((0, 0), (0, 3), (1, 1), (5, 0), (9, 5), (5, 9), (3, 40), (57, 8), (150, 90))
+    for (count, other), dimension in itertools.product(sizes, (2, 3)):
+        lo, low = (rng.integers(0, 20, (number, dimension)).astype(float) for number in (count, other))
+        hi, high = lo + rng.integers(0, 5, lo.shape), low + rng.integers(0, 5, low.shape)
         found = [p for i, j in box_pairs_between(lo, hi, low, high) for p in zip(i.tolist(), j.tolist(), strict=True)]
         meet = (lo[:, None] <= high).all(axis=2) & (low <= hi[:, None]).all(axis=2)
         assert len(found) == meet.sum()

@@ -186,7 +186,12 @@ def test_distortion_converts_to_a_dataframe(surface, solved, tmp_path):
     np.testing.assert_array_equal(table["mips"], measured.mips)
     table.to_csv(tmp_path / "table.csv")
     assert (tmp_path / "table.csv").read_text().startswith("triangle,share,sigma1")
-    assert isinstance(measured.summary(), str)
+    heading, *lines = measured.summary().splitlines()
+    assert heading.split() == ["median", "95", "%", "max"]
+    assert {line.split()[0] for line in lines} == set(measured.per_triangle())
+    assert float(dict(line.split(maxsplit=1) for line in lines)["mips"].split()[2]) == pytest.approx(
+        measured.mips.max(), rel=1e-3
+    )
 
 
 def test_a_missing_pandas_gives_the_install_command(surface, solved, monkeypatch):

@@ -1,4 +1,7 @@
-"""Tests share the code in `shared`: they import no other test and no private names, and use no file outside."""
+"""Tests share the code in `shared`: they import no other test and no private names, and use no file outside.
+
+No file is too long to read at once.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent
 MODULES = sorted(FOLDER.rglob("*.py"))
 TESTS = {path.stem for path in FOLDER.rglob("test_*.py")}
+MAX_LINES = 450
 # Methods of `namedtuple` have an underscore to be no fields, and notebooks' methods by convention: none is private.
 PUBLIC = {"_replace", "_asdict", "_fields", "_make", "_repr_html_", "_repr_png_"}
 
@@ -53,6 +57,11 @@ def private_names(tree):
         if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("setattr", "getattr", "delattr"):
             words = [a.value for a in node.args[:2] if isinstance(a, ast.Constant) and isinstance(a.value, str)]
             yield from (part for word in words for part in word.split(".") if private(part))
+
+
+def test_no_file_is_long():
+    lines = {path.name: path.read_text(encoding="utf-8").count("\n") for path in MODULES}
+    assert not {name: count for name, count in lines.items() if count > MAX_LINES}, "split it by behaviour"
 
 
 @pytest.mark.slow

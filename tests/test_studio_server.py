@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import http.client
 import socket
 import sys
 import threading
@@ -18,80 +17,13 @@ import pytest
 pytest.importorskip("websockets", reason="the extra studio is not installed")
 
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
 
-from quasiharmonic.surfaces import cat
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.studio.assets import assets, bundle
 from quasiharmonic.ui.studio.protocol import decode, encode
 from quasiharmonic.ui.studio.server import page_worker
 from quasiharmonic.ui.studio.server import server as served
-
-
-class Running:
-    """Run a server in a thread."""
-
-    def __init__(self, source):
-        self.source = source
-
-    def __enter__(self):
-        self.studio = served.Studio(self.source)
-        ready = threading.Event()
-        self.loop = asyncio.new_event_loop()
-        self.task = self.loop.create_task(self.studio.run(0, lambda address: ready.set()))
-        self.thread = threading.Thread(target=self._run)
-        self.thread.start()
-        assert ready.wait(30)
-        return self
-
-    def _run(self):
-        with contextlib.suppress(asyncio.CancelledError):
-            self.loop.run_until_complete(self.task)
-        self.loop.close()
-
-    def __exit__(self, *error):
-        self.loop.call_soon_threadsafe(self.task.cancel)
-        self.thread.join(30)
-
-    def get(self, path, **headers):
-        """Return status, headers and content of a response."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.studio.port, timeout=10)
-        connection.putrequest("GET", path, skip_host="Host" in headers)
-        for name, value in headers.items():
-            connection.putheader(name, value)
-        connection.endheaders()
-        answer = connection.getresponse()
-        content = answer.read()
-        connection.close()
-        return answer.status, dict(answer.getheaders()), content
-
-    def page(self, **options):
-        """Open a socket as the page's own script does."""
-        at = f"127.0.0.1:{self.studio.port}"
-        options = {"origin": f"http://{at}", "token": self.studio.token, "max_size": None, **options}
-        return connect(f"ws://{at}/{options.pop('token')}/socket", compression=None, **options)
-
-
-def hear(socket, kind, *, state=None, seconds=60):
-    """Return the next frame of a kind."""
-    until = time.monotonic() + seconds
-    while True:
-        frame = decode(socket.recv(timeout=until - time.monotonic()))
-        if frame.header["kind"] == kind and state in (None, frame.header.get("state")):
-            return frame
-
-
-@pytest.fixture(scope="module")
-def running(tmp_path_factory):
-    """A server of a small surface, which takes few bytes."""
-    source = tmp_path_factory.mktemp("studio") / "small.obj"
-    V, F = cat(8)
-    lines = [*(f"v {x!r} {y!r} {z!r}" for x, y, z in V.tolist()), *(f"f {a} {b} {c}" for a, b, c in (F + 1).tolist())]
-    source.write_text("\n".join(lines) + "\n")
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(served, "MAX_BYTES", 4 << 20)
-        with Running(str(source)) as server:
-            yield server
+from shared.studio_server import Running, children, hear, nobody_is_left
 
 
 def test_files_are_served_only_with_the_token(running):
@@ -153,24 +85,6 @@ def test_pages_are_independent_and_a_crash_ends_only_its_page(running):
         other.send(encode({"do": "outline", "to": "disk"}))
         assert hear(other, "map", state="settled").header["injective"]
     nobody_is_left()
-
-
-def children():
-    """Return processes of pages."""
-    found = []
-    for process in psutil.Process().children():
-        with contextlib.suppress(psutil.Error):
-            if "quasiharmonic.ui.studio.server.page_worker" in " ".join(process.cmdline()):
-                found.append(process)
-    return found
-
-
-def nobody_is_left():
-    """Wait until no page process is left."""
-    until = time.monotonic() + 20
-    while children() and time.monotonic() < until:
-        time.sleep(0.05)
-    assert children() == []
 
 
 def test_a_socket_closed_during_a_drag_leaves_no_process(running):
@@ -368,135 +282,3 @@ def test_a_process_reads_no_more_than_its_queue_holds(monkeypatch):
         # Three wait, and the next is being read.
         assert source.messages <= taken + 4
     assert inbox.waiting()
-
-
-# --- malformed requests ----------------------------------------------------------------------------------------------
-
-UPGRADE = (
-    b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
-    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
-)
-SOCKET = b"GET /TOKEN/socket HTTP/1.1\r\nHOSTORIGIN" + UPGRADE + b"\r\n"
-# HOST, ORIGIN and TOKEN represent the values of the server's own page; None means a closed connection.
-MALFORMED = {
-    "brackets": (b"GET //[x HTTP/1.1\r\nHOST\r\n", 403),
-    "brackets around the token": (b"GET //[TOKEN/ HTTP/1.1\r\nHOST\r\n", 403),
-    "a bracket behind the token": (b"GET /TOKEN/[ HTTP/1.1\r\nHOST\r\n", 404),
-    "an address": (b"GET http://[x/ HTTP/1.1\r\nHOST\r\n", 400),
-    "a star": (b"GET * HTTP/1.1\r\nHOST\r\n", 400),
-    "an empty path": (b"GET  HTTP/1.1\r\nHOST\r\n", 400),
-    "NUL": (b"GET /TOKEN/\0 HTTP/1.1\r\nHOST\r\n", 404),
-    "NUL for a token": (b"GET /\0/ HTTP/1.1\r\nHOST\r\n", 403),
-    "percent": (b"GET /TOKEN/%zz%00%ff HTTP/1.1\r\nHOST\r\n", 404),
-    "a long path": (b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\nHOST\r\n", (414, None)),
-    "a long header": (b"GET / HTTP/1.1\r\nHOSTX: " + b"a" * 100_000 + b"\r\n\r\n", (431, None)),
-    "many headers": (b"GET / HTTP/1.1\r\nHOST" + b"X: a\r\n" * 2000 + b"\r\n", (431, None)),
-    "no host": (b"GET / HTTP/1.1\r\n\r\n", 421),
-    "two hosts": (b"GET / HTTP/1.1\r\nHOSTHOST\r\n", 421),
-    "a host in UTF-8": (b"GET / HTTP/1.1\r\nHost: \xc3\xa9\r\n\r\n", 421),
-    "a header in UTF-8": (b"GET / HTTP/1.1\r\nHOSTX: \xc3\xa9\r\n\r\n", 403),
-    "POST": (b"POST /TOKEN/ HTTP/1.1\r\nHOST\r\n", (405, None)),
-    "PUT for a socket": (SOCKET.replace(b"GET", b"PUT"), (405, None)),
-    "no upgrade": (b"GET /TOKEN/socket HTTP/1.1\r\nHOSTORIGIN\r\n", 426),
-    "a key in UTF-8": (SOCKET.replace(b"dGh", b"\xff\xff\xff"), 400),
-    "a short key": (SOCKET.replace(b"dGhl", b""), 400),
-    "another version": (SOCKET.replace(b": 13", b": 99"), 400),
-    "an origin in UTF-8": (SOCKET.replace(b"ORIGIN", b"Origin: \xc3\xa9\r\n"), 403),
-    "a path in UTF-8": (b"GET /\xc3\xa9 HTTP/1.1\r\nHOST\r\n", (400, None)),
-    "a host with NUL": (b"GET / HTTP/1.1\r\nHost: \0\r\n\r\n", None),
-    "no header": (b"GET / HTTP/1.1\r\nHOSTnonsense\r\n\r\n", None),
-    "a body": (b"GET /TOKEN/ HTTP/1.1\r\nHOSTContent-Length: 3\r\n\r\nabc", None),
-    "HTTP/2": (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", None),
-    "TLS": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n", None),
-    "half a line": (b"GET / HT", None),
-    "nothing": (b"", None),
-}
-
-
-@pytest.mark.parametrize("name", MALFORMED)
-def test_a_malformed_request_gets_an_error_and_prints_nothing(running, capfd, name):
-    request, expected = MALFORMED[name]
-    port = running.studio.port
-    request = request.replace(b"HOST", b"Host: 127.0.0.1:%d\r\n" % port).replace(
-        b"TOKEN", running.studio.token.encode()
-    )
-    request = request.replace(b"ORIGIN", b"Origin: http://127.0.0.1:%d\r\n" % port)
-    answer = b""
-    with socket.create_connection(("127.0.0.1", port), timeout=10) as raw, contextlib.suppress(ConnectionError):
-        # The server may close the connection before it has read the whole request.
-        raw.sendall(request)
-        if not request.endswith(b"\n"):
-            raw.shutdown(socket.SHUT_WR)
-        while part := raw.recv(1 << 16):
-            answer += part
-    status = int(answer.split()[1]) if answer else None
-    assert status in (expected if isinstance(expected, tuple) else (expected,))
-    assert running.get(f"/{running.studio.token}/")[0] == 200
-    assert capfd.readouterr().err == ""
-
-
-def test_an_internal_error_of_the_server_is_logged(running, monkeypatch, caplog):
-    def broken():
-        raise ZeroDivisionError("a defect")
-
-    monkeypatch.setattr(served, "assets", broken)
-    assert running.get(f"/{running.studio.token}/")[0] == 500
-    until = time.monotonic() + 5
-    while "a defect" not in caplog.text and time.monotonic() < until:
-        time.sleep(0.01)
-    assert "a defect" in caplog.text
-
-
-def test_a_session_continues_after_a_reload_and_after_a_crash(running):
-    name = "0123456789abcdef" * 2
-    with session_page(running, name) as page:
-        hear(page, "map", state="settled")
-        page.send(encode({"do": "outline", "to": "disk"}))
-        shown = hear(page, "map", state="settled")
-        hear(page, "obstructions")
-        page.send(encode({"do": "stop"}))
-        hear(page, "obstructions")
-    with session_page(running, name) as page:
-        again = hear(page, "map", state="settled")
-        assert again.header["outline"] == "disk"
-        assert again.header["undo"]
-        assert np.array_equal(again.arrays["places"], shown.arrays["places"])
-        for process in children():
-            process.kill()
-        assert hear(page, "note").header["level"] == "gone"
-    with session_page(running, name) as page:
-        assert hear(page, "map", state="settled").header["outline"] == "disk"
-        page.send(encode({"do": "undo"}))
-        assert hear(page, "map", state="settled").header["outline"] == "rect:1x1"
-    nobody_is_left()
-
-
-def test_a_session_opened_elsewhere_ends_here(running):
-    name = "f" * 32
-    with session_page(running, name) as one:
-        hear(one, "map", state="settled")
-        with session_page(running, name) as other:
-            hear(other, "map", state="settled")
-            with pytest.raises(ConnectionClosed) as closed:
-                hear(one, "never")
-            assert closed.value.rcvd.code == served.ELSEWHERE
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["../../etc", *(pytest.param(name, marks=pytest.mark.slow) for name in ("A" * 32, "0" * 31, "0" * 64, "%2e%2e"))],
-)
-def test_names_of_sessions_are_not_paths(running, name):
-    with session_page(running, name) as one:
-        assert hear(one, "map", state="settled").header["injective"]
-        # A second page with this name does not take over a session of the first.
-        with session_page(running, name) as other:
-            hear(other, "map", state="settled")
-            assert one.ping().wait(60)
-
-
-def session_page(running, name):
-    """Open a socket with the name of a session, as a page does after a reload."""
-    at = f"127.0.0.1:{running.studio.port}"
-    address = f"ws://{at}/{running.studio.token}/socket?session={name}"
-    return connect(address, compression=None, origin=f"http://{at}", max_size=None)

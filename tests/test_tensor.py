@@ -7,7 +7,14 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from quasiharmonic.solver.field.tensor import PARAMETERISATIONS, SI_LOG, TANH, own_tensor
+from quasiharmonic.solver.field.tensor import (
+    PARAMETERISATIONS,
+    SI_LOG,
+    TANH,
+    beltrami_coefficients,
+    own_tensor,
+    parameterisation_of,
+)
 
 BOTH = list(PARAMETERISATIONS.values())
 
@@ -90,8 +97,42 @@ def test_determinant_defect_keeps_its_digits_where_mu_rounds_to_one():
     field = TANH.field(np.array([9.0 + 0j]))
     assert field.defect[0] == pytest.approx(1 / np.cosh(9.0) ** 2, rel=1e-13)
     assert SI_LOG.field(np.array([1e90 + 0j])).defect[0] > 0
+    assert TANH.field(np.array([1e3 + 0j])).defect[0] == 0
 
 
 def test_an_almost_zero_derivative_causes_no_division_by_zero():
     p, q = np.array([[5e-324, 1e-310j, 1e-300, 2.0, 0], [5e-324, 1e-309, 5e-301, 1j, 0]], dtype=complex)
     np.testing.assert_allclose(own_tensor(p, q), [0, 0, 0.5, 0.5j, 0])
+    # The smallest normal number is large enough.
+    assert own_tensor(np.array([2.0**-1022 + 0j]), np.array([2.0**-1023 + 0j])) == [0.5]
+
+
+def test_a_part_of_a_field():
+    xi = np.arange(6) + 1j
+    for parameterisation in BOTH:
+        field = parameterisation.field(xi)
+        np.testing.assert_array_equal(field[2:5].mu, field.mu[2:5])
+        assert parameterisation_of(parameterisation.number) is parameterisation
+
+
+def test_beltrami_coefficients_are_converted():
+    for given, expected in ((None, [0, 0]), ([0, 0.5], [0, 0.5]), (np.array([0.3j, -0.9]), [0.3j, -0.9])):
+        found = beltrami_coefficients(given, 2)
+        assert found.dtype == np.complex128
+        assert found.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("mu", "words"),
+    [
+        ([0.5], "mu must contain 2 numbers, one for each triangle, not an array of \\(1,\\)"),
+        ([[0.5, 0]], "mu must contain 2 numbers"),
+        (["a", "b"], "mu must contain 2 numbers"),
+        ([True, False], "mu must contain 2 numbers"),
+        ([0.5, 1j], "mu is not below 1 in modulus at triangle 1$"),
+        ([np.nan, -1], "mu is not below 1 in modulus at triangles 0, 1$"),
+    ],
+)
+def test_wrong_beltrami_coefficients_are_named(mu, words):
+    with pytest.raises(ValueError, match=words):
+        beltrami_coefficients(mu, 2)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic import io
+from quasiharmonic import boundary_loops, io
 from quasiharmonic.surfaces import cat
 from quasiharmonic.ui.studio.protocol import Frame, decode, encode
 from quasiharmonic.ui.studio.session.session import Session
@@ -62,3 +62,9 @@ class Visitor:
         """The saved files, by name."""
         frames = [frame for frame in self.does("save") if frame.header["kind"] == "file"]
         return {frame.header["name"]: frame.arrays["content"].tobytes() for frame in frames}
+
+
+def boundary(V: np.ndarray, F: np.ndarray) -> np.ndarray:
+    """The boundary loop of a disk."""
+    (loop,) = boundary_loops(F, len(V))
+    return loop

@@ -151,7 +151,7 @@ class Certificate(ReadOnly, Displayable):
         bad = self.inverted.size + self.degenerate.size + self.nonfinite.size
         triangles = count_of("triangle", "triangles", self.triangles)
         if bad or not self.triangles:
-            return f"not injective, {bad:,} of {triangles} not positive"
+            return f"not injective, {bad} of {triangles} not positive"
         also = {True: " and bijective", False: ", not bijective", None: ""}[self.bijective]
         return f"injective{also}, {triangles}"
 

@@ -1,0 +1,125 @@
+"""``qhm polish`` and ``qhm harmonise``."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from quasiharmonic import distortion, io
+from shared.commands import run, write_input
+from shared.solvable_problems import star_problem
+
+
+class TestPolish:
+    def test_a_few_steps_by_default(self, star, tmp_path, monkeypatch):
+        facts, maps = {}, {}
+        for name, options in {"unasked": [], "none": ["--no-polish"], "asked": ["--polish", "blend"]}.items():
+            out, report = tmp_path / f"{name}.obj", tmp_path / f"{name}.json"
+            assert run("map", star, "-o", out, "--json", report, *options) == 0
+            facts[name], maps[name] = json.loads(report.read_text()), io.map_of(io.read_mesh(out))
+        assert [stage["name"] for stage in facts["unasked"]["stages"]][-1] == "polish, blend"
+        assert len(facts["none"]["stages"]) == len(facts["unasked"]["stages"]) - 1
+        assert facts["none"]["status"] == facts["unasked"]["status"] == "injective"
+        assert facts["asked"]["status"] == "polished"
+        V, F, _, _ = star_problem()
+        worst = {name: distortion(V, F, uv).statistics("isometric").maximum for name, uv in maps.items()}
+        assert worst["unasked"] < 0.9 * worst["none"]
+        # Maps of large meshes are not polished by default.
+        monkeypatch.setattr("quasiharmonic.energies.polishing.LARGEST_SMOOTHED", 100)
+        assert run("map", star, "-o", tmp_path / "large.obj") == 0
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "large.obj")), maps["none"])
+
+    def test_not_by_default_where_distortion_is_undefined(self, tmp_path):
+        V, F, fixed, target = star_problem(n=120)
+        V = np.asarray(V, dtype=float).copy()
+        inner = next(t for t in range(len(F)) if not np.isin(F[t], fixed).any())
+        V[F[inner, 0]] = V[F[inner, 1]]
+        problem = write_input(tmp_path, V, F, fixed, target)
+        arguments = "--reference", "equilateral", "--json", tmp_path / "r.json"
+        assert run("map", problem, "-o", tmp_path / "o.obj", *arguments) == 0
+        assert "polish" not in json.loads((tmp_path / "r.json").read_text())["stages"][-1]["name"]
+
+    def test_not_with_and_without_polish(self, star, tmp_path, capsys):
+        with pytest.raises(SystemExit):
+            run("map", star, "-o", tmp_path / "o.obj", "--polish", "mips", "--no-polish")
+        assert "not allowed" in capsys.readouterr().err
+
+    def test_lowers_distortion_and_stays_certified(self, star, tmp_path, capsys):
+        first, polished = tmp_path / "first.obj", tmp_path / "polished.obj"
+        assert run("map", star, "-o", first, "--no-polish") == 0
+        assert run("polish", first, "-o", polished, "--energy", "mips", "--json", tmp_path / "r.json") == 0
+        facts = json.loads((tmp_path / "r.json").read_text())
+        before, after = (facts[name]["mips"]["mean"] for name in ("distortion_before", "distortion"))
+        assert after < before
+        assert f"MIPS from {before:.3g} to {after:.3g} on average" in capsys.readouterr().out
+        assert run("check", polished) == 0
+        both = tmp_path / "both.obj"
+        assert run("map", star, "-o", both, "--polish", "mips") == 0
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(both)), io.map_of(io.read_mesh(polished)))
+
+    def test_rejects_a_map_with_inverted_triangles(self, star, tmp_path, capsys):
+        assert run("polish", star, "-o", tmp_path / "o.obj") == 2
+        assert "injective" in capsys.readouterr().err
+        assert not (tmp_path / "o.obj").exists()
+
+    def test_energy_names_are_those_of_the_library(self):
+        from quasiharmonic import linsolve
+        from quasiharmonic.energies.polishing import ENERGIES
+        from quasiharmonic.solver.search import harmonising, strategy
+        from quasiharmonic.ui.cli import arguments
+
+        assert tuple(strategy.STRATEGIES) == arguments.STRATEGIES
+        assert set(arguments.ENERGIES) == set(ENERGIES)
+        assert set(arguments.HARMONISED) == set(harmonising.ENERGIES)
+        assert set(arguments.LINEAR_SOLVERS) - {"auto"} == set(linsolve.BACKENDS)
+
+
+class TestHarmonise:
+    @pytest.mark.parametrize("energy", ["arap", "mips"])
+    def test_lowers_distortion_and_stays_certified(self, star, tmp_path, energy):
+        first, out, report = tmp_path / "first.obj", tmp_path / "out.obj", tmp_path / "r.json"
+        assert run("map", star, "-o", first, "--no-polish") == 0
+        assert run("harmonise", first, "-o", out, "--energy", energy, "--json", report) == 0
+        facts = json.loads(report.read_text())
+        assert facts["distortion"][energy]["mean"] < facts["distortion_before"][energy]["mean"]
+        assert facts["injective"]
+        assert run("check", out) == 0
+        _, _, fixed, target = star_problem()
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(out))[fixed], target)
+
+    def test_options_reach_the_solver(self, star, tmp_path):
+        first, report = tmp_path / "first.obj", tmp_path / "r.json"
+        assert run("map", star, "-o", first) == 0
+        arguments = "--eta", 0.5, 0.25, "--max-iterations", 6, "--linear-solver", "superlu", "--json", report
+        assert run("harmonise", first, "-o", tmp_path / "o.obj", "--energy", "springs", *arguments) == 0
+        facts = json.loads(report.read_text())
+        assert [s["name"] for s in facts["stages"][:2]] == [f"harmonise, springs, η = {eta}" for eta in (0.5, 0.25)]
+        assert all(s["n_iterations"] <= 6 for s in facts["stages"][:2])
+        assert facts["linear_solver"] == "superlu"
+        # The map does not have the size of its surface.
+        assert run("harmonise", first, "-o", tmp_path / "o.obj", "--energy", "springs", "--unscaled", *arguments) == 0
+        unscaled = json.loads(report.read_text())
+        assert unscaled["stages"][0]["energy"] != facts["stages"][0]["energy"]
+
+    def test_rejects_maps_it_cannot_start_from(self, star, tmp_path, capsys):
+        assert run("harmonise", star, "-o", tmp_path / "o.obj", "--energy", "mips") == 2
+        assert "injective" in capsys.readouterr().err
+        assert run("harmonise", star, "-o", tmp_path / "o.obj", "--eta", "-1") == 2
+        assert "eta must be a positive number" in capsys.readouterr().err
+        assert not (tmp_path / "o.obj").exists()
+
+    @pytest.mark.parametrize("command", ["polish", "harmonise"])
+    def test_rejects_flat_rest_triangles(self, star, tmp_path, capsys, command):
+        """The message does not advise options that the command does not have."""
+        first = tmp_path / "first.obj"
+        assert run("map", star, "-o", first) == 0
+        mesh = io.read_mesh(first)
+        mesh.V[mesh.F[5, 0]] = mesh.V[mesh.F[5, 1]]
+        io.write_obj(first, mesh)
+        capsys.readouterr()
+        assert run(command, first, "-o", tmp_path / "o.obj") == 2
+        error = capsys.readouterr().err
+        assert "of zero area in the rest mesh: distortion is undefined there" in error
+        assert "reference" not in error

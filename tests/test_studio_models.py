@@ -1,0 +1,193 @@
+"""Models that a studio page opens: parts, holes, closed surfaces, images, and invalid files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import io
+from quasiharmonic.surfaces import annulus, cat, grid, starfish
+from quasiharmonic.ui.studio.session.setup import make_first_state
+from quasiharmonic.ui.studio.session.surface import MAX_TRIANGLES, make_sheet
+from shared.pages import Visitor
+
+
+def test_holes_closed_surfaces_and_planes_are_accepted():
+    ring = Visitor(*annulus(8))
+    assert ring.last("map").header["bijective"]
+    assert ring.last("surface").header["loops"] == [32, 16]
+    ring.does("outline", to="ring:0.5")
+    assert ring.last("map").header["bijective"]
+    assert ring.session.state.active.outline.to == "ring:0.5"
+    star = make_first_state(make_sheet(io.MeshData(*starfish(3, 8), source="star.obj"), "star.obj"))
+    assert len(star.islands) == 1
+    assert len(star.active.island.F) == 12 * 64
+    assert star.result.certificate.bijective
+    assert star.recipe.command == "qhm flatten star.obj --cut -o flat.obj"
+
+
+def test_a_boundary_of_three_vertices_opens(visitor):
+    """It has no map to a square, whose corners need four."""
+    content = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv .2 .2 1\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name="tent.obj")
+    assert visitor.session.state.sheet.name == "tent.obj"
+    assert visitor.session.state.result.certificate.bijective
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("notes.txt", b"hello", ".txt files cannot be read as a surface"),
+        ("a.obj", b"v 0 0 0\nf 1 2 3\n", "a.obj"),
+        ("a.obj", b"\x00\xff" * 50, "a.obj"),
+        ("a.ply", b"ply\nformat", "a.ply"),
+        ("a.glb", b"glTF", "a.glb"),
+        ("../../etc/passwd", b"", "passwd: has no suffix"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a.obj"),
+    ],
+)
+def test_invalid_meshes_are_rejected_with_a_message_about_the_users_file(name, content, says, visitor):
+    before = visitor.session.state
+    # The reason comes last, because a surface hides what was said before.
+    text = visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name=name)[-1].header["text"]
+    assert says in text
+    assert "/tmp" not in text
+    assert "dropped" not in text
+    assert visitor.session.state is before
+
+
+def test_too_many_triangles_are_rejected():
+    V, F = grid(4, 4)
+    many = np.broadcast_to(F[:1], (MAX_TRIANGLES + 1, 3))
+    with pytest.raises(ValueError, match=r"1,000,001 triangles, but the page shows at most 1,000,000"):
+        make_sheet(io.MeshData(V, many, source="big.obj"), "big.obj")
+
+
+def test_several_parts_are_shown_together_and_changed_one_by_one():
+    (V, F), (W, G) = cat(6), cat(5)
+    one = Visitor(np.concatenate([V, W + 3]), np.concatenate([F, G + len(V)]))
+    surface, shown = one.last("surface"), one.last("map").header
+    assert surface.header["triangles"] == len(F) + len(G)
+    assert surface.header["first_triangles"] == [0, len(F)]
+    first = surface.header["starts"][1]
+    assert shown["count"] == 2
+    assert shown["bijective"]
+    before = one.session.state.uv
+    one.does("select", islands=[1])
+    assert one.last("map").header["selected"] == [1]
+    one.does("outline", to="rect:1x1")
+    after = one.session.state.uv
+    assert np.array_equal(before[:first], after[:first])
+    assert not np.array_equal(before[first:], after[first:])
+    assert "--islands 1" in one.last("map").header["command"]
+    # A drag sends the positions of its island alone.
+    corner = one.session.state.corners[0]
+    moved = one.drags(corner, (after[corner] + 0.01).tolist())[0]
+    assert moved.header["start"] == first
+    assert len(moved.arrays["places"]) == len(before) - first
+    one.does("pack")
+    assert one.last("map").header["overlapping"] == 0
+    assert one.last("map").header["bijective"]
+    assert 0.3 < one.last("map").header["used"] < 1
+
+
+def test_overlapping_islands_are_reported():
+    (V, F), (W, G) = cat(6), cat(5)
+    one = Visitor(np.concatenate([V, W + 3]), np.concatenate([F, G + len(V)]))
+    one.does("select", islands=[0])
+    one.does("outline", to="disk")
+    one.does("select", islands=[1])
+    one.does("outline", to="disk")
+    shown = one.last("map").header
+    assert (shown["injective"], shown["bijective"], shown["overlapping"]) == (True, False, 1)
+    assert "1 pair overlaps" in shown["verdict"]
+
+
+def test_seams_have_one_number_on_both_sides():
+    one = Visitor(*starfish(3, 8))
+    seams = one.last("seams")
+    edges, chain = seams.arrays["edges"], seams.arrays["chain"]
+    origin = one.session.state.numbering.origin
+    pairs = np.sort(origin[edges], axis=1)
+    found, times = np.unique(pairs, axis=0, return_counts=True)
+    assert np.array_equal(found, one.session.state.mesh.seams)
+    assert (times == 2).all()
+    for pair in found:
+        assert len(set(chain[(pairs == pair).all(axis=1)].tolist())) == 1
+    assert seams.header["chains"] > 1
+
+
+def test_seams_are_drawn_along_the_shortest_path_and_erased():
+    one = Visitor(*cat(8))
+    V = one.session.state.numbering.V
+    start, end = int(np.argmin(V[:, 0])), int(np.argmax(V[:, 0]))
+    one.does("seam", start=start, vertex=end)
+    drawn = one.session.state.drawn
+    length = np.linalg.norm(V[drawn[:, 0]] - V[drawn[:, 1]], axis=1).sum()
+    assert np.linalg.norm(V[start] - V[end]) <= length < 1.5 * np.linalg.norm(V[start] - V[end])
+    assert one.last("map").header["drawn"]
+    (note,) = [frame for frame in one.does("polish", energy="mips", slide=False) if frame.header["kind"] == "note"]
+    assert "press Unwrap or Flatten" in note.header["text"]
+    one.does("flatten")
+    assert one.last("map").header["count"] == 2
+    assert one.last("map").header["bijective"]
+    one.does("erase", vertex=start)
+    one.does("flatten")
+    assert one.last("map").header["count"] == 1
+
+
+def test_a_model_that_is_inside_out_is_recognised_and_turned():
+    V, F = starfish(3, 8)
+    one = Visitor(V, F[:, ::-1])
+    shown = one.last("map").header
+    assert (shown["inward"], shown["injective"]) == (1, True)
+    one.does("turn")
+    shown = one.last("map").header
+    assert (shown["inward"], shown["turned"], shown["bijective"]) == (0, True, True)
+    one.does("undo")
+    assert one.last("map").header["inward"] == 1
+
+
+def test_the_surface_is_shown_before_its_map_and_every_step_reports_progress():
+    one = Visitor(*starfish(3, 8))
+    kinds = [frame.header["kind"] for frame in one.frames]
+    assert kinds[:2] == ["surface", "busy"]
+    assert "progress" in kinds[: kinds.index("map")]
+    for what in ("unwrap", "flatten"):
+        answered = one.does(what)
+        assert answered[0].header["kind"] == "busy"
+        assert any(frame.header["kind"] == "progress" for frame in answered)
+    phases = {frame.header.get("phase") for frame in one.frames if frame.header["kind"] == "progress"}
+    assert {"clean", "cut", "pack", "certify"} <= phases
+
+
+def test_a_large_model_that_must_be_cut_opens_without_a_map(monkeypatch):
+    monkeypatch.setattr("quasiharmonic.ui.studio.session.setup.MAX_AUTOMATIC", 100)
+    one = Visitor(*starfish(3, 8))
+    shown = one.last("map")
+    assert not shown.header["mapped"]
+    assert "places" not in shown.arrays
+    for what, words in (("polish", {"energy": "mips"}), ("pack", {}), ("save", {}), ("grab", {"vertex": 0})):
+        (note,) = [frame for frame in one.does(what, **words) if frame.header["kind"] == "note"]
+        assert "press Unwrap" in note.header["text"]
+    one.does("unwrap", resolution=512)
+    assert one.last("map").header["bijective"]
+    one.does("undo")
+    assert not one.last("map").header["mapped"]
+
+
+def test_an_image_is_shown_and_saved_with_the_map(tmp_path):
+    one = Visitor(*cat(6))
+    (note,) = one.does("image", {"content": np.frombuffer(b"no image", np.uint8)})
+    assert "PNG or JPEG" in note.header["text"]
+    picture = io.checkerboard().data
+    (shown,) = one.does("image", {"content": np.frombuffer(picture, np.uint8)})
+    assert (shown.header["kind"], shown.header["type"]) == ("image", "image/png")
+    for form in ("glb", "obj"):
+        for frame in one.does("save", format=form):
+            if frame.header["kind"] == "file":
+                (tmp_path / frame.header["name"]).write_bytes(frame.arrays["content"].tobytes())
+    for name in ("map.glb", "map.obj"):
+        assert io.own_texture(io.read_mesh(tmp_path / name)).data == picture
+    # The model's own image is shown when it is opened.
+    assert Visitor(tmp_path / "map.glb").last("image").arrays["content"].tobytes() == picture
