@@ -48,8 +48,12 @@ class TestRepair:
         result = repair(lift(V), F, start, fixed=pushed)
         assert result.injective, "the vertices around it move in its place"
         assert np.array_equal(result.uv[pushed], start[pushed])
-        for wrong in ([400], [-1], [[0]]):
-            with pytest.raises(ValueError, match="fixed must"):
+        for wrong, message in (
+            ([400], "fixed refers to vertex 400"),
+            ([-1], "fixed refers to vertex -1"),
+            ([[0]], "fixed must have shape"),
+        ):
+            with pytest.raises(ValueError, match=message):
                 repair(V, F, start, fixed=wrong)
 
     @pytest.mark.parametrize(("count", "scale"), [(1, 0.4), (12, 0.05), (12, 0.4), (120, 0.05)])

@@ -27,8 +27,8 @@ from quasiharmonic.util.arrays import (
     check_callback,
     check_integer,
     count_of,
-    index_array,
     names_of,
+    vertex_indices,
 )
 from quasiharmonic.util.outcome import Outcome
 from quasiharmonic.util.progress import reports_progress
@@ -242,7 +242,7 @@ def repair(
     check_bool("unmirror", unmirror)
     check_callback(callback)
     mesh = SeamedMesh(V, F, FT, uv)
-    held = _check_fixed(fixed, len(mesh.V))
+    held = vertex_indices("fixed", () if fixed is None else fixed, len(mesh.V))
     done = []
     for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         if mirrored:
@@ -278,18 +278,6 @@ def repair(
     repaired = mesh.with_places([new for new, _ in done])
     assert repaired.uv is not None
     return RepairResult(repaired.uv, repaired.FT, tuple(report for _, report in done))
-
-
-def _check_fixed(fixed: ArrayLike | None, n: int) -> IntArray:
-    """Return further fixed vertices as an array; ValueError if they are not indices of ``n`` vertices."""
-    if fixed is None:
-        return np.empty(0, dtype=np.int64)
-    held = index_array("fixed", fixed)
-    if held.ndim != 1:
-        raise ValueError(f"fixed must have shape (k,), not {held.shape}")
-    if held.size and not 0 <= held.min() <= held.max() < n:
-        raise ValueError(f"fixed must contain indices of the {n} vertices, from 0 to {n - 1}")
-    return held
 
 
 def _report_mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:
