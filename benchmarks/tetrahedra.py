@@ -135,17 +135,22 @@ def run_gmsh(options: argparse.Namespace) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (_LIMIT, _LIMIT))
     with np.load(options.output) as given:
         T, X = given["T"], given["X"]
+    F = certify_tetrahedra(T, X, boundary=False).boundary
+    # The untangler mixes up nodes unless those of the boundary come first and all are used.
+    boundary = np.unique(F)
+    order = np.concatenate([boundary, np.setdiff1d(np.unique(T), boundary)])
+    number = np.empty(len(X), dtype=np.int64)
+    number[order] = np.arange(1, len(order) + 1)
     gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
     tag, wall = gmsh.model.addDiscreteEntity(3), gmsh.model.addDiscreteEntity(2)
-    gmsh.model.mesh.addNodes(3, tag, np.arange(1, len(X) + 1), X.ravel())
-    F = certify_tetrahedra(T, X, boundary=False).boundary
-    gmsh.model.mesh.addElementsByType(wall, 2, [], (F + 1).ravel())
-    gmsh.model.mesh.addElementsByType(tag, 4, [], (T + 1).ravel())
+    gmsh.model.mesh.addNodes(3, tag, np.arange(1, len(order) + 1), X[order].ravel())
+    gmsh.model.mesh.addElementsByType(wall, 2, [], number[F].ravel())
+    gmsh.model.mesh.addElementsByType(tag, 4, [], number[T].ravel())
     gmsh.model.mesh.reclassifyNodes()
     gmsh.model.mesh.optimize("UntangleMeshGeometry", force=True)
     tags, found, _ = gmsh.model.mesh.getNodes()
-    X[np.asarray(tags, dtype=np.int64) - 1] = found.reshape(-1, 3)
+    X[order[np.asarray(tags, dtype=np.int64) - 1]] = found.reshape(-1, 3)
     gmsh.finalize()
     np.savez(options.output, X=X)
 
