@@ -79,7 +79,7 @@ def test_polygons(kind, seed):
 
 
 @pytest.mark.slow
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(KINDS))
 def test_any_polygon(seed, kind):
     problem = onto_polygon(seed, kind)
@@ -88,7 +88,7 @@ def test_any_polygon(seed, kind):
 
 
 @pytest.mark.parametrize(
-    ("holes", "pins"), [(1, 0), (0, 1), (0, 5), (3, 0), (2, 3), pytest.param(6, 6, marks=pytest.mark.slow)]
+    ("holes", "pins"), [(1, 0), (0, 1), (0, 5), (3, 0), (2, 3), pytest.param(6, 6, marks=pytest.mark.nightly)]
 )
 def test_holes_and_pins_at_any_position(holes, pins):
     problem = with_holes(np.random.default_rng(holes), holes, pins)

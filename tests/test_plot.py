@@ -367,7 +367,7 @@ def test_maps_and_triangles_that_do_not_match_are_rejected(planar, plot):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plot", [plot_map, plot_texture])
+@pytest.mark.parametrize("plot", [plot_map, pytest.param(plot_texture, marks=pytest.mark.nightly)])
 def test_pictures_do_not_depend_on_scale(planar, plot):
     V, F, folded = planar
     drawn = [plot(unit * V, F, unit * folded) for unit in (1, 1e-200, 1e200)]
