@@ -301,7 +301,9 @@ def test_animation(planar, tmp_path, suffix):
     save_animation(path, V, F, ((f"frame {k}", uv) for k, uv in enumerate([folded, V, V])), frames_per_second=10)
     if suffix == "gif":
         with Image.open(path) as image:
-            assert (image.n_frames, image.size) == (2, (600, 600)) or image.n_frames == 3
+            assert image.size == (600, 600)
+            # Pillow joins two equal frames.
+            assert image.n_frames in (2, 3)
             assert image.info["loop"] == 0
             assert red(np.asarray(image.convert("RGB")) / 255).sum() > 100
             image.seek(image.n_frames - 1)
