@@ -50,7 +50,7 @@ def test_simple_loops(number):
 
 
 @coordinates
-def test_contacts(number):
+def test_contacts_agree_with_exact_arithmetic(number):
     @given(
         st.lists(st.tuples(number, number), min_size=4, max_size=7),
         st.lists(st.tuples(st.integers(0, 3), st.integers(0, 6)), min_size=2, max_size=8),

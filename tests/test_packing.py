@@ -205,7 +205,7 @@ def test_nothing_to_pack():
         pytest.param(10_000, 20, marks=pytest.mark.nightly),
     ],
 )
-def test_time(count, seconds):
+def test_packing_time_is_limited(count, seconds):
     charts = grids(count)
     began = time.process_time()
     packing = pack_charts(charts, resolution=1024 if count < 10_000 else 2048, padding=4)

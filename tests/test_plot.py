@@ -385,7 +385,7 @@ def test_pictures_without_matplotlib(planar, monkeypatch):
         plot_map(V, F, V)
 
 
-def test_window(planar, tmp_path, monkeypatch):
+def test_a_window_shows_surface_and_map(planar, tmp_path, monkeypatch):
     polyscope = pytest.importorskip("polyscope")
     V, F, folded = planar
     monkeypatch.chdir(tmp_path)

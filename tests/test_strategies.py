@@ -275,7 +275,7 @@ class TestStrategy:
         with pytest.raises(ValueError, match=words):
             VectorAdam(**arguments)
 
-    def test_names(self):
+    def test_named_strategies_have_stages(self):
         problem = Problem(*star_problem(n=60))
         for name in STRATEGIES:
             assert all(isinstance(stage, SearchStage) for stage in stages_of(name, problem))
