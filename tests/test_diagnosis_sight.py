@@ -178,6 +178,7 @@ def test_winding_numbers(rng, monkeypatch, chunk):
         for k in np.flatnonzero(~on):
             assert turns[k] == winding_number(points[k], corners)
         assert len(turns) == m
+        assert turns.dtype == np.int64
 
 
 def test_the_number_of_contacts_is_limited(rng):
