@@ -309,7 +309,7 @@ class TestConvexity:
             ([(np.cos(a), np.sin(a)) for a in 4 * np.pi * np.arange(5) / 5], False),
         ],
     )
-    def test_rings(self, ring, convex):
+    def test_convex_rings_are_recognised(self, ring, convex):
         uv = np.array(ring, dtype=float)
         mesh = io.models.meshdata.polygon_mesh(
             np.column_stack([uv, np.zeros(len(uv))]), np.arange(len(uv)), np.array([0, len(uv)])

@@ -170,7 +170,7 @@ class TestJournal:
 
 
 class TestFinding:
-    def test_forms(self, tmp_path):
+    def test_archives_are_found_by_folder_and_pattern(self, tmp_path):
         for name in ("d/0.tar", "d/e/1.tar.gz", "d/out/results/2.tar", "8.tar", "9.tar"):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).write_bytes(b"")
@@ -296,7 +296,7 @@ class TestRun:
 
 
 class TestPlaces:
-    def test_attempts(self, monkeypatch):
+    def test_a_failed_read_is_tried_again(self, monkeypatch):
         fsspec = pytest.importorskip("fsspec")
         monkeypatch.setattr(places, "FIRST_PAUSE", 0.001)
         system = fsspec.filesystem("memory")

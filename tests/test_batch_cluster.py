@@ -53,7 +53,7 @@ def cluster(folder, workers, **environment):
 
 
 def test_a_worker_killed_during_a_problem(tmp_path):
-    source = write_stars(tmp_path / "set", [f"{i:02d}" for i in range(16)], rings=14)
+    source = write_stars(tmp_path / "set", [f"{i:02d}" for i in range(16)], rings=9)
     killed = []
     with cluster(tmp_path, 3) as (address, _, workers):
 

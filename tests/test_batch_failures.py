@@ -81,7 +81,7 @@ class TestTroubles:
         assert again.outcomes == {"injective": 2}
 
     @linux
-    def test_memory_hog(self, tmp_path, failing_worker, quick_workers):
+    def test_a_problem_beyond_the_memory_limit_is_recorded(self, tmp_path, failing_worker, quick_workers):
         source = write_stars(tmp_path / "set", ["a", "hog", "z"])
         progress = batch.run(source, tmp_path / "out", jobs=1, time_limit=60, memory_limit=400 << 20)
         assert progress.outcomes == {"injective": 2, "memory": 1}
@@ -89,7 +89,7 @@ class TestTroubles:
         assert record["error"] == "used more than 400 MiB of memory"
         assert 400 << 20 < record["peak_memory"] < 800 << 20
 
-    def test_real_limits(self, tmp_path):
+    def test_a_mesh_exceeds_the_limits_of_time_and_memory(self, tmp_path):
         """Real limits: a mesh exceeds the time limit, and then the memory limit."""
         source, out = tmp_path / "set", tmp_path / "out"
         write_problem(source / "small", *star_of(4))
@@ -104,7 +104,7 @@ class TestTroubles:
             assert (limited.outcomes, limited.resumed) == ({"memory": 1, "injective": 1}, 1)
         assert batch.run(source, out, jobs=1).outcomes == {"injective": 2}
 
-    def test_retry(self, tmp_path, quick_workers, monkeypatch):
+    def test_failed_problems_are_solved_again_on_request(self, tmp_path, quick_workers, monkeypatch):
         source = write_stars(tmp_path / "set", ["a", "killed", "bug"])
         (source / "a" / "handles.txt").write_text("not a number")
         monkeypatch.setattr(supervisor, "COMMAND", FAILING_WORKER)

@@ -86,7 +86,7 @@ class TestFinding:
         (stars / "b" / "up").symlink_to("..")
         assert names(stars) == ["a", "b/c", "b/d/e", "z"]
 
-    def test_lists(self, stars, tmp_path):
+    def test_lists_name_folders_and_meshes(self, stars, tmp_path):
         elsewhere = write_stars(tmp_path / "elsewhere", ["y"])
         text = f"# a list\n\nz # the last\nb\n{elsewhere}/y\nb/c\na/input.obj\n"
         (stars / "list.txt").write_text(text)

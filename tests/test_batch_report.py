@@ -72,7 +72,7 @@ def written(tmp_path, *arguments):
 
 
 class TestPage:
-    def test_numbers(self, tmp_path):
+    def test_the_page_states_the_numbers_of_the_records(self, tmp_path):
         rows = made(tmp_path)
         text = Reader(written(tmp_path, tmp_path / "t.csv")).text
         good = [row for row in rows if row["certified"]]

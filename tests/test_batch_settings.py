@@ -115,7 +115,7 @@ class TestSettings:
         assert batch.run(cats, tmp_path / "out", other, jobs=1).outcomes == {"bijective": 1}
         assert "guarded descent, distances" in record_of(tmp_path / "out", "cat.obj")["stages"]
 
-    def test_corners(self, tmp_path):
+    def test_corners_by_angle_and_by_position(self, tmp_path):
         """Corners by angle for any sheet, by position for aligned sheets; a file of corners is part of the input."""
         for name, cells in (("a", (9, 6)), ("b", (5, 8))):
             (tmp_path / "set").mkdir(exist_ok=True)
@@ -203,7 +203,7 @@ class TestSettings:
         written = io.read_mesh(tmp_path / "b" / "results" / "ears.obj" / "map.obj")
         np.testing.assert_array_equal(written.V[: len(V), :2], V)
 
-    def test_islands(self, tmp_path):
+    def test_islands_keep_their_borders(self, tmp_path):
         """Each island of a file with seams is mapped with its border kept; onto an outline, each fills its own copy."""
         V, F = grid(6, 4)
         left = V[F].mean(axis=1)[:, 0] < 0.5

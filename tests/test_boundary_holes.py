@@ -35,7 +35,7 @@ def octahedron():
         ("letter:8", [(-0.5, 0, 0.15), (0.5, 0, 0.15)]),
     ],
 )
-def test_holes(text, holes):
+def test_holes_go_to_the_holes_of_the_outline(text, holes):
     V, F = holed(250, *holes)
     contours = outline(text)
     fixed, target = boundary_to(V, F, contours)

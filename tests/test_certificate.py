@@ -255,3 +255,38 @@ def test_mirrored_map():
     c = certify(ring()[0], ring()[1] * [-1, 1])
     assert c.inverted.size == 24
     assert {Obstacle.WINDING, Obstacle.NESTING} <= kinds(c)
+
+
+def test_loops_inside_others_are_named_with_them():
+    inner = square(1, 1, 1)
+    c = certify(*together(square(0, 0, 3), inner, square(5, 0, 1)))
+    assert [(r.kind, r.loops) for r in c.reasons] == [(Obstacle.NESTING, (1, 0))]
+    assert c.reasons[0].text == "boundary loop 1 runs counterclockwise inside 0: its interior is covered 2 times"
+    F, uv = together(square(0, 0, 3), (inner[0][:, ::-1], inner[1]), square(-1, -1, 5))
+    c = certify(F, uv)
+    assert [(r.kind, r.loops) for r in c.reasons[1:]] == [(Obstacle.NESTING, (0, 2)), (Obstacle.NESTING, (1, 0, 2))]
+    assert c.reasons[2].text == "boundary loop 1 runs clockwise inside 0, 2: its interior is covered 1 times"
+
+
+def test_rays_that_cross_loops_in_several_portions(monkeypatch):
+    """The ray from a vertex of the small square crosses the large loop three times."""
+    monkeypatch.setattr("quasiharmonic.geometry.exact.loops.PAIR_CHUNK", 1)
+    for x, bijective in ((-2, True), (0.5, False), (4.3, True), (7, False)):
+        horns = fan([[0, 0], [9, 0], [9, 9], [7, 9], [4.5, 2], [2, 9], [0, 9]], centre=(4.5, 1))
+        c = certify(*together(horns, square(x, 6, 0.3)))
+        assert c.bijective == bijective
+        assert kinds(c) == (set() if bijective else {Obstacle.NESTING})
+
+
+def test_loops_that_begin_on_a_straight_side():
+    """The orientation of a loop is that of a corner, never that of a straight angle."""
+    side = np.array([[1.0, 0], [2, 0], [2, 2], [0, 2], [0, 0]])
+    for turn in ([[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[-1, 0], [0, -1]], [[0, -1], [1, 0]]):
+        for mirror in (1, -1):
+            F, uv = together(fan(side, centre=(1, 1)), fan(side + 5, centre=(6, 6)))
+            c = certify(F, uv @ turn * [mirror, 1])
+            assert kinds(c) == (set() if mirror == 1 else {Obstacle.NOT_INJECTIVE, Obstacle.WINDING})
+
+
+def test_a_certificate_is_drawn():
+    assert certify(SQUARE, CORNERS).plot().axes

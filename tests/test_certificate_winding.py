@@ -239,6 +239,8 @@ def test_islands_that_overlap_or_touch(parts, kind):
         ([[0, 1, 2], [0, 3, 1], [0, 1, 4]], r"edges are in three or more triangles (0–1)"),
         ([[0, 1, 2], [0, 1, 3]], "edges are traversed twice in the same direction (0–1)"),
         ([[0, 1, 2], [0, 1, 1]], "triangles repeat a vertex (1)"),
+        ([[0, 0, 1], [2, 3, 4]], "triangles repeat a vertex (0)"),
+        ([[2, 3, 4], [1, 0, 1]], "triangles repeat a vertex (1)"),
         ([[0, 1, 2], [2, 3, 4]], "passes more than once through vertex 2"),
     ],
 )

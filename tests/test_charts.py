@@ -128,7 +128,7 @@ def test_a_limit_on_charts_is_kept_and_what_it_costs_is_reported():
 
 @pytest.mark.slow
 def test_a_bound_that_no_charts_keep_is_reported():
-    V, F = sphere(4)
+    V, F = sphere(3)
     charts = find_charts(V, F, max_stretch=1.0)
     check(V, F, charts)
     assert max(chart.misses for chart in charts) > 0
@@ -187,17 +187,17 @@ def test_seams_avoid_sides_with_high_costs():
 
 
 @pytest.mark.slow
-def test_ten_thousand_boxes_take_seconds():
+@pytest.mark.parametrize("count", [1_000, pytest.param(10_000, marks=pytest.mark.nightly)])
+def test_thousands_of_boxes_take_seconds(count):
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     F = np.concatenate([quads[:, (0, 1, 2)], quads[:, (0, 2, 3)]])
     rng = np.random.default_rng(5)
-    count = 10_000
     V = (corners * rng.uniform(0.5, 2, (count, 1, 3)) + rng.normal(size=(count, 1, 3)) * 100).reshape(-1, 3)
     F = (F + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
     began = time.process_time()
     charts = find_charts(V, F)
-    assert time.process_time() - began < 30
+    assert time.process_time() - began < 30 * count / 10_000
     assert len(charts) == count
     check(V[: 8 * 50], F[: 12 * 50], charts[:50])
     for chart in charts[:50]:

@@ -190,7 +190,9 @@ class TestObstructions:
     def test_nothing_found(self, star, capsys):
         run("check", star, "--json", "-")
         facts = json.loads(capsys.readouterr().out)
-        assert facts["injective"] or not facts["diagnosis"]["obstructions"]
+        assert facts["injective"] is False
+        assert facts["diagnosis"]["obstructions"] == []
+        assert not facts["diagnosis"]["forbids_injective"]
 
     def test_names_the_obstacle_to_a_map(self, tmp_path, capsys):
         V, F, fixed, target = star_problem(n=80)

@@ -77,7 +77,7 @@ class TestReportFailures:
         assert "nothing was written" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
 
-    def test_ascii_console(self, star, tmp_path):
+    def test_reports_are_printed_on_an_ascii_console(self, star, tmp_path):
         command = [sys.executable, "-m", "quasiharmonic", "check", str(star)]
         plain = {
             **os.environ,

@@ -306,7 +306,7 @@ def test_nearest_on_boundary():
         ("near: 0, 1, 2, 4", (((0, 1, 2), None), (4, None))),
     ],
 )
-def test_specifications(text, entries):
+def test_specifications_of_corners_are_read(text, entries):
     assert read_corners(text).entries == entries
 
 
@@ -367,7 +367,7 @@ def sheet(tmp_path):
     ],
 )
 @pytest.mark.parametrize("slide", [[], ["--slide"]])
-def test_map(sheet, corners, places, slide):
+def test_corners_of_the_surface_get_their_positions_on_the_outline(sheet, corners, places, slide):
     out = sheet.with_name("out.obj")
     assert run("map", sheet, "-o", out, "--to", "rect:2x1", "--corners", corners, *slide) == 0
     uv = io.map_of(io.read_mesh(out))
@@ -394,7 +394,7 @@ def test_map_with_invalid_corners(sheet, capsys):
     assert not out.exists()
 
 
-def test_check_boundary(sheet, capsys):
+def test_the_command_lists_the_corners_of_a_boundary(sheet, capsys):
     picture, report = sheet.with_name("b.png"), sheet.with_name("b.json")
     assert run("check", sheet, "--boundary", "--plot", picture, "--json", report) == 0
     said = capsys.readouterr().out

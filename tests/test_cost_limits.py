@@ -117,7 +117,7 @@ class TestStart:
         ("start", "words"),
         [(np.zeros((3, 2)), r"start must have shape \(\d+, 2\)"), (np.nan, "start is not finite at vertices 0, 1")],
     )
-    def test_is_checked(self, start, words):
+    def test_invalid_starts_are_rejected(self, start, words):
         problem = Problem(*posed(4, "C"))
         start = np.full((problem.n, 2), start) if np.ndim(start) == 0 else start
         with pytest.raises(ValueError, match=words):
@@ -172,7 +172,7 @@ class TestAllocations:
         assert peak(certify, F, V[:, :2].copy())[0] / len(F) < 214
 
     @pytest.mark.slow
-    def test_grow_linearly(self):
+    def test_peak_memory_grows_linearly_with_the_triangles(self):
         small, large = (posed(rings, "C") for rings in (60, 120))
         solve(Problem(*small))
         first, second = (peak(lambda a: solve(Problem(*a)), arrays)[0] / len(arrays[1]) for arrays in (small, large))

@@ -159,7 +159,7 @@ class TestGain:
     @pytest.mark.slow
     @pytest.mark.parametrize("gain", [0.1, np.inf])
     def test_predicted_energy_is_close_to_that_of_the_map(self, gain):
-        for V, F in (surfaces.starfish(5, 24), surfaces.starfish(3, 24), double_torus()):
+        for V, F in (surfaces.starfish(5, 14), surfaces.starfish(3, 14), double_torus()):
             cut = find_cuts(V, F, min_gain=gain)
             graph, shrinking = edge_graph(V, F), Shrinking(edge_graph(V, F))
             open_at = np.zeros(len(V), dtype=bool)
@@ -169,7 +169,7 @@ class TestGain:
 
     @pytest.mark.slow
     def test_cuts_reach_arms(self):
-        V, F = surfaces.starfish(5, 24)
+        V, F = surfaces.starfish(5, 16)
         cut = find_cuts(V, F)
         V = V / V[:, 0].max()
         for turn in 2 * np.pi * np.arange(5) / 5:
@@ -181,7 +181,7 @@ class TestGain:
 
     @pytest.mark.slow
     def test_a_larger_required_gain_makes_cuts_shorter(self):
-        V, F = surfaces.starfish(5, 24)
+        V, F = surfaces.starfish(5, 16)
         lengths = [length_of(V, find_cuts(V, F, min_gain=gain)) for gain in (0.02, 0.2, 2, np.inf)]
         assert lengths == sorted(lengths, reverse=True)
         assert lengths[0] > 1.5 * lengths[-1]

@@ -23,7 +23,7 @@ def test_undamaged_files_are_accepted(kind, call, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", damaged_files.CALLS)
 def test_damaged_files_are_rejected_or_read_correctly(kind):
-    trials = list(damaged_files.trials([f"{kind}:{seed}" for seed in range(100, 105)]))
+    trials = list(damaged_files.trials([f"{kind}:{seed}" for seed in range(100, 103)]))
     assert not [(trial.name, trial.fault, trial.said) for trial in trials if trial.fault]
     assert {trial.status for trial in trials} & {1, 2}
 

@@ -26,7 +26,7 @@ BOTH = list(PARAMETERISATIONS)
 
 @pytest.mark.parametrize("name", BOTH)
 class TestParameterisation:
-    def test_invert(self, name, rng):
+    def test_the_parameterisation_is_inverted_exactly(self, name, rng):
         p = PARAMETERISATIONS[name]
         xi = rng.standard_normal(50) + 1j * rng.standard_normal(50)
         np.testing.assert_allclose(p.invert(p.field(xi).mu), xi, rtol=1e-11)

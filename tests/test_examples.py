@@ -36,7 +36,7 @@ def test_cortex(example):
 
 
 def test_creatures(example):
-    numbers = example("creatures", size=24)
+    numbers = example("creatures", size=20)
     for name, most in (("octopus", 0.45), ("armadillo", 0.8)):
         one, every = (numbers[name][cut] for cut in ("one cut", "a cut to every limb"))
         assert one["bijective"]
@@ -49,7 +49,7 @@ def test_creatures_are_spheres(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     sculptures = importlib.import_module("sculptures")
     for name in sculptures.CREATURES:
-        V, F = sculptures.creature(name, 36)
+        V, F = sculptures.creature(name, 24)
         sides = edges(F, len(V))
         assert not len(sides.boundary), name
         assert len(V) - len(sides.interior) + len(F) == 2, name
@@ -184,7 +184,7 @@ def test_tetrahedra(example):
 
 
 def test_cut(example):
-    numbers = example("cut")
+    numbers = example("cut", size=8)
     assert [row["handles"] for row in numbers.values()] == [0, 1, 2]
     assert all(row["exit status"] == 0 and row["bijective"] for row in numbers.values())
     assert all(row["edges cut"] > 10 for row in numbers.values())

@@ -93,7 +93,7 @@ class TestScales:
         assert [o.message for o in found[0].obstructions] == [o.message for o in found[1].obstructions]
 
     @pytest.mark.parametrize("scale", [1e-150, 1e150])
-    def test_in_files(self, scale, tmp_path, capsys):
+    def test_extreme_scales_in_files(self, scale, tmp_path, capsys):
         V, F, fixed, target = star_problem(n=60)
         uv = np.zeros((len(V), 2))
         uv[fixed] = target * scale
@@ -256,7 +256,7 @@ class TestSmallMeshes:
         assert mirrored.status is Status.IMPOSSIBLE
         assert mirrored.diagnosis.obstructions[0].kind is Kind.REVERSED
 
-    def test_of_nothing(self):
+    def test_meshes_without_triangles_are_rejected(self):
         V, F = np.empty((0, 2)), np.empty((0, 3), dtype=int)
         with pytest.raises(ValueError, match="no triangles"):
             injective_map(V, F, [], V)

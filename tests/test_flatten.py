@@ -149,7 +149,7 @@ class TestPlacement:
         turned = V @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
         np.testing.assert_allclose(flatten(turned, F).uv, flatten(V, F).uv, atol=1e-3)
 
-    def test_moments(self):
+    def test_the_longest_axis_agrees_with_a_sum_over_small_pieces(self):
         # Compared with a sum over small pieces.
         rng = np.random.default_rng(1)
         V, F = disk(4)

@@ -38,7 +38,7 @@ def test_writes_a_bijective_map(head, tmp_path, capsys):
     assert "Bijective" in capsys.readouterr().out
 
 
-def test_options(head, tmp_path):
+def test_options_change_the_map(head, tmp_path):
     weights = tmp_path / "weights.txt"
     weights.write_text("".join(f"{1 + i % 2}  # triangle {i}\n" for i in range(len(cat(6)[1]))))
     maps = []
@@ -139,7 +139,7 @@ def test_invalid_weights_are_named(head, tmp_path, capsys):
     assert "'heavy' is not a finite number at line 2" in capsys.readouterr().err
 
 
-def test_distances(head, tmp_path, capsys):
+def test_distance_errors_are_reported(head, tmp_path, capsys):
     out, report = tmp_path / "flat.obj", tmp_path / "report.json"
     errors = []
     for energy in ("symmetric-dirichlet", "distances"):
@@ -164,7 +164,7 @@ def test_distances(head, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("allowance", [0, 0.2])
-def test_pattern(tmp_path, allowance):
+def test_patterns_are_true_to_scale(tmp_path, allowance):
     """Two squares of 1 and 0.6 inch: their outlines are true to scale and far enough apart for seam allowances."""
     if allowance:
         pytest.importorskip("shapely")

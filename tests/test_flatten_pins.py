@@ -258,6 +258,13 @@ def test_a_map_that_overlaps_itself_has_the_more_specific_status(ended, told):
 
 @pytest.mark.slow
 def test_if_another_scaffold_does_not_help_the_search_restarts():
+    V, F = random_delaunay(38, 14)
+    target = np.array([[1.115, 0.998], [0.849, 1.151], [1.933, 0.916], [1.675, 0.112], [0.771, 1.121]])
+    solved(V, F, [26, 15, 24, 2, 33], target)
+
+
+@pytest.mark.nightly
+def test_on_a_larger_mesh_the_search_restarts_too():
     # Three pins of 250 vertices, two of them next to each other on the boundary, which must swap sides.
     rng = np.random.default_rng(3)
     V, F = random_delaunay(int(rng.integers(40, 300)), 3)

@@ -52,7 +52,7 @@ def test_the_registry_is_consistent():
 
 
 @pytest.mark.parametrize("suffix", MAPS)
-def test_format(suffix, tmp_path):
+def test_every_format_reads_back_what_it_writes(suffix, tmp_path):
     form = BY_SUFFIX[suffix]
     try_format(form.read, with_map(form.write_map), tmp_path / f"mesh{suffix}")
 

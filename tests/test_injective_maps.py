@@ -295,7 +295,7 @@ class TestTrouble:
             ({"polish": "shine"}, "shine"),
         ],
     )
-    def test_options(self, options, message):
+    def test_invalid_options_are_rejected(self, options, message):
         with pytest.raises(ValueError, match=message):
             injective_maps([], **options)
 

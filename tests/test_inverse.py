@@ -205,7 +205,7 @@ def test_nothing_is_outside():
     assert inverse.locate(np.empty((0, 2))).triangle.shape == (0,)
 
 
-def test_vertices():
+def test_vertices_are_their_own_corners():
     V, F = random_delaunay(30, seed=0)
     inverse = InverseMap(np.vstack([V, [[7, 7]]]), F, np.vstack([V, [[np.nan, 0]]]))
     at = inverse.vertices()

@@ -10,12 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import certify
+from quasiharmonic.geometry.exact import batched_loops
+from quasiharmonic.geometry.exact.batched_loops import certify_each
 from quasiharmonic.geometry.exact.loops import contacts, simple_loops
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
 from shared.exact import exact_orientation, exact_relation
 from shared.examples import examples
+from shared.sheets import SQUARE, ring, spiral, square, together
 
 lattice = st.integers(-2, 2).map(float)
 # Points near a line through the origin, one unit in the last place beside it.
@@ -50,7 +53,7 @@ def test_simple_loops(number):
 
 
 @coordinates
-def test_contacts(number):
+def test_contacts_agree_with_exact_arithmetic(number):
     @given(
         st.lists(st.tuples(number, number), min_size=4, max_size=7),
         st.lists(st.tuples(st.integers(0, 3), st.integers(0, 6)), min_size=2, max_size=8),
@@ -110,3 +113,49 @@ def test_missing_vertices():
         boundary_loops([[0, 1, 2], [0, 5, 9]], 4)
     with pytest.raises(ValueError, match=r"refers to node 9"):
         components([[0, 1, 2], [0, 2, 9]], 4)
+
+
+def few_maps():
+    """Maps by what is wrong with them; those of three strips differ in their positions alone."""
+    F, winding = spiral(turns=1.5, pitch=0.5)
+    good = spiral(turns=1.5, pitch=1.1)[1]
+    corners = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    return {
+        "one triangle": (np.array([[0, 1, 2]]), corners[:3]),
+        "a strip": (F, good),
+        "a strip that meets itself": (F, winding),
+        "another strip": (F, good + 1),
+        # Its boundary is simple.
+        "the first triangle is inverted": (SQUARE, np.array([[0.0, 0], [0.2, 0.8], [1, 1], [0, 1]])),
+        "square": (SQUARE, corners),
+        "islands that overlap": together(square(0, 0, 2), square(1, 1, 2)),
+        "an inner loop outside": (ring()[0], ring()[1] + [[0, 0], [5, 0]] * 12),
+        "a ring": ring(),
+        "no triangles": (np.empty((0, 3), dtype=np.int64), corners),
+    }
+
+
+def test_certificates_of_many_maps_have_the_given_arrays(monkeypatch):
+    single, maps = [], few_maps()
+
+    def certify_one(F, uv, **options):
+        single.append(len(F))
+        return certify_alone(F, uv, **options)
+
+    certify_alone = batched_loops.certify
+    monkeypatch.setattr(batched_loops, "certify", certify_one)
+    F, uv = zip(*maps.values(), strict=True)
+    # A loop may begin at any of its vertices.
+    loops = [[np.roll(loop, 1) for loop in boundary_loops(T, len(places))] for T, places in maps.values()]
+    found = certify_each(F, uv, loops)
+    for T, places, rims, verdict in zip(F, uv, loops, found, strict=True):
+        alone = certify_alone(T, places, loops=rims)
+        assert verdict.to_dict() == alone.to_dict()
+        for name in ("F", "uv", "inverted", "degenerate", "nonfinite", "crossings", "multiply_wound"):
+            one, other = getattr(verdict, name), getattr(alone, name)
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+    bijective = {name for name, verdict in zip(maps, found, strict=True) if verdict.bijective}
+    assert bijective == {"one triangle", "a strip", "another strip", "square", "a ring"}
+    # The bijective maps with one loop are certified together.
+    assert len(single) == len(maps) - 4

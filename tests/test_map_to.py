@@ -36,7 +36,7 @@ def qhm(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("text", ["disk", "letter:G", "rect:2x1", "star:5"])
-def test_to(qhm, text):
+def test_the_boundary_gets_the_named_outline(qhm, text):
     V, F = surfaces.cat(12)
     status, facts, _ = qhm((V, F), "--to", text)
     assert status == 0
@@ -48,7 +48,7 @@ def test_to(qhm, text):
     assert np.array_equal(io.map_of(written)[fixed], target)
 
 
-def test_to_files(qhm, tmp_path):
+def test_outlines_from_files_may_have_holes(qhm, tmp_path):
     (tmp_path / "o.svg").write_text('<svg><path d="M0 0h4v3h-4zm1 1h1v1h-1z" fill-rule="evenodd"/></svg>')
     (tmp_path / "o.txt").write_text("0 0\n4 0\n4 3\n0 3\n\n1 1\n2 1\n2 2\n1 2\n")
     for name in ("o.svg", "o.txt"):
@@ -251,7 +251,7 @@ def test_calls_that_cannot_be_read(qhm, options):
 def test_letters_of_the_paper(character, tmp_path):
     """A curved surface on each letter, by this option alone."""
     out, report = tmp_path / "out.obj", tmp_path / "report.json"
-    io.write_obj(tmp_path / "cat.obj", io.MeshData(*surfaces.cat(20)))
+    io.write_obj(tmp_path / "cat.obj", io.MeshData(*surfaces.cat(14)))
     command = ["map", str(tmp_path / "cat.obj"), "--to", f"letter:{character}"]
     assert main([*command, "-o", str(out), "--json", str(report)]) == 0
     facts = json.loads(report.read_text())

@@ -102,7 +102,7 @@ def test_a_closed_surface_is_cut_where_vertices_are_left_out(tmp_path, capsys):
     assert kept < {tuple(row) for row in F.tolist()}
 
 
-def test_text_patch(tmp_path):
+def test_patches_in_text_are_read(tmp_path):
     path = tmp_path / "lh.x.patch.asc"
     rows = [(1, 0, 0), (4, 1, 0), (3, 0, 1)]
     text = "#!ascii version of patch lh.orig. The 1st index is not a vertex number\n3 1\n"

@@ -19,7 +19,7 @@ from shared.obj_files import SQUARE_F
         "COFF\n4 2 0\n0 0 0 1 0 0 1\n1 0 0 1 0 0 1\n1 1 0 1 0 0 1\n0 1 0 1 0 0 1\n3 0 1 2\n3 0 2 3\n",
     ],
 )
-def test_off(put, text):
+def test_off_files_are_read(put, text):
     mesh = io.read_mesh(put(text, "mesh.off"))
     assert mesh.V.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     assert mesh.F.tolist() == SQUARE_F

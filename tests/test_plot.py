@@ -301,7 +301,9 @@ def test_animation(planar, tmp_path, suffix):
     save_animation(path, V, F, ((f"frame {k}", uv) for k, uv in enumerate([folded, V, V])), frames_per_second=10)
     if suffix == "gif":
         with Image.open(path) as image:
-            assert (image.n_frames, image.size) == (2, (600, 600)) or image.n_frames == 3
+            assert image.size == (600, 600)
+            # Pillow joins two equal frames.
+            assert image.n_frames in (2, 3)
             assert image.info["loop"] == 0
             assert red(np.asarray(image.convert("RGB")) / 255).sum() > 100
             image.seek(image.n_frames - 1)
@@ -367,7 +369,7 @@ def test_maps_and_triangles_that_do_not_match_are_rejected(planar, plot):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plot", [plot_map, plot_texture])
+@pytest.mark.parametrize("plot", [plot_map, pytest.param(plot_texture, marks=pytest.mark.nightly)])
 def test_pictures_do_not_depend_on_scale(planar, plot):
     V, F, folded = planar
     drawn = [plot(unit * V, F, unit * folded) for unit in (1, 1e-200, 1e200)]
@@ -383,7 +385,7 @@ def test_pictures_without_matplotlib(planar, monkeypatch):
         plot_map(V, F, V)
 
 
-def test_window(planar, tmp_path, monkeypatch):
+def test_a_window_shows_surface_and_map(planar, tmp_path, monkeypatch):
     polyscope = pytest.importorskip("polyscope")
     V, F, folded = planar
     monkeypatch.chdir(tmp_path)

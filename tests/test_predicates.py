@@ -19,6 +19,8 @@ from quasiharmonic.geometry.exact.predicates import (
     segment_relation,
     sure_orientation,
     twice_area,
+    two_product,
+    two_sum,
 )
 from shared.exact import exact_orientation, exact_relation
 
@@ -119,6 +121,10 @@ def test_signs_that_floating_point_is_sure_of_are_exact(rng, scale):
     # Products that overflow or underflow leave signs open.
     assert (np.mean(sure[70:] == exact[70:]) > 0.99) == (scale == 1.0)
     np.testing.assert_array_equal(sure_orientation(a[70], b[70:], c[70:]), sure_orientation(a[70:71], b[70:], c[70:]))
+    # Settings of the caller do not matter.
+    with np.errstate(all="raise"):
+        np.testing.assert_array_equal(sure_orientation(a, b, c), sure)
+        np.testing.assert_array_equal(orientation_or_nonfinite(a, b, c)[0], exact)
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     assert [int(sure_orientation(*corners[k])) for k in ([0, 1, 2], [2, 0, 1], [0, 2, 1])] == [1, 1, -1]
 
@@ -153,6 +159,15 @@ def test_shapes_broadcast_and_are_preserved():
     assert orientation(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2))).shape == (0,)
 
 
+def test_other_types_are_converted_to_double_precision(rng):
+    a, b = rng.random((2, 500, 2)).astype(np.float32)
+    c = (a + b) / 2
+    agrees(a, b, c)
+    far = 2**40
+    assert orientation([0, 0], [far, 0], [far, far]) == 1
+    assert orientation([0, 0], [far, far + 1], [far - 1, far]) == 1
+
+
 def test_numbers_that_are_not_finite_are_rejected_or_named():
     a = np.zeros((6, 2))
     b = np.tile([1.0, 0.0], (6, 1))
@@ -160,8 +175,22 @@ def test_numbers_that_are_not_finite_are_rejected_or_named():
     sign, nonfinite = orientation_or_nonfinite(a, b, c)
     np.testing.assert_array_equal(sign, [1, 0, 0, -1, 0, 0])
     np.testing.assert_array_equal(nonfinite, [1, 2, 4])
+    for some in ([0, 3], [0, 1]):
+        assert orientation_or_nonfinite(a[some], b[some], c[some])[1].dtype == np.int64
     with pytest.raises(ValueError, match=r"triple 1 \(3 in all\)"):
         orientation(a, b, c)
+
+
+def test_sums_and_products_equal_their_rounded_value_and_error(rng):
+    full = np.nextafter(2.0, 1.0) - rng.integers(0, 4, 200) * 2.0**-52
+    a = np.concatenate([rng.standard_normal(2000), full]) * 2.0 ** rng.integers(-60, 60, 2200)
+    b = rng.permutation(a)
+    for (value, error), exact in (
+        (two_sum(a, b), [Fraction(x) + Fraction(y) for x, y in zip(a, b, strict=True)]),
+        (two_product(a, b), [Fraction(x) * Fraction(y) for x, y in zip(a, b, strict=True)]),
+    ):
+        assert [Fraction(x) + Fraction(y) for x, y in zip(value, error, strict=True)] == exact
+        assert value.tolist() == [float(x) for x in exact]
 
 
 def test_twice_the_area_has_48_bits_even_if_triangles_are_thin(rng):

@@ -20,7 +20,7 @@ def turned_ring():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("k", [1, 3, 7])
+@pytest.mark.parametrize("k", [1, 3, pytest.param(7, marks=pytest.mark.nightly)])
 def test_every_kth_map_is_recorded(k):
     V, F, fixed, target = turned_ring()
     result = injective_map(V, F, fixed, target, record_every=k)

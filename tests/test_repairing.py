@@ -182,7 +182,7 @@ class TestRepair:
         assert result.injective
         assert np.array_equal(result.moved_vertices, lost)
 
-    def test_holes(self):
+    def test_a_surface_with_a_hole_is_repaired(self):
         V, F = annulus(12)
         start, _ = damaged(V, inner_rows(F), 30, 0.2)
         result = repair(V, F, start)
@@ -207,7 +207,7 @@ class TestRepair:
         start, _ = damaged(V, inner_rows(F), 4, 0.3)
         assert repair(np.zeros_like(V), F, start).injective
 
-    def test_interrupt(self):
+    def test_an_interrupt_of_the_callback_is_raised(self):
         V, F = random_delaunay(100, seed=2)
         start, _ = damaged(V, inner_rows(F), 5, 0.3)
 
@@ -310,7 +310,7 @@ class TestBeyondRepair:
         result = repair(V, F, V)
         assert result.islands[-1].reason == f"A vertex is used twice in triangle {len(F) - 1}."
 
-    def test_json(self):
+    def test_the_result_of_an_undefined_map_is_valid_json(self):
         V, F = grid(3, 3)
         uv = V.copy()
         uv[2] = np.nan
@@ -377,7 +377,7 @@ class TestCommand:
         for kind in ("map", "distortion", "texture"):
             assert run("plot", out, "-o", tmp_path / f"{kind}.png", "--kind", kind) == 0
 
-    def test_in_place(self, uv_file):
+    def test_a_file_is_repaired_in_place(self, uv_file):
         assert run("repair", uv_file, "-o", uv_file) == 0
         repaired = uv_file.read_bytes()
         assert run("repair", uv_file, "-o", uv_file) == 0

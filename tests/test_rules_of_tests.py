@@ -42,6 +42,11 @@ def imports(tree):
             yield from ((node.module, alias.name) for alias in node.names)
 
 
+def called(node):
+    """The name of the function or method that a call calls."""
+    return getattr(node.func, "attr", getattr(node.func, "id", ""))
+
+
 def private_names(tree):
     """Yield names with an underscore that are imported, accessed, or replaced by `monkeypatch.setattr`."""
     for module, name in imports(tree):
@@ -54,7 +59,7 @@ def private_names(tree):
             and ast.unparse(node.value) not in ("self", "super()")
         ):
             yield node.attr
-        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("setattr", "getattr", "delattr"):
+        if isinstance(node, ast.Call) and called(node) in ("setattr", "getattr", "delattr"):
             words = [a.value for a in node.args[:2] if isinstance(a, ast.Constant) and isinstance(a.value, str)]
             yield from (part for word in words for part in word.split(".") if private(part))
 
@@ -104,7 +109,7 @@ def test_packages_that_tests_skip_without_are_installed_somewhere():
         node.args[0].value
         for path in MODULES
         for node in ast.walk(parsed(path))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip"
+        if isinstance(node, ast.Call) and called(node) == "importorskip"
         if isinstance(node.args[0], ast.Constant)
     }
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -22,7 +22,7 @@ class TestIslands:
         assert np.array_equal(one.vertices, np.arange(len(V)))
         assert np.array_equal(one.uv, V)
 
-    def test_strips(self):
+    def test_islands_of_strips_have_their_own_vertices(self):
         _, F, uv, FT, strip = strips(4)
         found = islands(F, uv, FT)
         assert len(found) == 3

@@ -29,7 +29,7 @@ def turned(rings=8, angle=0.5):
 # Results
 
 
-@pytest.mark.parametrize("character", "GSPH")
+@pytest.mark.parametrize("character", ["G", "S", *(pytest.param(c, marks=pytest.mark.nightly) for c in "PH")])
 def test_a_letter_is_better_with_its_boundary_sliding(character):
     V, F, fixed, target, curves = lettered(f"letter:{character}")
     held = injective_map(V, F, fixed, target, polish="symmetric-dirichlet")

@@ -133,7 +133,7 @@ def test_nearest_points(rng):
         assert curve.nearest(np.stack([beside.real, beside.imag], axis=1))[1] == pytest.approx(1e-4, rel=0.1)
 
 
-def test_transformed():
+def test_a_transformed_curve_has_the_transformed_points():
     curve = Curve([*MIXED[:2], Arc((2.55, 0), (2.45, 0), (0, -1), 0, np.pi)])
     assert curve.closed
     matrix, shift = np.array([(0.5, -0.2), (0.3, 2.0)]), np.array([3.0, -1.0])

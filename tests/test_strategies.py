@@ -211,7 +211,7 @@ class TestReweighting:
         for grading in 5 * GRADINGS:
             *_, w = untangle(patch.F, w, np.flatnonzero(patch.fixed), grading=grading)
             assert signed_areas(patch.F, w).min() < 0
-        ends = [reweight(np.random.default_rng(seed), patch, start, "auto") for seed in range(4)]
+        ends = [reweight(np.random.default_rng(seed), patch, start, "auto") for seed in range(2)]
         assert any(signed_areas(patch.F, end).min() > 0 for end in ends)
         for end in ends:
             np.testing.assert_array_equal(end[patch.fixed], start[patch.fixed])
@@ -234,13 +234,11 @@ class TestReweighting:
             return np.sum(signed_areas(patch.F, w) <= 0)
 
         monkeypatch.setattr(reweighting, "untangle_fully", recorded)
-        for seed in range(2):
-            rounds.clear()
-            end = reweight(np.random.default_rng(seed), patch, start, "auto")
-            assert len(rounds) > 1
-            no_worse = [w for w in rounds if inverted(w) <= inverted(start)]
-            assert bool(no_worse) is not spoilt
-            np.testing.assert_array_equal(end, no_worse[-1] if no_worse else start)
+        end = reweight(np.random.default_rng(0), patch, start, "auto")
+        assert len(rounds) > 1
+        no_worse = [w for w in rounds if inverted(w) <= inverted(start)]
+        assert bool(no_worse) is not spoilt
+        np.testing.assert_array_equal(end, no_worse[-1] if no_worse else start)
 
     def test_weights_decide_which_of_two_triangles_is_repaired(self):
         """A vertex that can be on the correct side of one of two fixed edges, but not of both."""
@@ -277,7 +275,7 @@ class TestStrategy:
         with pytest.raises(ValueError, match=words):
             VectorAdam(**arguments)
 
-    def test_names(self):
+    def test_named_strategies_have_stages(self):
         problem = Problem(*star_problem(n=60))
         for name in STRATEGIES:
             assert all(isinstance(stage, SearchStage) for stage in stages_of(name, problem))

@@ -112,11 +112,11 @@ def test_many_movements_leave_no_extra_memory():
     moves(50)
     gc.collect()
     before = tracemalloc.get_traced_memory()[0]
-    moves(500)
+    moves(250)
     gc.collect()
     grown = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
-    assert grown < 100_000
+    assert grown < 50_000
 
 
 def test_pins_stay_exactly_at_their_position_and_can_be_dragged():

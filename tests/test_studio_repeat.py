@@ -148,12 +148,25 @@ def draw(one):
         *(("disk", step) for step in ("as it is", "letter", "corner", "by angle", "svg", "polygon", "polish", "slide")),
         *(("disk", step) for step in ("flatten", "unwrap", "drag", "pinned", "pinned flat", "pinned polish", "turned")),
         ("disk", "seams erased"),
-        *(("ring", step) for step in ("as it is", "drag", "polish")),
-        *(("closed", step) for step in ("as it is", "unwrap", "letter", "drag", "seams drawn, flat", "pack")),
-        *(("closed", step) for step in ("seams drawn, unwrapped", "seams kept", "turned, unwrapped")),
+        ("ring", "as it is"),
+        *(("closed", step) for step in ("as it is", "seams drawn, flat", "pack", "seams kept", "turned, unwrapped")),
         *(("two parts", step) for step in ("as it is", "one of two", "one of two polished", "one of two to a disk")),
-        *(("two parts", step) for step in ("drag", "flatten", "pack", "polish", "unwrap", "one of two moved")),
-        *(("spoilt", step) for step in ("as it is", "flatten", "polish", "drag", "turned, unwrapped")),
+        ("two parts", "one of two moved"),
+        ("spoilt", "as it is"),
+        # The same steps with further models.
+        *(pytest.param("ring", step, marks=pytest.mark.nightly) for step in ("drag", "polish")),
+        *(
+            pytest.param("closed", step, marks=pytest.mark.nightly)
+            for step in ("unwrap", "letter", "drag", "seams drawn, unwrapped")
+        ),
+        *(
+            pytest.param("two parts", step, marks=pytest.mark.nightly)
+            for step in ("drag", "flatten", "pack", "polish", "unwrap")
+        ),
+        *(
+            pytest.param("spoilt", step, marks=pytest.mark.nightly)
+            for step in ("flatten", "polish", "drag", "turned, unwrapped")
+        ),
     ],
 )
 def test_the_command_and_the_script_make_the_map_of_the_page(model, step, opened, tmp_path, monkeypatch):
@@ -188,8 +201,17 @@ def test_the_final_map_does_not_depend_on_the_path_of_the_drag(opened):
     assert np.array_equal(one.session.state.uv, other.session.state.uv)
 
 
-@pytest.mark.parametrize("form", ["obj", "glb", "ply"])
-@pytest.mark.parametrize("model", ["closed", "spoilt", "two parts"])
+@pytest.mark.parametrize(
+    ("model", "form"),
+    [
+        ("closed", "obj"),
+        ("spoilt", "glb"),
+        ("two parts", "ply"),
+        *(pytest.param("closed", form, marks=pytest.mark.nightly) for form in ("glb", "ply")),
+        *(pytest.param("spoilt", form, marks=pytest.mark.nightly) for form in ("obj", "ply")),
+        *(pytest.param("two parts", form, marks=pytest.mark.nightly) for form in ("obj", "glb")),
+    ],
+)
 def test_saved_files_are_opened_again_with_their_map(model, form, opened, tmp_path):
     one = opened(model)
     one.does("unwrap", resolution=512)

@@ -51,7 +51,10 @@ def test_a_session_opened_elsewhere_ends_here(running):
 
 @pytest.mark.parametrize(
     "name",
-    ["../../etc", *(pytest.param(name, marks=pytest.mark.slow) for name in ("A" * 32, "0" * 31, "0" * 64, "%2e%2e"))],
+    [
+        "../../etc",
+        *(pytest.param(name, marks=pytest.mark.nightly) for name in ("A" * 32, "0" * 31, "0" * 64, "%2e%2e")),
+    ],
 )
 def test_names_of_sessions_are_not_paths(running, name):
     with session_page(running, name) as one:

@@ -70,7 +70,7 @@ def test_tiny_meshes_agree_with_the_oracle():
     assert 20 < check_tiny_meshes(range(150)) < 130
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_more_tiny_meshes_agree_with_the_oracle():
     check_tiny_meshes(range(1000, 1300))
 

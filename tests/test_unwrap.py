@@ -15,7 +15,7 @@ from quasiharmonic.surfaces import annulus, grid, random_delaunay, starfish
 from shared.exact import exact_orientation
 from shared.meshes import lift
 
-V, F = starfish(3, 12)
+V, F = starfish(3, 8)
 
 
 @pytest.fixture(scope="module")

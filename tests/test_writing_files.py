@@ -23,7 +23,7 @@ def left_in(folder):
     return sorted(p.name for p in folder.iterdir())
 
 
-def test_write_whole(tmp_path):
+def test_bytes_and_functions_are_written(tmp_path):
     path = tmp_path / "file"
     io.write_whole(path, b"one")
     assert path.read_bytes() == b"one"

@@ -102,7 +102,7 @@ def serve_copies(channel):
         if channel in ready:
             script, numbers, _, _ = socket.recv_fds(channel, 1 << 12, 4)
             if not script:
-                os._exit(0)
+                sys.exit()
             pid = os.fork()
             if pid == 0:
                 signal.set_wakeup_fd(-1)
