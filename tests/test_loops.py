@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from quasiharmonic import certify
 from quasiharmonic.geometry.exact import batched_loops
 from quasiharmonic.geometry.exact.batched_loops import certify_each
-from quasiharmonic.geometry.exact.loops import contacts, simple_loops
+from quasiharmonic.geometry.exact.loops import contacts, join_items, simple_loops
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
@@ -113,6 +113,13 @@ def test_missing_vertices():
         boundary_loops([[0, 1, 2], [0, 5, 9]], 4)
     with pytest.raises(ValueError, match=r"refers to node 9"):
         components([[0, 1, 2], [0, 2, 9]], 4)
+
+
+def test_five_items_are_listed():
+    assert join_items([3, "a"]) == "3, a"
+    assert join_items(range(5)) == "0, 1, 2, 3, 4"
+    assert join_items(range(6)) == "0, 1, 2, 3, 4, …"
+    assert join_items(range(4), 3) == "0, 1, 2, …"
 
 
 def few_maps():
