@@ -157,6 +157,7 @@ def test_certificates_of_many_maps_have_the_given_arrays(monkeypatch):
     found = certify_each(F, uv, loops)
     for T, places, rims, verdict in zip(F, uv, loops, found, strict=True):
         alone = certify_alone(T, places, loops=rims)
+        assert verdict.crossings.shape[1] == 4
         assert verdict.to_dict() == alone.to_dict()
         for name in ("F", "uv", "inverted", "degenerate", "nonfinite", "crossings", "multiply_wound"):
             one, other = getattr(verdict, name), getattr(alone, name)
