@@ -233,6 +233,10 @@ def test_crossings_list_the_crossing_edges():
 def test_touching_is_not_simple(polygon):
     c = certify(*fan(polygon, centre=(1, 1)))
     assert Obstacle.SELF_INTERSECTION in kinds(c)
+    # Each pair once, in the order of the boundary.
+    rows = [tuple(row) for row in c.crossings.tolist()]
+    assert rows == sorted(set(rows))
+    assert rows
 
 
 def test_inner_loop_outside_the_outer_one():
