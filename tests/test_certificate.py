@@ -84,6 +84,9 @@ def test_three_reasons_are_listed_and_the_others_counted():
     c = certify(*together(*(square(k / 2, 0, 1) for k in range(2))))
     assert c.summary().startswith("Injective: all 4 triangles are positive. Not bijective: boundary loops 0 and 1 meet")
     assert c.short_repr() == "injective, not bijective, 4 triangles"
+    # Two squares with a common corner have four pairs of edges that meet there.
+    c = certify(*together(square(0, 0, 1), square(1, 1, 1)))
+    assert [r.text for r in c.reasons] == ["boundary loops 0 and 1 meet (1→2 with 4→5, 1→2 with 7→4, 2→3 with 4→5, …)"]
     c = certify(np.empty((0, 3), int), CORNERS)
     assert c.short_repr() == "not injective, 0 of 0 triangles not positive"
     assert c.to_dict()["reasons"] == [{"kind": "no triangles", "text": "there are no triangles", "loops": []}]
@@ -230,6 +233,10 @@ def test_crossings_list_the_crossing_edges():
 def test_touching_is_not_simple(polygon):
     c = certify(*fan(polygon, centre=(1, 1)))
     assert Obstacle.SELF_INTERSECTION in kinds(c)
+    # Each pair once, in the order of the boundary.
+    rows = [tuple(row) for row in c.crossings.tolist()]
+    assert rows == sorted(set(rows))
+    assert rows
 
 
 def test_inner_loop_outside_the_outer_one():

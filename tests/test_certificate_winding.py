@@ -96,6 +96,12 @@ def test_only_vertices_with_positive_triangles_are_multiply_wound():
     c = certify(*fan(polar(np.linspace(1, 2, 8), t)))
     np.testing.assert_array_equal(c.inverted, [2])
     assert not c.multiply_wound.size
+    F, uv = fan(polar(np.ones(11), np.array([0, 1, 1, 2, 3, 4, 5, 6, 7, 8, 9]) / 5))
+    uv[3] = 2 * uv[2]
+    c = certify(F, uv)
+    np.testing.assert_array_equal(c.degenerate, [1])
+    assert not c.inverted.size
+    assert not c.multiply_wound.size
 
 
 def overwound_exactly(F, uv):

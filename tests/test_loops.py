@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from quasiharmonic import certify
 from quasiharmonic.geometry.exact import batched_loops
 from quasiharmonic.geometry.exact.batched_loops import certify_each
-from quasiharmonic.geometry.exact.loops import contacts, simple_loops
+from quasiharmonic.geometry.exact.loops import contacts, join_items, simple_loops
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
@@ -115,6 +115,13 @@ def test_missing_vertices():
         components([[0, 1, 2], [0, 2, 9]], 4)
 
 
+def test_five_items_are_listed():
+    assert join_items([3, "a"]) == "3, a"
+    assert join_items(range(5)) == "0, 1, 2, 3, 4"
+    assert join_items(range(6)) == "0, 1, 2, 3, 4, …"
+    assert join_items(range(4), 3) == "0, 1, 2, …"
+
+
 def few_maps():
     """Maps by what is wrong with them; those of three strips differ in their positions alone."""
     F, winding = spiral(turns=1.5, pitch=0.5)
@@ -150,10 +157,11 @@ def test_certificates_of_many_maps_have_the_given_arrays(monkeypatch):
     found = certify_each(F, uv, loops)
     for T, places, rims, verdict in zip(F, uv, loops, found, strict=True):
         alone = certify_alone(T, places, loops=rims)
+        assert verdict.crossings.shape[1] == 4
         assert verdict.to_dict() == alone.to_dict()
         for name in ("F", "uv", "inverted", "degenerate", "nonfinite", "crossings", "multiply_wound"):
             one, other = getattr(verdict, name), getattr(alone, name)
-            assert one.dtype == other.dtype
+            assert one.dtype == other.dtype == (np.float64 if name == "uv" else np.int64)
             np.testing.assert_array_equal(one, other)
     bijective = {name for name, verdict in zip(maps, found, strict=True) if verdict.bijective}
     assert bijective == {"one triangle", "a strip", "another strip", "square", "a ring"}

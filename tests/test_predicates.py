@@ -109,6 +109,20 @@ def test_triples_over_more_than_130_orders_of_magnitude():
             assert [int(orientation(*corners)) for corners in ((a, b, c), (b, a, c))] == [1, -1]
 
 
+def test_orientation_where_rounding_and_underflow_have_equal_bounds(rng):
+    a, b = rng.standard_normal((2, 4000, 2)) * 2.0**-504
+    t = rng.random((4000, 1))
+    agrees(a, b, a * (1 - t) + b * t)
+
+
+def test_signs_within_the_rounding_error_are_open():
+    """The error of the determinant is up to three units, 3 · 2⁻⁵³, of the sum of both products, here 2."""
+    origin = np.zeros((3, 2))
+    a, b = np.array([[1.0, 1], [1, 1], [1, 1]]), np.array([[1.0, 1 + 3 * 2.0**-52], [1 + 3 * 2.0**-52, 1], [1, 1.5]])
+    assert sure_orientation(a, b, origin).tolist() == [0, 0, 1]
+    assert orientation(a, b, origin).tolist() == [1, -1, 1]
+
+
 @pytest.mark.parametrize("scale", [1.0, 1e-310, 1e-162, 1e200, 1.7e308])
 def test_signs_that_floating_point_is_sure_of_are_exact(rng, scale):
     a, b, c = rng.uniform(-1, 1, (3, 300, 2)) * scale
