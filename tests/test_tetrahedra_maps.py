@@ -154,6 +154,33 @@ def test_the_scale_does_not_matter(scale):
     np.testing.assert_allclose(scaled.points / scale, plain.points, atol=1e-3)
 
 
+@pytest.mark.parametrize("offset", [5e5, 1e8])
+def test_the_origin_does_not_matter(offset):
+    X, T, cavity = shell(4)
+    plain = morph(X, T, cavity, turned(X[cavity], 40))
+    moved = morph(X + offset, T, cavity, turned(X[cavity], 40) + offset)
+    assert moved.success
+    np.testing.assert_allclose(moved.points - offset, plain.points, atol=1e-7 + 100 * np.spacing(offset))
+    assert moved.energy == pytest.approx(plain.energy, rel=1e-3)
+
+
+def test_a_mesh_that_stays_where_it_is_has_converged():
+    X, T, cavity = shell(4)
+    result = morph(X, T, cavity, X[cavity])
+    assert result.status is TetrahedraStatus.POLISHED
+    np.testing.assert_array_equal(result.points, X)
+
+
+def test_a_mesh_that_overlaps_itself_is_no_success():
+    X, T = box(1, 1, 1)
+    X, T = np.concatenate([X, X + np.array([2, 0, 0])]), np.concatenate([T, T + len(X)])
+    other = np.arange(8, 16)
+    result = injective_tetrahedra(X, T, other[:4], X[other[:4]] - (1.5, 0, 0))
+    assert result.valid
+    assert not result.success
+    assert result.status is TetrahedraStatus.OVERLAPPING
+
+
 def test_a_known_diffeomorphism_is_found():
     X, T = box(6, 6, 6)
     boundary = np.unique(certify_tetrahedra(T, X).boundary)
@@ -254,8 +281,14 @@ def test_needles_and_malformed_meshes():
             morph(points, cells, cavity, X[cavity])
     with pytest.raises(ValueError, match="not finite"):
         morph(X, T, cavity, np.full((len(cavity), 3), np.inf))
-    with pytest.raises(ValueError, match="a vertex twice"):
+    with pytest.raises(ValueError, match="vertex 0 moved more than once"):
         morph(X, T, [0, 0], X[[0, 0]])
+    for options, message in (({"energy": "foo"}, "foo"), ({"linear_solver": "foo"}, "linear_solver must be one of")):
+        for function in (morph, lambda X, T, moved, _, **options: MovingMesh(X, T, moved, **options)):
+            with pytest.raises(ValueError, match=message):
+                function(X, T, cavity, X[cavity], **options)
+    with pytest.raises(ValueError, match="callback"):
+        morph(X, T, cavity, X[cavity], callback=3)
 
 
 def test_quality():

@@ -1,5 +1,8 @@
 """Boundary vertices of tetrahedral meshes that slide along planes and straight edges."""
 
+import json
+from pathlib import Path
+
 import meshlane
 import numpy as np
 import pytest
@@ -97,6 +100,32 @@ def test_a_mesh_moved_in_steps_slides():
     assert (mesh.points[X[:, 0] == 0, 0] == 0).all()
 
 
+def test_an_initial_mesh_is_brought_onto_the_walls():
+    X, T, top = cube()
+    result = morph(X, T, top, X[top] - (0, 0, 0.5), slide=WALLS, start=X + 0.1)
+    assert result.success
+    assert (result.points[X[:, 0] == 0, 0] == 0).all()
+
+
+@pytest.mark.parametrize("shift", [0, (3, -2, 7), (30, -20, 70)])
+def test_oblique_walls_in_single_precision_slide(shift):
+    X, T, top = cube()
+    Y = (X @ rotation().T + shift).astype(np.float32)
+    target = ((X[top] - (0, 0, 0.5)) @ rotation().T + shift).astype(np.float32)
+    result = morph(Y, T, top, target, slide=True)
+    assert result.success
+    assert result.sliding.size == morph(X, T, top, X[top], slide=True).sliding.size
+
+
+def test_on_a_thin_body_only_the_named_side_slides():
+    X, T, _ = cube()
+    thin = X * (1, 1, 1e-7)
+    inner = np.flatnonzero((X[:, :2] == 0.5).all(axis=1) & (X[:, 2] == 0.5))
+    result = morph(thin, T, inner, thin[inner], slide=[[0, 0, 1, 0]])
+    bottom = (X[:, 2] == 0) & (X[:, :2] > 0).all(axis=1) & (X[:, :2] < 1).all(axis=1)
+    np.testing.assert_array_equal(result.sliding, np.flatnonzero(bottom))
+
+
 @pytest.mark.parametrize("scale", [1e-150, 1e150])
 def test_planes_at_any_scale(scale):
     X, T, top = cube()
@@ -136,3 +165,17 @@ def test_qhm_morph_slides(options, tmp_path, capsys):
     np.testing.assert_array_equal(read_volume(out).points, expected.points)
     assert main(["morph", str(path), "--field", "u", "--slide", "--slide-plane", *"1000", "-o", str(out)]) == 2
     assert "--slide includes all planes" in capsys.readouterr().err
+    plane = ["--slide-plane", "1", "0", "0", "-1e-9"]
+    assert main(["morph", str(path), "--field", "u", *plane, "-o", str(out)]) == 1
+    assert "9 boundary vertices could slide" in capsys.readouterr().out
+
+
+def test_qhm_morph_reports_the_opposite_order_of_vertices(tmp_path, capsys):
+    X, T, _ = cube()
+    T[::3] = T[::3, [1, 0, 2, 3]]
+    path, out, report = (str(tmp_path / name) for name in ("mesh.vtu", "moved.vtu", "report.json"))
+    meshlane.write(path, meshlane.Mesh(X, [("tetra", T)], point_data={"u": np.zeros_like(X)}))
+    assert main(["morph", path, "--field", "u", "-o", out, "--json", report]) == 0
+    count = len(T[::3])
+    assert json.loads(Path(report).read_text())["reversed"] == count
+    assert f"The file lists {count} tetrahedra in the opposite order" in capsys.readouterr().out

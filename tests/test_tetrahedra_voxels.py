@@ -7,7 +7,6 @@ import pytest
 
 from quasiharmonic import certify_tetrahedra, inverse_field, nearest_invertible
 from quasiharmonic.apps.tetrahedra.voxel_fields import VoxelGrid, find_folded_cells
-from quasiharmonic.ui.cli import main
 from shared.exact_space import determinant, exact
 from shared.tetrahedral_meshes import folded_volume
 
@@ -125,7 +124,22 @@ def test_bad_input():
     np.testing.assert_array_equal(left.field, field)
 
 
-def test_qhm_field_rejects_volumes(tmp_path, capsys):
-    np.save(tmp_path / "field.npy", np.zeros((4, 4, 4, 3)))
-    assert main(["field", str(tmp_path / "field.npy"), "-o", str(tmp_path / "new.npy")]) == 2
-    assert "is a field on voxels" in capsys.readouterr().err
+def test_cells_below_the_bound_remain():
+    field = np.zeros((6, 6, 6, 3))
+    field[3, 5, 0, 2] = -0.5
+    result = nearest_invertible(field, min_jacobian=0.9, fixed=np.ones((6, 6, 6), dtype=bool))
+    assert result.folds == result.remaining.sum() > 0
+    assert not result.success
+    assert result.bijective
+    assert nearest_invertible(field, min_jacobian=0.4).folds == 0
+
+
+@pytest.mark.parametrize("scale", [2.0**-500, 2.0**500])
+def test_the_scale_of_a_volume_does_not_matter(scale):
+    field = folded_volume(12, 1)
+    plain, scaled = nearest_invertible(field), nearest_invertible(field * scale, spacing=scale)
+    assert plain.folds > 0
+    np.testing.assert_array_equal(scaled.field, plain.field * scale)
+    assert scaled.distance == plain.distance * scale
+    back = inverse_field(scaled.field, spacing=scale).field
+    np.testing.assert_array_equal(back, inverse_field(plain.field).field * scale)

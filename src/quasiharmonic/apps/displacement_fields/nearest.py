@@ -134,7 +134,8 @@ def nearest_invertible(
     -----
     Fields on voxels (d, h, w, 3) have displacements along x, y and z in slice z, row y and column x. Each cell between
     eight voxels is divided into six tetrahedra (`quasiharmonic.apps.tetrahedra.voxel_fields`), which must be positive.
-    The search can fail: the result then lists cells that still fold.
+    The search can fail, also because of fixed pixels: no error is raised then, and the result lists the cells that
+    still fold.
 
     With deep folds the distance has many local minima. The result depends on the start, a harmonic fill of patches
     around the folds (`quasiharmonic.apps.displacement_fields.patches`). If the field's border overlaps itself, which is

@@ -42,6 +42,7 @@ from quasiharmonic.geometry.mesh.elements import (
 )
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_planar_mesh
+from quasiharmonic.linsolve import BACKENDS
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
@@ -49,8 +50,11 @@ from quasiharmonic.solver.search.options import MAX_ITERATIONS
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
+    check_callback,
+    check_choice,
     check_finite,
     check_integer,
+    check_positive,
     map_array,
     names_of,
     vertex_indices,
@@ -159,7 +163,12 @@ def morph(
     if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
         if isinstance(slide, BoundaryCurves):
             raise ValueError("slide must be a bool or an array of planes for tetrahedra, not BoundaryCurves")
+        if energy is not None:
+            find_energy(energy)
+        check_choice("linear_solver", linear_solver, ("auto", *BACKENDS))
         check_integer("max_iterations", max_iterations, minimum=0)
+        check_positive(tol=tol)
+        check_callback(callback)
         options = Settings(energy is not None, max_iterations, tol, callback)
         return morph_tetrahedra(
             points, F, moved_vertices, target, rest=rest, start=start, settings=options, slide=slide

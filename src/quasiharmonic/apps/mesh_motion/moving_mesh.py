@@ -24,11 +24,13 @@ from quasiharmonic.geometry.mesh.elements import check_spread
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.accepts_mesh import init_accepts_planar_mesh
 from quasiharmonic.io.adapters.objects import MeshLike
+from quasiharmonic.linsolve import BACKENDS
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_bool,
+    check_choice,
     check_finite,
     check_integer,
     map_array,
@@ -64,10 +66,10 @@ class MovingMesh:
     settle : int
         Newton steps down the energy after each move. With 0 the mesh is also valid, and a step is faster.
     slide : bool or (m, 4) array
-        Let the boundary vertices that are not moved slide along their outline, with fixed corners; needs ``settle`` of
-        at least 1. They lag one step behind the mesh, so moved vertices that arrive along the same wall are blocked by
-        them. `morph` does not have this limitation. Vertices of tetrahedra slide at once, as in `morph`, along
-        the flat parts of the first mesh's boundary or along those on the given planes.
+        Let the boundary vertices that are not moved slide along their outline, with fixed corners; in the plane this
+        needs ``settle`` of at least 1, and they lag one step behind the mesh, so moved vertices that arrive along the
+        same wall are blocked by them. `morph` does not have this limitation. Vertices of tetrahedra slide at once, as
+        in `morph`, along the flat parts of the first mesh's boundary or along those on the given planes.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 
@@ -75,6 +77,11 @@ class MovingMesh:
     ------
     ValueError
         If the input is malformed, a triangle has no area, or an option is invalid.
+
+    Notes
+    -----
+    All tetrahedra stay positive, but separate parts of the boundary may be moved through each other. To detect this,
+    pass the mesh to `quasiharmonic.certify_tetrahedra`.
 
     Examples
     --------
@@ -131,6 +138,8 @@ class MovingMesh:
     ) -> None:
         self._volume: MovingTetrahedra | None = None
         if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
+            find_energy(energy)
+            check_choice("linear_solver", linear_solver, ("auto", *BACKENDS))
             check_integer("settle", settle, minimum=0)
             self._volume = MovingTetrahedra(points, F, moved_vertices, settle, slide)
             return

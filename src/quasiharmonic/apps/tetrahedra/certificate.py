@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.apps.tetrahedra.contacts import find_contacts
+from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED, find_contacts
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import FaceReport, find_patches, inspect_faces
 from quasiharmonic.apps.tetrahedra.winding import outer_winding
@@ -140,6 +140,7 @@ class TetrahedraCertificate(ReadOnly):
         if len(self.crossings):
             i, j = (_name_faces(self.boundary[k : k + 1]) for k in self.crossings[0])
             pairs = count_of("pair", "pairs", len(self.crossings))
+            pairs = f"at least {pairs}" if len(self.crossings) >= MAX_LISTED else pairs
             found.append(f"{pairs} of boundary triangles meet, the first of them {i} and {j}")
         if self.multiply_covered.size:
             where = _name_faces(self.boundary[self.multiply_covered])
@@ -188,8 +189,8 @@ def certify_tetrahedra(T: ArrayLike, X: ArrayLike, *, boundary: bool = True) -> 
 
     Notes
     -----
-    The result is exact for the coordinates as stored. The module `quasiharmonic.apps.tetrahedra.certificate` has the
-    conditions and the proof.
+    The result is exact for the coordinates in doubles; integers beyond 2⁵³ are rounded. The module
+    `quasiharmonic.apps.tetrahedra.certificate` has the conditions and the proof.
 
     Examples
     --------

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.energy import BlockMatrix, ShapeEnergy, reduce_epsilon
+from quasiharmonic.apps.tetrahedra.sliding import project
 from quasiharmonic.energies.newton.line_search import backtrack
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
@@ -100,7 +101,7 @@ class Descent:
             value += 0.5 * weight * float((away * away).sum())
             gradient = gradient + weight * away
             data[self._blocks.diagonal] += weight * np.eye(3)
-        g = self._project(gradient[self.free].ravel())
+        g = project(self.projections, gradient[self.free]).ravel()
         p = self._direction(data, g)
         decrease = -float(g @ p)
         self.iterations += 1
@@ -132,27 +133,21 @@ class Descent:
             diagonal = P @ diagonal @ P + scale[:, None, None] * (np.eye(3) - P)
         inverse = np.linalg.inv(diagonal + shift[:, None, None] * np.eye(3))
         x, r = np.zeros_like(g), -g
-        z = self._project(np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3)).ravel())
+        z = project(self.projections, np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3))).ravel()
         p, rz = z.copy(), float(r @ z)
         first = rz
         for _ in range(_MAX_CONJUGATE_STEPS):
             if not rz > _RESIDUAL**2 * first:
                 break
-            Ap = self._project(matrix @ p)
+            Ap = project(self.projections, (matrix @ p).reshape(-1, 3)).ravel()
             curvature = float(p @ Ap)
             if not curvature > 0:
                 break
             alpha = rz / curvature
             x += alpha * p
             r -= alpha * Ap
-            z = self._project(np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3)).ravel())
+            z = project(self.projections, np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3))).ravel()
             rz, old = float(r @ z), rz
             p = z + (rz / old) * p
             self.conjugate_steps += 1
         return x if x.any() else z
-
-    def _project(self, x: FloatArray) -> FloatArray:
-        """Project directions (3 k,) of the free vertices to those in which they move."""
-        if self.projections is None:
-            return x
-        return np.asarray(np.einsum("iab,ib->ia", self.projections, x.reshape(-1, 3)).ravel())

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.certificate import certify_arrays, find_boundary_contacts, tetrahedron_array
+from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED
 from quasiharmonic.apps.tetrahedra.descent import Descent
 from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
 from quasiharmonic.apps.tetrahedra.obstructions import find_obstructions
@@ -20,7 +21,7 @@ from quasiharmonic.apps.tetrahedra.result import (
     tetrahedron_quality,
 )
 from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
-from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding
+from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding, project
 from quasiharmonic.apps.tetrahedra.topology import FaceReport, inspect_faces
 from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
@@ -110,6 +111,8 @@ def place_vertices(
     if not obstructions:
         if start is not None:
             X[free] = np.ldexp(start[free], -exponent)
+            here = np.ldexp(points[sliding.vertices], -exponent)
+            X[sliding.vertices] = here + project(sliding.projections, X[sliding.vertices] - here)
         else:
             X = extend_harmonically(energy, np.ldexp(points, -exponent), fixed, X[fixed], projections)
         X, status, iterations = _search(Descent(energy, free, X, projections=projections), settings)
@@ -126,6 +129,8 @@ def place_vertices(
             status = TetrahedraStatus.IMPOSSIBLE
         elif status not in (TetrahedraStatus.OUT_OF_ITERATIONS, TetrahedraStatus.INTERRUPTED):
             status = TetrahedraStatus.STALLED
+    elif certificate.positive and not certificate.injective and status is not TetrahedraStatus.INTERRUPTED:
+        status = TetrahedraStatus.OVERLAPPING
     return TetrahedraResult(
         points=begin,
         T=T,
@@ -133,6 +138,7 @@ def place_vertices(
         status=status,
         obstructions=obstructions,
         forbidden=forbidden,
+        sliding=sliding.vertices,
         iterations=iterations,
         seconds=time.perf_counter() - began,
         energy=float(energy.densities(X).mean()) if certificate.positive else np.inf,
@@ -146,7 +152,8 @@ def _find_crossings(mesh: RestMesh, X: FloatArray, fixed: IntArray) -> tuple[Tet
     F = mesh.faces.boundary
     F = F[np.isin(F, fixed).all(axis=1)]
     pairs = F[find_boundary_contacts(F, X)]
-    rest = f" (first of {len(pairs)} pairs)" if len(pairs) > 1 else ""
+    count = f"{'at least ' if len(pairs) >= MAX_LISTED else ''}{len(pairs)}"
+    rest = f" (first of {count} pairs)" if len(pairs) > 1 else ""
     return tuple(
         TetrahedraObstruction(
             f"The boundary triangles {tuple(one)} and {tuple(other)} meet{rest if not k else ''}.", (*one, *other)
@@ -180,8 +187,8 @@ def make_energy(mesh: RestMesh, begin: FloatArray, whole: bool) -> tuple[ShapeEn
 
 
 def _volume(F: IntArray, X: FloatArray) -> float:
-    """Six times the volume that oriented triangles enclose."""
-    a, b, c = X[F].transpose(1, 0, 2)
+    """Six times the volume that oriented triangles enclose; accurate far from the origin, too."""
+    a, b, c = (X[F] - X[F[0, 0]]).transpose(1, 0, 2)
     return float((a * np.cross(b, c)).sum())
 
 
@@ -213,16 +220,13 @@ def extend_harmonically(
     diagonal = own.diagonal()
     inverse = 1.0 / np.where(diagonal > 0, diagonal, 1.0)
 
-    def project(x: FloatArray) -> FloatArray:
-        return x if projections is None else np.asarray(np.einsum("iab,ib->ia", projections, x))
-
     def apply(x: FloatArray) -> FloatArray:
-        return np.asarray(project(own @ x.reshape(-1, 3))).ravel()
+        return project(projections, own @ x.reshape(-1, 3)).ravel()
 
     def precondition(x: FloatArray) -> FloatArray:
         return np.asarray(inverse[:, None] * x.reshape(-1, 3)).ravel()
 
-    load = project(load).ravel()
+    load = project(projections, load).ravel()
     if load.any():
         size = (load.size, load.size)
         solved = cg(
@@ -232,7 +236,7 @@ def extend_harmonically(
             maxiter=2000,
             M=LinearOperator(size, matvec=precondition, dtype=np.float64),
         )[0]
-        displacement[free] = project(solved.reshape(-1, 3))
+        displacement[free] = project(projections, solved.reshape(-1, 3))
     there = X + displacement
     return there if np.isfinite(there).all() else X
 
@@ -289,8 +293,7 @@ def _polish(descent: Descent, settings: Settings) -> TetrahedraStatus:
     """Lower the energy of a valid mesh; return why this ended."""
     if not settings.polish or not descent.free.size:
         return TetrahedraStatus.FIRST_VALID
-    value = np.inf
     for value in descent.polish(settings.max_iterations - descent.iterations, settings.tol):
         _report(settings, descent, value, 0)
-    converged = descent.converged and np.isfinite(value)
+    converged = descent.converged and np.isfinite(descent.energy.value(descent.X, 0.0))
     return TetrahedraStatus.POLISHED if converged else TetrahedraStatus.STILL_FALLING

@@ -26,6 +26,7 @@ class TetrahedraStatus(Enum):
         "a valid mesh, but this mesh and this target may still allow none."
     )
     OUT_OF_ITERATIONS = "Some tetrahedra were still inverted after the last iteration: allow more iterations."
+    OVERLAPPING = "Every tetrahedron is strictly positive, but the mesh overlaps itself: points are covered twice."
     INTERRUPTED = "Interrupted. This is the best mesh so far."
     IMPOSSIBLE = "No valid mesh with these fixed vertices exists. The obstructions are listed."
     CROSSING = "The boundary crosses itself at its target positions, so no valid mesh exists. Nothing was computed."
@@ -63,6 +64,8 @@ class TetrahedraResult(Outcome):
         Reasons that were found why no valid mesh exists; at most 20.
     forbidden : (k,) int64
         Inverted or degenerate tetrahedra whose four vertices are fixed.
+    sliding : (k,) int64
+        Boundary vertices that were free to slide; none unless ``slide`` was given.
     iterations : int
         Newton steps.
     seconds : float
@@ -78,6 +81,7 @@ class TetrahedraResult(Outcome):
     status: TetrahedraStatus
     obstructions: tuple[TetrahedraObstruction, ...]
     forbidden: IntArray
+    sliding: IntArray
     iterations: int
     seconds: float
     energy: float

@@ -129,14 +129,13 @@ def find_moved(
 ) -> tuple[IntArray, FloatArray]:
     """Check the moved vertices and their target positions."""
     moved = vertex_indices("moved_vertices", moved_vertices, len(points))
-    if np.bincount(moved, minlength=1).max() > 1:
-        raise ValueError("moved_vertices has a vertex twice")
+    times = np.bincount(moved, minlength=1)
+    if times.max() > 1:
+        raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} moved more than once")
     goal = space_array("target", target, moved.size)
     idle = moved[~np.isin(moved, mesh.T)]
     if idle.size:
-        raise ValueError(
-            f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, but no tetrahedron uses them"
-        )
+        raise ValueError(f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, in no tetrahedron")
     return moved, goal
 
 

@@ -57,7 +57,8 @@ class InvertibleVolume(Outcome):
     folds : int
         Number of cells that the given field folds.
     remaining : (d − 1, h − 1, w − 1) bool
-        Cells with a tetrahedron that is not positive in ``field``, decided exactly.
+        Cells of ``field`` with a determinant that is not above ``min_jacobian``, or with a tetrahedron that is not
+        positive, decided exactly.
     bijective : bool
         Whether no cell folds and the surface of the grid does not cross itself, so that no point is covered twice.
     patches : int
@@ -78,7 +79,7 @@ class InvertibleVolume(Outcome):
 
     @property
     def success(self) -> bool:
-        """Whether every tetrahedron of every cell is positive, decided exactly."""
+        """Whether no cell remains: every tetrahedron is positive, decided exactly, and above the bound."""
         return not self.remaining.any()
 
     @property
@@ -134,6 +135,15 @@ class VoxelGrid:
         p[..., 1] += axes[1][:, None]
         p[..., 2] += axes[2][begin:stop, None, None]
         return p
+
+    def rescale(self, field: FloatArray) -> tuple[FloatArray, int]:
+        """Divide the spacing, and a field that is returned, by a power of two, so that no product overflows.
+
+        The second result is the exponent of this power.
+        """
+        exponent = int(np.frexp(self.spacing.max())[1])
+        self.spacing = np.ldexp(self.spacing, -exponent)
+        return np.ldexp(field, -exponent), exponent
 
     def tetrahedra(self, cells: IntArray) -> IntArray:
         """The tetrahedra (6 k, 4) of cells given by their first voxels (k,), voxels counted slice by slice."""
@@ -213,21 +223,23 @@ def nearest_invertible_volume(
             raise ValueError(
                 f"fixed must be a bool array of shape {grid.shape}, not {still.dtype} of shape {still.shape}"
             )
-    wrong = find_folded_cells(grid, given, min_jacobian)
-    repaired = given.copy()
+    scaled, exponent = grid.rescale(given)
+    wrong = find_folded_cells(grid, scaled, min_jacobian)
+    mended = scaled.copy()
     if wrong.any():
-        _repair(grid, repaired, wrong, still, min_jacobian)
-    moved = np.asarray((repaired != given).any(axis=3))
-    remaining = find_folded_cells(grid, repaired, None)
-    away = np.sqrt(((repaired - given) ** 2).sum(axis=3))
+        _repair(grid, mended, wrong, still, min_jacobian)
+    moved = np.asarray((mended != scaled).any(axis=3))
+    repaired = np.where(moved[..., None], np.ldexp(mended, exponent), given)
+    folds = find_folded_cells(grid, mended, None)
+    away = np.sqrt(((mended - scaled) ** 2).sum(axis=3))
     return InvertibleVolume(
         field=repaired,
         moved_mask=moved,
         folds=int(np.count_nonzero(wrong)),
-        remaining=remaining,
-        bijective=not remaining.any() and not _surface_crosses(grid, repaired),
+        remaining=folds | find_folded_cells(grid, mended, min_jacobian),
+        bijective=not folds.any() and not _surface_crosses(grid, mended),
         patches=_label(moved)[1],
-        distance=float(np.sqrt((away**2).mean())),
+        distance=float(np.ldexp(np.sqrt((away**2).mean()), exponent)),
         seconds=time.perf_counter() - began,
     )
 
@@ -353,6 +365,7 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
     """`quasiharmonic.inverse_field` for fields on voxels (d, h, w, 3), affine on the tetrahedra of each cell."""
     given = check_volume_field(field)
     grid = VoxelGrid(given.shape[:3], spacing)
+    given, exponent = grid.rescale(given)
     wrong = find_folded_cells(grid, given, None)
     if wrong.any():
         raise ValueError(
@@ -376,7 +389,7 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
         source = np.stack(np.unravel_index(tetrahedra[good], grid.shape), axis=-1)[..., ::-1]
         best[voxel[good]] = inside[good]
         back[voxel[good]] = (weights[good][..., None] * source).sum(axis=1) - position[good]
-    back *= grid.spacing
+    back = np.ldexp(back * grid.spacing, exponent)
     outside = np.isnan(back[:, 0])
     return InverseVolume(back.reshape(given.shape), outside.reshape(grid.shape))
 

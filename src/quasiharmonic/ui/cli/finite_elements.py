@@ -71,7 +71,7 @@ def _check_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
         facts |= {"hexahedra": len(mesh.H), "corners_not_positive": bad.tolist(), "injective": None if good else False}
         hexahedra = count_of("hexahedron", "hexahedra", len(mesh.H))
         lines.append(
-            f"Of {hexahedra}, {names_of('hexahedron', 'hexahedra', bad)} have a corner that is not positive."
+            f"Of {hexahedra}, these have a corner that is not positive: {names_of('hexahedron', 'hexahedra', bad)}."
             if bad.size
             else f"All corners of {hexahedra} are positive. This does not certify them: a hexahedron with positive "
             "corners can be inverted inside."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,8 +36,8 @@ def add_parser(commands: Commands) -> None:
         "of three or six nodes, quadrilaterals of four, or tetrahedra of four. Boundary nodes without a displacement "
         "stay fixed; mid-side nodes move with their sides. Only positions change in the file; data, time steps and "
         "physical groups stay unchanged.",
-        epilog="Exit status: 0 no element of the written mesh is inverted, verified exactly; 1 some are; 2 wrong "
-        "input or call, nothing written; 3 written, but the report failed.",
+        epilog="Exit status: 0 no element of the written mesh is inverted, verified exactly, and tetrahedra cover no "
+        "point twice; 1 otherwise; 2 wrong input or call, nothing written; 3 written, but the report failed.",
         examples=(
             "qhm morph mesh.msh --positions boundary.csv -o moved.msh",
             "qhm morph mesh.vtu --field displacement --slide -o moved.vtu",
@@ -73,6 +74,8 @@ def add_parser(commands: Commands) -> None:
         help="let boundary vertices without a displacement slide along the boundary, its corners stay fixed; in space "
         "along all flat parts of the boundary",
     )
+    # Before Python 3.14, argparse takes -1e-9 for an option.
+    parser._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
     parser.add_argument(
         "--slide-plane",
         type=float,
@@ -86,8 +89,8 @@ def add_parser(commands: Commands) -> None:
         "--rest",
         type=Path,
         metavar="MESH",
-        help="reference mesh of distortion, such as the first of several steps. The report gives the distance of "
-        "the written mesh from the result of a single step from there (default: the input)",
+        help="reference mesh of distortion, such as the first of several steps (default: the input). For planar meshes "
+        "the report gives the distance of the written mesh from the result of a single step from there",
     )
     arguments.add_linear_solver(parser)
     arguments.add_report(parser)
@@ -164,6 +167,7 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
     from quasiharmonic.io.errors import MeshFileError
     from quasiharmonic.io.fem.files import read_volume, write_volume
     from quasiharmonic.ui.cli import progress_line, report
+    from quasiharmonic.util.arrays import count_of
 
     if len(mesh.H):
         raise MeshFileError(options.input, "has hexahedra", remedy="split them into tetrahedra")
@@ -203,6 +207,7 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
     write_volume(options.output, mesh, morphed.points)
     with report.after_writing(options.output):
         certificate = certify_arrays(morphed.T, read_volume(options.output).points)
+        reversed_rows = int((morphed.T != mesh.T).any(axis=1).sum())
         facts = {
             **morphed.to_dict(),
             "certificate": certificate.to_dict(),
@@ -211,10 +216,20 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
             "input": str(options.input),
             "output": str(options.output),
             "moved": len(moved),
+            "sliding": len(morphed.sliding),
+            "reversed": reversed_rows,
         }
         lines = [f"wrote {options.output}: {certificate.summary()}"]
         if not certificate.injective:
             lines.append(morphed.summary())
+        if reversed_rows:
+            lines.append(
+                f"The file lists {count_of('tetrahedron', 'tetrahedra', reversed_rows)} in the opposite order of "
+                "vertices. They are verified in the order that is positive at rest, but `qhm check` reports them as "
+                "inverted."
+            )
+        if slide:
+            lines.append(f"{count_of('boundary vertex', 'boundary vertices', len(morphed.sliding))} could slide")
         for name, quality in (("before", morphed.quality_before), ("after", morphed.quality_after)):
             worst = f"worst {quality.min():.3g} (tetrahedron {int(quality.argmin())})"
             lines.append(f"mean-ratio quality {name}: {worst}, mean {quality.mean():.3g}")
