@@ -27,12 +27,15 @@ class TestSettings:
         settings = batch.Settings(to="letter:O")
         progress = batch.run(stars, tmp_path / "out", settings, jobs=1)
         assert progress.outcomes == {"injective": 5}
-        (outer, hole) = outline("letter:O")
+        (outer, hole), curves = outline("letter:O"), outline_curves("letter:O")
         for name, loops in (("a/input.obj", [outer]), ("ring.off", [outer, hole])):
             written = io.read_mesh(tmp_path / "out" / "results" / name / "map.obj")
             uv = io.map_of(written)
             areas = [abs(signed_area(uv[loop])) for loop in boundary_loops(written.F, len(uv))]
             np.testing.assert_allclose(sorted(areas), sorted(abs(signed_area(c)) for c in loops), rtol=0.2)
+            # The boundary vertices are on the outline, up to the chords that it is sampled with.
+            away = np.min([curve.nearest(uv[boundary_loops(written.F, len(uv))[0]])[1] for curve in curves], axis=0)
+            assert away.max() < 1e-5
 
     def test_boundaries_that_slide(self, stars, tmp_path):
         energies = []

@@ -139,6 +139,7 @@ def test_the_surface_hides_what_is_behind():
     assert seen.inside.mean() < 0.25
     assert seen.color.min() >= 0
     assert seen.color.max() <= 1
+    assert np.ptp(seen.color) > 0.1
     # Without relief nothing is hidden, and a planar mesh is shown in its plane.
     W, G = surfaces.annulus(6)
     flat = view(W, G)
