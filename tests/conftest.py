@@ -184,3 +184,11 @@ def failing_worker(monkeypatch):
     monkeypatch.setattr(supervisor, "COMMAND", FAILING_WORKER)
     # If several problems together make no progress, soon solve them one by one.
     monkeypatch.setattr(supervisor, "TOGETHER", 1.0)
+
+
+@pytest.fixture(scope="module")
+def visitor():
+    """A session of the page, shared by the tests of a module that leave it as it was or accept any state."""
+    from shared.pages import Visitor
+
+    return Visitor()

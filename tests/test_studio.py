@@ -21,11 +21,6 @@ from shared.pages import Visitor, boundary
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
 
 
-@pytest.fixture(scope="module")
-def visitor():
-    return Visitor()
-
-
 def test_the_first_map_is_certified_and_sent_completely():
     one = Visitor()
     surface, shown = one.last("surface"), one.last("map")
