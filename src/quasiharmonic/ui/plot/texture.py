@@ -163,14 +163,15 @@ def _render(
 
     image = np.zeros((side * side, 4))
     nearest = np.full(side * side, -np.inf)
+    depth_of, board_of = depth[F], board[F]
     for triangle, pixel, weights in _samples(place[F], side):
-        z = np.einsum("kc,kc->k", weights, depth[F[triangle]])
+        z = np.einsum("kc,kc->k", weights, depth_of[triangle])
         # Of repeated indices the last assignment counts, so sort by depth: the nearest is last.
         order = np.argsort(z, kind="stable")
         order = order[z[order] >= nearest[pixel[order]]]
         triangle, pixel, z, weights = triangle[order], pixel[order], z[order], weights[order]
         nearest[pixel] = z
-        color = color_at(np.einsum("kc,kcd->kd", weights, board[F[triangle]]))
+        color = color_at(np.einsum("kc,kcd->kd", weights, board_of[triangle]))
         color[bad[triangle]] = RED
         image[pixel, :3] = lit(color, light[triangle])
         image[pixel, 3] = 1
@@ -223,22 +224,32 @@ def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArra
     last = np.minimum(np.floor(corners.max(axis=1) - 0.5), side - 1).astype(np.int64)
     extent = np.maximum(last - first + 1, 0)
     count = extent.prod(axis=1)
+    a, b, c = corners.transpose(1, 0, 2)
+    doubled_area = _cross(*(b - a).T, *(c - a).T)
     cuts = np.searchsorted(np.cumsum(count), np.arange(_CHUNK, count.sum(), _CHUNK))
     for part in np.split(np.arange(len(corners)), np.unique(cuts)):
-        many = count[part]
-        triangle = repeat_each(part, many)
-        within = np.arange(many.sum()) - repeat_each(np.cumsum(many) - many, many)
-        column = first[triangle, 0] + within % np.maximum(extent[triangle, 0], 1)
-        row = first[triangle, 1] + within // np.maximum(extent[triangle, 0], 1)
-        at = np.stack([column, row], axis=1) + 0.5
-        a, b, c = corners[triangle].transpose(1, 0, 2)
-        doubled_area = _cross(b - a, c - a)
-        doubled_area = np.where(doubled_area == 0, np.nan, doubled_area)
-        weights = np.stack([_cross(b - at, c - at), _cross(c - at, a - at), _cross(a - at, b - at)], axis=1)
-        weights /= doubled_area[:, None]
-        inside = (weights >= 0).all(axis=1)
-        yield triangle[inside], (row * side + column)[inside], weights[inside]
+        # The rows of each triangle's box, and the samples of each row.
+        of, row = _count_up(part, extent[part, 1])
+        place, column = _count_up(np.arange(len(of)), extent[of, 0])
+        triangle = of[place]
+        row = (row + first[of, 1])[place]
+        column += first[triangle, 0]
+        x, y = column + 0.5, row + 0.5
+        (ax, ay), (bx, by), (cx, cy) = (
+            (corner[:, 0][triangle] - x, corner[:, 1][triangle] - y) for corner in (a, b, c)
+        )
+        parts = _cross(bx, by, cx, cy), _cross(cx, cy, ax, ay), _cross(ax, ay, bx, by)
+        area = doubled_area[triangle]
+        sign = np.sign(area)
+        inside = (area != 0) & (parts[0] * sign >= 0) & (parts[1] * sign >= 0) & (parts[2] * sign >= 0)
+        weights = np.stack([value[inside] for value in parts], axis=1) / area[inside, None]
+        yield triangle[inside], (row * side + column)[inside], weights
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+def _count_up(items: IntArray, many: IntArray) -> tuple[IntArray, IntArray]:
+    """Repeat each item as many times as given, and count its repetitions from 0."""
+    return repeat_each(items, many), np.arange(many.sum()) - repeat_each(np.cumsum(many) - many, many)
+
+
+def _cross(ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray) -> FloatArray:
+    return np.asarray(ax * by - ay * bx)
