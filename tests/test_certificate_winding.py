@@ -77,6 +77,7 @@ def test_a_fan_wound_twice():
         assert c.bijective is False
         np.testing.assert_array_equal(c.multiply_wound, [0])
         assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.MULTIPLY_WOUND}
+        assert c.reasons[-1].text == "triangles wind more than once around vertex 0"
 
 
 def test_a_fan_wound_once_is_not_multiply_wound(rng):
