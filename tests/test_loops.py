@@ -176,6 +176,7 @@ def test_simple_loops_in_several_portions(rng, monkeypatch):
             places = np.empty((order.size, 2))
             places[order] = np.concatenate(polygons)
             found = simple_loops(np.split(order, np.cumsum([len(one) for one in polygons])[:-1]), places)
+            assert found.dtype == np.bool_
             assert found.tolist() == [simple(one.tolist()) for one in polygons]
             seen |= set(found.tolist())
     assert seen == {True, False}
