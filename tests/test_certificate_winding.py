@@ -77,6 +77,7 @@ def test_a_fan_wound_twice():
         assert c.bijective is False
         np.testing.assert_array_equal(c.multiply_wound, [0])
         assert kinds(c) == {Obstacle.SELF_INTERSECTION, Obstacle.MULTIPLY_WOUND}
+        assert c.reasons[-1].text == "triangles wind more than once around vertex 0"
 
 
 def test_a_fan_wound_once_is_not_multiply_wound(rng):
@@ -150,6 +151,8 @@ def test_boundary_vertices_with_multiply_wound_triangles(rng):
     for _ in range(150):
         F, uv = open_fan(rng, int(rng.integers(2, 9)))
         F, uv = F[rng.permutation(len(F))], uv * rng.choice([1.0, 1e-200, 3e150])
+        # Any corner of a triangle may be the first one.
+        F = np.array([np.roll(t, by) for t, by in zip(F, rng.integers(0, 3, len(F)), strict=True)])
         c = certify(F, uv)
         assert c.injective
         np.testing.assert_array_equal(c.multiply_wound, overwound_exactly(F, uv))
@@ -301,6 +304,11 @@ def test_certificate_is_frozen_and_serialisable():
     assert told["loops"] == [{"start": 0, "length": 12}, {"start": 1, "length": 12}]
     with pytest.raises(ValueError, match="read-only"):
         c.inverted[:] = 0
+    arrays = [value for value in vars(c).values() if isinstance(value, np.ndarray)]
+    for array in (*arrays, *c.loops):
+        assert not array.flags.writeable
+        with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+            array.flags.writeable = True
     with pytest.raises(AttributeError):
         c.triangles = 3
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from quasiharmonic import certify
 from quasiharmonic.geometry.exact import batched_loops
 from quasiharmonic.geometry.exact.batched_loops import certify_each
-from quasiharmonic.geometry.exact.loops import contacts, join_items, simple_loops
+from quasiharmonic.geometry.exact.loops import contacts, doubtful_pairs, join_items, simple_loops
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
-from quasiharmonic.geometry.exact.triangles import triangle_signs
+from quasiharmonic.geometry.exact.triangles import sure_signs, triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
 from shared.exact import exact_orientation, exact_relation
 from shared.examples import examples
@@ -86,8 +86,44 @@ def test_signs_of_triangles(number):
         sign, nonfinite = triangle_signs(F, np.array(places))
         assert sign.tolist() == [exact_orientation(*(places[i] for i in corners)) for corners in F.tolist()]
         assert not nonfinite.size
+        assert sign.dtype == np.int8
 
     check()
+
+
+def test_floating_point_decides_all_triangles_on_a_lattice(rng):
+    places = rng.integers(-4, 5, (30, 2)).astype(float)
+    F = rng.integers(0, len(places), (200, 3))
+    expected = [exact_orientation(*places[corners]) for corners in F]
+    signs = np.empty(len(F), dtype=np.int8)
+    assert sure_signs(F, places, signs) == expected.count(0)
+    assert signs.tolist() == expected
+
+
+def test_floating_point_decides_all_pairs_of_segments_on_a_lattice(rng, monkeypatch):
+    """Their determinants are small integers. So the pairs to examine are the pairs that meet."""
+    monkeypatch.setattr("quasiharmonic.geometry.exact.predicates.PAIR_CHUNK", 50)
+
+    def may_meet(i, j):
+        ends = [places[k] for k in (tails[i], heads[i], tails[j], heads[j])]
+        shared = [(tails[i], tails[j]), (tails[i], heads[j]), (heads[i], tails[j]), (heads[i], heads[j])]
+        shared = sum(one == other for one, other in shared)
+        relation = exact_relation(*ends)
+        if shared == 1:
+            zero = (ends[0] == ends[1]).all() or (ends[2] == ends[3]).all()
+            return zero or relation == SegmentRelation.OVERLAPPING
+        return shared > 1 or relation != SegmentRelation.DISJOINT
+
+    for _ in range(12):
+        places = rng.integers(-4, 5, (40, 2)).astype(float)
+        tails, heads = rng.integers(0, len(places), (2, 60))
+        starts = np.array([0, 4, 4, 20, 60])
+        group = np.searchsorted(starts, np.arange(60), side="right")
+        expected = [(i, j) for i, j in combinations(range(60), 2) if group[i] == group[j] and may_meet(i, j)]
+        pairs = np.full((len(expected), 2), -1)
+        assert doubtful_pairs(places, tails, heads, starts, pairs) == len(expected)
+        assert pairs.tolist() == [list(pair) for pair in expected]
+        assert doubtful_pairs(places, tails, heads, starts, pairs[1:]) == -1
 
 
 def test_a_loop_with_more_uncertain_pairs_than_edges():
@@ -104,11 +140,54 @@ def test_a_loop_with_more_uncertain_pairs_than_edges():
     assert not found.complete
 
 
+@pytest.mark.parametrize("size", [3, 30])
+def test_contacts_in_several_portions_up_to_a_limit(size, rng, monkeypatch):
+    """On a small lattice there are more uncertain pairs than segments, on a large one fewer."""
+    monkeypatch.setattr("quasiharmonic.geometry.exact.predicates.PAIR_CHUNK", 50)
+    for _ in range(3):
+        tails = rng.integers(0, size, (40, 2))
+        places = np.concatenate([tails, tails + rng.integers(-3, 4, (40, 2))]).astype(float)
+        ends = np.stack([np.arange(40), np.arange(40, 80)], axis=1)
+        pairs = list(combinations(range(40), 2))
+        relation = {pair: exact_relation(*places[ends[list(pair)]].reshape(4, 2)) for pair in pairs}
+        expected = {pair: value for pair, value in relation.items() if value != SegmentRelation.DISJOINT}
+        for limit in (0, 1, len(expected) - 1, len(expected), len(expected) + 1):
+            found = contacts(places, ends, limit)
+            pairs = [tuple(pair) for pair in found.pairs.tolist()]
+            assert len(set(pairs)) == len(pairs) == min(limit, len(expected))
+            assert found.relation.tolist() == [expected[pair] for pair in pairs]
+            assert found.complete == (len(expected) <= limit)
+            assert found.pairs.dtype == np.int64
+            assert found.relation.dtype == np.int8
+
+
+def test_simple_loops_in_several_portions(rng, monkeypatch):
+    """Many loops, and one of them may have all the contacts of the first portion."""
+    monkeypatch.setattr("quasiharmonic.geometry.exact.predicates.PAIR_CHUNK", 20)
+    angle = np.arange(40) * np.pi / 20
+    circle = np.round(99 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    seen = set()
+    for count in (1, 4, 12):
+        for kind in range(4):
+            polygons = [rng.integers(0, 4, (int(rng.integers(3, 7)), 2)).astype(float) for _ in range(count)]
+            # One with 40 edges, simple or not.
+            polygons.insert(kind, circle if kind % 2 else rng.integers(0, 9, (40, 2)).astype(float))
+            order = rng.permutation(sum(map(len, polygons)))
+            places = np.empty((order.size, 2))
+            places[order] = np.concatenate(polygons)
+            found = simple_loops(np.split(order, np.cumsum([len(one) for one in polygons])[:-1]), places)
+            assert found.dtype == np.bool_
+            assert found.tolist() == [simple(one.tolist()) for one in polygons]
+            seen |= set(found.tolist())
+    assert seen == {True, False}
+
+
 def test_missing_vertices():
     with pytest.raises(ValueError, match=r"F refers to vertex 7, but there are only vertices 0 … 3"):
         certify([[0, 1, 2], [0, 2, 7]], np.eye(4, 2))
     with pytest.raises(ValueError, match=r"F refers to vertex -1"):
         triangle_signs(np.array([[0, 1, -1]]), np.eye(4, 2))
+    assert sure_signs(np.array([[0, 1, -1]]), np.eye(4, 2), np.zeros(1, dtype=np.int8)) == -1
     with pytest.raises(ValueError, match=r"F refers to vertices 5, 9, but there are only vertices 0 … 3"):
         boundary_loops([[0, 1, 2], [0, 5, 9]], 4)
     with pytest.raises(ValueError, match=r"refers to node 9"):
