@@ -266,7 +266,8 @@ def test_a_closed_surface():
     F = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
     c = certify(F, np.array([[0.0, 0], [3, 0], [0, 3], [1, 1]]))
     np.testing.assert_array_equal(c.inverted, [0])
-    assert Obstacle.NO_BOUNDARY in kinds(c)
+    assert kinds(c) == {Obstacle.NOT_INJECTIVE, Obstacle.NO_BOUNDARY}
+    assert c.reasons[-1].text == "the surface has no boundary"
 
 
 def test_boundary_that_is_not_finite():

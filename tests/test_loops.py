@@ -117,10 +117,10 @@ def test_floating_point_decides_all_pairs_of_segments_on_a_lattice(rng, monkeypa
     for _ in range(12):
         places = rng.integers(-4, 5, (40, 2)).astype(float)
         tails, heads = rng.integers(0, len(places), (2, 60))
-        starts = np.array([0, 4, 4, 20, 60])
+        starts = np.array([0, 4, 4, 20, 60], dtype=np.int64)
         group = np.searchsorted(starts, np.arange(60), side="right")
         expected = [(i, j) for i, j in combinations(range(60), 2) if group[i] == group[j] and may_meet(i, j)]
-        pairs = np.full((len(expected), 2), -1)
+        pairs = np.full((len(expected), 2), -1, dtype=np.int64)
         assert doubtful_pairs(places, tails, heads, starts, pairs) == len(expected)
         assert pairs.tolist() == [list(pair) for pair in expected]
         assert doubtful_pairs(places, tails, heads, starts, pairs[1:]) == -1
