@@ -177,5 +177,5 @@ def test_qhm_morph_reports_the_opposite_order_of_vertices(tmp_path, capsys):
     meshlane.write(path, meshlane.Mesh(X, [("tetra", T)], point_data={"u": np.zeros_like(X)}))
     assert main(["morph", path, "--field", "u", "-o", out, "--json", report]) == 0
     count = len(T[::3])
-    assert json.loads(Path(report).read_text())["reversed"] == count
+    assert json.loads(Path(report).read_text(encoding="utf-8"))["reversed"] == count
     assert f"The file lists {count} tetrahedra in the opposite order" in capsys.readouterr().out
