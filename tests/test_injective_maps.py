@@ -147,11 +147,12 @@ class TestAgreement:
         V, F = disk(rings)
         (loop,) = boundary_loops(F, len(V))
         problem = Problem(V, F, np.append(loop, 0), np.concatenate([V[loop], [[1.1, 0]]]))
-        strategy = [VectorAdam(iterations=1900)]
+        strategy = [VectorAdam(iterations=4000)]
         alone = solve(problem, strategy=strategy)
         for result in [alone, *injective_maps([problem, problem], strategy=strategy)]:
             assert len(result.stages) == len(alone.stages)
-            assert 300 < result.stages[0].n_iterations < 1600
+            # Between 600 and 1,710 were seen; a group that does not stall takes 4,000.
+            assert 300 < result.stages[0].n_iterations < 3000
             assert result.n_iterations == sum(stage.n_iterations for stage in result.stages)
             assert result.status is alone.status
             first, same = ([step.energy for step in one.history[:30]] for one in (result, alone))
