@@ -155,17 +155,17 @@ def run_gmsh(options: argparse.Namespace) -> None:
     np.savez(options.output, X=X)
 
 
-Mover = Callable[[VolumeScene, FloatArray, FloatArray, IntArray, FloatArray], FloatArray]
+Mover = Callable[[VolumeScene, FloatArray, IntArray, FloatArray], FloatArray]
 
 
-def _harmonic(scene: VolumeScene, base: FloatArray, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
-    return extend_harmonically(ShapeEnergy(scene.T, base), base, fixed, goal)
+def _harmonic(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
+    return extend_harmonically(ShapeEnergy(scene.T, here), here, fixed, goal)
 
 
-def _elastic(scene: VolumeScene, base: FloatArray, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
+def _elastic(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
     """Linear elasticity with a modulus inversely proportional to the volume, Poisson's ratio 0.3."""
-    energy = ShapeEnergy(scene.T, base)
-    G, T, n = energy.gradients, scene.T, len(base)
+    energy = ShapeEnergy(scene.T, here)
+    G, T, n = energy.gradients, scene.T, len(here)
     lame, shear = 0.3 / (1.3 * 0.4), 1 / 2.6
     rows, columns, values = [], [], []
     for i in range(4):
@@ -178,50 +178,45 @@ def _elastic(scene: VolumeScene, base: FloatArray, here: FloatArray, fixed: IntA
                     values.append(lame * G[i, a] * G[j, b] + shear * (G[i, b] * G[j, a] + (a == b) * dot))
     where = (np.concatenate(rows), np.concatenate(columns))
     matrix = coo_array((np.concatenate(values), where), shape=(3 * n, 3 * n)).tocsr()
-    way = np.zeros_like(base)
-    way[fixed] = goal - base[fixed]
+    way = np.zeros_like(here)
+    way[fixed] = goal - here[fixed]
     free = np.ones((n, 3), dtype=np.bool_)
     free[fixed] = False
     own = np.flatnonzero(free.ravel())
     way.ravel()[own] = cg(matrix[own][:, own], -(matrix[own] @ way.ravel()), rtol=1e-8, maxiter=3000)[0]
-    return base + way
+    return here + way
 
 
-def _rbf(scene: VolumeScene, base: FloatArray, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
-    there = base + RBFInterpolator(base[fixed], goal - base[fixed], kernel="thin_plate_spline", neighbors=200)(base)
+def _rbf(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
+    there = here + RBFInterpolator(here[fixed], goal - here[fixed], kernel="thin_plate_spline", neighbors=200)(here)
     there[fixed] = goal
     return there
 
 
-def _morph(scene: VolumeScene, base: FloatArray, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
+def _morph(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
     return morph(here, scene.T, fixed, goal, rest=scene.X, tol=1e-4).points
 
 
-def _gmsh(scene: VolumeScene, base: FloatArray, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
+def _gmsh(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
     return untangle_by_gmsh(scene.T, _begin(here, fixed, goal))
 
 
 def run_scenes(options: argparse.Namespace) -> None:
     """Move the body of every scene step by step until a mesh is not valid; print how far each method gets."""
-    methods: dict[str, tuple[Mover, bool]] = {
-        "harmonic": (_harmonic, False),
-        "elasticity": (_elastic, False),
-        "RBF": (_rbf, False),
-        "morph": (_morph, False),
-    }
+    methods: dict[str, Mover] = {"harmonic": _harmonic, "elasticity": _elastic, "RBF": _rbf, "morph": _morph}
     if options.gmsh:
-        methods["Gmsh"] = _gmsh, False
+        methods["Gmsh"] = _gmsh
     print("| scene | tetrahedra | " + " | ".join(methods) + " | CPU s of morph per step |")
     print("|---|---|" + "---|" * (len(methods) + 1))
     for name, scene in scenes(options.size).items():
         walls = np.setdiff1d(np.unique(certify_tetrahedra(scene.T, scene.X).boundary), scene.body)
         fixed = np.concatenate([scene.body, walls])
         reached, seconds = [], 0.0
-        for method, (move, from_rest) in methods.items():
+        for method, move in methods.items():
             here, steps, began = scene.X, 0, time.process_time()
             while steps * _STEP < _MAX_PARAMETER:
                 goal = np.concatenate([scene.places((steps + 1) * _STEP), scene.X[walls]])
-                there = move(scene, scene.X if from_rest else here, here, fixed, goal)
+                there = move(scene, here, fixed, goal)
                 if not certify_tetrahedra(scene.T, there).injective:
                     break
                 here, steps = there, steps + 1

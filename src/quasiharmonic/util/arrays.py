@@ -121,6 +121,14 @@ def repeat_each(values: ArrayLike, counts: ArrayLike) -> NDArray[Any]:
     return np.repeat(values, np.asarray(counts, dtype=np.intp))
 
 
+def enumerate_each(counts: ArrayLike) -> tuple[IntArray, IntArray]:
+    """For each count (k,), its index repeated as often, and the numbers from 0 to the count; (sum,) int64 each."""
+    counts = np.asarray(counts, dtype=np.int64)
+    return repeat_each(np.arange(counts.size), counts), np.arange(counts.sum()) - repeat_each(
+        np.cumsum(counts) - counts, counts
+    )
+
+
 def own_triangles(F: ArrayLike) -> IntArray:
     """Triangles as from `triangle_rows`, contiguous and unchangeable, as kernels require."""
     return unchangeable(triangle_rows(F, copy=False))

@@ -20,9 +20,9 @@ from quasiharmonic.apps.displacement_fields.patches import (
 )
 from quasiharmonic.apps.tetrahedra.voxel_fields import (
     InvertibleVolume,
-    VoxelGrid,
     check_volume_field,
     find_folded_cells,
+    in_units,
     nearest_invertible_volume,
 )
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
@@ -193,8 +193,8 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> BoolArray:
     those of `nearest_invertible`.
     """
     if np.ndim(field) == 4:
-        volume = check_volume_field(field)
-        return ~find_folded_cells(VoxelGrid(volume.shape[:3], spacing), volume, None)
+        volume, scaled, _ = in_units(check_volume_field(field), spacing)
+        return ~find_folded_cells(volume, scaled, None)
     given = check_field(field)
     return _is_fold_free(check_grid(given.shape, spacing), given)
 

@@ -377,8 +377,8 @@ def _select_curves(
     own_fixed = np.searchsorted(used, moved)
     if isinstance(slide, BoundaryCurves):
         return slide.among(used).holding(own_fixed)
-    if not slide:
-        return False
+    if slide is not True:
+        return slide
     positions = np.zeros((problem.n, 2))
     positions[problem.fixed] = problem.target
     return BoundaryCurves.around(problem.domain.loops, positions, fixed=own_fixed)

@@ -31,8 +31,7 @@ class MovingTetrahedra:
         self.points = space_array("points", points)
         self._mesh = check_rest(T, self.points)
         self._settle = settle
-        zeros = np.zeros((np.asarray(moved_vertices).size, 3))
-        self._moved, _ = find_moved(self._mesh, self.points, moved_vertices, zeros)
+        self._moved = find_moved(self._mesh, len(self.points), moved_vertices)
         sliding = find_sliding(self._mesh.faces.boundary, self.points, self._moved, slide)
         self._fixed = np.concatenate([self._moved, find_still(self._mesh, self._moved, sliding)])
         self._free = np.setdiff1d(np.unique(self._mesh.T), self._fixed)

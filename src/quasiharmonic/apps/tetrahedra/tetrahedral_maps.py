@@ -13,7 +13,6 @@ from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.apps.tetrahedra.sliding import Sliding, find_sliding
 from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import (
-    FloatArray,
     IntArray,
     check_bool,
     check_callback,
@@ -116,7 +115,8 @@ def morph_tetrahedra(
     points = space_array("points", points, finite=False)
     first = points if rest is None else space_array("rest", rest, len(points), finite=False)
     mesh = check_rest(T, first)
-    moved, goal = find_moved(mesh, points, moved_vertices, target)
+    moved = find_moved(mesh, len(points), moved_vertices)
+    goal = space_array("target", target, moved.size)
     sliding = find_sliding(mesh.faces.boundary, points, moved, slide)
     still = find_still(mesh, moved, sliding)
     begin = (None if rest is None else points) if start is None else space_array("start", start, len(points))
@@ -124,19 +124,16 @@ def morph_tetrahedra(
     return place_vertices(mesh, points, fixed, goal, begin, settings or Settings(), sliding)
 
 
-def find_moved(
-    mesh: RestMesh, points: FloatArray, moved_vertices: ArrayLike, target: ArrayLike
-) -> tuple[IntArray, FloatArray]:
-    """Check the moved vertices and their target positions."""
-    moved = vertex_indices("moved_vertices", moved_vertices, len(points))
+def find_moved(mesh: RestMesh, n: int, moved_vertices: ArrayLike) -> IntArray:
+    """Check the moved vertices of a mesh of ``n`` vertices."""
+    moved = vertex_indices("moved_vertices", moved_vertices, n)
     times = np.bincount(moved, minlength=1)
     if times.max() > 1:
         raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} moved more than once")
-    goal = space_array("target", target, moved.size)
     idle = moved[~np.isin(moved, mesh.T)]
     if idle.size:
         raise ValueError(f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, in no tetrahedron")
-    return moved, goal
+    return moved
 
 
 def find_still(mesh: RestMesh, moved: IntArray, sliding: Sliding) -> IntArray:

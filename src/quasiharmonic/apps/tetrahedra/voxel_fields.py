@@ -22,7 +22,7 @@ from quasiharmonic.apps.tetrahedra.descent import Descent
 from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import inspect_faces
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, real_array
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each, real_array
 from quasiharmonic.util.outcome import Outcome
 from quasiharmonic.util.progress import heartbeat
 
@@ -136,15 +136,6 @@ class VoxelGrid:
         p[..., 2] += axes[2][begin:stop, None, None]
         return p
 
-    def rescale(self, field: FloatArray) -> tuple[FloatArray, int]:
-        """Divide the spacing, and a field that is returned, by a power of two, so that no product overflows.
-
-        The second result is the exponent of this power.
-        """
-        exponent = int(np.frexp(self.spacing.max())[1])
-        self.spacing = np.ldexp(self.spacing, -exponent)
-        return np.ldexp(field, -exponent), exponent
-
     def tetrahedra(self, cells: IntArray) -> IntArray:
         """The tetrahedra (6 k, 4) of cells given by their first voxels (k,), voxels counted slice by slice."""
         steps = np.array([1, self.shape[2], self.shape[1] * self.shape[2]])
@@ -168,6 +159,17 @@ def check_volume_field(field: ArrayLike) -> FloatArray:
     if bad.any():
         raise ValueError(f"field is not finite at {_name_voxels(np.asarray(bad))}")
     return array
+
+
+def in_units(field: FloatArray, spacing: ArrayLike) -> tuple[VoxelGrid, FloatArray, int]:
+    """Divide a checked field and the spacing by a power of two, so that no product overflows or underflows.
+
+    Returns the grid with the new spacing, the new field, and the exponent of the power.
+    """
+    grid = VoxelGrid(field.shape[:3], spacing)
+    exponent = int(np.frexp(grid.spacing.max())[1])
+    grid.spacing = np.ldexp(grid.spacing, -exponent)
+    return grid, np.ldexp(field, -exponent), exponent
 
 
 def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | None) -> BoolArray:
@@ -215,7 +217,7 @@ def nearest_invertible_volume(
     """`quasiharmonic.nearest_invertible` for fields on voxels (d, h, w, 3)."""
     began = time.perf_counter()
     given = check_volume_field(field)
-    grid = VoxelGrid(given.shape[:3], spacing)
+    grid, scaled, exponent = in_units(given, spacing)
     still = np.zeros(grid.shape, dtype=np.bool_)
     if fixed is not None:
         still = np.asarray(fixed)
@@ -223,7 +225,6 @@ def nearest_invertible_volume(
             raise ValueError(
                 f"fixed must be a bool array of shape {grid.shape}, not {still.dtype} of shape {still.shape}"
             )
-    scaled, exponent = grid.rescale(given)
     wrong = find_folded_cells(grid, scaled, min_jacobian)
     mended = scaled.copy()
     if wrong.any():
@@ -231,12 +232,13 @@ def nearest_invertible_volume(
     moved = np.asarray((mended != scaled).any(axis=3))
     repaired = np.where(moved[..., None], np.ldexp(mended, exponent), given)
     folds = find_folded_cells(grid, mended, None)
+    low = find_folded_cells(grid, mended, min_jacobian) if moved.any() else wrong
     away = np.sqrt(((mended - scaled) ** 2).sum(axis=3))
     return InvertibleVolume(
         field=repaired,
         moved_mask=moved,
         folds=int(np.count_nonzero(wrong)),
-        remaining=folds | find_folded_cells(grid, mended, min_jacobian),
+        remaining=folds | low,
         bijective=not folds.any() and not _surface_crosses(grid, mended),
         patches=_label(moved)[1],
         distance=float(np.ldexp(np.sqrt((away**2).mean()), exponent)),
@@ -363,9 +365,7 @@ def _on_one_side(grid: VoxelGrid, F: IntArray) -> BoolArray:
 
 def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
     """`quasiharmonic.inverse_field` for fields on voxels (d, h, w, 3), affine on the tetrahedra of each cell."""
-    given = check_volume_field(field)
-    grid = VoxelGrid(given.shape[:3], spacing)
-    given, exponent = grid.rescale(given)
+    grid, given, exponent = in_units(check_volume_field(field), spacing)
     wrong = find_folded_cells(grid, given, None)
     if wrong.any():
         raise ValueError(
@@ -407,8 +407,7 @@ def _candidates(grid: VoxelGrid, X: FloatArray) -> Iterator[tuple[IntArray, IntA
         high = np.clip(np.floor(p.max(axis=1) + 1e-9), -1, last).astype(np.int64)
         size = np.maximum(high - low + 1, 0)
         count = size.prod(axis=1)
-        of = np.repeat(np.arange(len(T)), count)
-        rank = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+        of, rank = enumerate_each(count)
         x = rank % size[of, 0]
         y = rank // size[of, 0] % size[of, 1]
         z = rank // (size[of, 0] * size[of, 1])

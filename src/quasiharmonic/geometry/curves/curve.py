@@ -26,7 +26,7 @@ from quasiharmonic.geometry.curves.arcs import (
     split_piece,
     subcurve,
 )
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, enumerate_each
 
 # Squares, and products of four numbers, of coordinates below this do not overflow
 _MAX_SIZE = 1e75
@@ -276,8 +276,7 @@ class Curve:
         degree = self._degree.astype(np.intp)  # 32-bit systems reject others
         self._powers = np.stack([np.choose(degree, rows) for rows in zip(*by_degree, strict=True)], axis=1)
         count = np.array([count_chords(*part) for part in zip(self._degree, self._control, self._angles, strict=True)])
-        self._chord_piece = repeat_each(np.arange(count.size), count)
-        nth = np.arange(count.sum()) - repeat_each(np.cumsum(count) - count, count)
+        self._chord_piece, nth = enumerate_each(count)
         self._chord_width = 1.0 / count[self._chord_piece]
         self._chord_first = nth * self._chord_width
         self._chord_tail = self._point(self._chord_piece, self._chord_first)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, enumerate_each, repeat_each
 from quasiharmonic.util.kernels import compiled
 
 # Finest cells have integer coordinates below 2 to this power. A cell ``s`` halvings coarser has these coordinates
@@ -212,8 +212,7 @@ def divide_cells(
         first = np.maximum(low[t] >> shift, corner[p])
         last = np.minimum(high[t] >> shift, corner[p] + [columns - 1, lines - 1])
         wide, tall = (last - first + 1).T
-        row = repeat_each(np.arange(t.size), wide * tall)
-        step = np.arange(row.size) - repeat_each(np.cumsum(wide * tall) - wide * tall, wide * tall)
+        row, step = enumerate_each(wide * tall)
         across = wide[row]
         down = step // across
         x, y = first[row, 0] + step - down * across, first[row, 1] + down

@@ -25,7 +25,7 @@ from quasiharmonic.ui.plot.canvas import (
     verdict,
 )
 from quasiharmonic.ui.plot.shading import drawable, lit, view
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, map_array, repeat_each
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, enumerate_each, map_array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -229,8 +229,9 @@ def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArra
     cuts = np.searchsorted(np.cumsum(count), np.arange(_CHUNK, count.sum(), _CHUNK))
     for part in np.split(np.arange(len(corners)), np.unique(cuts)):
         # The rows of each triangle's box, and the samples of each row.
-        of, row = _count_up(part, extent[part, 1])
-        place, column = _count_up(np.arange(len(of)), extent[of, 0])
+        of, row = enumerate_each(extent[part, 1])
+        of = part[of]
+        place, column = enumerate_each(extent[of, 0])
         triangle = of[place]
         row = (row + first[of, 1])[place]
         column += first[triangle, 0]
@@ -244,11 +245,6 @@ def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArra
         inside = (area != 0) & (parts[0] * sign >= 0) & (parts[1] * sign >= 0) & (parts[2] * sign >= 0)
         weights = np.stack([value[inside] for value in parts], axis=1) / area[inside, None]
         yield triangle[inside], (row * side + column)[inside], weights
-
-
-def _count_up(items: IntArray, many: IntArray) -> tuple[IntArray, IntArray]:
-    """Repeat each item as many times as given, and count its repetitions from 0."""
-    return repeat_each(items, many), np.arange(many.sum()) - repeat_each(np.cumsum(many) - many, many)
 
 
 def _cross(ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import Shape
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, enumerate_each, repeat_each
 
 # Maximum distance between samples of an edge, in cells.
 _SPACING = 0.5
@@ -68,8 +68,7 @@ def _mark_near(cells: BoolArray, tails: ComplexArray, heads: ComplexArray, radiu
     """Mark the cells whose centres are within a distance of an edge."""
     h, w = cells.shape
     count = np.maximum(np.ceil(np.abs(heads - tails) / _SPACING), 1).astype(np.int64)
-    edge = repeat_each(np.arange(len(tails)), count)
-    step = np.arange(len(edge)) - repeat_each(np.cumsum(count) - count, count)
+    edge, step = enumerate_each(count)
     samples = tails[edge] + (heads - tails)[edge] * (step / count[edge])
     # Every point of an edge is at most half the spacing from a sample.
     reach = radius**2 + _SPACING**2 / 4
