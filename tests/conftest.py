@@ -93,7 +93,7 @@ def put(tmp_path):
 
 @pytest.fixture
 def star(tmp_path):
-    """The mesh file of a problem with a star as its target, and its fixed vertices beside it."""
+    """The mesh file of a problem with a star as its target, and its fixed vertices next to it."""
     from shared.commands import write_input
     from shared.solvable_problems import star_problem
 

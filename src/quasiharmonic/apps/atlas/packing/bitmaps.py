@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import Shape
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, enumerate_each, repeat_each
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, enumerate_each
 
 # Maximum distance between samples of an edge, in cells.
 _SPACING = 0.5
@@ -51,12 +51,8 @@ def _fill(tails: ComplexArray, heads: ComplexArray, h: int, w: int) -> BoolArray
     lower, upper = np.where(up, tails, heads), np.where(up, heads, tails)
     # Rows of centres y with lower ≤ y < upper.
     first, end = np.ceil(lower.imag - 0.5).astype(np.int64), np.ceil(upper.imag - 0.5).astype(np.int64)
-    count = end - first
-    crossed = np.flatnonzero(count)
-    edge = repeat_each(crossed, count[crossed])
-    row = np.arange(len(edge)) + repeat_each(
-        first[crossed] - np.cumsum(count[crossed]) + count[crossed], count[crossed]
-    )
+    edge, step = enumerate_each(end - first)
+    row = first[edge] + step
     ahead = upper[edge] - lower[edge]
     x = lower.real[edge] + (row + 0.5 - lower.imag[edge]) * (ahead.real / ahead.imag)
     column = np.clip(np.ceil(x - 0.5).astype(np.int64), 0, w)
