@@ -11,6 +11,8 @@ Without chords and ears, no choice of the boundary excludes an injective map by 
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
@@ -226,6 +228,14 @@ def cat(rings: int = 50) -> tuple[FloatArray, IntArray]:
     ValueError
         If ``rings`` is not positive.
     """
+    check_integer("rings", rings, minimum=1)
+    V, F = _cat(int(rings))
+    return V.copy(), F.copy()
+
+
+@lru_cache(maxsize=8)
+def _cat(rings: int) -> tuple[FloatArray, IntArray]:
+    """Make the cat; it is kept, because it takes forty relaxations."""
     flat, F = disk(rings)
     inside = len(flat) - 6 * rings
     r = np.hypot(*flat.T)[:, None]  # in quarter turns; np.sinc avoids 0 / 0 in flat / r * sin(π r / 2)
