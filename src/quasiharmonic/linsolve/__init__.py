@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.linsolve.base import LinearSolver
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
-from quasiharmonic.util.arrays import describe
+from quasiharmonic.util.arrays import check_choice
 
 __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver", "takes_order"]
 
@@ -59,16 +59,15 @@ def available(entries: int | None = None) -> tuple[str, ...]:
 
 
 def check_name(name: object) -> None:
-    """Raise a ValueError if the name of a linear solver is not a text."""
-    if not isinstance(name, str):
-        raise ValueError(f"linear_solver must be a name, not {describe(name)}")
+    """Raise a ValueError that lists the names of the linear solvers, unless this is one of them, installed or not."""
+    check_choice("linear_solver", name, ("auto", *BACKENDS))
 
 
 def takes_order(name: str = "auto") -> bool:
     """Whether `make_solver` with this name and a large system uses a given elimination order."""
     check_name(name)
     chosen = available()[0] if name == "auto" else name
-    return chosen in BACKENDS and _backend(chosen).takes_order
+    return _backend(chosen).takes_order
 
 
 def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", ordered: bool = False) -> LinearSolver:
@@ -104,11 +103,6 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
                 return _backend(candidate)(indptr, indices, ordered=ordered)
             except ImportError:
                 continue  # installed but broken; the last candidate is part of SciPy and always loads
-    if name not in BACKENDS:
-        raise ValueError(
-            f"unknown linear solver {name!r}; the names are 'auto', {', '.join(map(repr, BACKENDS))}; "
-            f"available: {', '.join(available())}"
-        )
     backend = _backend(name)
     if not backend.present():
         raise ImportError(

@@ -42,7 +42,7 @@ from quasiharmonic.geometry.mesh.elements import (
 )
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_planar_mesh
-from quasiharmonic.linsolve import BACKENDS
+from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
@@ -51,7 +51,6 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_callback,
-    check_choice,
     check_finite,
     check_integer,
     check_positive,
@@ -165,7 +164,7 @@ def morph(
             raise ValueError("slide must be a bool or an array of planes for tetrahedra, not BoundaryCurves")
         if energy is not None:
             find_energy(energy)
-        check_choice("linear_solver", linear_solver, ("auto", *BACKENDS))
+        check_name(linear_solver)
         check_integer("max_iterations", max_iterations, minimum=0)
         check_positive(tol=tol)
         check_callback(callback)

@@ -24,13 +24,12 @@ from quasiharmonic.geometry.mesh.elements import check_spread
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.accepts_mesh import init_accepts_planar_mesh
 from quasiharmonic.io.adapters.objects import MeshLike
-from quasiharmonic.linsolve import BACKENDS
+from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_bool,
-    check_choice,
     check_finite,
     check_integer,
     map_array,
@@ -139,7 +138,7 @@ class MovingMesh:
         self._volume: MovingTetrahedra | None = None
         if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
             find_energy(energy)
-            check_choice("linear_solver", linear_solver, ("auto", *BACKENDS))
+            check_name(linear_solver)
             check_integer("settle", settle, minimum=0)
             self._volume = MovingTetrahedra(points, F, moved_vertices, settle, slide)
             return
