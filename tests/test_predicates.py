@@ -109,6 +109,12 @@ def test_triples_over_more_than_130_orders_of_magnitude():
             assert [int(orientation(*corners)) for corners in ((a, b, c), (b, a, c))] == [1, -1]
 
 
+def test_a_coordinate_of_one_counts_beside_the_largest_doubles():
+    """The line of the other two points meets the y-axis at 2¹⁰²³, and x = 1 decides the side of the first point."""
+    high, b, c = 2.0**1023, 2.0**972, 2.0**971
+    assert orientation(np.array([1.0, high]), np.array([b, high + b]), np.array([c, high + c])) == 1
+
+
 def test_orientation_where_rounding_and_underflow_have_equal_bounds(rng):
     a, b = rng.standard_normal((2, 4000, 2)) * 2.0**-504
     t = rng.random((4000, 1))
