@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import importlib
 import json
-import multiprocessing
 import os
 import time
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from shared.quick_processes import quick_context
+
 PRELOAD = Path(__file__).with_name("failing_cluster.py")
-IMPORTS = [
-    "distributed.cli.dask_scheduler",
-    "distributed.cli.dask_worker",
-    "quasiharmonic.ui.batch.cluster",
-    "quasiharmonic.ui.batch.supervisor",
-]
 
 
 def run_command(kind, arguments, settings):
@@ -33,8 +28,7 @@ def run_command(kind, arguments, settings):
 @contextmanager
 def cluster(folder, workers, **settings):
     """A scheduler and single-threaded workers: address, scheduler process, worker processes."""
-    context = multiprocessing.get_context("forkserver" if os.name == "posix" else "spawn")
-    context.set_forkserver_preload(IMPORTS)
+    context = quick_context()
     told = folder / "scheduler.json"
 
     def start(kind, *arguments):
