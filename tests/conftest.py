@@ -192,3 +192,12 @@ def visitor():
     from shared.pages import Visitor
 
     return Visitor()
+
+
+@pytest.fixture
+def quick_campaign(monkeypatch):
+    """Solve the problems of a campaign in processes that start quickly."""
+    import campaign
+    from shared.quick_processes import quick_context
+
+    monkeypatch.setattr(campaign, "multiprocessing", SimpleNamespace(get_context=lambda _: quick_context()))

@@ -5,7 +5,6 @@ import os
 import re
 from itertools import islice
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ import tetrahedral_problems
 from quasiharmonic import Problem, boundary_loops, certify, certify_tetrahedra, injective_tetrahedra, solve
 from quasiharmonic.solver.search.strategy import stages_of
 from quasiharmonic.util import kernels
-from shared.quick_processes import quick_context
 
 pytestmark = pytest.mark.slow
 
@@ -97,12 +95,6 @@ def test_names_cover_all_families_and_difficulties():
         hard = np.array([difficulty for f, _, difficulty in names if f == family])
         counts = np.histogram(hard, bins=5, range=(0, 1))[0]
         assert counts.min() >= 18
-
-
-@pytest.fixture
-def quick_campaign(monkeypatch):
-    """Solve the problems of a campaign in processes that start quickly."""
-    monkeypatch.setattr(campaign, "multiprocessing", SimpleNamespace(get_context=lambda _: quick_context()))
 
 
 def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys, quick_campaign):
