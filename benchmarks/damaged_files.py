@@ -39,6 +39,7 @@ import quasiharmonic
 from quasiharmonic.geometry.mesh.elements import covering_triangles
 from quasiharmonic.io import MeshData, read_mesh, write_map
 from quasiharmonic.io.fem.files import read_fem
+from quasiharmonic.linsolve import make_solver
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.cli import main as qhm
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -317,6 +318,8 @@ def _import_all() -> None:
                 importlib.import_module(module.name)
     for name in ("scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial", "scipy.optimize", "matplotlib.path"):
         importlib.import_module(name)
+    # The first solver imports its library.
+    make_solver([0, 1], [0]).close()
 
 
 def trials(names: Sequence[str], keep: Path | None = None) -> Iterator[Trial]:

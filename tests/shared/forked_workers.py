@@ -121,11 +121,13 @@ def serve_copies(channel):
 
 
 # Modules that a worker imports while it solves its first problem.
-LATER = "qdldl", "fontTools.ttLib", "quasiharmonic.io.formats.obj", "quasiharmonic.apps.atlas.packing.pack"
+LATER = "fontTools.ttLib", "quasiharmonic.io.formats.obj", "quasiharmonic.apps.atlas.packing.pack"
 
 if __name__ == "__main__":
+    from quasiharmonic.linsolve import make_solver
     from quasiharmonic.ui.batch import worker
 
+    make_solver([0, 1], [0]).close()
     for module in LATER:
         with contextlib.suppress(ImportError):
             importlib.import_module(module)
