@@ -28,9 +28,11 @@ _STEPS = 10
 SWITCH = "QUASIHARMONIC_PURE"
 
 
-def timed(sizes: list[int], folders: list[Path], repetitions: int) -> Iterator[tuple[str, int, float, float]]:
+def timed(
+    sizes: list[int], letters: str, folders: list[Path], repetitions: int
+) -> Iterator[tuple[str, int, float, float]]:
     """Yield name, triangles, and seconds of mapping and polishing of each problem; the minimum of the repetitions."""
-    for name, arrays in problems(sizes, LETTERS, folders):
+    for name, arrays in problems(sizes, letters, folders):
         V, F, fixed, _ = arrays
         mapping, polishing = [], []
         # The first call loads libraries, so it is not measured.
@@ -82,12 +84,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--triangles", nargs="*", type=int, default=[1000, 4000, 16000, 64000])
+    parser.add_argument("--letters", default=LETTERS, help="their targets (%(default)s)")
     parser.add_argument("-r", "--repetitions", type=int, default=3, help="in a process, and processes of each kind")
     parser.add_argument("-o", "--output", type=Path, default=Path())
     parser.add_argument("--alone", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.alone:
-        for row in timed(options.triangles, options.folders, options.repetitions):
+        for row in timed(options.triangles, options.letters, options.folders, options.repetitions):
             print(json.dumps(row), flush=True)
         return
     if kernels.extension is None:

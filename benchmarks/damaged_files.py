@@ -28,6 +28,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
+from functools import cache
 from io import FileIO, TextIOWrapper
 from pathlib import Path
 from typing import NamedTuple
@@ -38,6 +39,7 @@ import quasiharmonic
 from quasiharmonic.geometry.mesh.elements import covering_triangles
 from quasiharmonic.io import MeshData, read_mesh, write_map
 from quasiharmonic.io.fem.files import read_fem
+from quasiharmonic.linsolve import make_solver
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.cli import main as qhm
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -90,6 +92,7 @@ _NUMBERS = (
 _BYTES = (b"\0", b"\n", b"\r", b"/", b"\\\n", b"#", b"\xff\xff\xff\x7f", b"\xff" * 8, b"\xef\xbb\xbf", b"<", b">", b'"')
 
 
+@cache
 def valid_files() -> dict[str, bytes]:
     """Return a valid file of every kind in `CALLS`."""
     flat, F = disk(4)
@@ -305,6 +308,7 @@ def _positive(F: IntArray, uv: FloatArray) -> bool:
     return all((b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0]) for a, b, c in corners)
 
 
+@cache
 def _import_all() -> None:
     """Import the command's modules once, before the processes are forked."""
     for module in pkgutil.walk_packages(quasiharmonic.__path__, "quasiharmonic."):
@@ -314,12 +318,14 @@ def _import_all() -> None:
                 importlib.import_module(module.name)
     for name in ("scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial", "scipy.optimize", "matplotlib.path"):
         importlib.import_module(name)
+    # The first solver imports its library.
+    make_solver([0, 1], [0]).close()
 
 
 def trials(names: Sequence[str], keep: Path | None = None) -> Iterator[Trial]:
     """Try damaged files one by one, each in its own subfolder of ``keep`` or in a temporary folder."""
-    files = valid_files()
     _import_all()
+    files = valid_files()
     for name in names:
         folder = Path(tempfile.mkdtemp()) if keep is None else keep / name.replace(":", "-")
         folder.mkdir(parents=True, exist_ok=True)

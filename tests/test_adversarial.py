@@ -151,7 +151,7 @@ def test_a_snowflake_is_reached_at_every_corner():
     assert abs(outlines.koch(3)[:, None] - target).min(axis=1).max() < 1e-12
 
 
-def test_an_option_runs_a_campaign_of_these_families(tmp_path, capsys):
+def test_an_option_runs_a_campaign_of_these_families(tmp_path, capsys, quick_campaign):
     output = tmp_path / "results.jsonl"
     assert campaign.main(["--adversarial", "-n", "2", "-o", str(output)]) == 0
     assert [record["family"] for record in campaign.read(output)] == ["needles", "sizes"]

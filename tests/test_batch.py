@@ -177,7 +177,7 @@ class TestRun:
         assert "cannot start /nonexistent" in capsys.readouterr().err
 
     def test_memory_of_the_driver_does_not_grow_with_the_problems(self, tmp_path, monkeypatch):
-        """Thousands of folders, each with one unread file."""
+        """Hundreds of folders, each with one unread file."""
 
         def attend_all(supervisor, some):
             for files in some:
@@ -187,23 +187,23 @@ class TestRun:
                 yield Finished(files.name, "injective", 0.0)
 
         def look(progress):
-            if progress.done in (100, 1000):
+            if progress.done in (100, 400):
                 held = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/batch/*.py")])
                 sizes[progress.done] = sum(trace.size for trace in held.traces)
 
         monkeypatch.setattr(supervisor.Supervisor, "attend_all", attend_all)
-        for k in range(1000):
+        for k in range(400):
             folder = tmp_path / "set" / f"{k // 50}" / f"{k}"
             folder.mkdir(parents=True)
             (folder / "input.obj").touch()
         sizes = {}
         tracemalloc.start()
         try:
-            assert batch.run(tmp_path / "set", tmp_path / "out", jobs=1, callback=look).solved == 1000
+            assert batch.run(tmp_path / "set", tmp_path / "out", jobs=1, callback=look).solved == 400
         finally:
             tracemalloc.stop()
-        # A list of the problems would take half a megabyte.
-        assert sizes[1000] < sizes[100] + 50_000
+        # A list of the problems would take 150 kB.
+        assert sizes[400] < sizes[100] + 50_000
 
     def test_an_interrupt_stops_at_once_and_keeps_finished_results(self, stars, tmp_path, failing_worker):
         write_stars(stars, ["y_sleep"])

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import os
 import signal
-import subprocess
 import sys
 import time
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -17,73 +12,49 @@ from quasiharmonic import batch
 from quasiharmonic.ui.batch.cluster import attend
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.cli import main
+from shared.dask_cluster import cluster
 from shared.datasets import lasting, record_of, write_stars
 
 pytestmark = pytest.mark.slow
 
 pytest.importorskip("distributed")
 
-PRELOAD = Path(__file__).with_name("shared") / "failing_cluster.py"
 
-
-@contextmanager
-def cluster(folder, workers, **environment):
-    """A scheduler and single-threaded workers: address, scheduler process, worker processes."""
-    environment = {**os.environ, **environment}
-    told = folder / "scheduler.json"
-
-    def start(kind, *arguments):
-        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--scheduler-file", str(told), *arguments]
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        stack.callback(process.wait)
-        stack.callback(process.kill)
-        return process
-
-    with ExitStack() as stack:
-        scheduler = start("scheduler", "--port", "0", "--no-dashboard", "--interface", "lo")
-        options = "--no-nanny", "--nthreads", "1", "--no-dashboard", "--preload", str(PRELOAD)
-        running = [start("worker", *options, "--local-directory", str(folder)) for _ in range(workers)]
-        deadline = time.monotonic() + 60
-        while not told.exists() or not told.read_text():
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        address = json.loads(told.read_text())["address"]
-        assert address.startswith("tcp://")
-        yield address, scheduler, running
-
-
-def test_a_worker_killed_during_a_problem(tmp_path):
-    source = write_stars(tmp_path / "set", [f"{i:02d}" for i in range(16)], rings=9)
+def test_a_worker_killed_during_a_problem(tmp_path, quick_workers):
+    names = [f"{i:02d}" for i in range(10)]
+    source = write_stars(tmp_path / "set", names, rings=7)
     killed = []
-    with cluster(tmp_path, 3) as (address, _, workers):
+    with cluster(tmp_path, 2) as (address, _, workers):
 
         def kill_one(progress):
-            if progress.done >= 4 and not killed:
-                workers[0].send_signal(signal.SIGKILL)
+            if progress.done >= 3 and not killed:
+                workers[0].kill()
                 killed.append(progress.done)
 
         progress = batch.run(source, tmp_path / "out", scheduler=address, callback=kill_one)
         assert killed
-        assert killed[0] < 16
-        assert workers[0].wait() == -signal.SIGKILL
-        assert workers[1].poll() is workers[2].poll() is None
-        assert progress.outcomes == {"injective": 16}
-        # Run the command on the remaining workers of the cluster.
+        assert killed[0] < len(names)
+        workers[0].join()
+        assert workers[0].exitcode == -signal.SIGKILL
+        assert workers[1].is_alive()
+        assert progress.outcomes == {"injective": len(names)}
+        # Run the command on the remaining worker of the cluster.
         assert main(["batch", str(source), "-o", str(tmp_path / "out"), "--scheduler", address]) == 0
-    assert batch.run(source, tmp_path / "out").resumed == 16
+    assert batch.run(source, tmp_path / "out").resumed == len(names)
     batch.run(source, tmp_path / "local")
-    for name in (f"{i:02d}" for i in range(16)):
+    for name in names:
         assert lasting(record_of(tmp_path / "out", name)) == lasting(record_of(tmp_path / "local", name))
 
 
 def test_problems_that_kill_workers_are_identified_and_affect_no_other(tmp_path):
-    source = write_stars(tmp_path / "set", ["a", "b", "c", "poison", "x", "y", "z"])
-    with cluster(tmp_path, 4, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0") as (address, _, workers):
+    source = write_stars(tmp_path / "set", ["a", "b", "poison", "x", "y"])
+    settings = {"distributed.scheduler.allowed-failures": 0}
+    with cluster(tmp_path, 3, **settings) as (address, _, workers):
         progress = batch.run(source, tmp_path / "out", scheduler=address)
-        assert progress.outcomes == {"injective": 6, "crash": 1}
+        assert progress.outcomes == {"injective": 4, "crash": 1}
         assert "died" in record_of(tmp_path / "out", "poison")["error"]
-        assert sum(worker.poll() is not None for worker in workers) == 2
-    assert batch.run(source, tmp_path / "out").resumed == 7
+        assert sum(not worker.is_alive() for worker in workers) == 2
+    assert batch.run(source, tmp_path / "out").resumed == 5
 
 
 def test_errors_that_end_the_run(tmp_path):

@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import subprocess
 import sys
 
 import pytest
 
-from quasiharmonic.ui.cli import main
+from quasiharmonic.ui.cli import commands, main
 from shared.datasets import write_stars
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_workers")]
@@ -61,28 +60,26 @@ class TestCommand:
         assert stop.value.code == 2
         assert "is not a size" in capsys.readouterr().err
 
-    def test_on_a_terminal_and_in_a_log(self, stars, tmp_path):
+    def test_on_a_terminal_and_in_a_log(self, stars, tmp_path, capsys, monkeypatch):
         pty = pytest.importorskip("pty")
-        leader, follower = pty.openpty()
         # Print every problem, however fast they follow each other.
-        often = (
-            "import sys; from quasiharmonic.ui.cli import main; from quasiharmonic.ui.cli.commands import batch; "
-            "batch.LIVE = batch.LOG = 0; main(sys.argv[1:])"
-        )
-        command = [sys.executable, "-c", often, "batch", str(stars), "-j", "1", "-o"]
-        run = subprocess.Popen([*command, str(tmp_path / "1")], stdout=subprocess.DEVNULL, stderr=follower)
-        os.close(follower)
+        monkeypatch.setattr(commands.batch, "LIVE", 0)
+        monkeypatch.setattr(commands.batch, "LOG", 0)
+        command = ["batch", str(stars), "-j", "1", "-o"]
+        leader, follower = pty.openpty()
+        with os.fdopen(follower, "w") as terminal, monkeypatch.context() as patch:
+            patch.setattr(sys, "stderr", terminal)
+            assert main([*command, str(tmp_path / "1")]) == 0
         shown = ""
         # At the terminal's end, reading raises an error on Linux and returns nothing elsewhere.
         with contextlib.suppress(OSError):
             while part := os.read(leader, 1 << 12):
                 shown += part.decode()
         os.close(leader)
-        assert run.wait() == 0
         assert re.search(r"\d/4 done   0 failed   \S+/s", shown)
         assert " left" in shown
         assert re.search(r"\r +\r$", shown)
-        done = subprocess.run([*command, str(tmp_path / "2")], capture_output=True, text=True)
-        lines = done.stderr.splitlines()
-        assert lines[-1].startswith("4/4 done")
-        assert "\r" not in done.stderr
+        assert main([*command, str(tmp_path / "2")]) == 0
+        log = capsys.readouterr().err
+        assert log.splitlines()[-1].startswith("4/4 done")
+        assert "\r" not in log

@@ -179,9 +179,9 @@ class TestPage:
         assert "1 no injective map found; 1 proven to have no such map" in text
         assert "The target has the opposite orientation to the mesh" in text
 
-    @pytest.mark.parametrize("column", ["problem", "error", "outcome", "source", "versions"])
-    def test_any_names(self, tmp_path, column):
-        made(tmp_path, 30, **{column: VILE, "certified": False})
+    @pytest.mark.parametrize("columns", [["problem"], ["error"], ["outcome"], ["source", "versions"]], ids="-".join)
+    def test_any_names(self, tmp_path, columns):
+        made(tmp_path, 30, **dict.fromkeys(columns, VILE), certified=False)
         made(tmp_path, 30, name="x.csv")
         (tmp_path / "x.csv").rename(tmp_path / "<b>o&.csv")
         read = Reader(written(tmp_path, tmp_path / "t.csv", tmp_path / "<b>o&.csv"))
@@ -189,7 +189,7 @@ class TestPage:
         assert all(attributes.get("src", "data:").startswith("data:") for _, attributes in read.tags)
         assert not any(name.startswith("on") or name == "href" for _, attributes in read.tags for name in attributes)
         assert "<b>o&.csv" in read.text
-        if column in ("problem", "error", "outcome"):
+        if columns[0] in ("problem", "error", "outcome"):
             assert r"<script>alert(1)</script>" in read.text
             assert r"\u202e" in read.text
             assert "\u202e" not in read.text
@@ -214,10 +214,10 @@ class TestPage:
         assert "0 of 2 certified" in Reader(written(tmp_path, tmp_path / "t.parquet")).text
 
     def test_many_failures_and_many_dots_are_limited(self, tmp_path):
-        made(tmp_path, 20_000, name="many.csv")
+        made(tmp_path, 11_000, name="many.csv")
         text = written(tmp_path, tmp_path / "many.csv", tmp_path / "many.csv")
-        assert len(text) < 2_000_000
-        assert "And 500 more" in text
+        assert len(text) < 450_000
+        assert "And 50 more" in text
 
     def test_errors(self, tmp_path, capsys):
         (tmp_path / "t.csv").write_text("problem,seconds\n")

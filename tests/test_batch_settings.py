@@ -191,17 +191,17 @@ class TestSettings:
             assert record_of(tmp_path / "out", "disk.obj")["cut_edges"] == 0
 
     def test_edges_without_space_are_split(self, tmp_path):
-        V, F = disk(2)
-        ring = np.arange(len(V) - 12, len(V))
+        V, F = disk(1)
+        ring = np.arange(1, 7)
         tips = 1.2 * (V[ring] + V[np.roll(ring, -1)]) / 2
-        V, F = np.vstack([V, tips]), np.vstack([F, np.stack([np.roll(ring, -1), ring, len(V) + np.arange(12)], axis=1)])
+        V, F = np.vstack([V, tips]), np.vstack([F, np.stack([np.roll(ring, -1), ring, len(V) + np.arange(6)], axis=1)])
         (tmp_path / "set").mkdir()
         io.write_obj(tmp_path / "set" / "ears.obj", io.MeshData(V, F))
         assert batch.run(tmp_path / "set", tmp_path / "a", batch.Settings(to="rect:2x1"), jobs=1).solved == 0
         settings = batch.Settings(to="rect:2x1", refine=True)
         assert batch.run(tmp_path / "set", tmp_path / "b", settings, jobs=1).solved == 1
         record = record_of(tmp_path / "b", "ears.obj")
-        assert record["added_vertices"] >= 8
+        assert record["added_vertices"] >= 2
         assert record["vertices"] == len(V) + record["added_vertices"]
         written = io.read_mesh(tmp_path / "b" / "results" / "ears.obj" / "map.obj")
         np.testing.assert_array_equal(written.V[: len(V), :2], V)

@@ -97,7 +97,7 @@ def test_names_cover_all_families_and_difficulties():
         assert counts.min() >= 18
 
 
-def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
+def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys, quick_campaign):
     output = tmp_path / "results.jsonl"
     todo = list(campaign.names(3, ["swirl", "limbs", "comb"]))
     started = campaign.campaign(todo, output, limit=60)
@@ -123,7 +123,7 @@ def test_a_campaign_runs_resumes_and_is_summarised(tmp_path, capsys):
     assert "among 3 problems" in text
 
 
-def test_a_hang_is_a_result_and_the_next_problem_is_solved(tmp_path, monkeypatch):
+def test_a_hang_is_a_result_and_the_next_problem_is_solved(tmp_path, monkeypatch, quick_campaign):
     start = campaign.Worker.start
     spares = [-30.0, 30.0]
 
@@ -174,7 +174,10 @@ def test_no_map_is_no_failure_without_a_known_solution():
     assert campaign.failed({"outcome": "not injective", "feasible": True})
 
 
-@pytest.mark.parametrize("name", ["jam:15:0.771", "jam:20:0.861", "spiral:83:0.797", "jam:84:0.415"])
+@pytest.mark.parametrize(
+    "name",
+    ["jam:15:0.771", "jam:20:0.861", "spiral:83:0.797", pytest.param("jam:84:0.415", marks=pytest.mark.nightly)],
+)
 def test_fallbacks_solve_problems_that_the_search_over_tensors_does_not(name):
     """Problems whose last triangles have almost no space, or whose target overlaps itself."""
     case = problems.make(*problems.parse(name))
@@ -281,9 +284,9 @@ def test_compiled_loops_are_compared_with_numpy(tmp_path, monkeypatch):
         with pytest.raises(SystemExit, match="not built, or switched off"):
             compiled_loops.main(["--triangles", "100"])
         return
-    compiled_loops.main(["--triangles", "100", "-r", "1", "-o", str(tmp_path)])
+    compiled_loops.main(["--triangles", "100", "--letters", "CS", "-r", "1", "-o", str(tmp_path)])
     lines = (tmp_path / "compiled_loops.md").read_text(encoding="utf-8").splitlines()
-    assert [line.split("|")[1].strip() for line in lines[4:]] == ["cat on C", "cat on R", "cat on S", "geometric mean"]
+    assert [line.split("|")[1].strip() for line in lines[4:]] == ["cat on C", "cat on S", "geometric mean"]
 
 
 def test_speed_is_measured_merged_and_limited(tmp_path, capsys):
@@ -306,8 +309,8 @@ def test_speed_is_measured_merged_and_limited(tmp_path, capsys):
 
 def test_lbfgs_only(tmp_path):
     """A row is read back as written, and the recorded runs are complete."""
-    (V, F) = next((V, F) for name, V, F in lbfgs_only.made(24) if name == "hand")
-    run = lbfgs_only.measure("hand", V, F, "A", "V₃ tanh", 100)
+    surface, V, F = next(lbfgs_only.made(24))
+    run = lbfgs_only.measure(surface, V, F, "A", "V₃ tanh", 100)
     assert run.flips == 0
     table = tmp_path / "table.csv"
     table.write_text(",".join(run._fields) + "\n" + ",".join(map(str, run)) + "\n", encoding="utf-8")

@@ -108,7 +108,7 @@ CALLS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.15, pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("seconds", [0.08, pytest.param(1, marks=pytest.mark.nightly)])
 def test_triangles_that_another_thread_overwrites(seconds):
     text = REWRITTEN.format(calls=CALLS, seconds=seconds)
     ran = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)

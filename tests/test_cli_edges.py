@@ -78,10 +78,11 @@ def test_a_full_disk_leaves_nothing_behind(folder, full_disk, capsys, call, afte
 
 
 def test_an_existing_folder_is_not_removed(folder, full_disk, capsys):
+    frames(folder, 1)
     (folder / "D").mkdir()
     full_disk()
-    assert run("demo", "-o", "D") == 2
-    assert left(folder) == ["D", "m.obj"]
+    assert run("animate", "m.obj", "frames.npy", "-o", "D") == 2
+    assert left(folder) == ["D", "frames.npy", "m.obj"]
 
 
 def test_written_frames_are_reported(folder, full_disk, capsys):
@@ -247,8 +248,14 @@ def shell(call, streams, *, unbuffered=False):
 
 @pytest.mark.slow
 @posix
-@pytest.mark.parametrize("unbuffered", [False, True])
-@pytest.mark.parametrize("call", ["--version", "--help", "map --help", "check m.obj", "measure m.obj"])
+@pytest.mark.parametrize(
+    ("call", "unbuffered"),
+    [
+        *((call, False) for call in ("--version", "--help", "map --help", "check m.obj", "measure m.obj")),
+        *((call, True) for call in ("--help", "check m.obj")),
+        *(pytest.param(call, True, marks=pytest.mark.nightly) for call in ("--version", "map --help", "measure m.obj")),
+    ],
+)
 def test_without_a_reader_the_command_ends_without_a_message(folder, call, unbuffered):
     status, said = shell(call, "| true", unbuffered=unbuffered)
     assert status == 141
@@ -271,8 +278,15 @@ def test_closed_standard_output_is_no_failure_if_the_report_goes_elsewhere(folde
 
 @pytest.mark.slow
 @posix
-@pytest.mark.parametrize("streams", ["2>&-", ">&- 2>&-", "2>&1 | true"])
-@pytest.mark.parametrize(("call", "status"), [("--version", (0, 141)), ("check m.obj", (0, 141)), ("check none", (2,))])
+@pytest.mark.parametrize(
+    ("call", "status", "streams"),
+    [
+        *(("check m.obj", (0, 141), streams) for streams in ("2>&-", ">&- 2>&-", "2>&1 | true")),
+        *(("check none", (2,), streams) for streams in ("2>&-", ">&- 2>&-", "2>&1 | true")),
+        ("--version", (0, 141), ">&- 2>&-"),
+        *(pytest.param("--version", (0, 141), each, marks=pytest.mark.nightly) for each in ("2>&-", "2>&1 | true")),
+    ],
+)
 def test_without_standard_error_the_command_ends_without_a_message(folder, call, status, streams):
     found, said = shell(call, streams)
     assert found in status
@@ -289,8 +303,15 @@ def test_json_output_stays_valid_without_standard_error(folder):
 
 @pytest.mark.slow
 @posix
-@pytest.mark.parametrize("unbuffered", [False, True])
-@pytest.mark.parametrize("call", ["--version", "--help", "map --help", "check m.obj"])
+@pytest.mark.parametrize(
+    ("call", "unbuffered"),
+    [
+        *((call, False) for call in ("--version", "--help", "check m.obj")),
+        *((call, True) for call in ("--help", "check m.obj")),
+        ("map --help", True),
+        *(pytest.param(*case, marks=pytest.mark.nightly) for case in (("--version", True), ("map --help", False))),
+    ],
+)
 def test_a_full_standard_output_is_reported(folder, call, unbuffered):
     if not os.path.exists("/dev/full"):
         pytest.skip("no /dev/full on this system")

@@ -16,7 +16,7 @@ from quasiharmonic.surfaces import starfish
 from quasiharmonic.ui.cli import parser_of
 from shared.commands import run
 
-V, F = starfish(3, 8)
+V, F = starfish(2, 4)
 
 
 @pytest.fixture

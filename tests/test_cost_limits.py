@@ -206,7 +206,7 @@ class TestImports:
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("letter", [None, "C", "R"])
+    @pytest.mark.parametrize("letter", [None, "R", pytest.param("C", marks=pytest.mark.nightly)])
     def test_the_command_maps_a_small_mesh_without_slow_imports(self, letter, tmp_path):
         """No time is measured; SciPy's subpackages and matplotlib would take longer than the map."""
         if available()[0] == "superlu":

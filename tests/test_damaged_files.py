@@ -14,10 +14,10 @@ CALLS = [(kind, call) for kind, calls in damaged_files.CALLS.items() for call in
 
 
 @pytest.mark.parametrize(("kind", "call"), CALLS)
-def test_undamaged_files_are_accepted(kind, call, tmp_path, monkeypatch):
+def test_undamaged_files_are_accepted(kind, call, monkeypatch):
     monkeypatch.setattr(damaged_files, "damaged", lambda rng, data: data)
     monkeypatch.setitem(damaged_files.CALLS, kind, [call])
-    trial = damaged_files.attempt(f"{kind}:0", damaged_files.valid_files(), tmp_path)
+    (trial,) = damaged_files.trials([f"{kind}:0"])
     assert (trial.status, trial.fault) == (0, ""), trial.said
 
 
@@ -49,9 +49,9 @@ def test_errors_are_detected(trouble, fault, tmp_path, monkeypatch):
         return 0
 
     monkeypatch.setattr(damaged_files, "qhm", fail)
-    monkeypatch.setattr(damaged_files, "SECONDS", 5.0)
+    monkeypatch.setattr(damaged_files, "SECONDS", 2.0)
     monkeypatch.setitem(damaged_files.CALLS, "mesh.obj", ["map {} -o out.obj"])
-    files = damaged_files.valid_files()
+    files = dict(damaged_files.valid_files())
     files["turned.obj"] = re.sub(rb"vt (\S+) (\S+)", rb"vt \2 \1", files["mesh.obj"])
     assert fault in damaged_files.attempt("mesh.obj:0", files, tmp_path).fault.replace(f"{tmp_path}/", "")
 

@@ -359,6 +359,7 @@ VECTORS u float
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("count", [300, pytest.param(1000, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("name", "whole"),
     [
@@ -368,7 +369,7 @@ VECTORS u float
         ("text.vtk", LEGACY.encode()),
     ],
 )
-def test_damage_causes_no_unexpected_error(tmp_path, name, whole):
+def test_damage_causes_no_unexpected_error(tmp_path, name, whole, count):
     path = tmp_path / name
     rng = np.random.default_rng(7)
     path.write_bytes(whole)
@@ -376,7 +377,7 @@ def test_damage_causes_no_unexpected_error(tmp_path, name, whole):
     if "u" in mesh.parts.fields and name != "text.msh":
         assert mesh.point_field("u", [0, 1, 2]).tolist() == [[0.5, 0.5]] * 3
     refused = 0
-    for _ in range(1000):
+    for _ in range(count):
         damaged = bytearray(whole[: rng.integers(len(whole)) if rng.random() < 0.2 else None])
         for place in rng.integers(len(damaged), size=rng.integers(1, 4)) if damaged else ():
             damaged[place] = rng.choice([rng.integers(256), 48 + rng.integers(10), 32, 10])
@@ -387,7 +388,7 @@ def test_damage_causes_no_unexpected_error(tmp_path, name, whole):
                 mesh.point_field(field, [0, 1])
         except MeshFileError:
             refused += 1
-    assert refused > 100
+    assert refused > count / 10
 
 
 def test_gmsh_and_the_solver_in_one_process(gmsh):

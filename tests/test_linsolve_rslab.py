@@ -207,7 +207,7 @@ with make_solver(indptr, indices, name="rslab") as solver:
 @pytest.mark.slow
 @needs_rslab
 def test_rslab_gives_the_same_bits_on_any_number_of_threads(tmp_path):
-    A = stiffness(180, contrast=1.0)
+    A = stiffness(174, contrast=1.0)
     assert A.shape[0] >= rslab.SEQUENTIAL_BELOW
     for part in ("indptr", "indices", "data"):
         np.save(tmp_path / f"{part}.npy", getattr(A, part))

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io as text_io
+import shutil
+from functools import cache
 
 import numpy as np
 import pytest
@@ -43,15 +46,28 @@ MODELS = {
 }
 
 
+@pytest.fixture(scope="module")
+def first_opened(tmp_path_factory):
+    """Return a function that opens a model as a file, once."""
+
+    @cache
+    def open_model(name):
+        V, F = MODELS[name]()
+        path = tmp_path_factory.mktemp("models") / "model.obj"
+        io.write_obj(path, io.MeshData(V, F))
+        return path, Visitor(path)
+
+    return open_model
+
+
 @pytest.fixture
-def opened(tmp_path):
+def opened(tmp_path, first_opened):
     """Return a function that opens a model as a file in an empty folder."""
 
     def open_model(name):
-        V, F = MODELS[name]()
-        path = tmp_path / "model.obj"
-        io.write_obj(path, io.MeshData(V, F))
-        return Visitor(path)
+        path, one = first_opened(name)
+        shutil.copyfile(path, tmp_path / path.name)
+        return copy.deepcopy(one)
 
     return open_model
 

@@ -39,11 +39,15 @@ def raise_disk_full(*arguments):
 
 
 def raise_in_use(old, new):
-    if "record.json" in str(new):
+    if Path(new).name == "record.json" and "in_use" in str(new):
         error = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         error.winerror = 32  # as on Windows
         raise error
     replace(old, new)
+
+
+def keep_in_use():
+    atomic.os.replace, atomic.PATIENCE = raise_in_use, 0.2
 
 
 def raise_memory_error(V, F, uv):
@@ -76,7 +80,7 @@ FAILURES = {
     "bug": lambda: {}["lost"],
     "noise": print_text,
     "late": lambda: setattr(metadata, "distortion", raise_memory_error),
-    "in_use": lambda: setattr(atomic.os, "replace", raise_in_use),
+    "in_use": keep_in_use,
     "full": lambda: setattr(atomic.os, "replace", raise_disk_full),
 }
 

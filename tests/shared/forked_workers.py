@@ -7,6 +7,7 @@ same pipes and the same function. Only its imports are saved, which take most of
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import runpy
 import select
@@ -119,9 +120,17 @@ def serve_copies(channel):
             channel.send(str(pid).encode())
 
 
+# Modules that a worker imports while it solves its first problem.
+LATER = "fontTools.ttLib", "quasiharmonic.io.formats.obj", "quasiharmonic.apps.atlas.packing.pack"
+
 if __name__ == "__main__":
+    from quasiharmonic.linsolve import make_solver
     from quasiharmonic.ui.batch import worker
 
+    make_solver([0, 1], [0]).close()
+    for module in LATER:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(module)
     if script := serve_copies(socket.socket(fileno=int(sys.argv[1]))):
         runpy.run_path(script, run_name="__main__")
     else:

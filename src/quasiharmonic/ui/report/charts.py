@@ -115,10 +115,12 @@ def _chart(x_label: str, y_label: str) -> tuple[Figure, Axes]:
 
 def _use_decades(axes: Axes, name: str, low: int, high: int) -> None:
     """Make the axis "x" or "y" logarithmic, from 10^low to 10^high with at most nine ticks."""
+    from matplotlib.ticker import NullLocator
+
     ticks = range(low, high + 1, -(-(high - low) // 8))
     axes.set(**{f"{name}scale": "log", f"{name}lim": (10.0**low, 10.0**high)})
     axes.set(**{f"{name}ticks": [10.0**k for k in ticks], f"{name}ticklabels": [power(k) for k in ticks]})
-    axes.tick_params(axis="x" if name == "x" else "y", which="minor", bottom=False, left=False)
+    (axes.xaxis if name == "x" else axes.yaxis).set_minor_locator(NullLocator())
 
 
 def _svg(figure: Figure) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
 
 from quasiharmonic.util.arrays import BoolArray, IntArray
 from quasiharmonic.util.kernels import compiled
@@ -67,6 +66,8 @@ def find_contact(
     occupied: BoolArray, rows: int, runs: IntArray, starts: IntArray, sizes: IntArray, spot: IntArray
 ) -> int:
     """Fill in number, row and column of `find_most_contact`; return 0 if there is no free place, else 1."""
+    import scipy.fft
+
     # Correlations by FFT count the occupied cells at all places at once.
     cells = occupied.reshape(rows, -1)
     spectrum = scipy.fft.rfft2(cells.astype(np.float64))

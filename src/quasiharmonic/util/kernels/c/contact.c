@@ -13,10 +13,17 @@ typedef struct {
     int32_t *before;
 } Board;
 
-/* A bitmap: the cells of row `runs[0]` from `runs[1]` to before `runs[2]`, and so on. */
+/* A run of cells of a bitmap: its row, first column and end, and two places from where the bits of a board say which of
+ * its cells are occupied: words from the first row and column on, and bits from there on. */
 typedef struct {
-    const int64_t *runs;
-    int64_t count, height, width;
+    int64_t row, first, end, words[2], bits[2];
+} Run;
+
+/* A bitmap: the longest runs first. By a shift of one row at most `rise` cells leave it, by one column at most one for
+ * each run. */
+typedef struct {
+    const Run *runs;
+    int64_t count, height, width, rise;
 } Bitmap;
 
 static uint64_t *row_of(const Board *board, int64_t level, int64_t row)
@@ -30,7 +37,7 @@ static uint64_t bits_from(const uint64_t *row, int64_t words, int64_t bit)
     const int64_t word = bit / 64, shift = bit % 64;
     if (word >= words)
         return 0;
-    return shift ? row[word] >> shift | row[word + 1] << (64 - shift) : row[word];
+    return row[word] >> shift | row[word + 1] << 1 << (63 - shift);
 }
 
 static void read_board(Board *board, const char *cells)
@@ -57,27 +64,61 @@ static void read_board(Board *board, const char *cells)
         }
 }
 
+/* Fill in runs (row, first column, end), `count` of them. */
+static void read_runs(const Board *board, const int64_t *given, int64_t count, Run *runs)
+{
+    for (int64_t k = 0; k < count; k++) {
+        const int64_t row = given[3 * k], first = given[3 * k + 1], end = given[3 * k + 2];
+        int64_t level = 0;
+        while ((int64_t)2 << level <= end - first)
+            level++;
+        const int64_t last = end - ((int64_t)1 << level), words = (level * board->rows + row) * (board->words + 1);
+        runs[k] = (Run){row, first, end, {words + first / 64, words + last / 64}, {first % 64, last % 64}};
+    }
+}
+
+static int64_t count_bits(uint64_t bits)
+{
+    int64_t count = 0;
+    for (; bits; bits &= bits - 1)
+        count++;
+    return count;
+}
+
+/* The number of a bitmap's cells that have no cell of it above. `cells` has room for all rows of the board. */
+static int64_t count_rise(const Bitmap *bitmap, uint64_t *cells)
+{
+    const int64_t words = bitmap->width / 64 + 1, size = bitmap->height * words;
+    int64_t count = 0;
+    memset(cells, 0, (size_t)(size + words) * sizeof(*cells));
+    for (int64_t k = 0; k < bitmap->count; k++) {
+        const Run *run = bitmap->runs + k;
+        uint64_t *row = cells + run->row * words;
+        for (int64_t w = run->first / 64; w <= run->end / 64; w++) {
+            const uint64_t from = w == run->first / 64 ? ~(uint64_t)0 << run->first % 64 : ~(uint64_t)0;
+            row[w] |= w == run->end / 64 ? from & (((uint64_t)1 << run->end % 64) - 1) : from;
+        }
+    }
+    for (int64_t w = 0; w < size; w++)
+        count += count_bits(cells[w] & ~cells[w + words]);
+    return count;
+}
+
 /* Mark the columns of a row where a bitmap would overlap occupied cells. */
 static void find_collisions(const Board *board, const Bitmap *bitmap, int64_t row, uint64_t *found)
 {
     const int64_t places = board->columns - bitmap->width + 1, words = (places + 63) / 64;
     const uint64_t none = ~(uint64_t)0, last = places % 64 ? none >> (64 - places % 64) : none;
-    memset(found, 0, (size_t)words * sizeof(*found));
-    found[words - 1] = ~last;
-    for (int64_t k = 0; k < bitmap->count; k++) {
-        const int64_t *run = bitmap->runs + 3 * k;
-        int64_t level = 0;
-        while ((int64_t)2 << level <= run[2] - run[1])
-            level++;
-        const uint64_t *near = row_of(board, level, row + run[0]);
-        const int64_t end = run[2] - ((int64_t)1 << level);
-        uint64_t all = none;
-        for (int64_t w = 0; w < words; w++) {
-            found[w] |= bits_from(near, board->words, 64 * w + run[1]) | bits_from(near, board->words, 64 * w + end);
-            all &= found[w];
+    for (int64_t w = 0; w < words; w++) {
+        const uint64_t *near = row_of(board, 0, row) + w;
+        uint64_t all = w == words - 1 ? ~last : 0;
+        for (int64_t k = 0; k < bitmap->count && all != none; k++) {
+            const Run *run = bitmap->runs + k;
+            const uint64_t *one = near + run->words[0], *other = near + run->words[1];
+            all |= one[0] >> run->bits[0] | one[1] << 1 << (63 - run->bits[0]);
+            all |= other[0] >> run->bits[1] | other[1] << 1 << (63 - run->bits[1]);
         }
-        if (all == none)
-            return;
+        found[w] = all;
     }
 }
 
@@ -86,49 +127,51 @@ static int64_t count_overlap(const Board *board, const Bitmap *bitmap, int64_t r
 {
     int64_t sum = 0;
     for (int64_t k = 0; k < bitmap->count; k++) {
-        const int64_t *run = bitmap->runs + 3 * k;
-        const int32_t *before = board->before + (row + run[0]) * (board->columns + 1) + column;
-        sum += before[run[2]] - before[run[1]];
+        const Run *run = bitmap->runs + k;
+        const int32_t *before = board->before + (row + run->row) * (board->columns + 1) + column;
+        sum += before[run->end] - before[run->first];
     }
     return sum;
 }
 
-static int is_free(const uint64_t *collisions, int64_t column)
-{
-    return !(collisions[column / 64] >> (column % 64) & 1);
-}
-
-/* Find the free place with the most contact, at least one cell away from the sides; its contact, or -1. `three` has room
- * for the collisions of three rows. */
-static int64_t find_place(const Board *board, const Bitmap *bitmap, uint64_t *three, int64_t *place)
+/* Find the free place with the most contact, at least one cell away from the sides; its contact, or -1 if it is not
+ * more than `least`. `three` has room for the collisions of three rows. */
+static int64_t find_place(const Board *board, const Bitmap *bitmap, int64_t least, uint64_t *three, int64_t *place)
 {
     const int64_t last_row = board->rows - bitmap->height, last_column = board->columns - bitmap->width;
-    const int64_t words = board->words + 1;
-    int64_t best = -1;
-    if (last_row < 2 || last_column < 2)
-        return best;
+    const int64_t words = board->words + 1, side = bitmap->count, rise = bitmap->rise;
+    int64_t best = least;
     uint64_t *below = three, *here = three + words, *above = three + 2 * words;
     find_collisions(board, bitmap, 0, below);
     find_collisions(board, bitmap, 1, here);
     for (int64_t i = 1; i < last_row; i++) {
         find_collisions(board, bitmap, i + 1, above);
         for (int64_t w = 0; w <= (last_column - 1) / 64; w++) {
-            uint64_t free_here = ~here[w];
+            // Bits of places where the bitmap is free, and of those where it is not if it is shifted by one cell.
+            uint64_t bits = ~here[w];
+            const uint64_t left = here[w] << 1 | (w ? here[w - 1] >> 63 : 1);
+            const uint64_t right = here[w] >> 1 | (w < last_column / 64 ? here[w + 1] << 63 : 0);
             if (w == 0)
-                free_here &= ~(uint64_t)1;
-            if (!free_here)
-                continue;
-            for (int64_t j = 64 * w; j < 64 * w + 64 && j < last_column; j++) {
-                if (!(free_here >> (j % 64) & 1))
+                bits &= ~(uint64_t)1;
+            if (w == last_column / 64)
+                bits &= ((uint64_t)1 << last_column % 64) - 1;
+            if (best >= 0)
+                bits &= above[w] | below[w] | left | right;
+            for (int64_t j = 64 * w; bits; bits >>= 1, j++) {
+                if (!(bits & 1))
+                    continue;
+                const int up = above[w] >> j % 64 & 1, down = below[w] >> j % 64 & 1;
+                const int to_left = left >> j % 64 & 1, to_right = right >> j % 64 & 1;
+                if ((up + down) * rise + (to_left + to_right) * side <= best)
                     continue;
                 int64_t contact = 0;
-                if (!is_free(above, j))
+                if (up)
                     contact += count_overlap(board, bitmap, i + 1, j);
-                if (!is_free(below, j))
+                if (down)
                     contact += count_overlap(board, bitmap, i - 1, j);
-                if (!is_free(here, j + 1))
+                if (to_right)
                     contact += count_overlap(board, bitmap, i, j + 1);
-                if (!is_free(here, j - 1))
+                if (to_left)
                     contact += count_overlap(board, bitmap, i, j - 1);
                 if (contact > best) {
                     best = contact;
@@ -142,11 +185,11 @@ static int64_t find_place(const Board *board, const Bitmap *bitmap, uint64_t *th
         here = above;
         above = spare;
     }
-    return best;
+    return best > least ? best : -1;
 }
 
 /* (occupied, rows, runs, starts, sizes, spot): the number of a bitmap and its place of most contact; 0 if there is none.
- * The runs of a bitmap are in its box. */
+ * The runs of a bitmap are in its box and have no common cells. */
 static PyObject *find_contact(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
@@ -158,7 +201,7 @@ static PyObject *find_contact(PyObject *module, PyObject *const *given, Py_ssize
              rows > 0 && a[0].size % rows == 0 && a[0].size > 0 && a[0].size <= INT32_MAX && a[2].size % 3 == 0
                  && bitmaps >= 0 && a[4].size == 2 * bitmaps && a[5].size == 3 && are_parts(&a[3], a[2].size / 3)))
         return NULL;
-    const int64_t *runs = a[2].data, *starts = a[3].data, *sizes = a[4].data;
+    const int64_t *starts = a[3].data, *sizes = a[4].data;
     int64_t *spot = a[5].data;
     const int64_t columns = a[0].size / rows;
     Board board = {rows, columns, (columns + 63) / 64, 1, NULL, NULL};
@@ -167,21 +210,33 @@ static PyObject *find_contact(PyObject *module, PyObject *const *given, Py_ssize
     board.near = malloc((size_t)(board.levels * rows * (board.words + 1)) * sizeof(*board.near));
     board.before = malloc((size_t)(rows * (columns + 1)) * sizeof(*board.before));
     uint64_t *three = malloc((size_t)(3 * (board.words + 1)) * sizeof(*three));
-    if (!board.near || !board.before || !three) {
+    uint64_t *cells = malloc((size_t)(rows * board.words) * sizeof(*cells));
+    Run *runs = malloc((size_t)(a[2].size / 3 + 1) * sizeof(*runs));
+    if (!board.near || !board.before || !three || !cells || !runs) {
         free(board.near);
         free(board.before);
         free(three);
+        free(cells);
+        free(runs);
         return out_of_memory(a, LENGTH(a));
     }
     int found = 0;
     Py_BEGIN_ALLOW_THREADS
     read_board(&board, a[0].data);
+    read_runs(&board, a[2].data, a[2].size / 3, runs);
     double best = -1;
     for (Py_ssize_t k = 0; k < bitmaps; k++) {
-        const Bitmap bitmap = {runs + 3 * starts[k], starts[k + 1] - starts[k], sizes[2 * k], sizes[2 * k + 1]};
-        int64_t place[2] = {0, 0};
-        const int64_t contact = find_place(&board, &bitmap, three, place);
-        const double share = (double)contact / (double)(bitmap.height + bitmap.width);
+        Bitmap bitmap = {runs + starts[k], starts[k + 1] - starts[k], sizes[2 * k], sizes[2 * k + 1], 0};
+        const double sides = (double)(bitmap.height + bitmap.width);
+        if (bitmap.height + 2 > rows || bitmap.width + 2 > columns)
+            continue;
+        bitmap.rise = count_rise(&bitmap, cells);
+        // A bitmap with this contact or less is not better than the ones before.
+        int64_t least = (int64_t)(best * sides), place[2] = {0, 0};
+        while (least >= 0 && (double)least / sides > best)
+            least--;
+        const int64_t contact = find_place(&board, &bitmap, least, three, place);
+        const double share = (double)contact / sides;
         if (contact >= 0 && share > best) {
             best = share;
             found = 1;
@@ -194,6 +249,8 @@ static PyObject *find_contact(PyObject *module, PyObject *const *given, Py_ssize
     free(board.near);
     free(board.before);
     free(three);
+    free(cells);
+    free(runs);
     return done_with_integer(a, LENGTH(a), found);
 }
 
