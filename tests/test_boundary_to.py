@@ -211,7 +211,7 @@ def test_too_few_vertices_for_the_shape_are_rejected():
         match=r"the boundary placed along the outline crosses or touches itself: boundary loop 0 meets itself.*too few",
     ):
         boundary_to(V, F, spiral)
-    V, F = surfaces.disk(15)
+    V, F = surfaces.disk(12)
     fixed, target = boundary_to(V, F, spiral)
     assert injective_map(V, F, fixed, target).certificate.bijective
 
