@@ -162,7 +162,7 @@ def test_impossible_problems_are_named():
 
 
 def test_a_boundary_fixed_with_the_wrong_orientation_is_named():
-    V, F = disk(6)
+    V, F = disk(4)
     loop = boundary_loops(F, len(V))[0]
     (patch,) = impossible(V, F, loop, V[loop] * [1, -1])
     assert patch.kind is Kind.INVERTED_PATCH

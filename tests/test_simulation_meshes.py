@@ -18,7 +18,7 @@ from shared.simulation import channel, min_jacobian, quadrilaterals, second_orde
 @pytest.fixture(scope="module")
 def flap():
     """Return a mesh around a flap, and the flap's vertices."""
-    points, F = surfaces.annulus(12, hole=(-0.6, -0.05, 0.6, 0.05))
+    points, F = surfaces.annulus(8, hole=(-0.6, -0.05, 0.6, 0.05))
     loops = boundary_loops(F, len(points))
     return points, F, min(loops, key=lambda loop: np.abs(points[loop]).max())
 
@@ -34,11 +34,11 @@ def dent(points, depth, waves=1):
 
 
 @pytest.mark.slow
-def test_fifty_small_steps_end_like_one_large_step(flap):
+def test_small_steps_end_like_one_large_step(flap):
     points, F, body = flap
     whole = morph(points, F, body, turned(points[body], 50))
     here = careless = points
-    for degrees in range(1, 51):
+    for degrees in range(2, 51, 2):
         place = turned(points[body], degrees)
         morphed = morph(here, F, body, place, rest=points)
         assert morphed.valid
