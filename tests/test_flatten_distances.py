@@ -125,8 +125,8 @@ def test_distance_errors_decrease_and_the_map_stays_bijective(dome):
     # A dome seen from above: its boundary region is compressed.
     start = V[:, :2]
     steps = DistinctSteps()
-    result = keep_distances(V, F, start, rings=8, callback=steps.append)
-    before, after = (distortion(V, F, uv, rings=8).distances for uv in (start, result.uv))
+    result = keep_distances(V, F, start, rings=6, callback=steps.append)
+    before, after = (distortion(V, F, uv, rings=6).distances for uv in (start, result.uv))
     assert result.status is Status.POLISHED
     assert result.certificate.bijective
     assert certify(F, result.uv).bijective
@@ -137,7 +137,7 @@ def test_distance_errors_decrease_and_the_map_stays_bijective(dome):
     energies = [step.energy for step in steps]
     assert steps == result.history
     assert energies[-1] < energies[0]
-    assert np.array_equal(keep_distances(V, F, start, rings=8).uv, result.uv)
+    assert np.array_equal(keep_distances(V, F, start, rings=6).uv, result.uv)
 
 
 def test_unit_and_position_of_the_start_do_not_matter(dome):
@@ -392,9 +392,10 @@ def test_flatten_preserves_the_distances_of_each_piece(dome):
     assert room == pytest.approx(0.05 * np.ptp(first, axis=0).max())
 
 
-def test_sampled_pairs_represent_all_pairs(dome):
+def test_sampled_pairs_represent_all_pairs():
     """With few rings and on a small surface, too, the map does not fit the sampled pairs alone."""
-    V, F = spherical(surfaces.disk(14)[0], 0.45), dome[1]
+    V, F = surfaces.disk(14)
+    V = spherical(V, 0.45)
     sample = surface_distances(V, F, rings=4)
     before, after = (sample.error(flatten(V, F, **o).uv) for o in ({}, {"energy": "distances", "rings": 4}))
     assert after.mean < 0.99 * before.mean
