@@ -175,7 +175,7 @@ class TestMirroredAndStacked:
 class TestCut:
     @pytest.mark.slow
     def test_a_closed_surface_stays_watertight(self, tmp_path):
-        V, F = starfish(rings=8)
+        V, F = starfish(3, 8)
         (tmp_path / "in.obj").write_text(
             "".join(f"v {x:.7f} {y:.4f} {z:.3e} # {i}\n" for i, (x, y, z) in enumerate(V))
             + "usemtl one\n"

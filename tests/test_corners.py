@@ -411,7 +411,7 @@ def test_the_command_lists_the_corners_of_a_boundary(sheet, capsys):
 
 def test_check_boundary_without_a_map_with_several_loops_and_without_loops(tmp_path, capsys):
     mesh = tmp_path / "in.obj"
-    io.write_obj(mesh, io.MeshData(lift(surfaces.annulus(40)[0]), surfaces.annulus(40)[1]))
+    io.write_obj(mesh, io.MeshData(lift(surfaces.annulus(30)[0]), surfaces.annulus(30)[1]))
     assert run("check", mesh, "--boundary", "--plot", tmp_path / "b.png") == 0
     said = capsys.readouterr().out
     assert "2 boundary loops" in said

@@ -51,7 +51,7 @@ def pinched(F, uv, loops, *, gap=1e-11, most=10):
 def test_a_start_from_which_the_map_collapses_is_replaced():
     replaced = 0
     for arms in (3, 5):
-        V, F = cut_starfish(arms, 10)
+        V, F = cut_starfish(arms, 8)
         loops = boundary_loops(F, len(V))
         result = flatten(V, F, start=pinched(F, flatten_coarse(V, F, loops), loops))
         assert result.certificate.bijective
