@@ -99,7 +99,7 @@ def test_a_boundary_fixed_inside_out_is_reached():
 
 @pytest.mark.parametrize("scale", [1e150, 1e-150])
 def test_the_unit_of_length_does_not_matter(scale):
-    V, F = disk(5)
+    V, F = disk(4)
     fixed, target = np.array([1, 50, 60]), np.array([[0.0, 0], [1, 0], [2, 0.3]])
     ordinary = solved(V, F, fixed, target)
     other = solved(scale * V, F, fixed, scale * target)
@@ -286,8 +286,8 @@ def test_the_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
     import pin_problems
     import pins
 
-    monkeypatch.setattr(pin_problems, "SMALLEST", 100)
-    monkeypatch.setattr(pin_problems, "LARGEST", 400)
+    monkeypatch.setattr(pin_problems, "SMALLEST", 60)
+    monkeypatch.setattr(pin_problems, "LARGEST", 200)
     monkeypatch.setitem(pin_problems.WEAKEST, "multiply_wound", 2.0)
     names = pins.names(7, list(pin_problems.FAMILIES))
     assert [name.partition(":")[0] for name in names] == list(pin_problems.FAMILIES)

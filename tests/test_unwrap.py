@@ -177,7 +177,7 @@ def test_edge_costs_move_seams():
 
 
 def test_identical_components_are_stacked():
-    points, triangles = annulus(8)
+    points, triangles = annulus(6)
     points = lift(points)
     model = np.vstack([points, points + 5, points * [-1, 1, 1] - 5])
     faces = np.concatenate([triangles, triangles + len(points), triangles[:, ::-1] + 2 * len(points)])
@@ -329,7 +329,7 @@ def quads(columns, rows):
 @pytest.mark.parametrize("shape", ["hills", "strip", "closed"])
 def test_sides_with_large_costs_are_not_cut(shape):
     if shape == "hills":
-        flat, triangles, inside = quads(8, 8)
+        flat, triangles, inside = quads(6, 6)
         points = np.column_stack([flat, 0.5 * np.sin(9 * flat[:, 0]) * np.cos(8 * flat[:, 1])])
     elif shape == "strip":
         # Its chart is too long for the texture, so it is divided.
