@@ -94,7 +94,7 @@ class TestShortest:
         assert find_cuts(*surfaces.disk(8)).shape == (0, 2)
         assert find_cuts(*surfaces.grid(30, 3)).shape == (0, 2)
 
-    @pytest.mark.parametrize("seed", range(6))
+    @pytest.mark.parametrize("seed", range(4))
     @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
     def test_a_random_cut_gets_shorter_and_stays_a_cut(self, name, seed):
         V, F = SURFACES[name]

@@ -26,7 +26,7 @@ from shared.meshes import boundary_of
 from shared.polygons import U, circle, random_polygon, spiral
 from shared.small_meshes import loose_wheel, wheel
 
-POLYGONS = 23
+POLYGONS = 15
 
 
 @cache
@@ -194,14 +194,14 @@ def test_the_number_of_contacts_is_limited(rng):
 def random_problems():
     """Simple targets with all kinds of obstruction."""
     rng = np.random.default_rng(4)
-    for n in (2, 3):
+    for n in (3,):
         mesh = disk(n)
         count = len(boundary_of(mesh[1]))
         yield onto(mesh, np.roll(spiral(count // 2, rng.uniform(0.7, 1.7)), int(rng.integers(count)), axis=0))
         yield onto(mesh, circle(count) * (0.05 + rng.random(count))[:, None])
         if count <= 18:
             yield onto(mesh, random_polygon(rng, count, 7))
-    for n in (5, 6):
+    for n in (5,):
         V, F = annulus(n)
         inner = np.abs(V).max(axis=1) < 1
         target = np.where(inner[:, None], V @ [[-1, 0], [0, -1]] * rng.uniform(0.5, 1.2), V)

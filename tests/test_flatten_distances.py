@@ -169,7 +169,7 @@ def test_the_boundary_does_not_cross_itself():
     assert sample.error(as_it_would).mean < sample.error(result.uv).mean < 0.5 * sample.error(start).mean
 
 
-@pytest.mark.parametrize("seed", [1, 8, 13])
+@pytest.mark.parametrize("seed", [1, 13])
 def test_a_start_that_scaling_would_invert_is_not_scaled(seed):
     V, F = surfaces.grid(4, 4)
     rng = np.random.default_rng(seed)
@@ -275,7 +275,7 @@ def test_a_coarse_mesh_helps_the_fine_one(folded, asked, coarse):
     found, _ = coarse
     plain = flatten(folded.V, folded.F)
     whole = lower_distance_error(folded, plain.uv, RINGS, asked)
-    sample = surface_distances(folded.V, folded.F, rings=RINGS, sources=150)
+    sample = surface_distances(folded.V, folded.F, rings=RINGS, sources=60)
     errors = [sample.error(uv) for uv in (plain.uv, whole.uv, found.uv)]
     assert found.status is Status.POLISHED
     assert certify(folded.F, found.uv).bijective

@@ -151,7 +151,7 @@ def cut_starfish(arms, rings, gain):
 @pytest.mark.parametrize("arms", [3, pytest.param(5, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("guarded", [False, True])
 def test_a_coarse_start_separates_the_two_sides_of_a_seam(arms, guarded):
-    V, F = cut_starfish(arms, 14, 0.01)
+    V, F = cut_starfish(arms, 20, 0.01)
     loops = boundary_loops(F, len(V))
     uv = flatten_coarse(V, F, loops, guarded=guarded)
     assert certify(F, uv).bijective

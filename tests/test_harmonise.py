@@ -33,7 +33,7 @@ BARRIERS = set(polishing.ENERGIES)
 class TestHarmonise:
     @pytest.mark.parametrize("name", ENERGIES)
     def test_lowers_the_energy_and_stays_certified(self, name):
-        V, F, uv, fixed = bowl(100)
+        V, F, uv, fixed = bowl()
         result = harmonise(V, F, uv, fixed=fixed, energy=name)
         assert result.status in (Status.POLISHED, Status.STILL_FALLING)
         assert certify(F, result.uv).injective
@@ -50,7 +50,7 @@ class TestHarmonise:
             assert least * (1 - 1e-9) < after < 1.01 * least
 
     def test_areas_become_as_equal_as_the_boundary_allows(self):
-        V, F, uv, fixed = bowl(100)
+        V, F, uv, fixed = bowl()
         found = harmonise(V, F, uv, fixed=fixed, energy="area", conformal=0, max_iterations=80)
         barrier = Combination((1.0, AreaPreserving()), (1e-5, MIPS()))
         least = polish(V, F, uv, fixed=fixed, energy=barrier, tol=1e-10)
@@ -88,7 +88,7 @@ class TestHarmonise:
 
     def test_conformal_without_an_energy(self):
         """R₁ alone ends near the map with the least MIPS."""
-        V, F, uv, fixed = bowl(100)
+        V, F, uv, fixed = bowl()
         found = harmonise(V, F, uv, fixed=fixed, energy=None, conformal=1.0)
         least = harmonise(V, F, uv, fixed=fixed, energy="mips", max_iterations=80)
         mips = [distortion(V, F, w).statistics("mips").mean for w in (uv, found.uv, least.uv)]
@@ -106,7 +106,7 @@ class TestHarmonise:
         assert not np.array_equal(free.uv[pin], uv[pin])
 
     def test_weights_shift_the_distortion(self):
-        V, F, uv, fixed = bowl(100)
+        V, F, uv, fixed = bowl()
         left = V[F].mean(axis=1)[:, 0] < 0
         shares = []
         for weights in (None, np.where(left, 30.0, 1.0), np.where(left, 1.0, 0.0)):
