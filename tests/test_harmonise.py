@@ -235,7 +235,7 @@ class TestHarmonise:
         V, F = disk(6)
         uv = V * np.linalg.norm(V, axis=1, keepdims=True) ** 11
         assert distortion(V, F, uv).area_ratio.min() < 1e-15
-        result = harmonise(V, F, uv, fixed=boundary_of(F), energy=name)
+        result = harmonise(V, F, uv, fixed=boundary_of(F), energy=name, max_iterations=10)
         assert result.injective
 
     def test_malformed_input(self):
