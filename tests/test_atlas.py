@@ -175,7 +175,7 @@ class TestMirroredAndStacked:
 class TestCut:
     @pytest.mark.slow
     def test_a_closed_surface_stays_watertight(self, tmp_path):
-        V, F = starfish(rings=12)
+        V, F = starfish(3, 8)
         (tmp_path / "in.obj").write_text(
             "".join(f"v {x:.7f} {y:.4f} {z:.3e} # {i}\n" for i, (x, y, z) in enumerate(V))
             + "usemtl one\n"
@@ -233,7 +233,7 @@ class TestSeenFromOutside:
         assert len(np.unique(vertices)) < len(vertices)
 
     @pytest.mark.slow
-    def test_a_batch_with_seams_has_a_report(self, source, tmp_path):
+    def test_a_batch_with_seams_has_a_report(self, source, tmp_path, quick_workers):
         assert run("batch", tmp_path, "-o", tmp_path / "out", "--flatten", "-j", "1") == 0
         assert run("batch", "-o", tmp_path / "out", "--report") == 0
 

@@ -76,9 +76,9 @@ def check(V, F, charts):
 
 
 SURFACES = {
-    "sphere": lambda: sphere(12),
-    "torus": lambda: torus(40, 20),
-    "starfish": lambda: starfish(5, 8),
+    "sphere": lambda: sphere(9),
+    "torus": lambda: torus(28, 14),
+    "starfish": lambda: starfish(3, 6),
 }
 
 
@@ -95,14 +95,14 @@ def test_charts_keep_the_bound(name, bound):
 
 
 def test_a_larger_bound_needs_shorter_seams():
-    V, F = sphere(12)
+    V, F = sphere(9)
     tight, loose = (find_charts(V, F, max_stretch=bound) for bound in (1.1, 1.6))
     assert len(seams(F, tight)) > len(seams(F, loose))
     assert len(loose) <= len(tight)
 
 
 def test_charts_do_not_depend_on_the_unit_or_on_the_number_of_threads():
-    V, F = starfish(4, 8)
+    V, F = starfish(3, 6)
     one, two, moved = find_charts(V, F, jobs=1), find_charts(V, F, jobs=2), find_charts(V * 2.0**40, F)
     assert len(one) == len(two) == len(moved)
     for first, second, third in zip(one, two, moved, strict=True):
@@ -112,7 +112,7 @@ def test_charts_do_not_depend_on_the_unit_or_on_the_number_of_threads():
 
 
 def test_a_limit_on_charts_is_kept_and_what_it_costs_is_reported():
-    V, F = sphere(12)
+    V, F = sphere(9)
     charts = find_charts(V, F, max_stretch=1.02, max_charts=2)
     check(V, F, charts)
     assert len(charts) <= 2
@@ -128,7 +128,7 @@ def test_a_limit_on_charts_is_kept_and_what_it_costs_is_reported():
 
 @pytest.mark.slow
 def test_a_bound_that_no_charts_keep_is_reported():
-    V, F = sphere(3)
+    V, F = sphere(2)
     charts = find_charts(V, F, max_stretch=1.0)
     check(V, F, charts)
     assert max(chart.misses for chart in charts) > 0
@@ -173,7 +173,7 @@ def test_given_cuts_are_seams():
 
 
 def test_seams_avoid_sides_with_high_costs():
-    V, F = sphere(12)
+    V, F = sphere(9)
     below = V[F].mean(axis=1)[:, 2] < 0
     costs = np.where(below, 1.0, 20.0)[:, None] * np.ones(3)
     plain, directed = (find_charts(V, F, edge_costs=given) for given in (None, costs))

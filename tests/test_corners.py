@@ -194,7 +194,7 @@ def test_the_runs_are_almost_as_straight_as_possible():
     """Compare with all choices: nine of ten random loops get the best corners, and few get much worse ones."""
     rng = np.random.default_rng(0)
     excess = []
-    for _ in range(400):
+    for _ in range(120):
         n, count = int(rng.integers(6, 14)), int(rng.integers(2, 5))
         lengths, turning = rng.uniform(0.2, 1, n), rng.uniform(-2, 2, n)
         found = BoundaryLoop(np.arange(n), lengths, turning).corners(count)[0].tolist()
@@ -411,7 +411,7 @@ def test_the_command_lists_the_corners_of_a_boundary(sheet, capsys):
 
 def test_check_boundary_without_a_map_with_several_loops_and_without_loops(tmp_path, capsys):
     mesh = tmp_path / "in.obj"
-    io.write_obj(mesh, io.MeshData(lift(surfaces.annulus(40)[0]), surfaces.annulus(40)[1]))
+    io.write_obj(mesh, io.MeshData(lift(surfaces.annulus(30)[0]), surfaces.annulus(30)[1]))
     assert run("check", mesh, "--boundary", "--plot", tmp_path / "b.png") == 0
     said = capsys.readouterr().out
     assert "2 boundary loops" in said

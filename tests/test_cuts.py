@@ -57,7 +57,7 @@ class TestDisks:
         assert parts(V, F, find_cuts(V, F)) == [(1, 1)]
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("seed", range(60))
+    @pytest.mark.parametrize("seed", range(40))
     def test_random_surfaces(self, seed):
         """Any number of handles, holes and touching components, random edges, and any proportions."""
         rng = np.random.default_rng(seed)
@@ -94,7 +94,7 @@ class TestShortest:
         assert find_cuts(*surfaces.disk(8)).shape == (0, 2)
         assert find_cuts(*surfaces.grid(30, 3)).shape == (0, 2)
 
-    @pytest.mark.parametrize("seed", range(6))
+    @pytest.mark.parametrize("seed", range(4))
     @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
     def test_a_random_cut_gets_shorter_and_stays_a_cut(self, name, seed):
         V, F = SURFACES[name]
@@ -159,7 +159,7 @@ class TestGain:
     @pytest.mark.slow
     @pytest.mark.parametrize("gain", [0.1, np.inf])
     def test_predicted_energy_is_close_to_that_of_the_map(self, gain):
-        for V, F in (surfaces.starfish(5, 14), surfaces.starfish(3, 14), double_torus()):
+        for V, F in (surfaces.starfish(5, 10), surfaces.starfish(3, 10), double_torus()):
             cut = find_cuts(V, F, min_gain=gain)
             graph, shrinking = edge_graph(V, F), Shrinking(edge_graph(V, F))
             open_at = np.zeros(len(V), dtype=bool)
@@ -169,7 +169,7 @@ class TestGain:
 
     @pytest.mark.slow
     def test_cuts_reach_arms(self):
-        V, F = surfaces.starfish(5, 16)
+        V, F = surfaces.starfish(5, 12)
         cut = find_cuts(V, F)
         V = V / V[:, 0].max()
         for turn in 2 * np.pi * np.arange(5) / 5:
@@ -181,14 +181,14 @@ class TestGain:
 
     @pytest.mark.slow
     def test_a_larger_required_gain_makes_cuts_shorter(self):
-        V, F = surfaces.starfish(5, 16)
+        V, F = surfaces.starfish(5, 12)
         lengths = [length_of(V, find_cuts(V, F, min_gain=gain)) for gain in (0.02, 0.2, 2, np.inf)]
         assert lengths == sorted(lengths, reverse=True)
         assert lengths[0] > 1.5 * lengths[-1]
 
     @pytest.mark.slow
     def test_unit_position_and_orientation_do_not_matter(self):
-        V, F = surfaces.starfish(4, 16)
+        V, F = surfaces.starfish(4, 12)
         V = jittered(V)
         cut = find_cuts(V, F)
         assert np.array_equal(cut, find_cuts(V, F))
@@ -203,7 +203,7 @@ class TestCosts:
         V, F = SURFACES["starfish"]
         assert np.array_equal(find_cuts(V, F), find_cuts(V, F, edge_costs=np.ones(F.shape)))
 
-    @pytest.mark.parametrize("shape", [(36, 14), (240, 80)], ids=["small", "large"])
+    @pytest.mark.parametrize("shape", [(36, 14), (210, 76)], ids=["small", "large"])
     def test_cuts_leave_costly_parts(self, shape):
         """A cut around a torus may be anywhere: it moves to the half where it is cheap."""
         V, F = torus(*shape)

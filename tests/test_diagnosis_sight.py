@@ -26,7 +26,7 @@ from shared.meshes import boundary_of
 from shared.polygons import U, circle, random_polygon, spiral
 from shared.small_meshes import loose_wheel, wheel
 
-POLYGONS = 43
+POLYGONS = 15
 
 
 @cache
@@ -106,7 +106,7 @@ def test_wedges_contain_exactly_the_visible_points(polygon, rng):
     sides, beside = np.stack([k, after], axis=1), np.stack([after, before], axis=1)
     views = Views(sides, corners, Lattice(corners), beside, Effort(10**9))
     low, high = corners.min(axis=0), corners.max(axis=0)
-    points = low + (high - low) * rng.random((40, 2))
+    points = low + (high - low) * rng.random((20, 2))
     for eye in range(n):
         wedges = views.wedges(eye)
         (p, q), tip = corners[wedges.wall.T], corners[eye]
@@ -169,7 +169,7 @@ def test_winding_numbers(rng, monkeypatch, chunk):
     monkeypatch.setattr("quasiharmonic.geometry.exact.loops.PAIR_CHUNK", chunk)
     for n in (3, 8, 30):
         corners = rng.integers(0, 9, (n, 2)).astype(float)
-        points = np.concatenate([rng.integers(0, 9, (40, 2)), rng.integers(0, 18, (40, 2)) / 2, corners])
+        points = np.concatenate([rng.integers(0, 9, (20, 2)), rng.integers(0, 18, (20, 2)) / 2, corners])
         after = np.roll(corners, -1, axis=0)
         turns, on = winding(points, corners, after)
         m = len(points)
@@ -194,20 +194,20 @@ def test_the_number_of_contacts_is_limited(rng):
 def random_problems():
     """Simple targets with all kinds of obstruction."""
     rng = np.random.default_rng(4)
-    for n in (2, 3, 4):
+    for n in (3,):
         mesh = disk(n)
         count = len(boundary_of(mesh[1]))
         yield onto(mesh, np.roll(spiral(count // 2, rng.uniform(0.7, 1.7)), int(rng.integers(count)), axis=0))
         yield onto(mesh, circle(count) * (0.05 + rng.random(count))[:, None])
         if count <= 18:
             yield onto(mesh, random_polygon(rng, count, 7))
-    for n in (5, 8, 11):
+    for n in (5,):
         V, F = annulus(n)
         inner = np.abs(V).max(axis=1) < 1
         target = np.where(inner[:, None], V @ [[-1, 0], [0, -1]] * rng.uniform(0.5, 1.2), V)
         fixed = boundary_of(F)
         yield Problem(V, F, fixed, target[fixed])
-    for _ in range(4):
+    for _ in range(2):
         V, F = grid(5, 5)
         inside = np.setdiff1d(np.arange(len(V)), boundary_of(F))
         fixed = np.concatenate([boundary_of(F), pins := rng.choice(inside, 6, replace=False)])
@@ -248,12 +248,12 @@ def crooked_wheel(n, mesh=wheel):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mesh", [wheel, loose_wheel])
-def test_hubs_with_thousands_of_neighbours_are_placed(mesh):
-    problem = crooked_wheel(2_000, mesh)
+def test_hubs_with_a_thousand_neighbours_are_placed(mesh):
+    problem = crooked_wheel(1_000, mesh)
     began = time.process_time()
     diagnosis = diagnose(problem)
-    # It takes a second or less on an idle machine.
-    assert time.process_time() - began < 30
+    # It takes half a second or less on an idle machine.
+    assert time.process_time() - began < 15
     assert diagnosis.obstructions == ()
     assert not any("sees" in words for words in diagnosis.unchecked)
 
@@ -263,8 +263,8 @@ def test_a_position_is_sought_for_any_number_of_neighbours(monkeypatch):
     # There are more nested visibility regions than Python allows nested calls.
     monkeypatch.setattr(examine, "find_unplaced", lambda stars, *_: np.arange(len(stars)))
     monkeypatch.setattr(examine, "MAX_EFFORT", 10**9)
-    problem, usual = crooked_wheel(250), sys.getrecursionlimit()
-    sys.setrecursionlimit(len(inspect.stack(0)) + 200)
+    problem, usual = crooked_wheel(190), sys.getrecursionlimit()
+    sys.setrecursionlimit(len(inspect.stack(0)) + 150)
     try:
         assert diagnose(problem).obstructions == ()
     finally:
@@ -292,7 +292,7 @@ def test_five_thousand_neighbours_take_a_few_seconds():
     "kind", ["wobble", "spiral", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("star", "gear"))]
 )
 def test_ten_thousand_boundary_vertices(kind):
-    problem = onto(grid(4980, 20), outlines(kind, 10_000))
+    problem = onto(grid(4990, 10), outlines(kind, 10_000))
     began = time.process_time()
     assert diagnose(problem).obstructions == ()
     # It takes less than a second on an idle machine.
@@ -300,7 +300,7 @@ def test_ten_thousand_boundary_vertices(kind):
 
 
 def test_every_vertex_of_a_ring_sees_too_little():
-    problem = turned_ring(84, 2)
+    problem = turned_ring(60, 2)
     began = time.process_time()
     diagnosis = diagnose(problem)
     assert time.process_time() - began < 30

@@ -51,7 +51,7 @@ def pinched(F, uv, loops, *, gap=1e-11, most=10):
 def test_a_start_from_which_the_map_collapses_is_replaced():
     replaced = 0
     for arms in (3, 5):
-        V, F = cut_starfish(arms)
+        V, F = cut_starfish(arms, 8)
         loops = boundary_loops(F, len(V))
         result = flatten(V, F, start=pinched(F, flatten_coarse(V, F, loops), loops))
         assert result.certificate.bijective
@@ -122,7 +122,7 @@ def test_collapse_from_every_start_is_reported_by_the_status(monkeypatch):
 
 
 def test_equal_results_of_two_starts_are_no_collapse(monkeypatch):
-    V, F = cut_starfish(3)
+    V, F = cut_starfish(3, 10)
     monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
     result = flatten(V, F)
     assert result.status is Status.POLISHED

@@ -125,8 +125,8 @@ def test_distance_errors_decrease_and_the_map_stays_bijective(dome):
     # A dome seen from above: its boundary region is compressed.
     start = V[:, :2]
     steps = DistinctSteps()
-    result = keep_distances(V, F, start, rings=8, callback=steps.append)
-    before, after = (distortion(V, F, uv, rings=8).distances for uv in (start, result.uv))
+    result = keep_distances(V, F, start, rings=6, callback=steps.append)
+    before, after = (distortion(V, F, uv, rings=6).distances for uv in (start, result.uv))
     assert result.status is Status.POLISHED
     assert result.certificate.bijective
     assert certify(F, result.uv).bijective
@@ -137,7 +137,7 @@ def test_distance_errors_decrease_and_the_map_stays_bijective(dome):
     energies = [step.energy for step in steps]
     assert steps == result.history
     assert energies[-1] < energies[0]
-    assert np.array_equal(keep_distances(V, F, start, rings=8).uv, result.uv)
+    assert np.array_equal(keep_distances(V, F, start, rings=6).uv, result.uv)
 
 
 def test_unit_and_position_of_the_start_do_not_matter(dome):
@@ -156,7 +156,7 @@ def test_developable_surfaces_are_unrolled(flat):
 
 def test_the_boundary_does_not_cross_itself():
     """A ramp with more than one turn would overlap itself if all distances were exact."""
-    V, F = surfaces.grid(60, 6)
+    V, F = surfaces.grid(45, 5)
     radius, angle = 1.5 - V[:, 1], 8.0 * V[:, 0]
     ramp = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.01 * angle], axis=1)
     as_it_would = np.stack([ramp[:, 0], ramp[:, 1]], axis=1)
@@ -169,7 +169,7 @@ def test_the_boundary_does_not_cross_itself():
     assert sample.error(as_it_would).mean < sample.error(result.uv).mean < 0.5 * sample.error(start).mean
 
 
-@pytest.mark.parametrize("seed", [1, 8, 13])
+@pytest.mark.parametrize("seed", [1, 13])
 def test_a_start_that_scaling_would_invert_is_not_scaled(seed):
     V, F = surfaces.grid(4, 4)
     rng = np.random.default_rng(seed)
@@ -248,8 +248,8 @@ def test_record_stores_intermediate_maps(dome):
 
 @pytest.fixture(scope="module")
 def folded():
-    """A square with hills and valleys, of 7,200 triangles."""
-    V, F = surfaces.grid(60, 60)
+    """A square with hills and valleys, of 4,600 triangles."""
+    V, F = surfaces.grid(48, 48)
     return Piece(np.column_stack([V, 0.3 * np.sin(7 * V[:, 0]) * np.cos(5 * V[:, 1])]), F)
 
 
@@ -258,12 +258,24 @@ def asked():
     return Settings("symmetric-dirichlet", 1e-3, 100, "auto", None, 0)
 
 
+@pytest.fixture(scope="module")
+def coarse(folded, asked):
+    """The result by way of a coarse mesh, with its record, and the steps passed to the callback."""
+    steps = []
+    settings = replace(asked, callback=steps.append, record_every=1)
+    return lower_coarse_distance_error(folded, RINGS, settings, least=LEAST), steps
+
+
+# Rings of the pairs, and vertices of the coarse mesh.
+RINGS, LEAST = 13, 800
+
+
 @pytest.mark.slow
-def test_a_coarse_mesh_helps_the_fine_one(folded, asked):
+def test_a_coarse_mesh_helps_the_fine_one(folded, asked, coarse):
+    found, _ = coarse
     plain = flatten(folded.V, folded.F)
-    found = lower_coarse_distance_error(folded, 16, asked, least=900)
-    whole = lower_distance_error(folded, plain.uv, 16, asked)
-    sample = surface_distances(folded.V, folded.F, rings=16, sources=150)
+    whole = lower_distance_error(folded, plain.uv, RINGS, asked)
+    sample = surface_distances(folded.V, folded.F, rings=RINGS, sources=60)
     errors = [sample.error(uv) for uv in (plain.uv, whole.uv, found.uv)]
     assert found.status is Status.POLISHED
     assert certify(folded.F, found.uv).bijective
@@ -273,18 +285,17 @@ def test_a_coarse_mesh_helps_the_fine_one(folded, asked):
     assert errors[2].rms < errors[0].rms
     assert errors[2].scale == pytest.approx(1, abs=0.03)
     assert [stage.name for stage in found.stages] == ["start, coarse", "guarded descent, distances, coarse"]
-    assert np.array_equal(lower_coarse_distance_error(folded, 16, asked, least=900).uv, found.uv)
+    assert np.array_equal(lower_coarse_distance_error(folded, RINGS, asked, least=LEAST).uv, found.uv)
 
 
 def test_too_few_rings_for_a_coarser_mesh(folded, asked):
-    assert lower_coarse_distance_error(folded, 3, asked, least=900) is None
+    assert lower_coarse_distance_error(folded, 3, asked, least=LEAST) is None
     assert lower_coarse_distance_error(folded, 20, asked, least=len(folded.V)) is None
 
 
 @pytest.mark.slow
-def test_callbacks_and_records_on_a_coarse_mesh(folded, asked):
-    steps = []
-    found = lower_coarse_distance_error(folded, 16, replace(asked, callback=steps.append, record_every=1), least=900)
+def test_callbacks_and_records_on_a_coarse_mesh(folded, coarse):
+    found, steps = coarse
     assert steps == found.history
     assert [step.iteration for step in steps] == [*range(len(steps))]
     assert steps[-1].energy < steps[0].energy
@@ -299,19 +310,19 @@ def test_ctrl_c_on_the_coarse_mesh_returns_a_map_of_the_surface(folded, asked):
         if step.iteration == 1:
             raise KeyboardInterrupt
 
-    found = lower_coarse_distance_error(folded, 16, replace(asked, callback=stop), least=900)
+    found = lower_coarse_distance_error(folded, RINGS, replace(asked, callback=stop), least=LEAST)
     assert found.status is Status.INTERRUPTED
     assert len(found.uv) == len(folded.V)
     assert certify(folded.F, found.uv).bijective
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rings", [28, pytest.param(120, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("rings", [20, pytest.param(120, marks=pytest.mark.nightly)])
 def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh(rings, monkeypatch):
     if rings < 120:
         for module in (piece, free_boundary):
-            monkeypatch.setattr(module, "COARSE_FROM", 3_000)
-        coarse = partial(lower_coarse_distance_error, least=700)
+            monkeypatch.setattr(module, "COARSE_FROM", 1_500)
+        coarse = partial(lower_coarse_distance_error, least=400)
         monkeypatch.setattr(free_boundary, "lower_coarse_distance_error", coarse)
     V, F = surfaces.cat(rings)
     assert len(F) >= piece.COARSE_FROM
@@ -381,9 +392,10 @@ def test_flatten_preserves_the_distances_of_each_piece(dome):
     assert room == pytest.approx(0.05 * np.ptp(first, axis=0).max())
 
 
-def test_sampled_pairs_represent_all_pairs(dome):
+def test_sampled_pairs_represent_all_pairs():
     """With few rings and on a small surface, too, the map does not fit the sampled pairs alone."""
-    V, F = spherical(surfaces.disk(14)[0], 0.45), dome[1]
+    V, F = surfaces.disk(14)
+    V = spherical(V, 0.45)
     sample = surface_distances(V, F, rings=4)
     before, after = (sample.error(flatten(V, F, **o).uv) for o in ({}, {"energy": "distances", "rings": 4}))
     assert after.mean < 0.99 * before.mean

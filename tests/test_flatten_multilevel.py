@@ -165,8 +165,8 @@ def test_a_coarse_start_separates_the_two_sides_of_a_seam(arms, guarded):
 @pytest.mark.parametrize(
     ("linear_solver", "rings"),
     [
-        ("auto", 30),
-        ("qdldl", 30),
+        ("auto", 22),
+        ("qdldl", 22),
         pytest.param("auto", 66, marks=pytest.mark.nightly),
         pytest.param("qdldl", 66, marks=pytest.mark.nightly),
     ],
@@ -174,7 +174,7 @@ def test_a_coarse_start_separates_the_two_sides_of_a_seam(arms, guarded):
 def test_a_large_surface_with_limbs_does_not_collapse(linear_solver, rings, monkeypatch):
     if rings < 66:
         for module in (piece, free_boundary):
-            monkeypatch.setattr(module, "COARSE_FROM", 8_000)
+            monkeypatch.setattr(module, "COARSE_FROM", 4_000)
     V, F = cut_starfish(3, rings, 0.1)
     assert len(F) >= piece.COARSE_FROM
     result = flatten(V, F, linear_solver=linear_solver)

@@ -50,14 +50,14 @@ def test_parts_without_pins_are_placed_next_to_the_others():
 
 
 def test_overlapping_parts_move_apart():
-    V, F, (_, second) = several(disk(6), disk(6))
+    V, F, (_, second) = several(disk(5), disk(5))
     fixed = [3, 50, second + 3, second + 50]
     result = solved(V, F, fixed, [(0.0, 0), (1, 0), (0.5, 0.1), (0.7, 0.8)])
     again = solved(V, F, fixed, [(0.0, 0), (1, 0), (0.5, 0.1), (0.7, 0.8)])
     np.testing.assert_array_equal(result.uv, again.uv)
     # Alone, each of them would cover pins of the other.
     where = [(0, 0), (1, 0)], [(0.5, 0.1), (0.7, 0.8)]
-    alone = [flatten(*disk(6), fixed=[3, 50], target=places).uv for places in where]
+    alone = [flatten(*disk(5), fixed=[3, 50], target=places).uv for places in where]
     assert not certify(F, np.concatenate(alone)).bijective
 
 
@@ -76,7 +76,7 @@ def test_three_parts_at_one_location():
 
 
 def test_the_reason_for_impossibility_uses_the_numbers_of_the_mesh():
-    V, F, (_, second) = several(disk(6), disk(6))
+    V, F, (_, second) = several(disk(4), disk(4))
     result = flatten(V, F, fixed=[3, second + 3], target=np.zeros((2, 2)))
     assert result.status is Status.IMPOSSIBLE
     (shared,) = result.diagnosis.obstructions

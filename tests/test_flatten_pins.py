@@ -42,21 +42,18 @@ def solved(V, F, fixed, target, **options):
 def energy_by_hand(V, F, uv):
     """Return the mean symmetric Dirichlet energy, 0 for an isometry, from singular values."""
     V = np.column_stack([V, np.zeros(len(V))])[:, :3]
-    total = area = 0.0
-    for t in F:
-        a, b = V[t[1]] - V[t[0]], V[t[2]] - V[t[0]]
-        x = a / np.linalg.norm(a)
-        y = b - (b @ x) * x
-        rest = np.array([[np.linalg.norm(a), b @ x], [0, np.linalg.norm(y)]])
-        image = np.stack([uv[t[1]] - uv[t[0]], uv[t[2]] - uv[t[0]]], axis=1)
-        s = np.linalg.svd(image @ np.linalg.inv(rest), compute_uv=False)
-        m = 0.5 * rest[0, 0] * rest[1, 1]
-        total, area = total + m * (s @ s + (s**-2).sum() - 4), area + m
-    return total / area
+    a, b = V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]
+    length = np.linalg.norm(a, axis=1)
+    along = (a * b).sum(axis=1) / length
+    height = np.linalg.norm(b - (along / length)[:, None] * a, axis=1)
+    rest = np.moveaxis(np.array([[length, along], [0 * length, height]]), 2, 0)
+    image = np.stack([uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]], axis=2)
+    s = np.linalg.svd(image @ np.linalg.inv(rest), compute_uv=False)
+    return np.average((s**2 + s**-2.0).sum(axis=1) - 4, weights=length * height)
 
 
 @pytest.mark.parametrize("angle", [1.0, -4.0])
-@pytest.mark.parametrize("surface", [cat(12), random_delaunay(700, 1), disk(14), grid(25, 25)])
+@pytest.mark.parametrize("surface", [cat(10), random_delaunay(400, 1), disk(10), grid(18, 18)])
 def test_pins_of_a_swirl_are_reached(surface, angle):
     V, F = surface
     flat = flatten(V, F).uv
@@ -102,7 +99,7 @@ def test_a_boundary_fixed_inside_out_is_reached():
 
 @pytest.mark.parametrize("scale", [1e150, 1e-150])
 def test_the_unit_of_length_does_not_matter(scale):
-    V, F = disk(5)
+    V, F = disk(4)
     fixed, target = np.array([1, 50, 60]), np.array([[0.0, 0], [1, 0], [2, 0.3]])
     ordinary = solved(V, F, fixed, target)
     other = solved(scale * V, F, fixed, scale * target)
@@ -165,7 +162,7 @@ def test_impossible_problems_are_named():
 
 
 def test_a_boundary_fixed_with_the_wrong_orientation_is_named():
-    V, F = disk(6)
+    V, F = disk(4)
     loop = boundary_loops(F, len(V))[0]
     (patch,) = impossible(V, F, loop, V[loop] * [1, -1])
     assert patch.kind is Kind.INVERTED_PATCH
@@ -289,8 +286,8 @@ def test_the_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
     import pin_problems
     import pins
 
-    monkeypatch.setattr(pin_problems, "SMALLEST", 100)
-    monkeypatch.setattr(pin_problems, "LARGEST", 400)
+    monkeypatch.setattr(pin_problems, "SMALLEST", 60)
+    monkeypatch.setattr(pin_problems, "LARGEST", 200)
     monkeypatch.setitem(pin_problems.WEAKEST, "multiply_wound", 2.0)
     names = pins.names(7, list(pin_problems.FAMILIES))
     assert [name.partition(":")[0] for name in names] == list(pin_problems.FAMILIES)

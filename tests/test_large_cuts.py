@@ -19,7 +19,7 @@ from shared.cuts import SURFACES, length_of, parts, random_cut
 class TestLevels:
     """Large surfaces are cut on a coarse mesh; the cuts are carried to the fine one."""
 
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", range(2))
     @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
     def test_cuts_keep_their_topology_when_vertices_are_inserted(self, name, seed):
         V, F = SURFACES[name]
@@ -41,7 +41,7 @@ class TestLevels:
                 assert parts(V, coarsening.levels[k], cut) == [(1, 1)]
         assert parts(V, F, cut) == [(1, 1)]
 
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", range(2))
     @pytest.mark.parametrize("name", ["starfish", "torus with holes", "two handles"])
     def test_shortening_close_to_cuts(self, name, seed):
         V, F = SURFACES[name]
@@ -70,14 +70,14 @@ class TestLevels:
     @pytest.mark.slow
     def test_a_large_torus(self):
         """The inner equator and a ring are nearly the shortest cuts."""
-        V, F = torus(240, 80, radius=3)
+        V, F = torus(210, 76, radius=3)
         cut = find_cuts(V, F, min_gain=np.inf)
         assert parts(V, F, cut) == [(1, 1)]
         assert length_of(V, cut) < 1.03 * 2 * np.pi * (1 + 2)
         assert np.array_equal(cut, find_cuts(V, F, min_gain=np.inf))
 
     def test_a_large_surface_avoids_diagonals(self):
-        V, F = torus(240, 80, radius=3)
+        V, F = torus(210, 76, radius=3)
         diagonals = F[: len(F) // 2, [0, 2]]
         cut = find_cuts(V, F, forbidden_edges=diagonals, min_gain=np.inf)
         assert parts(V, F, cut) == [(1, 1)]
@@ -86,9 +86,9 @@ class TestLevels:
     @pytest.mark.slow
     def test_large_arms(self):
         """On a fine mesh, cuts are about as long as on a coarse one, which reach all arms."""
-        V, F = surfaces.starfish(5, 24)
+        V, F = surfaces.starfish(3, 24)
         few = find_cuts(V, F)
-        V, F = surfaces.starfish(5, 64)
+        V, F = surfaces.starfish(3, 52)
         cut = find_cuts(V, F)
         assert parts(V, F, cut) == [(1, 1)]
-        assert length_of(V, cut) < 1.2 * length_of(*surfaces.starfish(5, 24)[:1], few)
+        assert length_of(V, cut) < 1.2 * length_of(*surfaces.starfish(3, 24)[:1], few)

@@ -251,7 +251,7 @@ def test_calls_that_cannot_be_read(qhm, options):
 def test_letters_of_the_paper(character, tmp_path):
     """A curved surface on each letter, by this option alone."""
     out, report = tmp_path / "out.obj", tmp_path / "report.json"
-    io.write_obj(tmp_path / "cat.obj", io.MeshData(*surfaces.cat(14)))
+    io.write_obj(tmp_path / "cat.obj", io.MeshData(*surfaces.cat(12)))
     command = ["map", str(tmp_path / "cat.obj"), "--to", f"letter:{character}"]
     assert main([*command, "-o", str(out), "--json", str(report)]) == 0
     facts = json.loads(report.read_text())

@@ -123,10 +123,16 @@ def test_a_square_fills_the_square():
         assert packing.utilisation > 0.95
 
 
-@pytest.mark.parametrize("scale", [1e-300, 1e-100, 1e100, 1e300])
-def test_the_unit_of_length_does_not_matter(scale):
+@pytest.fixture(scope="module")
+def six():
+    """Six charts, and where they are packed."""
     charts = grids(6)
-    wanted = pack_charts(charts)
+    return charts, pack_charts(charts)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-100, 1e100, 1e300])
+def test_the_unit_of_length_does_not_matter(scale, six):
+    charts, wanted = six
     found = pack_charts([(uv * scale, F) for uv, F in charts])
     for one, other in zip(found.uv, wanted.uv, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
@@ -216,12 +222,12 @@ def test_packing_time_is_limited(count, seconds):
 
 @pytest.mark.slow
 def test_textures_too_small():
-    charts = grids(100)
-    with pytest.raises(ValueError, match="100 charts with a padding of 4 texels do not fit into 32 ×") as raised:
+    charts = grids(64)
+    with pytest.raises(ValueError, match="64 charts with a padding of 4 texels do not fit into 32 ×") as raised:
         pack_charts(charts, resolution=32)
     sufficient = int(str(raised.value).split("resolution=")[1].split()[0])
-    # Ten rows of ten charts of at most one texel.
-    assert 40 <= sufficient <= 56
+    # Eight rows of eight charts of at most one texel.
+    assert 33 <= sufficient <= 45
     check(charts, pack_charts(charts, resolution=sufficient), [sufficient] * 2, 4)
 
 

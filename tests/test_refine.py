@@ -92,7 +92,7 @@ def without_room():
     V, F = wheel(3)
     step = 2.0**-52
     target = np.array([[1, 1], [1 + step, 1], [1, 1 + step]])
-    return V, F, target, injective_map(V, F, [0, 1, 2], target, refine=True)
+    return V, F, target, injective_map(V, F, [0, 1, 2], target, refine=True, max_iterations=60)
 
 
 @pytest.mark.slow
@@ -161,7 +161,7 @@ def interrupting(*_):
 
 def test_no_restarts_after_a_constructed_map(monkeypatch):
     """Quick stages, then the construction, then the whole search with a time limit and without random restarts."""
-    problem, searches = onto_polygon(1, "grid"), []
+    problem, searches = onto_polygon(9, "grid"), []
 
     def search(on, options):
         searches.append((len(on.F), options.strategy, options.max_iterations))
@@ -205,7 +205,7 @@ class TestCtrlCWithAMapInHand:
         assert [(rung.name, rung.added) for rung in result.refinement_attempts[-1:]] == [("constructed", result.added)]
 
     def test_after_the_construction(self):
-        problem, first = onto_polygon(1, "grid"), []
+        problem, first = onto_polygon(9, "grid"), []
 
         def stop(step):
             # The first step of every search has number 0, and the last one may be reported repeatedly.
@@ -222,7 +222,7 @@ class TestCtrlCWithAMapInHand:
 
     def test_while_vertices_are_removed(self, monkeypatch):
         monkeypatch.setattr(constructing, "thin_refinement", interrupting)
-        problem = onto_polygon(1, "grid")
+        problem = onto_polygon(9, "grid")
         self.check(problem, solve(problem, refine=True, strategy=self.haste, max_iterations=40))
 
     def test_while_a_found_map_is_thinned(self, monkeypatch):

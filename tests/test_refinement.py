@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -147,6 +149,21 @@ def test_invalid_vertices_are_rejected(V, message):
         refine(V, TWO[1], [])
 
 
+@cache
+def refined_problem(name):
+    return refine_problem(OBSTRUCTED[name][0])
+
+
+def test_refining_the_named_edges_leaves_only_obstructions_that_no_refinement_removes():
+    incurable = {"COLLAPSED_EDGE", "PIN", "NESTING", "NEGATIVE_WINDING", "TURNING_NUMBER", "CROSSING"}
+    rounds = {name: refined_problem(name).rounds for name in OBSTRUCTED}
+    assert max(rounds.values()) < 6
+    for name, number in rounds.items():
+        if number:
+            assert {o.kind.name for o in refined_problem(name).diagnosis.obstructions} <= incurable, name
+    assert sum(number > 0 for number in rounds.values()) >= 15
+
+
 def rounds_by_hand(problem):
     """Compute `refine_problem` independently, and transfer a function from each mesh to the next."""
     V, F, number = problem.V, problem.F, 0
@@ -160,8 +177,8 @@ def rounds_by_hand(problem):
 @pytest.mark.slow
 def test_problems_are_refined_until_no_obstruction_is_named():
     most = 0
-    for problem, _ in OBSTRUCTED.values():
-        result = refine_problem(problem)
+    for name, (problem, _) in OBSTRUCTED.items():
+        result = refined_problem(name)
         refined, n = result.refined, problem.n
         V, F, values, number = rounds_by_hand(problem)
         assert result.rounds == number
@@ -184,7 +201,7 @@ def test_problems_are_refined_until_no_obstruction_is_named():
 
 
 def test_rounds_are_limited():
-    problem, _ = next(case for case in OBSTRUCTED.values() if refine_problem(case[0]).rounds > 1)
+    problem, _ = next(case for name, case in OBSTRUCTED.items() if refined_problem(name).rounds > 1)
     result = refine_problem(problem, max_rounds=1)
     assert result.rounds == 1
     assert len(result.diagnosis.split)

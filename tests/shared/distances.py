@@ -26,5 +26,5 @@ def turned(V, angle):
 
 
 def make_dome():
-    V, F = surfaces.disk(14)
+    V, F = surfaces.disk(11)
     return spherical(V, 0.8), F

@@ -152,7 +152,10 @@ class Thinning:
         return quality(*(complex(row.get(old[1], 0.0), row.get(old[2], 0.0)) for row in rows))
 
     def _patch(self, ring: list[int], rings: int) -> Patch | None:
-        """Return the triangles within some rings of some vertices; None if no vertex of them is free."""
+        """Return the triangles within some rings of some vertices; None if no map of them can be positive.
+
+        That is the case if no vertex is free, or if a triangle of fixed vertices is not positive.
+        """
         inside = set(ring)
         for _ in range(rings):
             inside |= {end for vertex in inside for side in self.mesh.link(vertex) for end in side}
@@ -166,7 +169,10 @@ class Thinning:
         F = F.reshape(-1, 3).astype(np.int64)
         fixed = np.isin(vertices, self._fixed)
         fixed[boundary_edges(F, len(vertices))] = True
-        return None if fixed.all() else Patch(F, vertices, fixed)
+        stay = vertices[F[fixed[F].all(axis=1)]].tolist()
+        if fixed.all() or any(self._quality_in_map(*corners) <= 0 for corners in stay):
+            return None
+        return Patch(F, vertices, fixed)
 
 
 def quality(p: complex, q: complex, r: complex) -> float:

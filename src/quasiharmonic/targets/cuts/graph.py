@@ -131,6 +131,13 @@ class EdgeGraph:
         own = edge_keys(self.ends[:, 0], self.ends[:, 1], self.n)
         return np.searchsorted(own, edge_keys(tail, head, self.n))
 
+    @cached_property
+    def _rows(self) -> tuple[IntArray, IntArray]:
+        """Larger vertices of the edges (e,), and where the edges of each smaller vertex start (n + 1,)."""
+        # Before version 1.17, SciPy's graph searches accept 32-bit indices only.
+        start = np.searchsorted(self.ends[:, 0], np.arange(self.n + 1))
+        return self.ends[:, 1].astype(np.int32), start.astype(np.int32)
+
     def distances(self, sources: IntArray, weight: FloatArray, limit: float = np.inf) -> tuple[FloatArray, IntArray]:
         """Distance of each vertex from the nearest source, and its predecessor on the shortest path.
 
@@ -149,9 +156,8 @@ class EdgeGraph:
         before : (n,) int64
             Negative at sources and where no path exists.
         """
-        # Before version 1.17, SciPy's graph searches accept 32-bit indices only.
-        tail, head = self.ends.astype(np.int32).T
-        graph = csr_array((weight, (tail, head)), shape=(self.n, self.n))
+        head, start = self._rows
+        graph = csr_array((weight, head, start), shape=(self.n, self.n))
         distance, before, _ = dijkstra(
             graph, directed=False, indices=sources, return_predecessors=True, min_only=True, limit=limit
         )

@@ -10,6 +10,7 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw
 from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board
+from quasiharmonic.apps.atlas.packing.contact import Spot
 from quasiharmonic.apps.atlas.packing.shapes import Shape, find_smallest_box
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
@@ -215,6 +216,8 @@ class _Search:
         turns = np.exp(0.125j * pi * (np.arange(4) if len(shapes) <= _MOST_DIRECTIONS else np.arange(0, 4, 2)))
         turns = turns if few else turns[:1]
         self._bitmaps = {}
+        # Where the last of several shapes was placed, by the number of cells and the order of these shapes.
+        self._spots: dict[tuple[int, ...], tuple[int, Spot] | None] = {}
         for i in large.tolist():
             if given is not None or not rotate:
                 directions = np.ones(1, dtype=complex) if given is None else given[i : i + 1]
@@ -281,10 +284,16 @@ class _Search:
         boards = [Board(rows, columns, windows=self._windows) for _ in range(self._tiles)]
         n = len(self._areas)
         directions, centres, tiles = np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64)
+        placed: tuple[int, ...] = (cells,)
         for i in (self._order[: self._few] if order is None else order).tolist():
             heartbeat()
             bitmaps = self._bitmaps[i]
-            found = next(((tile, spot) for tile, board in enumerate(boards) if (spot := board.find(bitmaps))), None)
+            # Orders of few shapes often begin alike.
+            placed = (*placed, i)
+            if placed not in self._spots:
+                spots = ((tile, spot) for tile, board in enumerate(boards) if (spot := board.find(bitmaps)))
+                self._spots[placed] = next(spots, None)
+            found = self._spots[placed]
             if found is None:
                 return None
             tile, spot = found
@@ -297,11 +306,11 @@ class _Search:
         boxes = np.ceil(self._boxes + self._padding / texels).astype(np.int64)
         waiting = np.arange(len(rest))
         for tile, board in enumerate(boards):
-            spots = board.fill_rows(boxes[waiting])
-            done = waiting[spots[:, 0] >= 0]
+            corners = board.fill_rows(boxes[waiting])
+            done = waiting[corners[:, 0] >= 0]
             tiles[rest[done]] = tile
-            centres[rest[done]] = (spots[spots[:, 0] >= 0] + boxes[done] / 2) @ [1j, 1] * texels
-            waiting = waiting[spots[:, 0] < 0]
+            centres[rest[done]] = (corners[corners[:, 0] >= 0] + boxes[done] / 2) @ [1j, 1] * texels
+            waiting = waiting[corners[:, 0] < 0]
         return None if waiting.size else Layout(texels / self._cell, directions, centres, tiles)
 
 
