@@ -1,6 +1,5 @@
 """Tetrahedral meshes with a moved boundary, and maps onto a given boundary."""
 
-from fractions import Fraction
 from types import SimpleNamespace
 
 import meshlane
@@ -13,7 +12,7 @@ from quasiharmonic.apps.tetrahedra.energy import BlockMatrix, ShapeEnergy, reduc
 from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus, tetrahedron_quality
 from quasiharmonic.io.fem.files import read_volume
 from quasiharmonic.ui.cli import main
-from shared.exact_space import contact, cross, minus
+from shared.exact_space import contact, cross, exact, minus
 from shared.tetrahedral_meshes import box, sphere_points
 
 
@@ -246,7 +245,7 @@ def test_edges_that_meet_triangles_agree_with_rational_numbers():
     hits = 0
     for _ in range(300):
         X = rng.integers(0, 4, (5, 3)).astype(float)
-        corners = [[Fraction(value) for value in point] for point in X.tolist()]
+        corners = exact(X)
         if not any(cross(minus(corners[3], corners[2]), minus(corners[4], corners[2]))) or corners[0] == corners[1]:
             continue
         found = edges_meeting_triangles(np.array([[0, 1]]), np.array([[2, 3, 4]]), X)
