@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ from shared.polygons import circle
 from shared.small_meshes import eared
 from shared.solvable_problems import star_problem
 
-SCALES = [1e-300, 1e-150, 1e-12, 1.0, 1e12, 1e150, 1e300]
+SCALES = [1e-300, 1e-150, 1e-12, 1e12, 1e150, 1e300]
 
 
 def through_all(V, F, fixed, target, **more):
@@ -49,6 +50,14 @@ def through_all(V, F, fixed, target, **more):
     return result.uv
 
 
+@cache
+def star_map(reference):
+    """The map of the star where both scales are 1."""
+    uv = through_all(*star_problem(n=100), reference=reference)
+    uv.setflags(write=False)
+    return uv
+
+
 class TestScales:
     @pytest.mark.slow
     @pytest.mark.parametrize("scale", SCALES)
@@ -57,13 +66,13 @@ class TestScales:
         V, F, fixed, target = star_problem(n=100)
         uv = through_all(V * scale, F, fixed, target, reference=reference)
         # Only rounding depends on it.
-        np.testing.assert_allclose(uv, through_all(V, F, fixed, target, reference=reference), atol=1e-6)
+        np.testing.assert_allclose(uv, star_map(reference), atol=1e-6)
 
     @pytest.mark.parametrize("scale", SCALES)
     def test_of_the_target(self, scale):
         V, F, fixed, target = star_problem(n=100)
         uv = through_all(V, F, fixed, target * scale)
-        np.testing.assert_allclose(uv / scale, through_all(V, F, fixed, target), atol=1e-6)
+        np.testing.assert_allclose(uv / scale, star_map(None), atol=1e-6)
 
     @pytest.mark.parametrize(("rest", "image"), [(1e-150, 1e-150), (1e150, 1e150), (1e-150, 1e150), (1e150, 1e-150)])
     def test_of_both_in_a_polish(self, rest, image):
