@@ -53,7 +53,7 @@ def through_all(V, F, fixed, target, **more):
 @cache
 def star_map(reference):
     """The map of the star where both scales are 1."""
-    uv = through_all(*star_problem(n=100), reference=reference)
+    uv = through_all(*star_problem(n=60), reference=reference)
     uv.setflags(write=False)
     return uv
 
@@ -63,14 +63,14 @@ class TestScales:
     @pytest.mark.parametrize("scale", SCALES)
     @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
     def test_of_the_rest_mesh(self, scale, reference):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         uv = through_all(V * scale, F, fixed, target, reference=reference)
         # Only rounding depends on it.
         np.testing.assert_allclose(uv, star_map(reference), atol=1e-6)
 
     @pytest.mark.parametrize("scale", SCALES)
     def test_of_the_target(self, scale):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         uv = through_all(V, F, fixed, target * scale)
         np.testing.assert_allclose(uv / scale, star_map(None), atol=1e-6)
 
@@ -122,7 +122,7 @@ class TestScales:
 class TestOffsets:
     @pytest.mark.parametrize("offset", [1e3, 1e6, 1e8])
     def test_many_times_the_size(self, offset):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         away = offset * np.array([1.0, -0.7])
         uv = through_all(V, F, fixed, target + away)
         assert signed_areas(F, uv - away).min() > 0
@@ -130,7 +130,7 @@ class TestOffsets:
 
     def test_beyond_the_resolution_of_doubles(self):
         """The positions coincide: the problem is impossible, and there is no other failure."""
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         result = injective_map(V, F, fixed, target + 1e17)
         assert result.status is Status.IMPOSSIBLE
         assert {o.kind for o in result.diagnosis.obstructions} >= {Kind.SIGNED_AREA, Kind.COLLAPSED_EDGE}
@@ -139,7 +139,7 @@ class TestOffsets:
             injective_map(V + 1e17, F, fixed, target)
 
     def test_one_distant_vertex(self):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         target = target.copy()
         target[0] *= 1e12
         result = injective_map(V, F, fixed, target, max_iterations=60)
@@ -189,7 +189,7 @@ class TestSinglePrecision:
 
 class TestRestMeshes:
     def flat(self):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         inner = next(t for t in F if not np.isin(t, fixed).any())
         V = V.copy()
         V[inner[0]] = V[inner[1]]
@@ -208,11 +208,11 @@ class TestRestMeshes:
     @pytest.mark.parametrize("squash", [[0, 0, 0], [1, 0, 0]])
     @pytest.mark.parametrize("reference", ["equilateral", "corrected"])
     def test_that_are_a_point_or_a_line(self, squash, reference):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         through_all(V * squash, F, fixed, target, reference=reference)
 
     def test_extreme_proportions(self):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         through_all(V * [1, 1e-6, 1], F, fixed, target, reference="rest")
         through_all(V * [1, 1e-6, 1], F, fixed, target)
 
@@ -323,7 +323,7 @@ def test_numbers_that_are_not_finite(bad):
 
 
 class TestFlatteningAtScales:
-    @pytest.mark.parametrize("scale", [1e-322, 1e-310, 1e-300, 1.0, 1e300])
+    @pytest.mark.parametrize("scale", [1e-322, pytest.param(1e-310, marks=pytest.mark.nightly), 1e-300, 1.0, 1e300])
     @pytest.mark.parametrize("place", [[0.0, 0.0], [1.0, 2.0], [1e-300, 1e-300], [1e300, 2.0], [1.7e308, -1.7e308]])
     def test_one_pin_at_any_position_gives_finite_positions(self, scale, place):
         V, F = cat(2)

@@ -91,7 +91,7 @@ def test_random_paths_are_no_shorter():
     rng = np.random.default_rng(5)
     corners = spiral(12, 1.2)
     middles = np.concatenate([0.5 * (corners[k] + corners[[j]]) for k in range(24) for j in range(k)])
-    beside = np.concatenate([corners + 0.01 * direction for direction in circle(12)])
+    beside = np.concatenate([corners + 0.01 * direction for direction in circle(6)])
     places = np.concatenate([middles, beside, beside]) + 0.02 * rng.normal(size=(len(middles) + 2 * len(beside), 2))
     p, q = corners, np.roll(corners, -1, axis=0)
 

@@ -37,14 +37,14 @@ def computed_disk(n, seed):
 
 def surfaces():
     """(name, V, F) of planar and curved meshes with one or two boundary loops."""
-    flat, flat_faces = irregular_disk(150, 3)
+    flat, flat_faces = irregular_disk(90, 3)
     ring, ring_faces = annulus(8)
     return [
         ("disk", flat, flat_faces),
         ("bowl", lift(flat), flat_faces),
         ("annulus", ring, ring_faces),
         ("curved annulus", lift(ring), ring_faces),
-        ("random annulus", *random_annulus()),
+        ("random annulus", *random_annulus(120)),
     ]
 
 
