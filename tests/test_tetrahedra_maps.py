@@ -124,7 +124,7 @@ def test_a_turned_cavity():
     assert first.energy > result.energy
     # A longer cavity turn in steps, with the mesh carried along.
     mesh = MovingMesh(X, T, cavity)
-    for angle in np.arange(30, 121, 30):
+    for angle in (40, 80, 120):
         mesh.advance(turned(X[cavity], angle))
     assert certify_tetrahedra(mesh.F, mesh.points).injective
     before = mesh.points
@@ -312,7 +312,7 @@ def test_quality():
 
 def test_mesh_objects_and_files(tmp_path):
     X, T, cavity = shell(4)
-    there = turned(X[cavity], 30)
+    there = turned(X[cavity], 10)
     expected = morph(X, T, cavity, there).points
     walls = certify_tetrahedra(T, X).boundary
     mesh = meshlane.Mesh(X, [("triangle", walls), ("tetra", T[:50]), ("tetra", T[50:])])
@@ -327,11 +327,22 @@ def test_mesh_objects_and_files(tmp_path):
         morph(SimpleNamespace(points=X, cells_dict={"tetra10": np.zeros((1, 10), int)}), cavity, there)
 
 
+@cache
+def displaced():
+    """A displacement of the cavity, and the positions of all vertices after it."""
+    X, T, cavity = shell(4)
+    displacement = np.zeros_like(X)
+    displacement[cavity] = turned(X[cavity], 20) - X[cavity]
+    points = morph(X, T, cavity, X[cavity] + displacement[cavity]).points
+    for array in (displacement, points):
+        array.setflags(write=False)
+    return displacement, points
+
+
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh"])
 def test_qhm_morph_keeps_everything_but_positions(suffix, tmp_path, capsys):
     X, T, cavity = shell(4)
-    displacement = np.zeros_like(X)
-    displacement[cavity] = turned(X[cavity], 30) - X[cavity]
+    displacement, points = displaced()
     form = {"file_format": "gmsh22"} if suffix == ".msh" else {}
     path, out = tmp_path / f"mesh{suffix}", tmp_path / f"moved{suffix}"
     walls = certify_tetrahedra(T, X).boundary
@@ -342,7 +353,7 @@ def test_qhm_morph_keeps_everything_but_positions(suffix, tmp_path, capsys):
     assert main(["morph", str(path), "--field", "u", "-o", str(out)]) == 0
     assert "Injective" in capsys.readouterr().out
     moved = read_volume(out)
-    np.testing.assert_array_equal(moved.points, morph(X, T, cavity, X[cavity] + displacement[cavity]).points)
+    np.testing.assert_array_equal(moved.points, points)
     np.testing.assert_array_equal(moved.T, T)
     # With the old positions every byte is the old one.
     assert moved.parts.replace_points(X) == path.read_bytes() or suffix == ".msh"
