@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from quasiharmonic import certify
@@ -44,6 +44,7 @@ def simple(places):
 def test_simple_loops(number):
     @given(st.lists(st.lists(st.tuples(number, number), min_size=3, max_size=9), min_size=1, max_size=3))
     @examples(25)
+    @example([[(0.0, 0.0), (2.0, 0.0), (1.0, 0.0)]])  # edges that overlap and meet no other
     def check(polygons):
         loops = np.split(np.arange(sum(map(len, polygons))), np.cumsum([len(one) for one in polygons])[:-1])
         found = simple_loops(loops, np.concatenate([np.array(one) for one in polygons]))
