@@ -39,8 +39,8 @@ from shared.meshes import boundary_of, signed_areas
 
 pytestmark = pytest.mark.slow
 
-often = examples(60, suppress_health_check=[HealthCheck.too_slow])
-seldom = examples(20, suppress_health_check=[HealthCheck.too_slow])
+often = examples(35, suppress_health_check=[HealthCheck.too_slow])
+seldom = examples(15, suppress_health_check=[HealthCheck.too_slow])
 
 MESHES = [
     (np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])),

@@ -17,6 +17,9 @@ PLAN = {
     name: {other.strip() for other in others.split(",") if other.strip()}
     for name, others in re.findall(r"^\| `(\w+)` \|.*\| ([\w, ]*)\|$", PAGE, re.MULTILINE)
 }
+# What `imported` reads: imports, strings, and what may have a docstring.
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+READ = {*DOCUMENTED, ast.Import, ast.ImportFrom, ast.Constant}
 # These modules re-export names of packages: the public names, the command, and the short public paths.
 FACADE = {"__init__", "__main__", "atlas", "batch", "jax", "plot", "results", "surfaces", "torch"}
 
@@ -36,9 +39,10 @@ def imported(tree):
     docstrings = set()
     # A node is visited after the one that contains it.
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
-            docstrings.add(id(body[0].value))
+        if type(node) not in READ:
+            continue
+        if isinstance(node, DOCUMENTED) and isinstance(node.body[0], ast.Expr):
+            docstrings.add(id(node.body[0].value))
         if isinstance(node, ast.Import):
             dotted = [(alias.name.split("."), None) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -30,7 +30,7 @@ def test_a_clean_mesh_is_returned_unchanged(mesh):
 
 
 @given(st.integers(3, 12), st.integers(1, 60), st.integers(0, 2**31), st.integers(-20, -6))
-@examples(40)
+@examples(20)
 @example(10, 19, 825, -17)  # a widened triangle must not be thin in a second cleaning
 def test_triangles_that_are_almost_degenerate_form_surfaces(n, f, seed, exponent):
     rng = np.random.default_rng(seed)
@@ -45,7 +45,7 @@ def test_triangles_that_are_almost_degenerate_form_surfaces(n, f, seed, exponent
 
 
 @given(st.integers(3, 9), st.integers(1, 40), st.integers(0, 2**31), st.booleans(), st.booleans())
-@examples(60)
+@examples(30)
 @example(7, 27, 3023, False, True)  # separated triangles change the larger part of a component
 def test_any_triangles_form_surfaces(n, f, seed, weld, on_a_grid):
     rng = np.random.default_rng(seed)
@@ -61,7 +61,7 @@ def test_any_triangles_form_surfaces(n, f, seed, weld, on_a_grid):
 
 
 @given(st.integers(0, 2**31), st.floats(0, 1))
-@examples(25)
+@examples(15)
 def test_mixed_winding_is_mended_to_the_larger_part(seed, share):
     V, F = starfish(rings=6)
     rows = np.flatnonzero(np.random.default_rng(seed).random(len(F)) < share)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ from shared.polygons import circle
 from shared.small_meshes import eared
 from shared.solvable_problems import star_problem
 
-SCALES = [1e-300, 1e-150, 1e-12, 1.0, 1e12, 1e150, 1e300]
+SCALES = [1e-300, 1e-150, 1e-12, 1e12, 1e150, 1e300]
 
 
 def through_all(V, F, fixed, target, **more):
@@ -49,21 +50,37 @@ def through_all(V, F, fixed, target, **more):
     return result.uv
 
 
+@cache
+def star_map(reference):
+    """The map of the star where both scales are 1."""
+    uv = through_all(*star_problem(n=60), reference=reference)
+    uv.setflags(write=False)
+    return uv
+
+
+@cache
+def obstructions_of(name):
+    problem, _ = OBSTRUCTED[name]
+    found = [o.message for o in diagnose(problem).obstructions]
+    assert found
+    return found
+
+
 class TestScales:
     @pytest.mark.slow
     @pytest.mark.parametrize("scale", SCALES)
     @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
     def test_of_the_rest_mesh(self, scale, reference):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         uv = through_all(V * scale, F, fixed, target, reference=reference)
         # Only rounding depends on it.
-        np.testing.assert_allclose(uv, through_all(V, F, fixed, target, reference=reference), atol=1e-6)
+        np.testing.assert_allclose(uv, star_map(reference), atol=1e-6)
 
     @pytest.mark.parametrize("scale", SCALES)
     def test_of_the_target(self, scale):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         uv = through_all(V, F, fixed, target * scale)
-        np.testing.assert_allclose(uv / scale, through_all(V, F, fixed, target), atol=1e-6)
+        np.testing.assert_allclose(uv / scale, star_map(None), atol=1e-6)
 
     @pytest.mark.parametrize(("rest", "image"), [(1e-150, 1e-150), (1e150, 1e150), (1e-150, 1e150), (1e150, 1e-150)])
     def test_of_both_in_a_polish(self, rest, image):
@@ -88,9 +105,8 @@ class TestScales:
     @pytest.mark.parametrize("name", ["no kernel", "nothing sees all", "too few edges across"])
     def test_of_obstructions(self, scale, name):
         problem, _ = OBSTRUCTED[name]
-        found = [diagnose(problem.with_target(problem.target * s)) for s in (1.0, scale)]
-        assert found[0].obstructions
-        assert [o.message for o in found[0].obstructions] == [o.message for o in found[1].obstructions]
+        found = diagnose(problem.with_target(problem.target * scale))
+        assert [o.message for o in found.obstructions] == obstructions_of(name)
 
     @pytest.mark.parametrize("scale", [1e-150, 1e150])
     def test_extreme_scales_in_files(self, scale, tmp_path, capsys):
@@ -113,7 +129,7 @@ class TestScales:
 class TestOffsets:
     @pytest.mark.parametrize("offset", [1e3, 1e6, 1e8])
     def test_many_times_the_size(self, offset):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         away = offset * np.array([1.0, -0.7])
         uv = through_all(V, F, fixed, target + away)
         assert signed_areas(F, uv - away).min() > 0
@@ -121,7 +137,7 @@ class TestOffsets:
 
     def test_beyond_the_resolution_of_doubles(self):
         """The positions coincide: the problem is impossible, and there is no other failure."""
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         result = injective_map(V, F, fixed, target + 1e17)
         assert result.status is Status.IMPOSSIBLE
         assert {o.kind for o in result.diagnosis.obstructions} >= {Kind.SIGNED_AREA, Kind.COLLAPSED_EDGE}
@@ -130,7 +146,7 @@ class TestOffsets:
             injective_map(V + 1e17, F, fixed, target)
 
     def test_one_distant_vertex(self):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         target = target.copy()
         target[0] *= 1e12
         result = injective_map(V, F, fixed, target, max_iterations=60)
@@ -180,7 +196,7 @@ class TestSinglePrecision:
 
 class TestRestMeshes:
     def flat(self):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         inner = next(t for t in F if not np.isin(t, fixed).any())
         V = V.copy()
         V[inner[0]] = V[inner[1]]
@@ -199,11 +215,11 @@ class TestRestMeshes:
     @pytest.mark.parametrize("squash", [[0, 0, 0], [1, 0, 0]])
     @pytest.mark.parametrize("reference", ["equilateral", "corrected"])
     def test_that_are_a_point_or_a_line(self, squash, reference):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         through_all(V * squash, F, fixed, target, reference=reference)
 
     def test_extreme_proportions(self):
-        V, F, fixed, target = star_problem(n=100)
+        V, F, fixed, target = star_problem(n=60)
         through_all(V * [1, 1e-6, 1], F, fixed, target, reference="rest")
         through_all(V * [1, 1e-6, 1], F, fixed, target)
 
@@ -314,10 +330,10 @@ def test_numbers_that_are_not_finite(bad):
 
 
 class TestFlatteningAtScales:
-    @pytest.mark.parametrize("scale", [1e-322, 1e-310, 1e-300, 1.0, 1e300])
+    @pytest.mark.parametrize("scale", [1e-322, pytest.param(1e-310, marks=pytest.mark.nightly), 1e-300, 1.0, 1e300])
     @pytest.mark.parametrize("place", [[0.0, 0.0], [1.0, 2.0], [1e-300, 1e-300], [1e300, 2.0], [1.7e308, -1.7e308]])
     def test_one_pin_at_any_position_gives_finite_positions(self, scale, place):
-        V, F = cat(3)
+        V, F = cat(2)
         result = flatten(V / np.abs(V).max() * scale, F, fixed=[3], target=[place], record_every=1)
         assert np.isfinite(result.uv).all()
         assert all(np.isfinite(snapshot.uv).all() for snapshot in result.path)

@@ -98,15 +98,21 @@ def test_wrong_files_are_rejected(tmp_path):
     assert main(["field", str(path), "--spacing", "2", "-o", str(tmp_path / "g.nii")]) == 2
 
 
-def folded_volume(d=9, h=10, w=12):
+def folded_volume(d=5, h=6, w=7):
     """A field on voxels along the axes of the grid, with folds."""
     z, y, x = np.mgrid[:d, :h, :w]
-    bump = 4 * np.exp(-((x - 5) ** 2 + (y - 5) ** 2 + (z - 4) ** 2) / 4)
+    bump = 2 * np.exp(-((x - 3) ** 2 + (y - 2) ** 2 + (z - 2) ** 2))
     return np.stack([bump + 0.1 * z, 0.3 * bump, -0.2 * bump], axis=-1)
 
 
-@pytest.mark.parametrize("name", ["f.mha", "f.nrrd", "f.nii", "f.nii.gz"])
-@pytest.mark.parametrize("reflect", [1, -1])
+@pytest.mark.parametrize(
+    ("name", "reflect"),
+    [
+        *((name, 1) for name in ("f.mha", "f.nrrd", "f.nii", "f.nii.gz")),
+        *((name, -1) for name in ("f.mha", "f.nii")),
+        *(pytest.param(name, -1, marks=pytest.mark.nightly) for name in ("f.nrrd", "f.nii.gz")),
+    ],
+)
 def test_simpleitk_applies_the_written_volume(name, reflect, tmp_path):
     source, out = str(tmp_path / name), str(tmp_path / f"out_{name}")
     turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, reflect]])
@@ -121,13 +127,13 @@ def test_simpleitk_applies_the_written_volume(name, reflect, tmp_path):
     assert main(["field", source, "-o", out]) == 0
     field = io.read_field(out).field
     changed = (field != read.field).any(axis=3)
-    assert 0 < changed.sum() < 500
+    assert 0 < changed.sum() < 100
     image, before = sitk.ReadImage(out), sitk.ReadImage(source)
     assert (sitk.GetArrayFromImage(image) == sitk.GetArrayFromImage(before))[~changed].all()
     assert image.GetOrigin() == before.GetOrigin()
     assert image.GetDirection() == before.GetDirection()
     transform = sitk.DisplacementFieldTransform(sitk.Cast(image, sitk.sitkVectorFloat64))
-    for x, y, z in ((5, 5, 4), (6, 5, 4), (11, 9, 8), (0, 3, 2)):
+    for x, y, z in ((3, 2, 2), (4, 2, 2), (6, 5, 4), (0, 3, 2)):
         start = before.TransformIndexToPhysicalPoint((x, y, z))
         moved = np.array([x, y, z]) + field[z, y, x] / (1.0, 2.0, 1.5)
         expected = before.TransformContinuousIndexToPhysicalPoint(moved.tolist())

@@ -38,10 +38,10 @@ def inverse_field(mesh, w):
 @pytest.mark.parametrize(("name", "V", "F"), MESHES, ids=IDS)
 class TestValues:
     def test_agree_with_the_papers_formulas(self, name, V, F):
-        problem = posed(V, F, noise=0.05)
+        problem, xi = posed(V, F, noise=0.05), random_xi(F)
+        L, D, pinv = matrices(problem, Objective(problem).evaluate(xi))
         for functional, formula in PAPER.items():
-            iterate = Objective(problem, functional).evaluate(random_xi(F))
-            L, D, pinv = matrices(problem, iterate)
+            iterate = Objective(problem, functional).evaluate(xi)
             w = iterate.w
             g = -1j * (D @ w)
             np.testing.assert_allclose(neumann_target(problem, w), g, atol=1e-14)
@@ -168,7 +168,7 @@ def test_gradients_against_differences(functional, parameterisation, reference, 
     rng = np.random.default_rng(1)
     h = 1e-5
     gradient = objective.evaluate(xi).gradient
-    for _ in range(3):
+    for _ in range(2):
         direction = rng.standard_normal(len(F)) + 1j * rng.standard_normal(len(F))
         slope = (objective.evaluate(xi + h * direction).value - objective.evaluate(xi - h * direction).value) / (2 * h)
         assert np.vdot(gradient, direction).real == pytest.approx(slope, rel=1e-6)

@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from quasiharmonic import certify
@@ -43,7 +43,8 @@ def simple(places):
 @coordinates
 def test_simple_loops(number):
     @given(st.lists(st.lists(st.tuples(number, number), min_size=3, max_size=9), min_size=1, max_size=3))
-    @examples(50)
+    @examples(25)
+    @example([[(0.0, 0.0), (2.0, 0.0), (1.0, 0.0)]])  # edges that overlap and meet no other
     def check(polygons):
         loops = np.split(np.arange(sum(map(len, polygons))), np.cumsum([len(one) for one in polygons])[:-1])
         found = simple_loops(loops, np.concatenate([np.array(one) for one in polygons]))
@@ -58,7 +59,7 @@ def test_contacts_agree_with_exact_arithmetic(number):
         st.lists(st.tuples(number, number), min_size=4, max_size=7),
         st.lists(st.tuples(st.integers(0, 3), st.integers(0, 6)), min_size=2, max_size=8),
     )
-    @examples(50)
+    @examples(25)
     def check(places, ends):
         ends = [(i, j % len(places)) for i, j in ends]
         expected = {}
@@ -79,7 +80,7 @@ def test_contacts_agree_with_exact_arithmetic(number):
 @coordinates
 def test_signs_of_triangles(number):
     @given(st.lists(st.tuples(number, number), min_size=3, max_size=6), st.data())
-    @examples(40)
+    @examples(25)
     def check(places, data):
         corner = st.integers(0, len(places) - 1)
         F = np.array(data.draw(st.lists(st.tuples(corner, corner, corner), min_size=1, max_size=9)))
@@ -114,7 +115,7 @@ def test_floating_point_decides_all_pairs_of_segments_on_a_lattice(rng, monkeypa
             return zero or relation == SegmentRelation.OVERLAPPING
         return shared > 1 or relation != SegmentRelation.DISJOINT
 
-    for _ in range(12):
+    for _ in range(4):
         places = rng.integers(-4, 5, (40, 2)).astype(float)
         tails, heads = rng.integers(0, len(places), (2, 60))
         starts = np.array([0, 4, 4, 20, 60], dtype=np.int64)
@@ -167,7 +168,7 @@ def test_simple_loops_in_several_portions(rng, monkeypatch):
     angle = np.arange(40) * np.pi / 20
     circle = np.round(99 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     seen = set()
-    for count in (1, 4, 12):
+    for count in (1, 6):
         for kind in range(4):
             polygons = [rng.integers(0, 4, (int(rng.integers(3, 7)), 2)).astype(float) for _ in range(count)]
             # One with 40 edges, simple or not.

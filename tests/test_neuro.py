@@ -18,7 +18,7 @@ NEEDED = "no dependency of the tests: .ci/optional installs it"
 def sphere_with_patch(folder):
     """Write a closed surface ``lh.inflated`` and a patch of it; return the surface and the patch's vertices."""
     geometry = pytest.importorskip("nibabel", reason=NEEDED).freesurfer
-    V, F = starfish(rings=8)
+    V, F = starfish(rings=5)
     V = V.astype(np.float32).astype(float)
     geometry.write_geometry(str(folder / "lh.inflated"), V, F)
     inside = np.flatnonzero(V[:, 2] > 0)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from quasiharmonic import io, refine
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
 from quasiharmonic.io import MeshFileError
+from shared.examples import examples
 
 
 def rings(polygons):
@@ -44,6 +45,7 @@ class TestTriangulation:
             assert areas(V, F).sum() == pytest.approx(6.0)
 
     @pytest.mark.slow
+    @examples(40)
     @given(st.integers(4, 60), st.integers(0, 10**6))
     def test_a_star_shaped_polygon_is_triangulated_without_inversion(self, size, seed):
         rng = np.random.default_rng(seed)

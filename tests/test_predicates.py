@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic.geometry.exact import predicates
@@ -23,6 +23,7 @@ from quasiharmonic.geometry.exact.predicates import (
     two_sum,
 )
 from shared.exact import exact_orientation, exact_relation
+from shared.examples import examples
 
 
 def agrees(a, b, c):
@@ -42,7 +43,7 @@ point_of = {name: st.tuples(x, x) for name, x in (("any", any_float), ("sparse",
 @pytest.mark.parametrize("kind", point_of)
 def test_orientation_is_exact_for_all_doubles(kind):
     @given(st.lists(st.tuples(*[point_of[kind]] * 3), min_size=1, max_size=20))
-    @settings(deadline=None)
+    @examples(40)
     def check(triples):
         agrees(*np.array(triples).transpose(1, 0, 2))
 
@@ -55,7 +56,7 @@ def test_orientation_is_exact_for_all_doubles(kind):
     st.integers(-2, 2),
     st.integers(-2, 2),
 )
-@settings(deadline=None)
+@examples(50)
 def test_orientation_of_points_close_to_a_line(ends, t, i, j):
     a, b = np.array(ends[:2]) / 2, np.array(ends[2:]) / 2
     c = a * (1 - t) + b * t
@@ -236,7 +237,7 @@ lattice_segments = st.lists(st.tuples(*[st.tuples(st.integers(0, 4), st.integers
 
 
 @given(lattice_segments, st.sampled_from([1.0, 0.1, 1e-200, 1e299, 5e-324]), st.sampled_from([0.0, 1e8]))
-@settings(max_examples=200, deadline=None)
+@examples(50)
 def test_segment_relation_is_exact(segments, scale, offset):
     p, q, r, s = ((np.array(segments) + offset) * scale).transpose(1, 0, 2)
     expected = [exact_relation(*ends) for ends in zip(p, q, r, s, strict=True)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ import pytest
 from quasiharmonic import distortion, inverted_triangles, io, repair
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.commands import run
+from shared.exact import exact_orientation
 from shared.meshes import bend, boundary_of, lift, signed_areas
 from shared.seam_meshes import islands, strips
 
@@ -30,14 +30,8 @@ def inner_rows(FT, rows=slice(None)):
 
 
 def exact_signs(uv, FT):
-    """Return the orientation of every triangle in rational arithmetic."""
-    signs = []
-    for (ax, ay), (bx, by), (cx, cy) in uv[FT].tolist():
-        area = (Fraction(bx) - Fraction(ax)) * (Fraction(cy) - Fraction(ay)) - (Fraction(by) - Fraction(ay)) * (
-            Fraction(cx) - Fraction(ax)
-        )
-        signs.append((area > 0) - (area < 0))
-    return np.array(signs)
+    """Return the orientation of every triangle in exact arithmetic."""
+    return np.array([exact_orientation(*corners) for corners in uv[FT]])
 
 
 class TestRepair:

@@ -19,22 +19,24 @@ ROOT = FOLDER.parent
 MODULES = sorted(FOLDER.rglob("*.py"))
 TESTS = {path.stem for path in FOLDER.rglob("test_*.py")}
 MAX_LINES = 450
+# What `read` returns.
+READ = {ast.Import, ast.ImportFrom, ast.Attribute, ast.Call}
 # Methods of `namedtuple` have an underscore to be no fields, and notebooks' methods by convention: none is private.
 PUBLIC = {"_replace", "_asdict", "_fields", "_make", "_repr_html_", "_repr_png_"}
-
-
-@cache
-def parsed(path):
-    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def private(name):
     return name.startswith("_") and not name.startswith("__") and name not in PUBLIC
 
 
-def imports(tree):
-    """Yield (module, name or None) of every import in the file."""
-    for node in ast.walk(tree):
+def read(text):
+    """The imports, attributes and calls of a file."""
+    return [node for node in ast.walk(ast.parse(text)) if type(node) in READ]
+
+
+def imports(nodes):
+    """Yield (module, name or None) of every import."""
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from ((alias.name, None) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -47,11 +49,11 @@ def called(node):
     return getattr(node.func, "attr", getattr(node.func, "id", ""))
 
 
-def private_names(tree):
+def private_names(nodes):
     """Yield names with an underscore that are imported, accessed, or replaced by `monkeypatch.setattr`."""
-    for module, name in imports(tree):
+    for module, name in imports(nodes):
         yield from (part for part in (*module.split("."), name or "") if private(part))
-    for node in ast.walk(tree):
+    for node in nodes:
         # A class of the tests that implements a protocol may call the method that it replaces.
         if (
             isinstance(node, ast.Attribute)
@@ -64,6 +66,20 @@ def private_names(tree):
             yield from (part for word in words for part in word.split(".") if private(part))
 
 
+def optional_packages(nodes):
+    """Yield the packages without which a test is skipped."""
+    for node in nodes:
+        if isinstance(node, ast.Call) and called(node) == "importorskip" and isinstance(node.args[0], ast.Constant):
+            yield node.args[0].value
+
+
+@cache
+def facts(path):
+    """Modules that a file imports, private names, and optional packages; to keep the trees would take longer."""
+    nodes = read(path.read_text(encoding="utf-8"))
+    return [module for module, _ in imports(nodes)], list(private_names(nodes)), list(optional_packages(nodes))
+
+
 def test_no_file_is_long():
     lines = {path.name: path.read_text(encoding="utf-8").count("\n") for path in MODULES}
     assert not {name: count for name, count in lines.items() if count > MAX_LINES}, "split it by behaviour"
@@ -72,9 +88,9 @@ def test_no_file_is_long():
 @pytest.mark.slow
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(FOLDER).as_posix())
 def test_rules(path):
-    text, tree = path.read_text(encoding="utf-8"), parsed(path)
-    assert not [module for module, _ in imports(tree) if module.split(".")[-1] in TESTS | {"conftest"}]
-    assert not list(private_names(tree))
+    text, (modules, private, _) = path.read_text(encoding="utf-8"), facts(path)
+    assert not [module for module in modules if module.split(".")[-1] in TESTS | {"conftest"}]
+    assert not private
     assert not re.search(r"parents\[[2-9]\]|\.parent\.parent\.parent", text), "looks outside the checkout"
 
 
@@ -89,11 +105,11 @@ def test_rules(path):
     ],
 )
 def test_private_names_are_detected(code):
-    assert list(private_names(ast.parse(code))) == ["_hidden"]
+    assert list(private_names(read(code))) == ["_hidden"]
 
 
 def test_imports_of_tests_are_detected():
-    assert list(imports(ast.parse("def f():\n    from test_cli import run"))) == [("test_cli", "run")]
+    assert list(imports(read("def f():\n    from test_cli import run"))) == [("test_cli", "run")]
 
 
 def test_files_named_in_scripts_exist():
@@ -105,13 +121,7 @@ def test_files_named_in_scripts_exist():
 
 def test_packages_that_tests_skip_without_are_installed_somewhere():
     """Every package is required, is part of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
-    wanted = {
-        node.args[0].value
-        for path in MODULES
-        for node in ast.walk(parsed(path))
-        if isinstance(node, ast.Call) and called(node) == "importorskip"
-        if isinstance(node.args[0], ast.Constant)
-    }
+    wanted = {package for path in MODULES for package in facts(path)[2]}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     brought = re.search(r"\[(.*)\]", extras["test"][0]).group(1).split(",")

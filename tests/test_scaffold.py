@@ -27,7 +27,7 @@ def blocks(gap, seed=0):
     rng = np.random.default_rng(seed)
     parts, places, count = [], [], 0
     for low in (-0.3, gap):
-        x = np.sort(np.concatenate([[0, 1], rng.uniform(0, 1, 60)]))
+        x = np.sort(np.concatenate([[0, 1], rng.uniform(0, 1, 24)]))
         k = np.arange(len(x) - 1) + count
         up = len(x)
         places += [np.stack([x, np.full(up, y)], axis=1) for y in (low, low + 0.3)]
@@ -59,7 +59,7 @@ def way(request, monkeypatch):
     return request.param
 
 
-@pytest.mark.parametrize("surface", [disk(8), annulus(8), random_delaunay(500), grid(9, 3)])
+@pytest.mark.parametrize("surface", [disk(5), annulus(6), random_delaunay(200), grid(9, 3)])
 def test_scaffold_surrounds_surfaces(surface, way):
     V, F = surface
     air, points, _ = checked(F, V[:, :2])
@@ -88,7 +88,7 @@ def test_thin_gaps_are_filled(gap, way):
     checked(F, uv)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_needles_bays_and_edges_of_any_length(seed, way):
     rng = np.random.default_rng(seed)
     angles = np.unique(np.concatenate([rng.uniform(0, 2 * np.pi, 40), 1 + np.cumsum(10.0 ** rng.uniform(-11, -2, 30))]))
@@ -142,10 +142,10 @@ def test_triangles_are_delaunay_except_at_segments(way):
     rng = np.random.default_rng(3)
     hull_angles = np.arange(12) * np.pi / 6
     hull = 3 * np.stack([np.cos(hull_angles), np.sin(hull_angles)], axis=1)
-    points = np.concatenate([hull, rng.uniform(-1, 1, (200, 2))])
+    points = np.concatenate([hull, rng.uniform(-1, 1, (100, 2))])
     # Two long chords that pass through no other point.
     points = np.concatenate([points, [[-1.5, 0.013], [1.5, 0.0117], [-1.4, 0.5], [1.4, 0.51]]])
-    segments = np.array([[212, 213], [214, 215]])
+    segments = np.array([[112, 113], [114, 115]])
     triangles = constrained_delaunay(points, segments, np.arange(12))
     assert is_injective(triangles, points)
     assert len(triangles) == 2 * len(points) - 2 - 12

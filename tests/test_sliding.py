@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
@@ -26,14 +28,22 @@ def turned(rings=8, angle=0.5):
     return V, F, uv, loop
 
 
+@cache
+def slid(text):
+    """The problem of `lettered`, and its map with a sliding boundary."""
+    V, F, fixed, target, curves = lettered(text)
+    return (V, F, fixed, target, curves), injective_map(
+        V, F, fixed, target, polish="symmetric-dirichlet", slide=BoundaryCurves(curves)
+    )
+
+
 # Results
 
 
 @pytest.mark.parametrize("character", ["G", "S", *(pytest.param(c, marks=pytest.mark.nightly) for c in "PH")])
 def test_a_letter_is_better_with_its_boundary_sliding(character):
-    V, F, fixed, target, curves = lettered(f"letter:{character}")
+    (V, F, fixed, target, curves), result = slid(f"letter:{character}")
     held = injective_map(V, F, fixed, target, polish="symmetric-dirichlet")
-    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=BoundaryCurves(curves))
     assert result.status is Status.POLISHED
     assert certify(F, result.uv).bijective
     polishing = [step.energy for step in result.history[-result.stages[-1].n_iterations - 1 :]]
@@ -144,8 +154,7 @@ def test_vertices_stop_at_bends():
 
 def test_an_edge_does_not_cut_off_a_bend():
     """A curved letter with few vertices: without bounds, the last two jump across, for a lower energy."""
-    V, F, fixed, target, curves = lettered("letter:S")
-    result = injective_map(V, F, fixed, target, polish="symmetric-dirichlet", slide=BoundaryCurves(curves))
+    (_, _, fixed, target, curves), result = slid("letter:S")
     (curve,) = curves
 
     def strays(uv):

@@ -79,7 +79,7 @@ class TestFinds:
 
     def test_ends_close_to_the_least_area_if_no_map_exists(self):
         """Figure 18: the map covers a pin outside the target and little other area."""
-        V, F = disk(10)
+        V, F = disk(7)
         rim = boundary_of(F)
         result = injective_map(V, F, np.append(rim, 0), np.vstack([V[rim], [[1.5, 0.0]]]))
         assert result.status is Status.IMPOSSIBLE

@@ -76,7 +76,7 @@ def test_arcs_lie_on_their_ellipse(turn, large, sweep):
     """There are two ellipses through both ends, each with two arcs; the flags choose one."""
     rx, ry, end = 3.0, 1.5, np.array([1.2, 1.7])
     (pieces,) = parse_path(f"M0 0A{rx} {ry} {turn} {large} {sweep} {end[0]} {end[1]}")
-    arc = np.concatenate([flatten([piece], 1e-9) for piece in pieces])
+    arc = np.concatenate([flatten([piece], 1e-6) for piece in pieces])
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
     circle = arc @ np.array([(c, -s), (s, c)]) / (rx, ry)
     # The centre of the circle through the first, middle and last point.
@@ -92,7 +92,7 @@ def test_arcs_lie_on_their_ellipse(turn, large, sweep):
 def test_unusual_arcs():
     # Radii that are too small grow; without a radius, the arc is a line; an arc to the current point is empty.
     (pieces,) = parse_path("M0 0A1 1 0 0 1 4 0")
-    half = np.concatenate([flatten([piece], 1e-9) for piece in pieces])
+    half = np.concatenate([flatten([piece], 1e-6) for piece in pieces])
     assert np.linalg.norm(half - (2, 0), axis=1) == pytest.approx(np.full(len(half), 2), abs=1e-6)
     assert [len(piece) for piece in parse_path("M0 0A0 1 0 0 1 4 0")[0]] == [2]
     assert parse_path("M1 1A1 1 0 0 1 1 1") == []

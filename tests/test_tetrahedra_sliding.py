@@ -1,6 +1,7 @@
 """Boundary vertices of tetrahedral meshes that slide along planes and straight edges."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import meshlane
@@ -126,14 +127,19 @@ def test_on_a_thin_body_only_the_named_side_slides():
     np.testing.assert_array_equal(result.sliding, np.flatnonzero(bottom))
 
 
+@cache
+def pressed():
+    X, T, top = cube()
+    return morph(X, T, top, X[top] - (0, 0, 0.5), slide=WALLS)
+
+
 @pytest.mark.parametrize("scale", [1e-150, 1e150])
 def test_planes_at_any_scale(scale):
     X, T, top = cube()
     planes = WALLS * (1, 1, 1, scale)
     result = morph(X * scale, T, top, (X[top] - (0, 0, 0.5)) * scale, slide=planes)
     assert result.success
-    plain = morph(X, T, top, X[top] - (0, 0, 0.5), slide=WALLS)
-    np.testing.assert_allclose(result.points / scale, plain.points, atol=1e-6)
+    np.testing.assert_allclose(result.points / scale, pressed().points, atol=1e-6)
 
 
 def test_malformed_planes():

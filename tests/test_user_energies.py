@@ -23,7 +23,7 @@ from quasiharmonic.energies.energies import Deformation, QuadraticForm, Symmetri
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import disk, grid
 
-UV, F = disk(4)
+UV, F = disk(3)
 V = np.column_stack([UV, 0.4 * UV[:, 0] ** 2 - 0.3 * UV[:, 1] ** 2 + 0.3 * UV[:, 0]])
 RIM = boundary_loops(F, len(UV))[0]
 PROBLEM = Problem(V, F, RIM, UV[RIM])

@@ -111,11 +111,11 @@ def test_conformal_maps_keep_the_surface_area():
 @pytest.fixture(scope="module")
 def dome():
     """A curved disk with two pins, mapped into the unit circle."""
-    V, F = disk(6)
+    V, F = disk(4)
     rng = np.random.default_rng(5)
-    rim = np.arange(len(V) - 36, len(V))
+    rim = np.arange(len(V) - 24, len(V))
     surface = np.column_stack([V * (1 + 0.03 * rng.standard_normal(V.shape)), 0.4 * np.sin(2 * V[:, 0])])
-    fixed = np.append(rim, [10, 40])
+    fixed = np.append(rim, [10, 30])
     return surface, F, fixed, injective_map(surface, F, fixed, V[fixed], polish="symmetric-dirichlet").uv
 
 
@@ -161,11 +161,11 @@ def test_sliding_along_a_circle(dome):
     assert np.abs((ahead - behind) / 2 - moved).max() < 0.01 * np.abs(moved).max()
 
 
-@pytest.mark.parametrize("width", [1.3, 1.5])
+@pytest.mark.parametrize("width", [pytest.param(1.3, marks=pytest.mark.nightly), 1.5])
 def test_sliding_along_an_ellipse_converges(dome, width):
     """The parameters are uneven along it: gradients of the barrier match its values only if they are exact."""
     surface, F, fixed, _ = dome
-    V, _ = disk(6)
+    V, _ = disk(4)
     found = injective_map(surface, F, fixed, V[fixed] * [width, 0.8], polish="symmetric-dirichlet")
     rails = BoundaryCurves([Curve.circle().transform([[width, 0], [0, 0.8]])])
     uv = polish(surface, F, found.uv, fixed=fixed, slide=rails).uv
@@ -262,7 +262,7 @@ def test_a_map_that_does_not_converge_is_doubtful():
 
 def test_a_boundary_in_contact_with_itself_is_doubtful():
     """A strip around more than the full circle of a cone that is flatter than the plane allows."""
-    square, F = grid(60, 3)
+    square, F = grid(45, 3)
     angle, radius = 7.2 * square[:, 0], 1 + square[:, 1] / square[:, 1].max() * 0.5
     V = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0.02 * angle])
     result = flatten(V, F)

@@ -1,13 +1,17 @@
-"""Geometry in space in rational numbers, independent of the library's."""
+"""Geometry in space in exact numbers, independent of the library's."""
 
 from fractions import Fraction
 from itertools import combinations, product
 
 import numpy as np
 
+from shared.exact import integers
+
 
 def exact(points):
-    return [[Fraction(value) for value in point] for point in np.asarray(points).tolist()]
+    """The points, times a common power of two, in integers."""
+    numbers = iter(integers(*np.asarray(points).ravel()))
+    return [list(point) for point in zip(numbers, numbers, numbers, strict=True)]
 
 
 def minus(a, b):
@@ -50,7 +54,7 @@ def clip(polygon, normal, offset):
         if left >= 0:
             result.append(a)
         if left * right < 0:
-            t = left / (left - right)
+            t = Fraction(left, left - right)
             result.append([x + t * (y - x) for x, y in zip(a, b, strict=True)])
     return result
 

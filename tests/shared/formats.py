@@ -65,7 +65,7 @@ def try_format(read, write, path):
         path.write_bytes(garbage)
         with pytest.raises(MeshFileError, match=path.name):
             read(path)
-    for cut in range(0, len(whole), max(len(whole) // 50, 1)):
+    for cut in range(0, len(whole), max(len(whole) // 25, 1)):
         path.write_bytes(whole[:cut] + b"\xff" + whole[cut + 1 :])
         try:
             read(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
@@ -23,22 +25,32 @@ def lift(points):
     return np.stack([x, y, 0.8 * np.exp(-2 * x**2 - y**2) + 0.3 * x * y], axis=1)
 
 
+def irregular_disk(n, seed):
+    """A mesh of `random_delaunay`, computed once."""
+    return tuple(array.copy() for array in computed_disk(n, seed))
+
+
+@cache
+def computed_disk(n, seed):
+    return random_delaunay(n, seed=seed)
+
+
 def surfaces():
     """(name, V, F) of planar and curved meshes with one or two boundary loops."""
-    flat, flat_faces = random_delaunay(150, seed=3)
+    flat, flat_faces = irregular_disk(90, 3)
     ring, ring_faces = annulus(8)
     return [
         ("disk", flat, flat_faces),
         ("bowl", lift(flat), flat_faces),
         ("annulus", ring, ring_faces),
         ("curved annulus", lift(ring), ring_faces),
-        ("random annulus", *random_annulus()),
+        ("random annulus", *random_annulus(120)),
     ]
 
 
 def random_annulus(n=220, seed=1, radius=0.35):
     """An irregular disk with a hole, without unused vertices."""
-    V, F = random_delaunay(n, seed=seed)
+    V, F = irregular_disk(n, seed)
     F = F[np.hypot(*V[F].mean(axis=1).T) > radius]
     used, F = np.unique(F, return_inverse=True)
     return V[used], F.reshape(-1, 3)

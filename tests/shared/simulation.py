@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from fractions import Fraction
 from itertools import combinations
+from operator import mul
 
 import numpy as np
+
+from shared.exact import integers
 
 
 def quadrilaterals(n, m):
@@ -47,34 +50,33 @@ def min_jacobian(nodes):
     The determinant is a quadratic polynomial of (s, t), determined by its values at six points. Its minimum is at a
     corner or at a stationary point on a side or inside.
     """
-    X = [[Fraction(x) for x in row] for row in np.asarray(nodes).tolist()]
+    *numbers, unit = integers(*np.ravel(nodes), 1.0)
+    x, y = numbers[::2], numbers[1::2]
 
     def determinant(s, t):
-        r = 1 - s - t
-        by_s = [1 - 4 * r, 4 * s - 1, 0, 4 * (r - s), 4 * t, -4 * t]
-        by_t = [1 - 4 * r, 0, 4 * t - 1, -4 * s, 4 * s, 4 * (r - t)]
-        (a, b), (c, d) = (
-            [sum(slope * x[i] for slope, x in zip(by, X, strict=True)) for i in (0, 1)] for by in (by_s, by_t)
-        )
+        """At s / 2 and t / 2, in squares of the unit."""
+        r = 2 - s - t
+        by_s = [1 - 2 * r, 2 * s - 1, 0, 2 * (r - s), 2 * t, -2 * t]
+        by_t = [1 - 2 * r, 0, 2 * t - 1, -2 * s, 2 * s, 2 * (r - t)]
+        a, b, c, d = (sum(map(mul, by, at)) for by in (by_s, by_t) for at in (x, y))
         return a * d - b * c
 
-    half = Fraction(1, 2)
-    corners = [(Fraction(0), Fraction(0)), (Fraction(1), Fraction(0)), (Fraction(0), Fraction(1))]
+    corners = [(0, 0), (2, 0), (0, 2)]
     candidates = [determinant(*corner) for corner in corners]
     for (s0, t0), (s1, t1) in combinations(corners, 2):
-        a, b, c = determinant(s0, t0), determinant((s0 + s1) * half, (t0 + t1) * half), determinant(s1, t1)
+        a, b, c = determinant(s0, t0), determinant((s0 + s1) // 2, (t0 + t1) // 2), determinant(s1, t1)
         bend, slope = 2 * (a + c - 2 * b), 4 * b - 3 * a - c
-        if bend > 0 and 0 < -slope / (2 * bend) < 1:
-            candidates.append(a - slope * slope / (4 * bend))
+        if 0 < -slope < 2 * bend:
+            candidates.append(a - Fraction(slope * slope, 4 * bend))
     # f = c + p s + q t + u s² + v s t + w t²
     c, at_s, at_t = candidates[:3]
-    u = 2 * (c + at_s - 2 * determinant(half, 0))
-    w = 2 * (c + at_t - 2 * determinant(0, half))
+    u = 2 * (c + at_s - 2 * determinant(1, 0))
+    w = 2 * (c + at_t - 2 * determinant(0, 1))
     p, q = at_s - c - u, at_t - c - w
-    v = 4 * (determinant(half, half) - c - (p + q) * half - (u + w) * half * half)
+    v = 4 * (determinant(1, 1) - c) - 2 * (p + q) - u - w
     det = 4 * u * w - v * v
     if det != 0:
-        s, t = (v * q - 2 * w * p) / det, (v * p - 2 * u * q) / det
+        s, t = Fraction(v * q - 2 * w * p, det), Fraction(v * p - 2 * u * q, det)
         if s > 0 and t > 0 and s + t < 1:
-            candidates.append(determinant(s, t))
-    return min(candidates)
+            candidates.append(determinant(2 * s, 2 * t))
+    return min(candidates) / Fraction(unit) ** 2

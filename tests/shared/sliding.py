@@ -34,7 +34,7 @@ def sheared(n=10):
 
 def lettered(text, **options):
     """A curved disk mapped to a letter."""
-    V, F = surfaces.random_delaunay(600, seed=4)
+    V, F = surfaces.random_delaunay(400, seed=4)
     V = lift(V)
     return V, F, *boundary_to(V, F, filled(outline(text))), outline_curves(text)
 
@@ -45,19 +45,19 @@ def off_the_glyph(points, character):
     for control in [piece for path in glyph_paths(character) for piece in path]:
 
         def at(t, control=control):
-            rows = list(control)
+            rows = [complex(*row) for row in control]
+            t = min(max(t, 0), 1)
             while len(rows) > 1:
                 rows = [(1 - t) * a + t * b for a, b in itertools.pairwise(rows)]
             return rows[0]
 
-        near = np.linalg.norm(points[:, None] - np.array([at(t) for t in np.linspace(0, 1, 30)]), axis=2).min(axis=1)
+        near = np.abs(z_of(points)[:, None] - [at(t) for t in np.linspace(0, 1, 30).tolist()]).min(axis=1)
         for i in np.flatnonzero(near < 0.03):
             found = minimize_scalar(
-                lambda t, p=points[i]: np.linalg.norm(at(np.clip(t, 0, 1)) - p) ** 2,
+                lambda t, p=complex(*points[i]): abs(at(t) - p) ** 2,
                 bounds=(-1e-9, 1 + 1e-9),
                 method="bounded",
                 options={"xatol": 1e-12},
             )
-            ends = [found.x, 0, 1]
-            away[i] = min(away[i], *(np.linalg.norm(at(np.clip(t, 0, 1)) - points[i]) for t in ends))
+            away[i] = min(away[i], *(abs(at(t) - complex(*points[i])) for t in (found.x, 0, 1)))
     return away

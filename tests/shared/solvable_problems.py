@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic import boundary_loops
-from quasiharmonic.surfaces import annulus, random_delaunay
-from shared.meshes import boundary_of, lift
+from quasiharmonic.surfaces import annulus
+from shared.meshes import boundary_of, irregular_disk, lift
 
 
 def star_problem(depth=0.55, points=5, n=300, seed=0):
     """An irregular disk onto a star, whose Tutte embedding has inverted triangles."""
-    V, F = random_delaunay(n, seed=seed)
+    V, F = irregular_disk(n, seed)
     (loop,) = boundary_loops(F, len(V))
     angle = np.linspace(0, 2 * np.pi, len(loop), endpoint=False)
     corner = np.abs((angle * points / np.pi) % 2 - 1)

@@ -139,12 +139,15 @@ def _meet_aligned(F: IntArray, G: IntArray, count: int, X: FloatArray, signs: Ex
     some = np.flatnonzero(~(np.all(of_g > 0, axis=1) | np.all(of_g < 0, axis=1)))
     F, G, of_g = F[some], G[some], of_g[some]
     flat = np.all(of_g == 0, axis=1)
-    meet[some[flat]] = _meet_in_plane(F[flat], G[flat], count, X)
-    if count == 2:
+    if flat.any():
+        meet[some[flat]] = _meet_in_plane(F[flat], G[flat], count, X)
+    if count == 2 or flat.all():
         return meet
     some, F, G, of_g = some[~flat], F[~flat], G[~flat], of_g[~flat]
     of_f = _plane_signs(G, F[:, count:], signs)
     near = ~(np.all(of_f > 0, axis=1) | np.all(of_f < 0, axis=1))
+    if not near.any():
+        return meet
     some, F, G, of_f, of_g = some[near], F[near], G[near], of_f[near], of_g[near]
     for one, other, sign in ((F, G, of_f), (G, F, of_g)):
         for p, q in _SIDES if not count else ((0, 1),):

@@ -68,8 +68,8 @@ class ExactSigns:
 
     def _edges(self, corners: IntArray) -> list[FloatArray]:
         """The nine differences of corners (4, k) to the first corner, vector by vector."""
-        x = self._scaled
-        return [axis.take(corners[k]) - axis.take(corners[0]) for k in (1, 2, 3) for axis in x]
+        axes = [(axis, axis.take(corners[0])) for axis in self._scaled]
+        return [axis.take(corners[k]) - first for k in (1, 2, 3) for axis, first in axes]
 
 
 def tetrahedron_signs(T: IntArray, X: FloatArray) -> tuple[SignArray, IntArray]:

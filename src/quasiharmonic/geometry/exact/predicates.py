@@ -97,7 +97,7 @@ def orientation_or_nonfinite(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> tuple[
         if np.all(sign):
             return sign, np.empty(0, dtype=np.int64)
         undecided = sign == 0
-        x = np.stack([np.broadcast_to(p, sign.shape)[undecided] for p in corners])
+        x = np.stack([(p if p.shape == sign.shape else np.broadcast_to(p, sign.shape))[undecided] for p in corners])
         finite = np.isfinite(x).all(axis=0)
         decided = np.zeros(finite.size, dtype=np.int8)
         decided[finite] = _decide_exactly(x[:, finite])

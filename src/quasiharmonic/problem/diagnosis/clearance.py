@@ -22,6 +22,8 @@ def clear(
     an approximate limit on the pairs of a segment and a nearby wall to check.
     """
     result = np.zeros(len(p), dtype=bool)
+    if not len(p):
+        return result
     # Sort along a space-filling curve, so that few boxes overlap.
     order = _curve(p / 2 + q / 2)
     walls = walls[_curve(positions[walls[:, 0]] / 2 + positions[walls[:, 1]] / 2)]

@@ -113,6 +113,8 @@ class Shortcuts:
         left = np.stack([-dy * inward, dx * inward], axis=1)
         for height in _BESIDE:
             left_over = np.flatnonzero(~result)
+            if not left_over.size:
+                break
             with np.errstate(over="ignore"):
                 index = p[left_over] / 2 + q[left_over] / 2 + height * left[left_over]
             once = self._clear(tails[left_over], None, p[left_over], index)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path as FilePath
@@ -60,6 +61,19 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
 
 def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
     """Closed paths of lines and Bézier curves of a character, in units of the font size; raises as `letter`."""
+    if font is None:
+        return [[piece.copy() for piece in path] for path in _default_glyph(character)]
+    return _read_glyph(character, _font_file(font))
+
+
+@lru_cache(maxsize=256)
+def _default_glyph(character: str) -> list[Pieces]:
+    """The paths of a character in the default font, which does not change."""
+    return _read_glyph(character, _find_default())
+
+
+def _read_glyph(character: str, file: FilePath) -> list[Pieces]:
+    """The paths of a character in a font file."""
     import logging
 
     from fontTools.pens.basePen import BasePen
@@ -91,7 +105,6 @@ def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
     # Without a handler, messages of fontTools about odd fonts would appear on the screen.
     if not (log := logging.getLogger("fontTools")).handlers:
         log.addHandler(logging.NullHandler())
-    file = _font_file(font)
     try:
         with file.open("rb") as data, TTFont(data, fontNumber=0, lazy=True) as face:
             name = (face.getBestCmap() or {}).get(ord(character))
@@ -106,9 +119,7 @@ def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
     return [[piece / em for piece in path] for path in pen.paths if path]
 
 
-def _font_file(font: Font | None) -> FilePath:
-    if font is None:
-        return _find_default()
+def _font_file(font: Font) -> FilePath:
     check_path("font", font)
     file = FilePath(font)
     if file.is_file():
