@@ -161,29 +161,33 @@ def _render(
     bad = np.zeros(len(F), dtype=bool)
     bad[inverted] = True
 
-    image = np.zeros((side * side, 4))
+    colors = np.zeros((side * side, 3))
     nearest = np.full(side * side, -np.inf)
     depth_of, board_of = depth[F], board[F]
     for triangle, pixel, weights in _samples(place[F], side):
-        z = np.einsum("kc,kc->k", weights, depth_of[triangle])
+        z = np.einsum("kc,kc->k", weights, depth_of.take(triangle, axis=0))
         # Of repeated indices the last assignment counts, so sort by depth: the nearest is last.
         order = np.argsort(z, kind="stable")
         order = order[z[order] >= nearest[pixel[order]]]
-        triangle, pixel, z, weights = triangle[order], pixel[order], z[order], weights[order]
+        triangle, pixel, z, weights = (array.take(order, axis=0) for array in (triangle, pixel, z, weights))
         nearest[pixel] = z
-        color = color_at(np.einsum("kc,kcd->kd", weights, board_of[triangle]))
+        color = color_at(np.einsum("kc,kcd->kd", weights, board_of.take(triangle, axis=0)))
         color[bad[triangle]] = RED
-        image[pixel, :3] = lit(color, light[triangle])
-        image[pixel, 3] = 1
-    grid = image.reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES, 4)[::-1]
-    cover = grid[..., 3].sum(axis=(1, 3))
-    shown = grid[..., :3].sum(axis=(1, 3)) / np.maximum(cover, 1)[..., None]
+        colors[pixel] = lit(color, light[triangle])
+    grid = colors.reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES, 3)[::-1]
+    covered = np.isfinite(nearest).reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES)[::-1]
+    # Adding the few samples of a pixel one by one is much faster than a sum over two axes.
+    samples = [(slice(None), i, slice(None), j) for i in range(_SAMPLES) for j in range(_SAMPLES)]
+    cover = sum(covered[sample].astype(np.float64) for sample in samples)
+    shown = sum(grid[sample] for sample in samples) / np.maximum(cover, 1)[..., None]
     return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
 
 
 def _checkerboard_color(coordinates: FloatArray) -> FloatArray:
     """Return the colours (k, 3) of a checkerboard whose squares have side 1."""
-    return np.where(np.floor(coordinates).sum(axis=1)[:, None] % 2 == 0, _LIGHT, _DARK)
+    column, row = np.floor(coordinates).T
+    half = (column + row) / 2
+    return np.where((np.floor(half) == half)[:, None], _LIGHT, _DARK)
 
 
 def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[FloatArray], FloatArray]:
@@ -206,13 +210,15 @@ def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[Float
     # Rows from bottom to top, as v increases.
     pixels = np.asarray(Image.alpha_composite(white, glass).convert("RGB"), dtype=np.float64)[::-1] / 255
     size = np.array(pixels.shape[1::-1])
+    pixels = pixels.reshape(-1, 3)
 
     def color(coordinates: FloatArray) -> FloatArray:
         within = (coordinates - np.floor(coordinates)) * size - 0.5
         left = np.floor(within).astype(np.int64)
         (x, y), (s, t) = left.T, (within - left).T[:, :, None]
-        x, right, y, up = x % size[0], (x + 1) % size[0], y % size[1], (y + 1) % size[1]
-        below, above = (1 - s) * pixels[y, x] + s * pixels[y, right], (1 - s) * pixels[up, x] + s * pixels[up, right]
+        x, right, y, up = x % size[0], (x + 1) % size[0], y % size[1] * size[0], (y + 1) % size[1] * size[0]
+        below = (1 - s) * pixels.take(y + x, axis=0) + s * pixels.take(y + right, axis=0)
+        above = (1 - s) * pixels.take(up + x, axis=0) + s * pixels.take(up + right, axis=0)
         return np.asarray((1 - t) * below + t * above)
 
     return color
