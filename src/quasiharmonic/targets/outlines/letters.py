@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path as FilePath
@@ -60,6 +61,18 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
 
 def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
     """Closed paths of lines and Bézier curves of a character, in units of the font size; raises as `letter`."""
+    paths, em = _default_glyph(character) if font is None else _read_glyph(character, _font_file(font))
+    return [[piece / em for piece in path] for path in paths]
+
+
+@lru_cache
+def _default_glyph(character: str) -> tuple[list[Pieces], int]:
+    """Read a character of the default font, whose file does not change."""
+    return _read_glyph(character, _find_default())
+
+
+def _read_glyph(character: str, file: FilePath) -> tuple[list[Pieces], int]:
+    """Read the paths of a character in a font's units, and the number of these units in the font size."""
     import logging
 
     from fontTools.pens.basePen import BasePen
@@ -91,7 +104,6 @@ def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
     # Without a handler, messages of fontTools about odd fonts would appear on the screen.
     if not (log := logging.getLogger("fontTools")).handlers:
         log.addHandler(logging.NullHandler())
-    file = _font_file(font)
     try:
         with file.open("rb") as data, TTFont(data, fontNumber=0, lazy=True) as face:
             name = (face.getBestCmap() or {}).get(ord(character))
@@ -103,12 +115,10 @@ def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
         raise ValueError(f"{file} is not a readable font: {error}") from error
     if name is None:
         raise ValueError(f"{file.name} has no glyph for {character!r}")
-    return [[piece / em for piece in path] for path in pen.paths if path]
+    return [path for path in pen.paths if path], em
 
 
-def _font_file(font: Font | None) -> FilePath:
-    if font is None:
-        return _find_default()
+def _font_file(font: Font) -> FilePath:
     check_path("font", font)
     file = FilePath(font)
     if file.is_file():
