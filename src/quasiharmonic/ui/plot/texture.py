@@ -37,7 +37,7 @@ _LIGHT = np.array((0.93, 0.93, 0.90))
 _DARK = np.array((0.16, 0.38, 0.75))
 _SIDE = 600  # pixels of a panel
 _SAMPLES = 2  # per pixel and direction
-_CHUNK = 1 << 17  # samples processed together, so that they fit into the cache
+_CHUNK = 1 << 16  # samples processed together, so that they fit into the cache
 
 
 @accepts_mesh
@@ -229,21 +229,20 @@ def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArra
     first = np.maximum(np.ceil(corners.min(axis=1) - 0.5), 0).astype(np.int64)
     last = np.minimum(np.floor(corners.max(axis=1) - 0.5), side - 1).astype(np.int64)
     extent = np.maximum(last - first + 1, 0)
-    count = extent.prod(axis=1)
     a, b, c = corners.transpose(1, 0, 2)
     doubled_area = _cross(*(b - a).T, *(c - a).T)
-    cuts = np.searchsorted(np.cumsum(count), np.arange(_CHUNK, count.sum(), _CHUNK))
-    for part in np.split(np.arange(len(corners)), np.unique(cuts)):
-        # The rows of each triangle's box, and the samples of each row.
-        of, row = enumerate_each(extent[part, 1])
-        of = part[of]
-        place, column = enumerate_each(extent[of, 0])
-        triangle = of[place]
-        row = (row + first[of, 1])[place]
+    # The rows of each triangle's box, which are split into chunks, and the samples of each row.
+    of, row_of = enumerate_each(extent[:, 1])
+    row_of += first[of, 1]
+    width = extent[of, 0]
+    cuts = np.searchsorted(np.cumsum(width), np.arange(_CHUNK, width.sum(), _CHUNK))
+    for part in np.split(np.arange(len(of)), np.unique(cuts)):
+        place, column = enumerate_each(width[part])
+        triangle, row = of[part][place], row_of[part][place]
         column += first[triangle, 0]
         x, y = column + 0.5, row + 0.5
         (ax, ay), (bx, by), (cx, cy) = (
-            (corner[:, 0][triangle] - x, corner[:, 1][triangle] - y) for corner in (a, b, c)
+            (corner[:, 0].take(triangle) - x, corner[:, 1].take(triangle) - y) for corner in (a, b, c)
         )
         parts = _cross(bx, by, cx, cy), _cross(cx, cy, ax, ay), _cross(ax, ay, bx, by)
         area = doubled_area[triangle]
