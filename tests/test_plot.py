@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 from importlib.util import find_spec
 
@@ -194,26 +193,8 @@ def test_degenerate_map_is_drawn(planar):
 
 
 @pytest.mark.slow
-def test_no_display_and_no_pyplot():
-    code = (
-        "import sys, quasiharmonic.plot as p\n"
-        "assert 'matplotlib' not in sys.modules\n"
-        "from quasiharmonic import surfaces as s\n"
-        "V, F = s.disk(2); p.plot_map(V, F, V)\n"
-        "assert 'matplotlib.pyplot' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-@pytest.mark.slow
-def test_distortion_is_drawn_for_every_measure(planar):
+def test_distortion_shows_inverted_triangles(planar):
     V, F, folded = planar
-    stretched = V * (3, 1)
-    for measure in LABELS:
-        figure = plot_distortion(V, F, stretched, measure)
-        image = pixels(figure)
-        assert image.shape == (450, 1350, 3)
-        assert not red(image).any(), measure
     assert red(pixels(plot_distortion(V, F, folded, "isometric"))).any()
     assert tuple(LABELS) == MEASURES
 
@@ -232,8 +213,10 @@ def test_the_histogram_of_distortion_contains_the_whole_area(planar):
 def test_colour_bars_have_labels(planar, measure):
     """Five values at the colour bar, those of the histogram; its ends are open if values may lie beyond."""
     V, F, _ = planar
-    figure = plot_distortion(V, F, np.column_stack([V[:, 0] ** 2 + V[:, 0], 1e-3 * V[:, 1]]), measure)
-    figure.canvas.draw()
+    figure = plot_distortion(V, F, np.column_stack([V[:, 0] ** 2 / 3 + V[:, 0], 1e-3 * V[:, 1]]), measure)
+    image = pixels(figure)
+    assert image.shape == (450, 1350, 3)
+    assert not red(image).any()
     bars, bar = figure.axes[2:]
     names = [label.get_text() for label in bar.get_yticklabels()]
     assert names == [label.get_text() for label in bars.get_xticklabels()]
