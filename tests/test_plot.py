@@ -8,6 +8,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from matplotlib import rc_context
 from matplotlib.image import imread
 from PIL import Image
 
@@ -314,6 +315,15 @@ def test_an_animation_shows_every_frame_completely(planar, tmp_path):
         assert (rim == 1).all()
     # The format has a resolution of 0.01 s: the mean is 30 frames per second, not 33.
     assert durations == [30, 40, 30, 30 + 1000]
+
+
+def test_settings_of_matplotlib_do_not_change_the_size(planar, tmp_path):
+    V, F, _ = planar
+    with rc_context({"savefig.dpi": 30, "savefig.bbox": "tight"}):
+        save_animation(tmp_path / "a.gif", V, F, [("one", V)])
+        save_map_figure(tmp_path / "b.png", V, F, V)
+    with Image.open(tmp_path / "a.gif") as moving, Image.open(tmp_path / "b.png") as still:
+        assert (moving.size, still.size) == ((600, 600), (800, 450))
 
 
 def test_errors_of_an_animation_are_reported(planar, tmp_path):
