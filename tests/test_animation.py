@@ -18,7 +18,7 @@ from quasiharmonic.ui.cli import main
 @pytest.fixture(scope="module")
 def head():
     """A cat's head and its boundary loop."""
-    V, F = cat(10)
+    V, F = cat(8)
     return V, F, boundary_loops(F, len(V))[0]
 
 
