@@ -61,18 +61,19 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
 
 def glyph_paths(character: str, font: Font | None = None) -> list[Pieces]:
     """Closed paths of lines and Bézier curves of a character, in units of the font size; raises as `letter`."""
-    paths, em = _default_glyph(character) if font is None else _read_glyph(character, _font_file(font))
-    return [[piece / em for piece in path] for path in paths]
+    if font is None:
+        return [[piece.copy() for piece in path] for path in _default_glyph(character)]
+    return _read_glyph(character, _font_file(font))
 
 
-@lru_cache
-def _default_glyph(character: str) -> tuple[list[Pieces], int]:
-    """Read a character of the default font, whose file does not change."""
+@lru_cache(maxsize=256)
+def _default_glyph(character: str) -> list[Pieces]:
+    """The paths of a character in the default font, which does not change."""
     return _read_glyph(character, _find_default())
 
 
-def _read_glyph(character: str, file: FilePath) -> tuple[list[Pieces], int]:
-    """Read the paths of a character in a font's units, and the number of these units in the font size."""
+def _read_glyph(character: str, file: FilePath) -> list[Pieces]:
+    """The paths of a character in a font file."""
     import logging
 
     from fontTools.pens.basePen import BasePen
@@ -115,7 +116,7 @@ def _read_glyph(character: str, file: FilePath) -> tuple[list[Pieces], int]:
         raise ValueError(f"{file} is not a readable font: {error}") from error
     if name is None:
         raise ValueError(f"{file.name} has no glyph for {character!r}")
-    return [path for path in pen.paths if path], em
+    return [[piece / em for piece in path] for path in pen.paths if path]
 
 
 def _font_file(font: Font) -> FilePath:
