@@ -39,6 +39,8 @@ def test_figure_05(example, size):
         assert numbers["tanh"]["iterations"] < 60 < numbers["si-log"]["iterations"]
 
 
+# `test_figure_04` descends V₁, V₂ and V₃ in such rings; `test_v4_vanishes_at_a_map_with_inverted_triangles` tests V₄.
+@pytest.mark.nightly
 def test_figure_06(example):
     numbers = example("figure_06", size=12, iterations=500)
     assert numbers["V₃"]["flips"] == numbers["V₂"]["flips"] == 0
@@ -217,6 +219,8 @@ def test_table_2(example):
         assert columns[0]["max(σ₁, 1/σ₂)"] < columns[2]["max(σ₁, 1/σ₂)"]
 
 
+# `test_table_2` makes the same maps of this surface and of two more.
+@pytest.mark.nightly
 def test_figure_02(example):
     numbers = example("figure_02", size=24)
     assert all(numbers[name]["flips"] == 0 for name in ("tanh", "si-log", "tanh + MIPS"))

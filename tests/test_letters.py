@@ -128,7 +128,7 @@ def test_files_that_are_not_fonts(tmp_path):
 
 
 def test_tolerance_of_letters():
-    fine = targets.letter("S", tolerance=1e-7)[0]
+    fine = targets.letter("S", tolerance=1e-6)[0]
     for tolerance in (1e-2, 1e-4):
         assert 0.2 * tolerance < distance(fine, targets.letter("S", tolerance=tolerance)[0]).max() < tolerance
 
