@@ -175,7 +175,7 @@ def test_channel(example):
 
 
 def test_tetrahedra(example):
-    numbers = example("tetrahedra", size=8)
+    numbers = example("tetrahedra", size=6)
     assert len(numbers) == 2
     for row in numbers.values():
         assert row["inverted"] > 20
@@ -231,6 +231,6 @@ def test_learned_landmarks(example):
 
 
 def test_letter_grid(example):
-    numbers = example("letter_grid", size=14, steps=8)
+    numbers = example("letter_grid", size=12, steps=6)
     assert numbers["off"] < 0.7 * numbers["off at first"]
     assert numbers["inverted"] == 0

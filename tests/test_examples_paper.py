@@ -219,7 +219,7 @@ def test_table_2(example):
         assert columns[0]["max(σ₁, 1/σ₂)"] < columns[2]["max(σ₁, 1/σ₂)"]
 
 
-# `test_table_2` makes the same maps of this surface and of two more.
+# `test_table_2` makes the same maps of this problem and of two more.
 @pytest.mark.nightly
 def test_figure_02(example):
     numbers = example("figure_02", size=24)
