@@ -364,7 +364,7 @@ def test_letters_agree_with_freetype_up_to_its_rounding(font):
 
     file = Path(get_data_path(), "fonts", "ttf", f"{font}.ttf")
     known = FT2Font(str(file)).get_charmap()
-    characters = [chr(code) for code in range(0x21, 0x530, 23) if code in known]
+    characters = [chr(code) for code in range(0x21, 0x530, 43) if code in known]
     # Recent matplotlib puts a mark that stands alone onto a dotted circle.
     characters = [character for character in characters if category(character)[0] != "M"]
     assert len(characters) > 3
