@@ -113,7 +113,8 @@ def show(ax: Axes, problem: Problem, uv: FloatArray, title: str, *, size: float 
     plot_map(problem.V, problem.F, uv, fixed=problem.fixed if pins else None, ax=ax)
     count = flips(problem, uv)
     verdict = f"{count:,} inverted" if count else "none inverted"
-    ax.set_title(f"{title}\n{verdict}", size=size, color=RED if count else INK)
+    # With a given height matplotlib does not measure the labels of a frame that is not drawn.
+    ax.set_title(f"{title}\n{verdict}", y=1, size=size, color=RED if count else INK)
 
 
 def show_ratios(ax: Axes, problem: Problem, uv: FloatArray, title: str, highest: float) -> PolyCollection:
@@ -131,7 +132,7 @@ def show_ratios(ax: Axes, problem: Problem, uv: FloatArray, title: str, highest:
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_axis_off()
-    ax.set_title(title, size=10, color=RED if flips(problem, uv) else INK)
+    ax.set_title(title, y=1, size=10, color=RED if flips(problem, uv) else INK)
     return drawn
 
 

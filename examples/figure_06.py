@@ -33,14 +33,14 @@ def around_own_tensor(problem: Problem, uv: np.ndarray) -> dict[str, float]:
     return {"V₄ at an injective map's tensor": here.value / area, "largest close by": max(others) / area}
 
 
-def main(output: Path, size: int = 24) -> dict[str, Any]:
+def main(output: Path, size: int = 24, iterations: int = 1000) -> dict[str, Any]:
     problem = ring(size, HOLE, np.pi)
     figure, axes = panels(4, SHOTS, (2.2, 2.6))
     numbers: dict[str, Any] = {"triangles": len(problem.F)}
     maps = {}
     for row, (functional, name) in zip(axes, NAMES.items(), strict=True):
         stage = VectorAdam(parameterisation="si-log", functional=functional)
-        result = solve(problem, strategy=[stage], max_iterations=1000, record_every=1)
+        result = solve(problem, strategy=[stage], max_iterations=iterations, record_every=1)
         # V₄ untangles nothing, so its frames are spaced evenly by iteration.
         still = functional == "poisson"
         path = [-shot.iteration if still else inverted_area(problem, shot.uv) for shot in result.path]

@@ -35,13 +35,15 @@ def winding_area(problem: Problem) -> float:
     place = dict(zip(problem.fixed.tolist(), problem.target @ (1, 1j), strict=True))
     low, high = problem.target.min(axis=0), problem.target.max(axis=0)
     x, y = (low[k] + (np.arange(400) + 0.5) / 400 * (high - low)[k] for k in range(2))
-    points = (x[:, None] + 1j * y).ravel()
-    turns = np.zeros(points.size)
+    turns = np.zeros((len(y), len(x)))
     for loop in problem.domain.loops:
         b = np.array([place[i] for i in loop.tolist()])
         for start, end in zip(b, np.roll(b, -1), strict=True):
-            turns += np.angle((end - points) / (start - points))
-    return float(np.abs(np.round(turns / (2 * np.pi))).mean() * np.prod(high - low))
+            # An edge that goes up adds one turn to the points at its left.
+            rows = np.flatnonzero((start.imag <= y) != (end.imag <= y))
+            crossing = start.real + (y[rows] - start.imag) / (end - start).imag * (end - start).real
+            turns[rows] += np.sign((end - start).imag) * (x < crossing[:, None])
+    return float(np.abs(turns).mean() * np.prod(high - low))
 
 
 def main(output: Path, size: int = 16) -> dict[str, Any]:

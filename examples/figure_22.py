@@ -55,14 +55,14 @@ def least_angles(V: FloatArray, F: IntArray) -> FloatArray:
     return np.degrees(np.arctan2(sines, (sides * other).sum(axis=2))).min(axis=1)
 
 
-def count_iterations(problem: Problem, parameterisation: str, reference: Reference) -> int | None:
-    """Iterations of VectorAdam alone to the first injective map, or None after a thousand."""
-    stage = VectorAdam(parameterisation=parameterisation, reference=reference, iterations=1000)
-    result = solve(problem, strategy=[stage], max_iterations=1000)
+def count_iterations(problem: Problem, parameterisation: str, reference: Reference, most: int) -> int | None:
+    """Iterations of VectorAdam alone to the first injective map, or None if it takes more than ``most``."""
+    stage = VectorAdam(parameterisation=parameterisation, reference=reference, iterations=most)
+    result = solve(problem, strategy=[stage], max_iterations=most)
     return result.n_iterations if result.injective else None
 
 
-def main(output: Path, size: int = 44) -> dict[str, Any]:
+def main(output: Path, size: int = 44, iterations: int = 1000) -> dict[str, Any]:
     figure, (axes,) = panels(1, 4, (3.2, 4.0))
     V, F = make_slivers(*standing(cactus, (-1.15, -0.5, -0.6), (1.05, 2.4, 0.6), size), height=-0.15)
     angles = least_angles(V, F)
@@ -90,7 +90,7 @@ def main(output: Path, size: int = 44) -> dict[str, Any]:
             "flips": flips(problem, result.uv),
             "iterations": result.n_iterations,
             "alone": {
-                f"{p}, {reference}": count_iterations(problem, p, reference)
+                f"{p}, {reference}": count_iterations(problem, p, reference, iterations)
                 for p in ("tanh", "si-log")
                 for reference in ("equilateral", "corrected", "rest")
             },

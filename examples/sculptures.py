@@ -8,7 +8,7 @@ along y, face +z and are between one and three units high. Two creatures, an oct
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -23,24 +23,31 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 Field = Callable[[FloatArray], FloatArray]
 
 
+def length(vectors: Sequence[FloatArray]) -> FloatArray:
+    """Return the lengths of vectors, given one array per coordinate, which takes less time than rows of three."""
+    x, y, z = vectors
+    return np.sqrt(x * x + y * y + z * z)
+
+
 def cone(x: FloatArray, a: ArrayLike, b: ArrayLike, ra: float, rb: float) -> FloatArray:
     """The field of the convex hull of two balls: radius ``ra`` at ``a`` and ``rb`` at ``b``."""
     a, axis = np.asarray(a), np.subtract(b, a)
     t = np.clip((x - a) @ axis / (axis @ axis), 0, 1)
-    return np.linalg.norm(x - a - t[..., None] * axis, axis=-1) - (ra + t * (rb - ra))
+    return length([x[..., k] - a[k] - t * axis[k] for k in range(3)]) - (ra + t * (rb - ra))
 
 
-def ball(x: FloatArray, middle: ArrayLike, radii: ArrayLike, turn: float = 0.0, axis: int = 2) -> FloatArray:
+def ball(
+    x: FloatArray, middle: Sequence[float], radii: Sequence[float], turn: float = 0.0, axis: int = 2
+) -> FloatArray:
     """The field of an ellipsoid turned about ``axis`` by ``turn`` radians; near it an approximate signed distance."""
-    p = x - np.asarray(middle)
+    p = [x[..., k] - c for k, c in enumerate(middle)]
     if turn:
         i, j = (k for k in range(3) if k != axis)
-        w = (p[..., i] + 1j * p[..., j]) * np.exp(-1j * turn)
-        p = p.copy()
-        p[..., i], p[..., j] = w.real, w.imag
-    p = p / radii + 1e-9  # avoid 0 / 0
-    near = np.linalg.norm(p, axis=-1)
-    return near * (near - 1) / np.linalg.norm(p / radii, axis=-1)
+        w = (p[i] + 1j * p[j]) * np.exp(-1j * turn)
+        p[i], p[j] = w.real, w.imag
+    p = [c / radius + 1e-9 for c, radius in zip(p, radii, strict=True)]  # avoid 0 / 0
+    near = length(p)
+    return near * (near - 1) / length([c / radius for c, radius in zip(p, radii, strict=True)])
 
 
 def join(smooth: float, *fields: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from quasiharmonic.ui.cli import main
 @pytest.fixture(scope="module")
 def head():
     """A cat's head and its boundary loop."""
-    V, F = cat(10)
+    V, F = cat(8)
     return V, F, boundary_loops(F, len(V))[0]
 
 
@@ -84,7 +84,7 @@ def test_searched_frames_stay_close_to_the_previous_one(pinned, most):
 @pytest.mark.slow
 def test_polished_frames_do_not_jump(head):
     V, F, loop = head
-    targets = turning_stars(len(loop), 24)
+    targets = turning_stars(len(loop), 16)
     problem = Problem(V, F, loop, targets[0])
     animation = animate(problem, targets, polish="symmetric-dirichlet")
     assert animation.found.all()

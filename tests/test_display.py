@@ -261,7 +261,7 @@ def test_dir_lists_public_names_only():
 
 @pytest.mark.slow
 def test_matplotlib_is_imported_only_for_plots():
-    """Neither the package nor a search imports matplotlib; only plots do."""
+    """Neither the package nor a search imports matplotlib; only plots do, and none imports its window."""
     code = """
 import sys
 import quasiharmonic
@@ -270,6 +270,9 @@ from quasiharmonic.surfaces import disk
 result = quasiharmonic.flatten(*disk(2))
 repr(result), result.summary()
 assert not {"matplotlib", "quasiharmonic.plot", "quasiharmonic.ui.display"} & {*sys.modules}
+import quasiharmonic.plot
+assert "matplotlib" not in sys.modules
+quasiharmonic.plot.plot_map(*disk(2), disk(2)[0])
 assert "<img" in result._repr_html_()
 assert "matplotlib.pyplot" not in sys.modules
 """

@@ -10,7 +10,9 @@ from __future__ import annotations
 import csv
 import re
 import shlex
+import shutil
 import warnings
+from contextlib import chdir
 from importlib import import_module
 from inspect import ismodule
 from pathlib import Path
@@ -65,14 +67,26 @@ def test_block_runs(code, tmp_path, monkeypatch, capsys):
 DOCS = FOLDER / "docs"
 
 
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """The folder that `qhm demo`, the first command of every page, writes."""
+    folder = tmp_path_factory.mktemp("demo")
+    with chdir(folder):
+        assert main(["demo"]) == 0
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorials/first_shape.md", "docs/tutorials/textured_model.md"])
-def test_commands_run(page, tmp_path, monkeypatch):
-    commands = re.findall(r"^    (qhm .*)$", (FOLDER / page).read_text(encoding="utf-8"), re.MULTILINE)
+def test_commands_run(page, demo, tmp_path, monkeypatch):
+    lines = re.findall(r"^    (qhm .*)$", (FOLDER / page).read_text(encoding="utf-8"), re.MULTILINE)
+    first, *commands = (shlex.split(line, comments=True)[1:] for line in lines)
+    assert first == ["demo"]
     assert commands
+    shutil.copytree(demo, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     for command in commands:
-        assert main(shlex.split(command, comments=True)[1:]) == 0, command
+        assert main(command) == 0, command
 
 
 def test_the_speed_table_of_the_readme_has_the_measured_times():

@@ -29,7 +29,7 @@ def test_script_runs_when_pasted(name, scripts, tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "common", raising=False)
     names = {}
     exec(compile(scripts[name].replace("print(main(", "(lambda *_: None)(("), name, "exec"), names)
-    assert names["main"](tmp_path, size=16)
+    assert names["main"](tmp_path, size=12)
     assert (tmp_path / f"{name}.png").stat().st_size > 0
 
 

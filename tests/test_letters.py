@@ -128,7 +128,7 @@ def test_files_that_are_not_fonts(tmp_path):
 
 
 def test_tolerance_of_letters():
-    fine = targets.letter("S", tolerance=1e-7)[0]
+    fine = targets.letter("S", tolerance=1e-6)[0]
     for tolerance in (1e-2, 1e-4):
         assert 0.2 * tolerance < distance(fine, targets.letter("S", tolerance=tolerance)[0]).max() < tolerance
 
@@ -364,7 +364,7 @@ def test_letters_agree_with_freetype_up_to_its_rounding(font):
 
     file = Path(get_data_path(), "fonts", "ttf", f"{font}.ttf")
     known = FT2Font(str(file)).get_charmap()
-    characters = [chr(code) for code in range(0x21, 0x530, 23) if code in known]
+    characters = [chr(code) for code in range(0x21, 0x530, 43) if code in known]
     # Recent matplotlib puts a mark that stands alone onto a dotted circle.
     characters = [character for character in characters if category(character)[0] != "M"]
     assert len(characters) > 3

@@ -47,7 +47,9 @@ assert polish(V, F, first.uv, fixed=fixed, max_iterations=5).injective
 problems = [(V, F, fixed, k * target) for k in (1, 2)]
 assert [result.injective for result in injective_maps(problems, jobs=3)] == [True, True]
 assert flatten(*disk(4)).certificate.bijective
-assert len(unwrap(*starfish(rings=5), jobs=3).uvs)
+# With a given scale the charts are placed once.
+unwrapped = unwrap(*starfish(rings=5), texels_per_unit=20, jobs=3)
+assert len(unwrapped.uvs) and unwrapped.charts.max() > 0
 assert set(threading.enumerate()) == before
 print("mapped")
 """

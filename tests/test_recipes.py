@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -38,10 +38,13 @@ def test_all_recipes_are_tested():
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_recipe_runs(name, tmp_path):
+def test_recipe_runs(name, tmp_path, monkeypatch):
     assert "assert" in RECIPES[name]
-    done = subprocess.run([sys.executable, "-c", RECIPES[name]], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    # Dataclasses look their module up. The code has no imports from this file, not even those from the future.
+    module = ModuleType("recipe")
+    monkeypatch.setitem(sys.modules, "recipe", module)
+    exec(compile(RECIPES[name], name, "exec", dont_inherit=True), module.__dict__)
 
 
 def test_the_format_passes_its_tests(tmp_path, monkeypatch):

@@ -33,7 +33,7 @@ def test_landmarks_reach_their_targets_and_the_border_stays():
 
 def test_landmarks_that_pass_each_other():
     before = np.array([(40, 50), (60, 50)], dtype=float)
-    warped = warp_by_landmarks(np.zeros((100, 100), np.uint8), before, before[::-1])
+    warped = warp_by_landmarks(np.zeros((100, 100), np.uint8), before, before[::-1], resolution=32)
     assert warped.result.certificate.bijective
 
 
@@ -41,10 +41,10 @@ def test_without_moved_landmarks_the_image_does_not_change():
     rng = np.random.default_rng(5)
     for image in (rng.integers(0, 255, (33, 48, 3), dtype=np.uint8), rng.normal(size=(40, 30)).astype(np.float32)):
         points = [[11.5, 9.25], [20, 20]]
-        warped = warp_by_landmarks(image, points, points)
+        warped = warp_by_landmarks(image, points, points, resolution=16)
         assert warped.image.dtype == image.dtype
         assert warped.image == pytest.approx(image, abs=1e-5)
-        empty = warp_by_landmarks(image, [], np.empty((0, 2)))
+        empty = warp_by_landmarks(image, [], np.empty((0, 2)), resolution=16)
         assert empty.image == pytest.approx(image, abs=1e-5)
 
 
@@ -87,7 +87,7 @@ def test_landmarks_on_the_border_move_it():
     # The lower side bends up, the right upper corner moves in; the left side stays.
     before = [[31.5, 63], [63, 0], [20, 20]]
     after = [[31.5, 40], [50, 5], [22, 20]]
-    warped = warp_by_landmarks(image, before, after)
+    warped = warp_by_landmarks(image, before, after, resolution=32)
     assert warped.result.certificate.bijective
     for start, end in zip(before, after, strict=True):
         assert warped.positions[(warped.points == start).all(axis=1)].tolist() == [end]
@@ -103,14 +103,14 @@ def test_landmarks_on_the_border_move_it():
         warp_by_landmarks(image, [[31.5, 63]], [[31.5, -10]])
 
 
-@pytest.mark.parametrize("shape", [None, (300, 500)])
+@pytest.mark.parametrize("shape", [None, (90, 150)])
 def test_rasterised_triangles_agree_with_located_points(shape, monkeypatch):
     rng = np.random.default_rng(2)
-    image = rng.normal(size=(200, 300))
+    image = rng.normal(size=(60, 90))
     points, F = surfaces.grid(4, 4)
     upper = np.flatnonzero(points[:, 1] == 1)
     moved = morph(points, F, upper, points[upper] + [0.1, -0.2]).points
-    size = (299, 199)
+    size = (89, 59)
     quick = warp_along(image, points * size, F, moved * size, shape=shape)
     monkeypatch.setattr("quasiharmonic.apps.warping.image_warp.LARGE", np.inf)
     slow = warp_along(image, points * size, F, moved * size, shape=shape)
@@ -130,7 +130,7 @@ def test_points_without_a_position_are_named():
 @pytest.mark.slow
 def test_an_impossible_warp_has_advice():
     with pytest.raises(RuntimeError, match="Move them less, or give more landmarks"):
-        warp_by_landmarks(np.zeros((50, 50)), [[31.5, 49], [20, 20]], [[31.5, 30], [31.5, 40]])
+        warp_by_landmarks(np.zeros((50, 50)), [[31.5, 49], [20, 20]], [[31.5, 30], [31.5, 40]], resolution=16)
 
 
 @pytest.mark.parametrize(

@@ -305,8 +305,9 @@ def neumann_target(problem: Problem, w: ComplexArray) -> ComplexArray:
     """
     g = np.zeros(problem.n, dtype=np.complex128)
     for loop in problem.domain.loops:
-        b = w[loop]
-        g[loop] = -0.5j * (np.roll(b, -1) - np.roll(b, 1))
+        # The boundary values with the last before the first and the first after the last: much faster than np.roll.
+        b = w[np.concatenate([loop[-1:], loop, loop[:1]])]
+        g[loop] = -0.5j * (b[2:] - b[:-2])
     return g
 
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.ui.plot.canvas import as_mesh, new_figure, not_positive, paint_map, verdict
+from quasiharmonic.ui.plot.canvas import AS_DRAWN, as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.ui.plot.shading import view
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_sequence, map_array
 
@@ -144,8 +144,11 @@ def _extent(points: FloatArray) -> FloatArray:
 
 def _picture(figure: Figure) -> NDArray[np.uint8]:
     """Return the pixels of a figure, (height, width, 3) uint8."""
+    from matplotlib import rc_context
+
     file = BytesIO()
-    figure.savefig(file, format="rgba")
+    with rc_context(AS_DRAWN):
+        figure.savefig(file, format="rgba")
     width, height = (int(side) for side in figure.bbox.size)
     return np.frombuffer(file.getvalue(), dtype=np.uint8).reshape(height, width, 4)[..., :3]
 

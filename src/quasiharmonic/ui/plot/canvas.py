@@ -26,6 +26,9 @@ PICTURES = (".png", ".svg", ".pdf")
 # Above this number of triangles vector formats get pixels too, because shapes would take megabytes.
 _MAX_SHAPES = 10_000
 
+#: Settings of matplotlib with which a figure is saved in its own size, whatever the user's settings are.
+AS_DRAWN: dict[Any, Any] = {"savefig.dpi": "figure", "savefig.bbox": "standard"}
+
 RED = (0.89, 0.07, 0.17)
 INK = (0.06, 0.12, 0.29)
 BORDER = 1.2  # width in points
@@ -58,7 +61,7 @@ def save_picture(path: str | PathLike[str], figure: Figure) -> None:
     suffix = check_ending(path)
     # Equal figures give equal files: no date and no random identifiers.
     metadata: dict[str, dict[str, Any]] = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-    with rc_context({"svg.hashsalt": "quasiharmonic"}):
+    with rc_context(AS_DRAWN | {"svg.hashsalt": "quasiharmonic"}):
         write_whole(path, lambda file: figure.savefig(file, format=suffix[1:], metadata=metadata[suffix]))
 
 

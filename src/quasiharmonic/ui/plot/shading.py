@@ -118,4 +118,5 @@ def lit(hue: FloatArray, light: FloatArray) -> FloatArray:
     strength = ((1 + light) / 2)[:, None]  # never black, because a map also shows unlit triangles
     shade = 0.15 + 0.95 * np.minimum(strength / 0.8, 1)
     gleam = 0.42 * np.maximum(strength - 0.8, 0) / 0.2
-    return np.asarray(np.clip(hue * shade + (1 - hue * shade) * gleam, 0, 1))
+    shaded = hue * shade
+    return np.asarray(np.clip(shaded + (1 - shaded) * gleam, 0, 1))

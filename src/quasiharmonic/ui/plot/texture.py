@@ -37,7 +37,7 @@ _LIGHT = np.array((0.93, 0.93, 0.90))
 _DARK = np.array((0.16, 0.38, 0.75))
 _SIDE = 600  # pixels of a panel
 _SAMPLES = 2  # per pixel and direction
-_CHUNK = 1 << 17  # samples processed together, so that they fit into the cache
+_CHUNK = 1 << 16  # samples processed together, so that they fit into the cache
 
 
 @accepts_mesh
@@ -161,29 +161,33 @@ def _render(
     bad = np.zeros(len(F), dtype=bool)
     bad[inverted] = True
 
-    image = np.zeros((side * side, 4))
+    colors = np.zeros((side * side, 3))
     nearest = np.full(side * side, -np.inf)
     depth_of, board_of = depth[F], board[F]
     for triangle, pixel, weights in _samples(place[F], side):
-        z = np.einsum("kc,kc->k", weights, depth_of[triangle])
+        z = np.einsum("kc,kc->k", weights, depth_of.take(triangle, axis=0))
         # Of repeated indices the last assignment counts, so sort by depth: the nearest is last.
         order = np.argsort(z, kind="stable")
         order = order[z[order] >= nearest[pixel[order]]]
-        triangle, pixel, z, weights = triangle[order], pixel[order], z[order], weights[order]
+        triangle, pixel, z, weights = (array.take(order, axis=0) for array in (triangle, pixel, z, weights))
         nearest[pixel] = z
-        color = color_at(np.einsum("kc,kcd->kd", weights, board_of[triangle]))
+        color = color_at(np.einsum("kc,kcd->kd", weights, board_of.take(triangle, axis=0)))
         color[bad[triangle]] = RED
-        image[pixel, :3] = lit(color, light[triangle])
-        image[pixel, 3] = 1
-    grid = image.reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES, 4)[::-1]
-    cover = grid[..., 3].sum(axis=(1, 3))
-    shown = grid[..., :3].sum(axis=(1, 3)) / np.maximum(cover, 1)[..., None]
+        colors[pixel] = lit(color, light[triangle])
+    grid = colors.reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES, 3)[::-1]
+    covered = np.isfinite(nearest).reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES)[::-1]
+    # Adding the few samples of a pixel one by one is much faster than a sum over two axes.
+    samples = [(slice(None), i, slice(None), j) for i in range(_SAMPLES) for j in range(_SAMPLES)]
+    cover = sum(covered[sample].astype(np.float64) for sample in samples)
+    shown = sum(grid[sample] for sample in samples) / np.maximum(cover, 1)[..., None]
     return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
 
 
 def _checkerboard_color(coordinates: FloatArray) -> FloatArray:
     """Return the colours (k, 3) of a checkerboard whose squares have side 1."""
-    return np.where(np.floor(coordinates).sum(axis=1)[:, None] % 2 == 0, _LIGHT, _DARK)
+    column, row = np.floor(coordinates).T
+    half = (column + row) / 2
+    return np.where((np.floor(half) == half)[:, None], _LIGHT, _DARK)
 
 
 def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[FloatArray], FloatArray]:
@@ -206,13 +210,15 @@ def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[Float
     # Rows from bottom to top, as v increases.
     pixels = np.asarray(Image.alpha_composite(white, glass).convert("RGB"), dtype=np.float64)[::-1] / 255
     size = np.array(pixels.shape[1::-1])
+    pixels = pixels.reshape(-1, 3)
 
     def color(coordinates: FloatArray) -> FloatArray:
         within = (coordinates - np.floor(coordinates)) * size - 0.5
         left = np.floor(within).astype(np.int64)
         (x, y), (s, t) = left.T, (within - left).T[:, :, None]
-        x, right, y, up = x % size[0], (x + 1) % size[0], y % size[1], (y + 1) % size[1]
-        below, above = (1 - s) * pixels[y, x] + s * pixels[y, right], (1 - s) * pixels[up, x] + s * pixels[up, right]
+        x, right, y, up = x % size[0], (x + 1) % size[0], y % size[1] * size[0], (y + 1) % size[1] * size[0]
+        below = (1 - s) * pixels.take(y + x, axis=0) + s * pixels.take(y + right, axis=0)
+        above = (1 - s) * pixels.take(up + x, axis=0) + s * pixels.take(up + right, axis=0)
         return np.asarray((1 - t) * below + t * above)
 
     return color
@@ -223,21 +229,20 @@ def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArra
     first = np.maximum(np.ceil(corners.min(axis=1) - 0.5), 0).astype(np.int64)
     last = np.minimum(np.floor(corners.max(axis=1) - 0.5), side - 1).astype(np.int64)
     extent = np.maximum(last - first + 1, 0)
-    count = extent.prod(axis=1)
     a, b, c = corners.transpose(1, 0, 2)
     doubled_area = _cross(*(b - a).T, *(c - a).T)
-    cuts = np.searchsorted(np.cumsum(count), np.arange(_CHUNK, count.sum(), _CHUNK))
-    for part in np.split(np.arange(len(corners)), np.unique(cuts)):
-        # The rows of each triangle's box, and the samples of each row.
-        of, row = enumerate_each(extent[part, 1])
-        of = part[of]
-        place, column = enumerate_each(extent[of, 0])
-        triangle = of[place]
-        row = (row + first[of, 1])[place]
+    # The rows of each triangle's box, which are split into chunks, and the samples of each row.
+    of, row_of = enumerate_each(extent[:, 1])
+    row_of += first[of, 1]
+    width = extent[of, 0]
+    cuts = np.searchsorted(np.cumsum(width), np.arange(_CHUNK, width.sum(), _CHUNK))
+    for part in np.split(np.arange(len(of)), np.unique(cuts)):
+        place, column = enumerate_each(width[part])
+        triangle, row = of[part][place], row_of[part][place]
         column += first[triangle, 0]
         x, y = column + 0.5, row + 0.5
         (ax, ay), (bx, by), (cx, cy) = (
-            (corner[:, 0][triangle] - x, corner[:, 1][triangle] - y) for corner in (a, b, c)
+            (corner[:, 0].take(triangle) - x, corner[:, 1].take(triangle) - y) for corner in (a, b, c)
         )
         parts = _cross(bx, by, cx, cy), _cross(cx, cy, ax, ay), _cross(ax, ay, bx, by)
         area = doubled_area[triangle]
