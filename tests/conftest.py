@@ -149,30 +149,13 @@ def example(tmp_path, monkeypatch):
     return run
 
 
-@pytest.fixture(scope="session")
-def page_forks(tmp_path_factory):
-    """Processes of studio pages that start without importing the library again, where it is safe to copy processes."""
-    from shared.page_forks import Forks
-
-    if sys.platform != "linux":
-        yield None
-        return
-    made = Forks(tmp_path_factory.mktemp("pages"))
-    yield made
-    made.close()
-
-
 @pytest.fixture(scope="module")
-def running(page_forks, tmp_path_factory):
+def running(tmp_path_factory):
     """A studio server of a small surface, which takes few bytes."""
-    from quasiharmonic.ui.studio.server import pages
     from shared.studio_server import serve_small_surface
 
-    with pytest.MonkeyPatch.context() as patch:
-        if page_forks is not None:
-            patch.setattr(pages, "sys", SimpleNamespace(executable=str(page_forks.executable)))
-        with serve_small_surface(tmp_path_factory.mktemp("studio")) as server:
-            yield server
+    with serve_small_surface(tmp_path_factory.mktemp("studio")) as server:
+        yield server
 
 
 @pytest.fixture(scope="session")

@@ -21,9 +21,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.studio.assets import assets, bundle
 from quasiharmonic.ui.studio.protocol import decode, encode
-from quasiharmonic.ui.studio.server import page_worker, pages
+from quasiharmonic.ui.studio.server import page_worker
 from quasiharmonic.ui.studio.server import server as served
-from shared.studio_server import Running, children, hear, nobody_is_left, serve_small_surface
+from shared.studio_server import Running, children, hear, nobody_is_left
 
 
 def test_files_are_served_only_with_the_token(running):
@@ -87,10 +87,8 @@ def test_pages_are_independent_and_a_crash_ends_only_its_page(running):
     nobody_is_left()
 
 
-def test_a_socket_closed_during_a_drag_leaves_no_process(tmp_path, monkeypatch):
-    """The process starts as it does for users."""
-    monkeypatch.setattr(pages, "sys", sys)
-    with serve_small_surface(tmp_path) as server, server.page() as page:
+def test_a_socket_closed_during_a_drag_leaves_no_process(running):
+    with running.page() as page:
         shown = hear(page, "map", state="settled").header
         page.send(encode({"do": "grab", "vertex": shown["corners"][0]}))
         for seq in range(20):
