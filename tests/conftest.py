@@ -71,6 +71,12 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def pytest_runtest_teardown():
+    """Ignore SIGPIPE again, as Python does: Gmsh undoes this, and then a write to a closed socket ends the process."""
+    if "gmsh" in sys.modules and hasattr(signal, "SIGPIPE"):
+        signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+
+
 @pytest.fixture
 def rng():
     """A random generator with a constant seed."""
