@@ -174,6 +174,7 @@ def test_all_public_functions_of_v_and_f_are_tested():
     assert set(CALLS) - {"surface_distances"} <= found
 
 
+@pytest.mark.slow
 def test_pictures_of_meshes(tmp_path):
     for number, given in enumerate(((V, F), (MESH,))):
         plot.save_map_figure(tmp_path / f"{number}.png", *given, MAP)
@@ -342,6 +343,7 @@ def test_strings_are_no_booleans(name, call):
         call("no")
 
 
+@pytest.mark.slow
 def test_trimesh():
     trimesh = pytest.importorskip("trimesh")
     mesh = trimesh.Trimesh(V, F, process=False)

@@ -53,6 +53,7 @@ def test_holes_within_holes():
     assert areas(points, air).sum() == pytest.approx(36 - 0.01 - solid)
 
 
+@pytest.mark.slow
 def test_a_free_shape_is_pushed_as_a_rigid_body():
     V, F = surfaces.disk(4)
     V = V * 0.5
@@ -69,6 +70,7 @@ def test_a_free_shape_is_pushed_as_a_rigid_body():
     assert moment.energy < 1e-3
 
 
+@pytest.mark.slow
 def test_shapes_push_each_other():
     V, F = surfaces.disk(3)
     V = V * 0.4
@@ -94,6 +96,7 @@ def test_results_are_deterministic_and_inputs_do_not_change():
     assert np.array_equal(V, kept)
 
 
+@pytest.mark.slow
 def test_missing_space_is_reported_and_the_current_state_kept():
     V, F = surfaces.disk(2)
     air = AirMesh(V, F, [square(4)])

@@ -52,6 +52,7 @@ def test_proximal_penalty_against_differences():
             assert second[v] == pytest.approx(slope, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_frames_are_certified_and_follow_the_target(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 24)
@@ -65,6 +66,7 @@ def test_frames_are_certified_and_follow_the_target(head):
     assert animation.moves.shape == (23,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pinned", "most"), [(False, 2), (True, 5)])
 def test_searched_frames_stay_close_to_the_previous_one(pinned, most):
     """If a frame cannot start from the last frame's map, the search stays as close to it as possible."""
@@ -109,6 +111,7 @@ def test_the_sweeps_shorten_jumps(head):
     assert loose.energies.mean() < tight.energies.mean()
 
 
+@pytest.mark.slow
 def test_a_boundary_without_motion(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 8)[[0, 0, 1, 2, 2, 2, 3]]
@@ -128,6 +131,7 @@ def backwards(head):
     return Problem(V, F, loop, targets[0]), targets
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("energy", [None, "symmetric-dirichlet"])
 def test_an_impossible_frame_is_reported_with_its_reason(backwards, energy):
     problem, targets = backwards
@@ -200,6 +204,7 @@ def test_invalid_options_are_reported(head):
         animate(problem, targets, max_motion_ratio=2)
 
 
+@pytest.mark.slow
 def test_inputs_are_not_changed(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 4).astype(np.float32)
@@ -239,6 +244,7 @@ def test_interrupted_before_the_first_frame(head, monkeypatch):
     json.dumps(animation.to_dict(), allow_nan=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sweep", [0, 1])
 def test_interrupted_with_the_finished_frames(head, sweep):
     V, F, loop = head
@@ -339,6 +345,7 @@ def test_an_unwritable_film_is_reported_before_the_work(head, tmp_path, capsys, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_frame_without_a_map_is_not_written(backwards, head, tmp_path, capsys):
     problem, targets = backwards
     V, F, _ = head

@@ -103,6 +103,7 @@ def test_no_import_outside_the_plan():
     assert [f"{file} imports from {other}" for one, other, file in imports() if other not in PLAN[one]] == []
 
 
+@pytest.mark.slow
 def test_the_plan_names_no_missing_import():
     assert {(one, other) for one, others in PLAN.items() for other in others} - arrows() == set()
 
@@ -112,6 +113,7 @@ def test_packages_import_only_from_packages_above_them():
     assert [(one, other) for one, other in arrows() if order.index(other) >= order.index(one)] == []
 
 
+@pytest.mark.slow
 def test_no_cycle_between_subpackages():
     """Subpackages of one package import each other in one direction only."""
     graph = {}

@@ -45,6 +45,7 @@ def source(tmp_path):
 
 
 class TestCommands:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "command",
         [
@@ -134,6 +135,7 @@ class TestCommands:
 
 
 class TestMirroredAndStacked:
+    @pytest.mark.slow
     def test_a_mirrored_island_stays_mirrored_and_is_reported(self, tmp_path, capsys):
         before = seamed(tmp_path / "in.obj", mirrored=1)
         assert run("check", tmp_path / "in.obj") == 1
@@ -164,6 +166,7 @@ class TestMirroredAndStacked:
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
         assert not atlas.certify(io.mapped(io.read_mesh(tmp_path / "out.obj"))).mirrored.size
 
+    @pytest.mark.slow
     def test_overlapping_islands_are_reported_and_left(self, tmp_path, capsys):
         seamed(tmp_path / "in.obj", stacked=True)
         assert run("polish", tmp_path / "in.obj", "-o", tmp_path / "out.obj") == 0
@@ -282,6 +285,7 @@ class TestErrors:
             assert "face 0 (0-based) without texture coordinates" in capsys.readouterr().err
         assert not (tmp_path / "out.obj").exists()
 
+    @pytest.mark.slow
     def test_an_island_with_a_handle_is_named(self, tmp_path, capsys):
         i, j = np.divmod(np.arange(100), 10)
         u, v = 2 * np.pi * i / 10, 2 * np.pi * j / 10

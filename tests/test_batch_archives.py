@@ -133,6 +133,7 @@ class TestJournal:
     def record(self, name):
         return {"problem": name, "outcome": "injective", "key": "0", "seconds": 0.1}
 
+    @pytest.mark.slow
     def test_cut_anywhere_it_continues(self, tmp_path):
         names = ["a", "b/ü", "x" * 120]
         journal = Journal(tmp_path / "r.tar")
@@ -156,6 +157,7 @@ class TestJournal:
             assert read_about(tmp_path / "s.tar")["outcomes"] == [["injective", None, None, 3]]
             (tmp_path / "s.tar").unlink()
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["r.tar", "r.parquet"])
     def test_a_finished_archive_is_opened_again(self, tmp_path, name):
         pytest.importorskip("pyarrow")

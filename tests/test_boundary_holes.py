@@ -25,6 +25,7 @@ def octahedron():
 # --- several loops
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "holes"),
     [
@@ -47,6 +48,7 @@ def test_holes_go_to_the_holes_of_the_outline(text, holes):
     assert result.certificate.bijective
 
 
+@pytest.mark.slow
 def test_holes_go_to_the_closest_contour():
     centres = np.array([(-0.5, -0.4), (0.5, -0.4), (0.0, 0.55)])
     V, F = holed(600, *((x, y, 0.12) for x, y in centres))
@@ -60,6 +62,7 @@ def test_holes_go_to_the_closest_contour():
             assert where[loop].mean(axis=0) == pytest.approx(0.9 * centres[near], abs=0.05)
 
 
+@pytest.mark.slow
 def test_holes_are_rotated_for_the_least_energy():
     """Compare with the Dirichlet energy of Tutte's embedding, over all combinations of a few rotations."""
     from quasiharmonic import quasi_harmonic_map
@@ -190,6 +193,7 @@ def test_cut_open_tetrahedron():
     assert len(boundary_loops(opened.F, len(opened.V))[0]) == 4
 
 
+@pytest.mark.slow
 def test_cut_open_along_more_edges_than_needed():
     V, F = surfaces.starfish(3, 12)
     copies = [len(cut_open(V, F, min_gain=gain).V) for gain in (np.inf, 0.1)]

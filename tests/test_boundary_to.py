@@ -19,6 +19,7 @@ from shared.boundaries import holed, placed, plain_grid, torus
 # --- one loop
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["disk", "rect:2x1", "star:5", "letter:G", "letter:H"])
 def test_corners_are_matched_and_other_vertices_lie_on_the_outline(text):
     V, F = surfaces.cat(16)
@@ -35,6 +36,7 @@ def test_corners_are_matched_and_other_vertices_lie_on_the_outline(text):
     assert injective_map(V, F, fixed, target).certificate.bijective
 
 
+@pytest.mark.slow
 def test_same_positions_as_arc_length_without_conflicts():
     V, F = surfaces.cat(16)
     (loop,) = boundary_loops(F, len(V))
@@ -54,6 +56,7 @@ def test_either_orientation_and_single_or_listed_outlines():
         assert np.array_equal(target, wanted[1])
 
 
+@pytest.mark.slow
 def test_scale_and_position_of_the_surface_do_not_matter():
     V, F = holed(150, (0.1, 0.2, 0.3))
     wanted = boundary_to(V, F, outline("letter:R"))[1]
@@ -219,6 +222,7 @@ def test_too_few_vertices_for_the_shape_are_rejected():
 # --- space for chords
 
 
+@pytest.mark.slow
 def test_corners_go_to_ears():
     """The two triangles at corners of the grid fit only at corners of the rectangle, for every rotation."""
     V, F = plain_grid(7, 5)
@@ -244,6 +248,7 @@ def brute_force(along, wanted, room):
     return best
 
 
+@pytest.mark.slow
 def test_vertices_move_as_little_as_needed(rng):
     solved = 0
     for _ in range(300):

@@ -295,5 +295,6 @@ def test_loops_that_begin_on_a_straight_side():
             assert kinds(c) == (set() if mirror == 1 else {Obstacle.NOT_INJECTIVE, Obstacle.WINDING})
 
 
+@pytest.mark.slow
 def test_a_certificate_is_drawn():
     assert certify(SQUARE, CORNERS).plot().axes

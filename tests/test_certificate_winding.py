@@ -146,6 +146,7 @@ def open_fan(rng, triangles):
     return np.stack([np.zeros_like(rim), rim, rim + 1], axis=1), np.vstack([[0, 0], points]).astype(float)
 
 
+@pytest.mark.slow
 def test_boundary_vertices_with_multiply_wound_triangles(rng):
     counted = {True: 0, False: 0}
     for _ in range(75):
@@ -163,6 +164,7 @@ def test_boundary_vertices_with_multiply_wound_triangles(rng):
     assert counted[False] > 20
 
 
+@pytest.mark.slow
 def test_maps_of_annuli_that_are_multiply_wound_or_not(rng):
     """Rings with integer coordinates, some torn, some with a loop reflected; a third have inverted triangles."""
     seen = 0
@@ -278,6 +280,7 @@ def test_boundary_that_is_not_finite():
     assert kinds(c) == {Obstacle.NOT_INJECTIVE}
 
 
+@pytest.mark.slow
 def test_a_collapsed_map_is_certified_quickly():
     F, uv = ring(columns=20_000)
     c = certify(F, np.zeros_like(uv))
@@ -285,6 +288,7 @@ def test_a_collapsed_map_is_certified_quickly():
     assert 0 < len(c.crossings) <= 1000
 
 
+@pytest.mark.slow
 def test_many_loops_and_long_loops():
     holes = [ring(1, 1.5, columns=5)[1] + [4 * i, 4 * j] for i in range(15) for j in range(15)]
     F = ring(columns=5)[0]
@@ -317,6 +321,7 @@ def test_certificate_is_frozen_and_serialisable():
 # --- against slower methods
 
 
+@pytest.mark.slow
 @given(st.data())
 @examples(30)
 def test_bijective_if_no_triangles_share_more_than_their_vertices(data):
@@ -344,6 +349,7 @@ def test_bijective_if_no_triangles_share_more_than_their_vertices(data):
     assert certify(F, uv).bijective == covers_nothing_twice(F, uv)
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=8))
 @examples(50)
 def test_polygons_agree_with_all_pairs_of_edges(polygon):
@@ -364,6 +370,7 @@ def test_polygons_agree_with_all_pairs_of_edges(polygon):
         assert (Obstacle.WINDING in found) == (np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0)
 
 
+@pytest.mark.slow
 def test_every_triangle_agrees_with_rational_arithmetic(rng):
     F = strip(9, rows=9)
     flat = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0), indexing="ij"), axis=-1).reshape(-1, 2)

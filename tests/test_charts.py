@@ -82,6 +82,7 @@ SURFACES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SURFACES)
 @pytest.mark.parametrize("bound", [1.2, 1.5])
 def test_charts_keep_the_bound(name, bound):
@@ -94,6 +95,7 @@ def test_charts_keep_the_bound(name, bound):
     assert all(chart.misses == 0 for chart in charts)
 
 
+@pytest.mark.slow
 def test_a_larger_bound_needs_shorter_seams():
     V, F = sphere(9)
     tight, loose = (find_charts(V, F, max_stretch=bound) for bound in (1.1, 1.6))
@@ -101,6 +103,7 @@ def test_a_larger_bound_needs_shorter_seams():
     assert len(loose) <= len(tight)
 
 
+@pytest.mark.slow
 def test_charts_do_not_depend_on_the_unit_or_on_the_number_of_threads():
     V, F = starfish(3, 6)
     one, two, moved = find_charts(V, F, jobs=1), find_charts(V, F, jobs=2), find_charts(V * 2.0**40, F)
@@ -111,6 +114,7 @@ def test_charts_do_not_depend_on_the_unit_or_on_the_number_of_threads():
         assert np.array_equal(first.uv * 2.0**40, third.uv)
 
 
+@pytest.mark.slow
 def test_a_limit_on_charts_is_kept_and_what_it_costs_is_reported():
     V, F = sphere(9)
     charts = find_charts(V, F, max_stretch=1.02, max_charts=2)
@@ -134,6 +138,7 @@ def test_a_bound_that_no_charts_keep_is_reported():
     assert max(chart.misses for chart in charts) > 0
 
 
+@pytest.mark.slow
 def test_planar_parts_and_single_triangles_are_isometric():
     rng = np.random.default_rng(3)
     flat, F = disk(5)
@@ -162,6 +167,7 @@ def test_a_planar_spiral_that_overlaps_itself_is_divided():
     assert 2 <= len(charts) <= 5
 
 
+@pytest.mark.slow
 def test_given_cuts_are_seams():
     V, F = sphere(10)
     given = find_cuts(V, F)
@@ -172,6 +178,7 @@ def test_given_cuts_are_seams():
     assert {tuple(edge) for edge in far.tolist()} <= seams(F, charts)
 
 
+@pytest.mark.slow
 def test_seams_avoid_sides_with_high_costs():
     V, F = sphere(9)
     below = V[F].mean(axis=1)[:, 2] < 0
@@ -208,6 +215,7 @@ def test_thousands_of_boxes_take_seconds(count):
         assert len(own) == 14
 
 
+@pytest.mark.slow
 def test_a_callback_reports_phases_and_stops_the_search():
     V, F = starfish(3, 6)
     heard = []
@@ -247,6 +255,7 @@ def test_small_charts_are_joined_unless_they_overlap(degrees, expected):
         assert len(joined[0].vertices) == 9
 
 
+@pytest.mark.slow
 def test_charts_are_not_joined_across_given_seams():
     """The seams cut off a corner, which is not planar."""
     V, F = grid(20, 20)

@@ -29,6 +29,7 @@ def test_a_clean_mesh_is_returned_unchanged(mesh):
     assert not any(found.size for found in cleaned.changes.values())
 
 
+@pytest.mark.slow
 @given(st.integers(3, 12), st.integers(1, 60), st.integers(0, 2**31), st.integers(-20, -6))
 @examples(20)
 @example(10, 19, 825, -17)  # a widened triangle must not be thin in a second cleaning
@@ -44,6 +45,7 @@ def test_triangles_that_are_almost_degenerate_form_surfaces(n, f, seed, exponent
         assert "degenerate" in str(error)  # noqa: PT017
 
 
+@pytest.mark.slow
 @given(st.integers(3, 9), st.integers(1, 40), st.integers(0, 2**31), st.booleans(), st.booleans())
 @examples(30)
 @example(7, 27, 3023, False, True)  # separated triangles change the larger part of a component
@@ -60,6 +62,7 @@ def test_any_triangles_form_surfaces(n, f, seed, weld, on_a_grid):
         check(V, F, weld=weld, outward=True)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**31), st.floats(0, 1))
 @examples(15)
 def test_mixed_winding_is_mended_to_the_larger_part(seed, share):
@@ -264,6 +267,7 @@ def test_an_inside_out_component_is_reported_and_can_be_turned():
     assert np.flatnonzero(cleaned.flipped).tolist() == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_many_components():
     V, F = cube()
     shift = 2 * np.arange(10_000)

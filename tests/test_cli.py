@@ -26,6 +26,7 @@ from shared.solvable_problems import star_problem, turned_ring
 
 
 class TestMap:
+    @pytest.mark.slow
     def test_writes_a_certified_map(self, star, tmp_path, capsys):
         out, report, picture = tmp_path / "out.obj", tmp_path / "report.json", tmp_path / "out.png"
         assert run("map", star, "-o", out, "--json", report, "--plot", picture) == 0
@@ -74,6 +75,7 @@ class TestMap:
         assert facts["inverted"]
         assert run("check", out) == 1
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("scale", [1e-300, 1e160])
     def test_pictures_of_any_scale(self, tmp_path, scale):
         V, F, fixed, target = star_problem(n=120)
@@ -177,6 +179,7 @@ class TestRejects:
         assert run("check", star, "--json", star) == 2
         assert run("map", star, "-o", star) == 0
 
+    @pytest.mark.slow
     def test_messages_name_the_file_and_its_numbering(self, tmp_path, capsys):
         _, V, F, _ = bad_meshes()[0]
         problem = write_input(tmp_path, V, F, np.arange(3), np.zeros((3, 2)), handles=False)
@@ -243,6 +246,7 @@ class TestDemo:
         assert run("check", tmp_path / "d" / "demo.obj") == 0
 
 
+@pytest.mark.slow
 def test_help_imports_no_numerics():
     """`qhm --help` must not import NumPy."""
     code = (
@@ -268,6 +272,7 @@ def test_every_subcommand_has_help(command):
     assert not re.findall(r"^  -[^ ]+(?:, --[\w-]+)?(?: [A-Z]+)?$(?!\n {10})", subparser.format_help(), re.MULTILINE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pure", ["", "1"])
 def test_version_names_the_environment(pure):
     """The module runs as the command."""

@@ -58,6 +58,7 @@ def left(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("call", "after"),
     [
@@ -262,12 +263,14 @@ def test_without_a_reader_the_command_ends_without_a_message(folder, call, unbuf
     assert said == ""
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("call", ["--version", "check m.obj", "check m.obj --boundary", "measure m.obj"])
 def test_a_command_that_writes_no_file_ends_with_141_when_standard_output_is_closed(folder, call):
     assert shell(call, ">&-") == (141, "")
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("call", ["check m.obj --json out.json", "measure m.obj --export out.csv", "--help"])
 def test_closed_standard_output_is_no_failure_if_the_report_goes_elsewhere(folder, call):
@@ -293,6 +296,7 @@ def test_without_standard_error_the_command_ends_without_a_message(folder, call,
     assert said == ""
 
 
+@pytest.mark.slow
 @posix
 def test_json_output_stays_valid_without_standard_error(folder):
     command = f"{sys.executable} -m quasiharmonic check m.obj --json - 2>&-"

@@ -20,6 +20,7 @@ def field(tmp_path):
     return array
 
 
+@pytest.mark.slow
 def test_a_field_and_its_inverse(tmp_path, field, capsys):
     paths = [str(tmp_path / name) for name in ("field.npy", "mended.npy", "back.npy")]
     options = [
@@ -86,6 +87,7 @@ def test_invalid_calls(tmp_path, monkeypatch, field, capsys, arguments, message)
     assert not (tmp_path / "a.npy").exists()
 
 
+@pytest.mark.slow
 def test_a_field_on_voxels_and_its_inverse(tmp_path, capsys):
     z, y, x = np.mgrid[:9, :10, :12]
     field = np.zeros((9, 10, 12, 3))
@@ -106,6 +108,7 @@ def test_a_field_on_voxels_and_its_inverse(tmp_path, capsys):
     assert f"{mended.folds} cells folded" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_volume_that_cannot_be_mended_is_not_written(tmp_path, capsys):
     field = np.zeros((4, 4, 4, 3))
     field[0, 0, 0] = 5.0

@@ -13,6 +13,7 @@ from shared.solvable_problems import star_problem
 
 
 class TestPolish:
+    @pytest.mark.slow
     def test_a_few_steps_by_default(self, star, tmp_path, monkeypatch):
         facts, maps = {}, {}
         for name, options in {"unasked": [], "none": ["--no-polish"], "asked": ["--polish", "blend"]}.items():
@@ -46,6 +47,7 @@ class TestPolish:
             run("map", star, "-o", tmp_path / "o.obj", "--polish", "mips", "--no-polish")
         assert "not allowed" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_lowers_distortion_and_stays_certified(self, star, tmp_path, capsys):
         first, polished = tmp_path / "first.obj", tmp_path / "polished.obj"
         assert run("map", star, "-o", first, "--no-polish") == 0
@@ -77,6 +79,7 @@ class TestPolish:
 
 
 class TestHarmonise:
+    @pytest.mark.slow
     @pytest.mark.parametrize("energy", ["arap", "mips"])
     def test_lowers_distortion_and_stays_certified(self, star, tmp_path, energy):
         first, out, report = tmp_path / "first.obj", tmp_path / "out.obj", tmp_path / "r.json"
@@ -89,6 +92,7 @@ class TestHarmonise:
         _, _, fixed, target = star_problem()
         np.testing.assert_array_equal(io.map_of(io.read_mesh(out))[fixed], target)
 
+    @pytest.mark.slow
     def test_options_reach_the_solver(self, star, tmp_path):
         first, report = tmp_path / "first.obj", tmp_path / "r.json"
         assert run("map", star, "-o", first) == 0

@@ -27,6 +27,7 @@ def write(folder, name, **more):
     return problem
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["no kernel", "nothing sees all", "chord touches a corner", "flat ear"])
 def test_after_refining_there_is_a_map(tmp_path, capsys, name):
     problem = write(tmp_path, name)

@@ -17,6 +17,7 @@ from shared.commands import run
 class TestReportFailures:
     """After a map is written, an error message must not claim that nothing was written."""
 
+    @pytest.mark.slow
     def test_full_standard_output(self, star, tmp_path):
         if os.name != "posix" or not Path("/dev/full").exists():
             pytest.skip("no /dev/full on this system")
@@ -77,6 +78,7 @@ class TestReportFailures:
         assert "nothing was written" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
 
+    @pytest.mark.slow
     def test_reports_are_printed_on_an_ascii_console(self, star, tmp_path):
         command = [sys.executable, "-m", "quasiharmonic", "check", str(star)]
         plain = {
@@ -96,6 +98,7 @@ class TestReportFailures:
         command = f"{sys.executable} -m quasiharmonic map {star} -o {tmp_path / 'o.obj'} 2>&-"
         assert subprocess.run(command, shell=True, capture_output=True).returncode == 0
 
+    @pytest.mark.slow
     def test_distortion_is_drawn(self, star, tmp_path):
         from matplotlib.image import imread
 
@@ -105,6 +108,7 @@ class TestReportFailures:
         # The picture is the same as that of the written file.
         np.testing.assert_array_equal(imread(picture), imread(tmp_path / "again.png"))
 
+    @pytest.mark.slow
     def test_no_first_map_to_draw(self, star, tmp_path, monkeypatch):
         from quasiharmonic.linsolve import NotPositiveDefinite
 

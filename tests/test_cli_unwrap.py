@@ -25,6 +25,7 @@ def model(tmp_path):
     return tmp_path / "model.obj"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".gltf"])
 def test_writes_certified_coordinates(model, tmp_path, capsys, suffix):
     out, report = tmp_path / f"out{suffix}", tmp_path / "report.json"
@@ -41,6 +42,7 @@ def test_writes_certified_coordinates(model, tmp_path, capsys, suffix):
         assert words in said
 
 
+@pytest.mark.slow
 def test_materials_groups_and_attributes_stay(tmp_path):
     lines = [f"v {x!r} {y!r} {z!r} 0.5 0.25 1\n" for x, y, z in V.tolist()]
     faces = [f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in F.tolist()]
@@ -61,6 +63,7 @@ CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1
 g one\nf 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nusemtl two\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
 def test_polygons_stay(tmp_path, suffix):
     (tmp_path / "cube.obj").write_text(CUBE)
@@ -83,6 +86,7 @@ def test_polygons_that_seams_cross_are_divided(tmp_path):
     assert sorted(mesh.F.ravel()[divided.corners[:3]].tolist()) == sorted(mesh.F[0].tolist())
 
 
+@pytest.mark.slow
 def test_defects_are_reported(tmp_path, capsys):
     spoilt = np.concatenate([F, F[:1], [[0, 0, 1]]])
     io.write_obj(tmp_path / "model.obj", io.MeshData(V, spoilt))
@@ -117,6 +121,7 @@ def test_wrong_input_writes_nothing(model, tmp_path, capsys):
     assert run("unwrap", model, "-o", tmp_path / "out.off") == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["targets.cuts.find.shorten_cuts", "apps.unwrapping.unwrap.certify_charts"])
 def test_interrupt_writes_nothing(where, model, tmp_path, monkeypatch, capsys):
     def interrupt(*args, **options):
@@ -129,6 +134,7 @@ def test_interrupt_writes_nothing(where, model, tmp_path, monkeypatch, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model.obj"]
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_in_every_phase(model, tmp_path, monkeypatch, capsys):
     """The process exceeds the bound while charts are packed."""
     used = [10 << 20]
@@ -146,6 +152,7 @@ def test_memory_is_bounded_in_every_phase(model, tmp_path, monkeypatch, capsys):
     assert run(*call, "1G") == 0
 
 
+@pytest.mark.slow
 def test_vertices_at_one_position_share_coordinates(tmp_path):
     """Triangles that have their own vertices are joined in the file's map as in the certified one."""
     corners = V[F].reshape(-1, 3)

@@ -66,6 +66,7 @@ class TestCoarsen:
         assert euler[0] == euler[1]
         assert np.unique(coarse.F).size < 0.45 * len(V)
 
+    @pytest.mark.slow
     def test_prolongs_to_the_original_mesh(self, name, V, F, pins):
         """In each round, rings contain the vertices that existed before, and fans fill them."""
         _, coarse = coarsened(V, F, pins)
@@ -136,6 +137,7 @@ def removed_by_hand(T, free, dice):
     return rings, why
 
 
+@pytest.mark.slow
 def test_rounds_remove_the_expected_vertices():
     """The meshes are such that every reason to keep a vertex occurs."""
     whys = Counter()
@@ -277,6 +279,7 @@ class TestSearch:
         assert result.mu.shape == (len(problem.F),)
         assert np.all(np.abs(result.mu) < 1)
 
+    @pytest.mark.slow
     def test_its_maps_are_no_worse(self, posed):
         def mean(uv):
             d = distortion(posed.V, posed.F, uv)
@@ -294,6 +297,7 @@ class TestSearch:
         assert coarse is not None
         assert coarse_mesh(shifted) is coarse
 
+    @pytest.mark.slow
     def test_handles_pins_and_holes(self):
         V, F = random_annulus(4000, seed=3)
         fixed = np.append(boundary_of(F), [int(np.argmin(np.abs(V - (0, 0.7)).sum(axis=1)))])
@@ -304,6 +308,7 @@ class TestSearch:
         assert result.injective
         assert result.stages[0].name.startswith("coarse-to-fine, vector-adam, si-log")
 
+    @pytest.mark.slow
     def test_continues_if_the_coarse_problem_fails(self, posed, monkeypatch):
         found = solve(posed)
 
@@ -325,6 +330,7 @@ class TestSearch:
         assert result.n_iterations == len(result.history) - 1
         assert not np.array_equal(result.uv, found.uv)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("repaired", [True, False])
     def test_triangles_that_the_coarse_search_leaves_inverted_are_repaired(self, posed, monkeypatch, repaired):
         """A search on the whole mesh for one or two triangles took many times as long."""
@@ -358,6 +364,7 @@ class TestSearch:
             assert others == ["vector-adam"]
             assert result.stages[1].inverted[1] > left == len(result.certificate.inverted)
 
+    @pytest.mark.slow
     def test_is_skipped_where_it_does_not_help(self, posed):
         small = Problem(*on_letter("C", rings=12))
         assert coarse_mesh(small) is None

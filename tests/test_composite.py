@@ -101,6 +101,7 @@ def test_it_takes_no_more_steps_than_requested():
         assert len(list(Composite(iterations=count).iterates(objective, start))) == count
 
 
+@pytest.mark.slow
 def test_it_solves_problems_that_are_slow_from_tuttes_embedding():
     problem = Problem(*star_problem(depth=0.1, points=7, n=1000))
     few = solve(problem, strategy=[Composite(iterations=100)])

@@ -70,6 +70,7 @@ def check(problem, made):
     assert covered == [1] * len(problem.F)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, 1, 6, 9])
 def test_polygons_of_every_kind_are_targets(kind, seed):
@@ -87,6 +88,7 @@ def test_random_polygons_are_targets(seed, kind):
         check(problem, construct(problem))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("holes", "pins"), [(1, 0), (0, 1), (0, 5), (3, 0), (2, 3), pytest.param(6, 6, marks=pytest.mark.nightly)]
 )
@@ -98,12 +100,14 @@ def test_holes_and_pins_at_any_position(holes, pins):
     check(problem, construct(problem, thin=(holes, pins) != (2, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quarters", range(4))
 def test_a_turned_ring_is_mapped(quarters):
     problem = turned_ring(quarters)
     check(problem, construct(problem))
 
 
+@pytest.mark.slow
 def test_a_ring_turned_inside_out():
     """Any loop may be the outer one in the target."""
     problem = turned_ring(0)
@@ -121,6 +125,7 @@ def test_a_guide_may_have_inverted_triangles():
     check(problem, construct(problem, guide))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exponent", [-900, -40, 900])
 def test_the_scale_of_the_target_has_no_effect(exponent):
     problem = onto_polygon(2, "grid")
@@ -232,6 +237,7 @@ def test_thinning_keeps_the_needed_vertices():
 
 
 class TestPrecisionLimit:
+    @pytest.mark.slow
     def test_a_triangle_of_adjacent_doubles(self):
         """The triangle contains no other point with double-precision coordinates."""
         V, F = wheel(3)

@@ -70,6 +70,7 @@ def l_shape():
 # --- turning
 
 
+@pytest.mark.slow
 def test_turning_is_pi_minus_the_angle_sum():
     V, F = random_annulus()
     for points in (V, lift(V), lift(V)[:, [2, 0, 1]]):
@@ -80,6 +81,7 @@ def test_turning_is_pi_minus_the_angle_sum():
             np.testing.assert_allclose(loop.lengths, np.linalg.norm(ahead - points[loop.vertices], axis=1))
 
 
+@pytest.mark.slow
 def test_gauss_and_bonnet():
     V, F = surfaces.cat(12)
     (loop,) = boundary_turning(V, F)
@@ -170,6 +172,7 @@ def with_bend(lengths, turning):
     return turning + 0.01 * (lengths + np.roll(lengths, 1)) / 2 / lengths.sum()
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(st.floats(0.2, 1), st.floats(-2, 2)), min_size=6, max_size=13),
     st.integers(2, 4),
@@ -394,6 +397,7 @@ def test_map_with_invalid_corners(sheet, capsys):
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_the_command_lists_the_corners_of_a_boundary(sheet, capsys):
     picture, report = sheet.with_name("b.png"), sheet.with_name("b.json")
     assert run("check", sheet, "--boundary", "--plot", picture, "--json", report) == 0
@@ -409,6 +413,7 @@ def test_the_command_lists_the_corners_of_a_boundary(sheet, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_check_boundary_without_a_map_with_several_loops_and_without_loops(tmp_path, capsys):
     mesh = tmp_path / "in.obj"
     io.write_obj(mesh, io.MeshData(lift(surfaces.annulus(30)[0]), surfaces.annulus(30)[1]))

@@ -142,6 +142,7 @@ class TestAllocations:
         Problem(*arrays)
         assert peak(Problem, *arrays)[0] / len(arrays[1]) < 220
 
+    @pytest.mark.slow
     def test_iteration(self):
         problem = Problem(*posed(80, "C"))
         objective = Objective(problem)
@@ -191,6 +192,7 @@ class TestImports:
         assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.solver.search.solving"}
         assert len(found - self.modules("pass")) < 60
 
+    @pytest.mark.slow
     def test_help_imports_nothing_else(self):
         found = self.modules("from quasiharmonic.ui.cli import COMMANDS, parser_of; parser_of(COMMANDS).format_help()")
         assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.solver.search.solving"}
@@ -201,6 +203,7 @@ class TestImports:
         found = self.modules("import quasiharmonic.ui.batch.worker")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.fft", "shapely", "pyarrow"}
 
+    @pytest.mark.slow
     def test_a_solve_imports_only_what_it_needs(self):
         found = self.modules("from quasiharmonic import injective_map")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}

@@ -31,6 +31,7 @@ class TestDisks:
         assert np.array_equal(V, before[0])
         assert np.array_equal(F, before[1])
 
+    @pytest.mark.slow
     def test_several_surfaces_are_cut_like_each_alone(self):
         (V, F), (W, G) = surfaces.starfish(3, 12), torus(12, 8)
         V = jittered(V)
@@ -199,10 +200,12 @@ class TestGain:
 
 
 class TestCosts:
+    @pytest.mark.slow
     def test_costs_of_one_change_nothing(self):
         V, F = SURFACES["starfish"]
         assert np.array_equal(find_cuts(V, F), find_cuts(V, F, edge_costs=np.ones(F.shape)))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("shape", [(36, 14), (210, 76)], ids=["small", "large"])
     def test_cuts_leave_costly_parts(self, shape):
         """A cut around a torus may be anywhere: it moves to the half where it is cheap."""
@@ -247,6 +250,7 @@ class TestGiven:
         enough = find_cuts(V, F, min_gain=np.inf)
         assert np.array_equal(find_cuts(V, F, edges=enough[::-1, ::-1], min_gain=np.inf), enough)
 
+    @pytest.mark.slow
     def test_one_interior_edge_opens_nothing(self):
         V, F = TORUS
         lone = np.setdiff1d(np.arange(len(V)), find_cuts(V, F))[0]

@@ -102,6 +102,7 @@ class TestEveryMethod:
         assert count <= 2 or not limited
         assert steps.converged is not limited
 
+    @pytest.mark.slow
     def test_a_solve_after_an_abandoned_one(self, kind):
         method = kind()
         objective, start = self.begun(method)

@@ -54,6 +54,7 @@ def test_scale_and_location_do_not_matter(name):
         assert [(o.kind, o.vertices.tolist(), o.split.tolist()) for o in found] == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["flat ear", "chord over a notch", "chord touches a corner", "no kernel", "nothing sees all"]
 )
@@ -114,6 +115,7 @@ def test_feasible_problems_have_no_obstruction():
     assert diagnosis.summary().startswith("No known obstruction")
 
 
+@pytest.mark.slow
 def test_diagnoses_have_text_and_json_forms():
     for name, (_, (kind, _, _)) in OBSTRUCTED.items():
         diagnosis = diagnosed(name)

@@ -88,6 +88,7 @@ def test_bands_around_a_circle_and_bands_that_overlap(turns):
     assert {o.kind for o in diagnosis.obstructions} == ({Kind.CROSSING} if turns > 1 else set())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [0.8, 2.3])
 def test_spirals_that_fill_a_band(turns):
     V, F = grid(int(40 * turns), 3)

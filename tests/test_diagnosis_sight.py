@@ -65,6 +65,7 @@ def turned_ring(n, layers, angle=np.pi):
     return Problem(z.view(float).reshape(-1, 2), F, fixed, target.view(float).reshape(-1, 2)[fixed])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(POLYGONS))
 def test_triangles_fill_polygons(k):
     corners = polygons()[k]
@@ -138,6 +139,7 @@ def test_directions_that_differ_by_rounding_are_sorted_exactly():
     assert wedges.right.tolist() == list(range(1, n - 1))
 
 
+@pytest.mark.slow
 def test_clear_segments_agree_with_all_pairs(rng):
     points = rng.integers(0, 12, (60, 2)).astype(float)
     walls = np.stack([np.arange(0, 40, 2), np.arange(1, 40, 2)], axis=1)
@@ -299,6 +301,7 @@ def test_ten_thousand_boundary_vertices(kind):
     assert time.process_time() - began < 30
 
 
+@pytest.mark.slow
 def test_every_vertex_of_a_ring_sees_too_little():
     problem = turned_ring(60, 2)
     began = time.process_time()

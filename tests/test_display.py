@@ -86,6 +86,7 @@ def reds(image):
     return int(((image[..., 0] > 0.8) & (image[..., 1] < 0.25)).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", SHOWN, ids=lambda shown: type(shown).__name__)
 def test_repr_summary_and_picture(shown):
     assert re.fullmatch(r"<\w+: [^\n]+>", repr(shown))
@@ -104,6 +105,7 @@ def test_repr_summary_and_picture(shown):
     assert len(pickle.dumps(shown)) < 200_000
 
 
+@pytest.mark.slow
 def test_display_methods_of_notebooks():
     assert RESULT._repr_html_() == html(RESULT)
     assert repr(RESULT) == f"<MapResult: {RESULT.short_repr()}>"
@@ -122,6 +124,7 @@ def test_summary_of_all_measures_contains_each_summary():
         assert [float(number) for number in rows[name]] == pytest.approx([one.median, one.p95, one.maximum], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_everything_is_escaped():
     """Names come from callers, for example of an energy's class or a stage."""
     stage = replace(RESULT.stages[0], name="<script>alert('&')</script>")
@@ -220,6 +223,7 @@ def test_a_problem_is_drawn_with_pins_and_marked_triangles():
     np.testing.assert_array_equal(red, BEAN[:3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".svg", ".pdf", ".png"])
 def test_the_file_suffix_determines_the_format_of_figures(tmp_path, suffix):
     paths = [tmp_path / f"{name}{suffix.upper() if name == 'b' else suffix}" for name in "ab"]
@@ -232,6 +236,7 @@ def test_the_file_suffix_determines_the_format_of_figures(tmp_path, suffix):
         assert one.count(b"<path") > 2 * len(F)
 
 
+@pytest.mark.slow
 def test_many_triangles_are_rasterised_in_vector_graphics(tmp_path):
     points, triangles = disk(42)
     plot.save_map_figure(tmp_path / "many.svg", points, triangles, points)
@@ -241,6 +246,7 @@ def test_many_triangles_are_rasterised_in_vector_graphics(tmp_path):
     assert len(text) < 3_000_000
 
 
+@pytest.mark.slow
 def test_other_suffixes_are_rejected(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"pictures are written as \.png, \.svg, \.pdf"):
         plot.save_map_figure(tmp_path / "map.jpg", V, F, RESULT)

@@ -94,6 +94,7 @@ def test_every_vertex_occurs_once(mesh):
     np.testing.assert_array_equal(nested_dissection(V, tail, head), order)
 
 
+@pytest.mark.slow
 def test_fill_is_close_to_that_of_minimum_degree(mesh):
     """1.0 to 1.2 times as much; 1.4 times for the strip, which is unsuitable for dissection."""
     V, tail, head = mesh
@@ -146,6 +147,7 @@ def test_poor_cuts_are_rejected():
     assert nested_dissection(np.random.default_rng(0).permutation(V), *edges) is None
 
 
+@pytest.mark.slow
 @examples(25)
 @given(n=st.integers(2, 60), share=st.floats(0.5, 4), seed=st.integers(0, 2**32 - 1))
 def test_separators_separate(n, share, seed):
@@ -162,6 +164,7 @@ def test_separators_separate(n, share, seed):
         assert not np.any(inside & crossing)
 
 
+@pytest.mark.slow
 @examples(50)
 @given(m=st.integers(1, 12), n=st.integers(1, 12), density=st.floats(0.05, 1), seed=st.integers(0, 2**32 - 1))
 def test_covers_are_minimal(m, n, density, seed):

@@ -35,6 +35,7 @@ def test_segments_cross_at_most_the_given_number_of_edges():
     assert squares[1] <= squares[2] <= {1, 2, 4, 5, 8, 10}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lift", [lambda V: V, lambda V: rolled(V, 0.4)], ids=["plane", "cylinder"])
 def test_distances_on_developable_surfaces(flat, lift):
     V, F = flat
@@ -135,6 +136,7 @@ def test_the_scale_is_optimal(dome):
     assert sample.error(7 * turned(uv, 1.0)).mean == pytest.approx(found.mean, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_isometries_have_no_error_and_a_point_has_the_whole_error(flat):
     V, F = flat
     assert surface_distances(rolled(V, 50.0), F, rings=5, crossings=20).error(turned(V, 0.3)).mean < 1e-5

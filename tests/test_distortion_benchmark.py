@@ -29,6 +29,7 @@ def rows(text):
     return [row for row in found if row[0].startswith("set/")]
 
 
+@pytest.mark.slow
 def test_tables(folder, capsys):
     benchmark.compare([folder])
     crossed, star, crossed_stretch, star_stretch = rows(capsys.readouterr().out)
@@ -45,6 +46,7 @@ def test_tables(folder, capsys):
     assert worst[-1] == min(worst)
 
 
+@pytest.mark.slow
 def test_a_strategy_that_fails_has_no_numbers_of_another(folder, capsys, monkeypatch):
     found = benchmark.first_map
     monkeypatch.setattr(benchmark, "first_map", lambda p, strategy: None if strategy == "paper" else found(p, strategy))

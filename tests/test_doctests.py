@@ -18,6 +18,7 @@ NAMES = sorted(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_examples_print_the_shown_output(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -94,6 +94,7 @@ class TestEdgePoisson:
         assert gain > 1e-3
         assert Objective(problem, "edge-poisson").evaluate(xi).value == pytest.approx(at.value - gain, rel=1e-9)
 
+    @pytest.mark.slow
     def test_descends_to_an_injective_map_where_linear_elements_fail(self):
         V, F = disk(10)
         (loop,) = boundary_loops(F, len(V))

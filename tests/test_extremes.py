@@ -101,6 +101,7 @@ class TestScales:
         assert not found.inverted.size
         json.dumps(found.to_dict(), allow_nan=False)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("scale", [1e-150, 1e150])
     @pytest.mark.parametrize("name", ["no kernel", "nothing sees all", "too few edges across"])
     def test_of_obstructions(self, scale, name):
@@ -117,6 +118,7 @@ class TestScales:
         assert main(["map", str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj")]) == 0
         np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "out.obj"))[fixed], target * scale)
 
+    @pytest.mark.slow
     def test_targets_of_the_size_of_the_least_positive_doubles_cause_no_warning(self):
         """Their curvatures underflow to zero, by which a Newton step would divide."""
         V, F = cat(4)
@@ -237,6 +239,7 @@ class TestCollinearRuns:
         else:
             through_all(V, F, fixed, target)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("raised", [0.0, 1.0, -1.0])
     def test_an_ear_on_them_has_no_space(self, raised):
         """The middle of three vertices on a slanted line, and the effect of one unit in its last place."""
@@ -297,6 +300,7 @@ class TestCrossingTargets:
         assert result.status is Status.INJECTIVE
         assert result.certificate.bijective is False
 
+    @pytest.mark.slow
     def test_are_impossible_if_they_turn_too_little(self):
         V, F = random_delaunay(60, seed=1)
         (loop,) = onto((V, F), circle(len(boundary_of(F)))).domain.loops
@@ -350,6 +354,7 @@ class TestFlatteningAtScales:
         with pytest.raises(ValueError, match="range of doubles"):
             flatten(V / np.abs(V).max() * scale, F, **pins)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("flat", [1e-6, 1e-7, 1e-8, 1e-9])
     @pytest.mark.parametrize("energy", ["symmetric-dirichlet", "distances"])
     def test_thin_disks(self, flat, energy):

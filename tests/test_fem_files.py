@@ -47,6 +47,7 @@ GMSH_KINDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("version", "binary", "options"), GMSH_KINDS)
 def test_gmsh_finds_everything_that_was_there_before(gmsh, tmp_path, version, binary, options):
     path, out = tmp_path / "square.msh", tmp_path / "moved.msh"
@@ -131,6 +132,7 @@ VTK_KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("name", VTK_KINDS)
 def test_vtk_finds_everything_that_was_there_before(vtk, tmp_path, name, single):
@@ -391,6 +393,7 @@ def test_damage_causes_no_unexpected_error(tmp_path, name, whole, count):
     assert refused > count / 10
 
 
+@pytest.mark.slow
 def test_gmsh_and_the_solver_in_one_process(gmsh):
     script = """
 import gmsh

@@ -31,6 +31,7 @@ def image_of(field):
     return image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["f.mha", "f.nrrd", "f.nii", "f.nii.gz"])
 def test_simpleitk_applies_the_written_field(name, tmp_path):
     source, out = str(tmp_path / name), str(tmp_path / f"out_{name}")
@@ -105,6 +106,7 @@ def folded_volume(d=5, h=6, w=7):
     return np.stack([bump + 0.1 * z, 0.3 * bump, -0.2 * bump], axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "reflect"),
     [

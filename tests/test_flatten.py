@@ -80,6 +80,7 @@ def test_holes_and_planar_meshes():
     assert mean_energy(V, F, result.uv) < 1e-6
 
 
+@pytest.mark.slow
 def test_overlaps_are_avoided():
     V, F = overlapping_ring()
     result = flatten(V, F)
@@ -89,6 +90,7 @@ def test_overlaps_are_avoided():
     assert 1e-4 < mean_energy(V, F, result.uv) < 0.05
 
 
+@pytest.mark.slow
 def test_the_reported_energy_is_that_of_the_map():
     V, F = overlapping_ring()
     result = flatten(V, F)
@@ -194,6 +196,7 @@ class TestOptions:
         assert again.certificate.bijective
         assert again.history[-1].energy == pytest.approx(first.history[-1].energy, rel=1e-2)
 
+    @pytest.mark.slow
     def test_a_start_that_overlaps_itself_is_replaced(self):
         V, F = overlapping_ring()
         start = V[:, :2] * (1, -1)  # seen from the side where triangles are counterclockwise

@@ -123,6 +123,7 @@ def test_any_size_is_flattened(scale, pinned, tmp_path):
     np.testing.assert_array_equal(uv, result.uv)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [1e-150, 1e150])
 def test_pins_of_any_size_are_reached(apart, tmp_path):
     fixed, target = [1, 50], np.array([(0.0, 0.0), (apart, 0.0)])
@@ -150,6 +151,7 @@ def test_an_annulus_of_twenty_triangles(options, tmp_path):
     np.testing.assert_array_equal(uv, result.uv)
 
 
+@pytest.mark.slow
 def test_pins_on_an_annulus_of_twenty_triangles(tmp_path):
     V, F = annulus_of_twenty()
     fixed, target = [0, 5, 10], [(0.0, 0.0), (2.0, 0.0), (0.5, 0.5)]

@@ -38,6 +38,7 @@ def test_writes_a_bijective_map(head, tmp_path, capsys):
     assert "Bijective" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_options_change_the_map(head, tmp_path):
     weights = tmp_path / "weights.txt"
     weights.write_text("".join(f"{1 + i % 2}  # triangle {i}\n" for i in range(len(cat(6)[1]))))
@@ -139,6 +140,7 @@ def test_invalid_weights_are_named(head, tmp_path, capsys):
     assert "'heavy' is not a finite number at line 2" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_distance_errors_are_reported(head, tmp_path, capsys):
     out, report = tmp_path / "flat.obj", tmp_path / "report.json"
     errors = []

@@ -48,6 +48,7 @@ def pinched(F, uv, loops, *, gap=1e-11, most=10):
     return uv
 
 
+@pytest.mark.slow
 def test_a_start_from_which_the_map_collapses_is_replaced():
     replaced = 0
     for arms in (3, 5):
@@ -75,6 +76,7 @@ def shrunk(F, uv, centre):
     return next(start for start in starts if not inverted_triangles(F, start).size)
 
 
+@pytest.mark.slow
 def test_a_far_start_with_a_guarded_boundary_takes_few_steps():
     # Almost all of the disk is shrunk to 1e-15. The energy at the start depends on rounding: 5e13 to 2e14. Newton steps
     # that at most halve the energy took 219.
@@ -106,6 +108,7 @@ class Stuck(SymmetricDirichlet):
         return tuple(-slope for slope in super().density_gradient(d))
 
 
+@pytest.mark.slow
 def test_collapse_from_every_start_is_reported_by_the_status(monkeypatch):
     V, F = cat(8)
     monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
@@ -121,6 +124,7 @@ def test_collapse_from_every_start_is_reported_by_the_status(monkeypatch):
     assert min(ends) == kept[-1]
 
 
+@pytest.mark.slow
 def test_equal_results_of_two_starts_are_no_collapse(monkeypatch):
     V, F = cut_starfish(3, 10)
     monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
@@ -129,6 +133,7 @@ def test_equal_results_of_two_starts_are_no_collapse(monkeypatch):
     assert result.certificate.bijective
 
 
+@pytest.mark.slow
 def test_a_collapsed_island_is_reported_for_an_atlas(monkeypatch):
     monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
     plane, F = disk(3)

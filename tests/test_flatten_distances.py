@@ -6,6 +6,7 @@ import re
 import time
 from dataclasses import replace
 from functools import partial
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -94,6 +95,7 @@ def test_diagonal_blocks_are_those_of_the_form(energy):
             assert np.abs(form.apply_off_diagonal(e)[vertex]) < 1e-14 * np.abs(product).max()
 
 
+@pytest.mark.slow
 def test_direction_solves_newtons_system(energy):
     """Conjugate gradients agree with a solution that uses the whole matrix."""
     total, piece, _ = energy
@@ -120,6 +122,7 @@ def test_direction_solves_newtons_system(energy):
     assert np.sqrt(off @ matrix @ off) < 0.2 * np.sqrt(exact @ matrix @ exact)
 
 
+@pytest.mark.slow
 def test_distance_errors_decrease_and_the_map_stays_bijective(dome):
     V, F = dome
     # A dome seen from above: its boundary region is compressed.
@@ -140,6 +143,7 @@ def test_distance_errors_decrease_and_the_map_stays_bijective(dome):
     assert np.array_equal(keep_distances(V, F, start, rings=6).uv, result.uv)
 
 
+@pytest.mark.slow
 def test_unit_and_position_of_the_start_do_not_matter(dome):
     V, F = dome
     wanted = keep_distances(V, F, V[:, :2], rings=6).uv
@@ -147,6 +151,7 @@ def test_unit_and_position_of_the_start_do_not_matter(dome):
     assert np.allclose(np.ldexp(far, -300), wanted, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_developable_surfaces_are_unrolled(flat):
     V, F = flat
     start = np.stack([V[:, 0] * (1 + 0.5 * V[:, 0]), V[:, 1]], axis=1)
@@ -154,6 +159,7 @@ def test_developable_surfaces_are_unrolled(flat):
     assert distortion(V, F, result.uv, rings=8).distances.mean < 5e-3
 
 
+@pytest.mark.slow
 def test_the_boundary_does_not_cross_itself():
     """A ramp with more than one turn would overlap itself if all distances were exact."""
     V, F = surfaces.grid(45, 5)
@@ -169,6 +175,7 @@ def test_the_boundary_does_not_cross_itself():
     assert sample.error(as_it_would).mean < sample.error(result.uv).mean < 0.5 * sample.error(start).mean
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 13])
 def test_a_start_that_scaling_would_invert_is_not_scaled(seed):
     V, F = surfaces.grid(4, 4)
@@ -230,6 +237,7 @@ def test_numbers_of_rings_that_are_not_valid_are_rejected(dome, rings):
         keep_distances(V, F, V[:, :2], rings=rings)
 
 
+@pytest.mark.slow
 def test_record_stores_intermediate_maps(dome):
     V, F = dome
     result = keep_distances(V, F, V[:, :2], rings=6, record_every=2)
@@ -357,6 +365,7 @@ def test_three_hundred_thousand_triangles_take_about_as_long_as_without_distance
 # --- as an energy of `flatten`
 
 
+@pytest.mark.slow
 def test_flatten_ends_with_the_descent_of_distances():
     V, F = surfaces.cat(6)
     plain = flatten(V, F)
@@ -392,6 +401,7 @@ def test_flatten_preserves_the_distances_of_each_piece(dome):
     assert room == pytest.approx(0.05 * np.ptp(first, axis=0).max())
 
 
+@pytest.mark.slow
 def test_sampled_pairs_represent_all_pairs():
     """With few rings and on a small surface, too, the map does not fit the sampled pairs alone."""
     V, F = surfaces.disk(14)
@@ -419,12 +429,8 @@ def test_ctrl_c_ends_flattening_by_distances_with_a_map(dome, stage):
 
 
 def test_ctrl_c_during_sampling_returns_the_current_map(dome, monkeypatch):
-    from quasiharmonic.apps.flattening.distances import distance_descent as distance_descent
-
-    def cut_short(*arguments, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(distance_descent, "sample_distances", cut_short)
+    sample = "quasiharmonic.apps.flattening.distances.distance_descent.sample_distances"
+    monkeypatch.setattr(sample, Mock(side_effect=KeyboardInterrupt))
     result = flatten(*dome, energy="distances", rings=6)
     assert result.status is Status.INTERRUPTED
     assert np.array_equal(result.uv, flatten(*dome).uv)

@@ -100,6 +100,7 @@ def test_affine_maps_are_prolonged_exactly():
     assert np.median(error) < 5e-3
 
 
+@pytest.mark.slow
 def test_coarse_starts_are_bijective_and_closer_to_the_result_than_a_disk(surface):
     V, F, loops = surface
     uv = flatten_coarse(V, F, loops)
@@ -111,6 +112,7 @@ def test_coarse_starts_are_bijective_and_closer_to_the_result_than_a_disk(surfac
     assert here - least < 0.5 * (disk - least)
 
 
+@pytest.mark.slow
 def test_a_guarded_coarse_start_of_a_surface_that_would_overlap():
     square, F = grid(200, 6)
     angle, r = 7.2 * square[:, 0], 1 + 0.5 * square[:, 1]
@@ -120,6 +122,7 @@ def test_a_guarded_coarse_start_of_a_surface_that_would_overlap():
         assert certify(F, uv).bijective
 
 
+@pytest.mark.slow
 def test_smoothing_opens_almost_closed_gaps():
     V, F = cat(20)
     loops = boundary_loops(F, len(V))

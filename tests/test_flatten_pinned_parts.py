@@ -40,6 +40,7 @@ def test_each_part_goes_to_its_pins():
     np.testing.assert_allclose(result.uv[:second], V[:second], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_parts_without_pins_are_placed_next_to_the_others():
     V, F, (_, second, third) = several(disk(6), disk(5), disk(3))
     result = solved(V, F, [second + 3, third + 3], [(10.0, 20.0), (10.2, 20.0)], gap=0.5)
@@ -49,6 +50,7 @@ def test_parts_without_pins_are_placed_next_to_the_others():
     assert free[:, 1].min() == pytest.approx(held[:, 1].min())
 
 
+@pytest.mark.slow
 def test_overlapping_parts_move_apart():
     V, F, (_, second) = several(disk(5), disk(5))
     fixed = [3, 50, second + 3, second + 50]
@@ -61,6 +63,7 @@ def test_overlapping_parts_move_apart():
     assert not certify(F, np.concatenate(alone)).bijective
 
 
+@pytest.mark.slow
 def test_one_part_is_placed_in_the_hole_of_another():
     ring, tile = annulus(6), disk(5)
     V, F, (_, second) = several(ring, tile)
@@ -70,11 +73,13 @@ def test_one_part_is_placed_in_the_hole_of_another():
     assert np.abs(result.uv[second:]).max() < np.abs(V[inner]).max()
 
 
+@pytest.mark.slow
 def test_three_parts_at_one_location():
     V, F, (_, second, third) = several(disk(4), disk(4), disk(4))
     solved(V, F, [3, second + 3, third + 3], [(10.0, 10), (10.2, 10), (10.1, 10.1)], energy="mips")
 
 
+@pytest.mark.slow
 def test_the_reason_for_impossibility_uses_the_numbers_of_the_mesh():
     V, F, (_, second) = several(disk(4), disk(4))
     result = flatten(V, F, fixed=[3, second + 3], target=np.zeros((2, 2)))
@@ -122,6 +127,7 @@ def test_ctrl_c_leaves_every_pin_at_its_target_position(at):
     np.testing.assert_array_equal(result.uv[fixed], target)
 
 
+@pytest.mark.slow
 def test_the_command_accepts_several_parts(tmp_path, capsys):
     V, F, (_, second) = several(disk(4), disk(4))
     write_obj(tmp_path / "in.obj", MeshData(np.column_stack([V, 0 * V[:, 0]]), F).with_map(V + 7))
@@ -135,6 +141,7 @@ def test_the_command_accepts_several_parts(tmp_path, capsys):
     assert certify(written.F, map_of(written)).bijective
 
 
+@pytest.mark.slow
 def test_the_messages_of_the_command_have_the_numbers_of_the_file(tmp_path, capsys, rng):
     V, F, (_, second) = several(disk(4), disk(4))
     number, order = rng.permutation(len(V)), rng.permutation(len(F))

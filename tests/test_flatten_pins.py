@@ -52,6 +52,7 @@ def energy_by_hand(V, F, uv):
     return np.average((s**2 + s**-2.0).sum(axis=1) - 4, weights=length * height)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [1.0, -4.0])
 @pytest.mark.parametrize("surface", [cat(10), random_delaunay(400, 1), disk(10), grid(18, 18)])
 def test_pins_of_a_swirl_are_reached(surface, angle):
@@ -76,6 +77,7 @@ def test_a_hole_is_turned_and_the_outside_follows():
     assert np.allclose(result.uv, V @ [[0, 1], [-1, 0]] + 3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_vertices_that_must_pass_each_other():
     V, F = disk(6)
     fixed = np.array([3, 23, 43, 63, 83])
@@ -91,12 +93,14 @@ def test_any_number_of_pins_from_one_to_all():
     assert np.array_equal(result.uv, 2 * V)
 
 
+@pytest.mark.slow
 def test_a_boundary_fixed_inside_out_is_reached():
     V, F = disk(6)
     loop = boundary_loops(F, len(V))[0][:18]
     solved(V, F, loop, V[loop] * [1, -1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e150, 1e-150])
 def test_the_unit_of_length_does_not_matter(scale):
     V, F = disk(4)
@@ -111,6 +115,7 @@ def test_the_unit_of_length_does_not_matter(scale):
     assert energies[-1] < 0.99 * energies[0]
 
 
+@pytest.mark.slow
 def test_is_deterministic():
     V, F = cat(8)
     fixed = np.arange(0, len(V), 9)
@@ -119,6 +124,7 @@ def test_is_deterministic():
     assert np.array_equal(first.uv, second.uv)
 
 
+@pytest.mark.slow
 def test_the_requested_energy_is_minimised():
     V, F = cat(8)
     fixed, target = np.array([5, 100, 150]), np.array([[0.0, 0], [1, 0], [0.5, 1.5]])
@@ -161,6 +167,7 @@ def test_impossible_problems_are_named():
     assert within.vertices.tolist() == [80, *F[5]]
 
 
+@pytest.mark.slow
 def test_a_boundary_fixed_with_the_wrong_orientation_is_named():
     V, F = disk(4)
     loop = boundary_loops(F, len(V))[0]
@@ -168,6 +175,7 @@ def test_a_boundary_fixed_with_the_wrong_orientation_is_named():
     assert patch.kind is Kind.INVERTED_PATCH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("twist", "possible"), [(0.3, True), (1.0, True), (1.3, False)])
 def test_a_vertex_without_a_position_among_surrounding_pins_is_named(twist, possible):
     # The ring around the centre becomes a star with three bent arms, until no point sees all of it.
@@ -281,6 +289,7 @@ def test_least_squares_of_a_similarity():
     assert np.allclose(move_onto_pins(uv, fixed, np.ones((3, 2))), uv - uv[fixed].mean(0) + 1)
 
 
+@pytest.mark.slow
 def test_the_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import pin_problems

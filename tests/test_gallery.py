@@ -33,11 +33,13 @@ def test_script_runs_when_pasted(name, scripts, tmp_path, monkeypatch):
     assert (tmp_path / f"{name}.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_scripts_without_records_import_no_shared_module(scripts):
     shared = [name for name, text in scripts.items() if "from common import" in text]
     assert sorted(shared) == ["figure_10", "figure_13", "figure_14"]
 
 
+@pytest.mark.slow
 def test_captions_have_at_most_two_lines(scripts):
     for name, text in scripts.items():
         title, underline, empty, *caption = text.partition('"""')[2].partition('"""')[0].rstrip().split("\n")

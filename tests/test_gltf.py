@@ -31,6 +31,7 @@ def cube():
     return trimesh.Trimesh(V[quads.ravel()], F, visual=visual, process=False)
 
 
+@pytest.mark.slow
 def test_a_cube_is_closed_and_its_seams_are_at_the_right_edges(tmp_path):
     there = cube()
     there.export(tmp_path / "cube.glb")

@@ -31,6 +31,7 @@ BARRIERS = set(polishing.ENERGIES)
 
 
 class TestHarmonise:
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ENERGIES)
     def test_lowers_the_energy_and_stays_certified(self, name):
         V, F, uv, fixed = bowl()
@@ -49,6 +50,7 @@ class TestHarmonise:
             least = polish(V, F, uv, fixed=fixed, energy=name, tol=1e-10).history[-1].energy
             assert least * (1 - 1e-9) < after < 1.01 * least
 
+    @pytest.mark.slow
     def test_areas_become_as_equal_as_the_boundary_allows(self):
         V, F, uv, fixed = bowl()
         found = harmonise(V, F, uv, fixed=fixed, energy="area", conformal=0, max_iterations=80)
@@ -58,6 +60,7 @@ class TestHarmonise:
         uneven = [np.sum(d.share * (d.area_ratio - 1) ** 2) for d in (distortion(V, F, r.uv) for r in (least, found))]
         assert uneven[0] * (1 - 1e-3) < uneven[1] < 1.2 * uneven[0]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["arap", "arap-unsigned", "area", "springs", None])
     def test_starts_from_any_map(self, name):
         """The map may even have inverted triangles, if the energy is finite."""
@@ -70,6 +73,7 @@ class TestHarmonise:
         np.testing.assert_array_equal(result.uv[problem.fixed], problem.target)
         assert result.history[0].inverted > 0
 
+    @pytest.mark.slow
     def test_as_the_paper_has_it(self):
         """One round with η = 1e-4 and without a barrier."""
         problem, uv = folded()
@@ -86,6 +90,7 @@ class TestHarmonise:
         assert result.injective
         assert result.stages[0].name == "harmonise, arap-unsigned, η = 0.0001"
 
+    @pytest.mark.slow
     def test_conformal_without_an_energy(self):
         """R₁ alone ends near the map with the least MIPS."""
         V, F, uv, fixed = bowl()
@@ -94,6 +99,7 @@ class TestHarmonise:
         mips = [distortion(V, F, w).statistics("mips").mean for w in (uv, found.uv, least.uv)]
         assert mips[2] < mips[1] < mips[2] + 0.1 * (mips[0] - mips[2])
 
+    @pytest.mark.slow
     def test_pins_and_inner_loops_do_not_move(self):
         V, F = annulus(12)
         pin = int(np.argmin(np.linalg.norm(V - [0.75, 0.1], axis=1)))
@@ -105,6 +111,7 @@ class TestHarmonise:
         free = harmonise(V, F, uv, fixed=fixed[1:], energy="area")
         assert not np.array_equal(free.uv[pin], uv[pin])
 
+    @pytest.mark.slow
     def test_weights_shift_the_distortion(self):
         V, F, uv, fixed = bowl()
         left = V[F].mean(axis=1)[:, 0] < 0
@@ -117,6 +124,7 @@ class TestHarmonise:
         assert shares[1] < 0.9 * shares[0]
         assert shares[2] < 0.9 * shares[0]
 
+    @pytest.mark.slow
     def test_the_surfaces_own_scale(self):
         """Weighted triangles are undistorted in the surface's own scale; if the whole map is scaled, they are not."""
         V, F = disk(7)
@@ -173,6 +181,7 @@ class TestHarmonise:
             np.testing.assert_array_equal(x, y)
         assert not np.shares_memory(first.uv, uv)
 
+    @pytest.mark.slow
     def test_is_never_worse_than_the_given_map(self):
         V, F, uv, fixed = bowl()
         best = harmonise(V, F, uv, fixed=fixed, energy="mips", max_iterations=100, eta=(1,) * 6, conformal=0)
@@ -194,6 +203,7 @@ class TestHarmonise:
         assert result.injective
         assert result.status is not Status.POLISHED
 
+    @pytest.mark.slow
     def test_a_perfect_map_does_not_change(self):
         V, F = random_delaunay(30)
         for name in ENERGIES:
@@ -221,6 +231,7 @@ class TestHarmonise:
         assert stopped.injective
         assert len(stopped.history) == 13
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("linear_solver", available())
     def test_other_linear_solvers(self, linear_solver):
         V, F, uv, fixed = bowl()
@@ -271,6 +282,7 @@ class TestHarmonise:
         with pytest.raises(ValueError, match="iterations must be an integer"):
             harmonise(V, F, uv, fixed=fixed, max_iterations=0)
 
+    @pytest.mark.slow
     def test_flat_rest_triangles(self):
         """The energy is undefined there; R₁ with triangles of another shape is not."""
         V, F, uv, fixed = bowl()

@@ -71,6 +71,7 @@ def outline(result):
 
 
 class TestAgreement:
+    @pytest.mark.slow
     def test_each_result_is_as_for_a_single_call(self):
         problems = mixed()
         together = list(injective_maps(problems))
@@ -91,6 +92,7 @@ class TestAgreement:
         assert [result.status for result in together].count(Status.INJECTIVE) == 9
         assert {Status.IMPOSSIBLE} == {together[6].status, together[-1].status}
 
+    @pytest.mark.slow
     def test_maps_are_injective_and_respect_fixed_vertices(self):
         problems = ellipses(40)
         for (_, F, fixed, target), result in zip(problems, injective_maps(problems), strict=True):
@@ -105,6 +107,7 @@ class TestAgreement:
             assert outline(a) == outline(b)
             np.testing.assert_array_equal(a.uv, b.uv)
 
+    @pytest.mark.slow
     def test_merged_groups_continue_as_they_would_alone(self, monkeypatch):
         """Some problems of several groups, of one mesh or of many, remain after the first iterations."""
         monkeypatch.setattr(first_stage, "GROUP", 900)
@@ -138,6 +141,7 @@ class TestAgreement:
             assert result.injective
             np.testing.assert_array_equal(result.uv[fixed], held)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("rings", [4, pytest.param(2, marks=pytest.mark.nightly)])
     def test_a_stage_ends_where_it_does_alone(self, rings):
         """A pin outside the target: the descent stalls before its last iteration.
@@ -162,6 +166,7 @@ class TestAgreement:
         strategy = [VectorAdam(schedule=[(0, 0.1)], momenta=[0.9, 0.999])]
         assert all(result.injective for result in injective_maps(ellipses(2), strategy=strategy))
 
+    @pytest.mark.slow
     def test_the_search_continues_after_a_stage_without_success(self):
         """The history continues that of the common stage, and later stages run."""
         problems = [star_problem(depth=0.15, points=6, n=100, seed=seed) for seed in range(2)]
@@ -223,6 +228,7 @@ class TestAgreement:
 
 
 class TestStream:
+    @pytest.mark.slow
     def test_problems_are_read_as_they_are_needed(self):
         read = count()
         endless = (ellipses(1)[0] for _ in read)
@@ -252,6 +258,7 @@ class TestStream:
         with pytest.raises(KeyboardInterrupt):
             list(injective_maps(ellipses(5), callback=tired))
 
+    @pytest.mark.slow
     def test_closing_the_iterator_ends_the_work(self):
         hard = star_problem(depth=0.02, points=30, n=3000, seed=1)
         results = injective_maps([*ellipses(1), hard, hard], jobs=1)
@@ -301,6 +308,7 @@ class TestTrouble:
             injective_maps([], **options)
 
 
+@pytest.mark.slow
 def test_certificates_of_many_maps_are_those_of_each(rng):
     """Valid and invalid maps: inverted, flat, not finite, boundaries that cross, touch and repeat, holes, islands."""
     maps = []

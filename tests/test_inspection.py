@@ -110,6 +110,7 @@ def test_coincident_vertices_are_listed_but_are_no_defect():
     assert "at the position of an earlier vertex" in report.summary()
 
 
+@pytest.mark.slow
 def test_any_triangles_are_accepted_and_clean_ones_are_surfaces():
     seen = Counter()
 

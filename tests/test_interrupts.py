@@ -59,6 +59,7 @@ def test_while_the_command_itself_is_imported(at):
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "qhm: interrupted, nothing was written\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", ["numpy", "numpy.linalg", "quasiharmonic.util.arrays"])
 def test_while_its_dependencies_are_imported(tmp_path, at):
     path = tmp_path / "grid.off"
@@ -131,6 +132,7 @@ def test_not_if_interrupts_are_ignored(monkeypatch):
         signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 def test_after_the_last_output():
     # Too late to undo anything: the printed report stays true.
     late = "import signal; atexit.register(signal.raise_signal, signal.SIGINT)"

@@ -94,6 +94,7 @@ TAKERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TAKERS)
 def test_invalid_indices_are_named(name):
     refused = 0

@@ -129,6 +129,7 @@ def test_error_is_that_of_rounding_in_the_map(rng):
         assert (error <= 10 * 2.0**-53 * (np.abs(uv).max() / shrunk + 1)).all()
 
 
+@pytest.mark.slow
 def test_graded_over_twelve_orders_of_magnitude(rng):
     V, F = random_delaunay(3000, seed=4)
     uv = V * np.hypot(*V.T)[:, None] ** 5

@@ -76,6 +76,7 @@ class TestLevels:
         assert length_of(V, cut) < 1.03 * 2 * np.pi * (1 + 2)
         assert np.array_equal(cut, find_cuts(V, F, min_gain=np.inf))
 
+    @pytest.mark.slow
     def test_a_large_surface_avoids_diagonals(self):
         V, F = torus(210, 76, radius=3)
         diagonals = F[: len(F) // 2, [0, 2]]

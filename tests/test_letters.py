@@ -10,6 +10,7 @@ from unicodedata import category
 
 import numpy as np
 import pytest
+from matplotlib import get_data_path
 
 from quasiharmonic import boundary_loops, surfaces, targets
 from quasiharmonic.targets.boundary.correspondence import viewer_axes
@@ -53,7 +54,6 @@ def test_letter_with_straight_sides_has_only_its_corners():
 
 
 def test_curves_are_flat_to_tolerance():
-    from matplotlib import get_data_path
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
@@ -133,6 +133,7 @@ def test_tolerance_of_letters():
         assert 0.2 * tolerance < distance(fine, targets.letter("S", tolerance=tolerance)[0]).max() < tolerance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "holes"), [("QH", 1), ("LOVE", 1), ("G", 0), ("mesh", 2), ("R8", 3)])
 def test_letters_of_a_word_form_one_piece(text, holes):
     pytest.importorskip("shapely")
@@ -293,6 +294,7 @@ def test_holes_run_clockwise():
     assert placed == pytest.approx(hole)
 
 
+@pytest.mark.slow
 def test_a_curved_loop_is_seen_upright():
     V, F = surfaces.cat(20)
     loop = boundary_loops(F, len(V))[0]
@@ -356,7 +358,6 @@ def test_invalid_curves_are_rejected(loop, outline, options, message):
 @pytest.mark.parametrize("font", ["DejaVuSans-Bold", "cmr10", "STIXGeneral"])
 def test_letters_agree_with_freetype_up_to_its_rounding(font):
     """Letters, ligatures, combined accents, Greek, Cyrillic, symbols: read by this package and by matplotlib."""
-    from matplotlib import get_data_path
     from matplotlib.font_manager import FontProperties
     from matplotlib.ft2font import FT2Font
     from matplotlib.path import Path as Outline
@@ -408,6 +409,7 @@ def test_fonts_with_cubic_curves(tmp_path):
     assert targets.signed_area(circle) == pytest.approx(0.16 * np.pi, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_unusual_fonts_cause_no_warning():
     code = """if True:
         import matplotlib
@@ -418,18 +420,15 @@ def test_unusual_fonts_cause_no_warning():
 
 @pytest.mark.parametrize("cut", [0, 3, 11, 40, 300, 5000, 100_000])
 def test_a_damaged_font_is_an_error(tmp_path, cut):
-    from matplotlib import get_data_path
-
     data = Path(get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf").read_bytes()
     (tmp_path / "cut.ttf").write_bytes(data[:cut])
     with pytest.raises(ValueError, match=r"cut\.ttf is not a readable font"):
         targets.letter("R", tmp_path / "cut.ttf")
 
 
+@pytest.mark.slow
 def test_a_damaged_font_causes_no_endless_loop(tmp_path, rng):
     """Bytes are changed at random, in the tables and their directory: the result is an outline or a ValueError."""
-    from matplotlib import get_data_path
-
     data = bytearray(Path(get_data_path(), "fonts", "ttf", "DejaVuSans-Bold.ttf").read_bytes())
     read = rejected = 0
     for bytes_changed, end in 6 * [(3, len(data)), (10, len(data)), (50, len(data)), (5, 400)]:

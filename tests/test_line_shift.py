@@ -76,6 +76,7 @@ def test_a_fold_of_many_triangles_is_moved_as_a_whole():
     assert signed_areas(F, w + step).min() > 0
 
 
+@pytest.mark.slow
 def test_it_solves_a_problem_that_earlier_methods_do_not_solve():
     case = problems.make("needles", 4, 0.972)
     problem = Problem(case.V, case.F, case.fixed, case.target)

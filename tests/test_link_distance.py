@@ -54,12 +54,14 @@ def test_corners_of_a_corridor():
     assert distance[1, 6] == 2
 
 
+@pytest.mark.slow
 def test_teeth_of_a_comb():
     distance = table(comb(5))
     bottoms = [4 * k + 1 for k in range(5)]
     assert set(distance[np.ix_(bottoms, bottoms)].ravel()) == {0, 3}
 
 
+@pytest.mark.slow
 def test_stairs_need_one_segment_per_step():
     # Narrow stairs, 1 up and 1 right each: a segment crosses at most one step.
     steps, width = 5, 0.01
@@ -69,6 +71,7 @@ def test_stairs_need_one_segment_per_step():
     assert distance[0, 2 * steps - 1] == 2 * steps - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corners", [spiral(10, 1.6), comb(3), star(np.random.default_rng(1), 24)])
 def test_distances_are_a_metric(corners):
     distance = table(corners)
@@ -78,6 +81,7 @@ def test_distances_are_a_metric(corners):
     assert (np.diag(np.roll(distance, -1, axis=1)) == 1).all()
 
 
+@pytest.mark.slow
 def test_the_limit_is_respected():
     corners = spiral(10, 1.6)
     distance, found = table(corners), polygon(corners)
@@ -86,6 +90,7 @@ def test_the_limit_is_respected():
         assert found.link_distance(*far, limit) == limit + 1
 
 
+@pytest.mark.slow
 def test_random_paths_are_no_shorter():
     # Random points, and the least number of segments from each corner to them and on to the others.
     rng = np.random.default_rng(5)

@@ -41,6 +41,7 @@ def dense(matrix):
 # ---- matrices that are not positive definite ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     n=st.integers(1, 30),
@@ -232,6 +233,7 @@ def test_order_of_calls(name):
         solver.factor(A.data)
 
 
+@pytest.mark.slow
 def test_two_threads_with_a_solver_each(name):
     barrier = threading.Barrier(2)
 

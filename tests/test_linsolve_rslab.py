@@ -69,6 +69,7 @@ def test_preference_depends_on_the_number_of_entries(monkeypatch):
     assert available(1) == ("mkl", "cholmod", "rslab", "superlu")
 
 
+@pytest.mark.slow
 def test_import_loads_no_backend():
     code = (
         "import sys, quasiharmonic.linsolve as l; l.available(); "
@@ -278,6 +279,7 @@ def test_rslab_works_after_its_first_thread_has_ended(trial):
     assert set(finished(_THREADS + _ENDING[trial] + "\nprint(*found)")) == {"rslab"}
 
 
+@pytest.mark.slow
 @needs_rslab
 def test_rslab_imported_by_other_code_is_not_used():
     """The thread that imported it may have ended; rslab then crashes."""
@@ -323,6 +325,7 @@ assert os.waitpid(child, 0)[1] == 0
 """
 
 
+@pytest.mark.slow
 @needs_rslab
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
 def test_a_forked_process_does_not_wait_for_threads_of_its_parent():

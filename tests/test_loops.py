@@ -53,6 +53,7 @@ def test_simple_loops(number):
     check()
 
 
+@pytest.mark.slow
 @coordinates
 def test_contacts_agree_with_exact_arithmetic(number):
     @given(
@@ -77,6 +78,7 @@ def test_contacts_agree_with_exact_arithmetic(number):
     check()
 
 
+@pytest.mark.slow
 @coordinates
 def test_signs_of_triangles(number):
     @given(st.lists(st.tuples(number, number), min_size=3, max_size=6), st.data())
@@ -127,6 +129,7 @@ def test_floating_point_decides_all_pairs_of_segments_on_a_lattice(rng, monkeypa
         assert doubtful_pairs(places, tails, heads, starts, pairs[1:]) == -1
 
 
+@pytest.mark.slow
 def test_a_loop_with_more_uncertain_pairs_than_edges():
     """All vertices at one point, on one line, and beside a simple loop."""
     around = np.exp(2j * np.pi * np.arange(400) / 400)
@@ -141,6 +144,7 @@ def test_a_loop_with_more_uncertain_pairs_than_edges():
     assert not found.complete
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [3, 30])
 def test_contacts_in_several_portions_up_to_a_limit(size, rng, monkeypatch):
     """On a small lattice there are more uncertain pairs than segments, on a large one fewer."""
@@ -162,6 +166,7 @@ def test_contacts_in_several_portions_up_to_a_limit(size, rng, monkeypatch):
             assert found.relation.dtype == np.int8
 
 
+@pytest.mark.slow
 def test_simple_loops_in_several_portions(rng, monkeypatch):
     """Many loops, and one of them may have all the contacts of the first portion."""
     monkeypatch.setattr("quasiharmonic.geometry.exact.predicates.PAIR_CHUNK", 20)

@@ -48,6 +48,7 @@ def test_the_boundary_gets_the_named_outline(qhm, text):
     assert np.array_equal(io.map_of(written)[fixed], target)
 
 
+@pytest.mark.slow
 def test_outlines_from_files_may_have_holes(qhm, tmp_path):
     (tmp_path / "o.svg").write_text('<svg><path d="M0 0h4v3h-4zm1 1h1v1h-1z" fill-rule="evenodd"/></svg>')
     (tmp_path / "o.txt").write_text("0 0\n4 0\n4 3\n0 3\n\n1 1\n2 1\n2 2\n1 2\n")
@@ -57,6 +58,7 @@ def test_outlines_from_files_may_have_holes(qhm, tmp_path):
         assert facts["bijective"]
 
 
+@pytest.mark.slow
 def test_to_with_corners(qhm):
     V, F = surfaces.cat(12)
     loop = boundary_loops(F, len(V))[0].tolist()
@@ -67,6 +69,7 @@ def test_to_with_corners(qhm):
     assert io.map_of(io.read_mesh(qhm.out))[[a, b]].tolist() == [[2, 0], [1.5, 1]]
 
 
+@pytest.mark.slow
 def test_to_edge_by_edge_from_a_file(qhm, tmp_path):
     V, F = surfaces.cat(12)
     loop = boundary_loops(F, len(V))[0]
@@ -107,6 +110,7 @@ def groups(path):
     return found, np.array([line.split()[1:] for line in lines if line.startswith("v ")], dtype=float)
 
 
+@pytest.mark.slow
 def test_cut_and_refined_files_keep_groups_and_colours(tmp_path):
     V, F = torus()
     grouped(tmp_path / "in.obj", V, F)
@@ -124,6 +128,7 @@ def test_cut_and_refined_files_keep_groups_and_colours(tmp_path):
         assert area(vertices[:, :3], np.array(found[part])) == pytest.approx(area(V, before))
 
 
+@pytest.mark.slow
 def test_holes_missing_in_the_outline_are_filled(qhm):
     status, facts, said = qhm(surfaces.cat(12), "--to", "letter:B", "--font", "DejaVu Sans")
     assert status == 0
@@ -131,6 +136,7 @@ def test_holes_missing_in_the_outline_are_filled(qhm):
     assert "the surface has no hole, so the 2 holes of letter:B are filled" in said
 
 
+@pytest.mark.slow
 def test_to_a_word(qhm):
     pytest.importorskip("shapely")
     assert qhm(surfaces.cat(20), "--to", "word:QH")[0] == 0
@@ -173,6 +179,7 @@ def test_refine_without_to(tmp_path, capsys):
     np.testing.assert_array_equal(io.map_of(io.read_mesh(tmp_path / "out.obj"))[fixed], uv[fixed])
 
 
+@pytest.mark.slow
 def test_closed_surfaces(qhm):
     status, _, said = qhm(torus(), "--to", "disk")
     assert status == 2
@@ -247,6 +254,7 @@ def test_calls_that_cannot_be_read(qhm, options):
     assert stop.value.code == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("character", "AGHPRS")
 def test_letters_of_the_paper(character, tmp_path):
     """A curved surface on each letter, by this option alone."""

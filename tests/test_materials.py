@@ -103,6 +103,7 @@ def test_a_missing_library_keeps_its_name(tmp_path):
     assert (tmp_path / "x.obj").read_text().startswith("mtllib  gone.mtl here.mtl\n")
 
 
+@pytest.mark.slow
 def test_a_written_obj_refers_to_its_image(tmp_path, qhm):
     trimesh = pytest.importorskip("trimesh", reason="an independent reader of OBJ and its materials")
     picture = gradient(tmp_path / "photo.png")
@@ -224,6 +225,7 @@ def test_files_written_with_an_obj_replace_no_other_files(tmp_path, qhm):
     assert ".ply files cannot store an image; supported: .obj, .glb, .gltf" in told
 
 
+@pytest.mark.slow
 def test_commands_from_format_to_format(tmp_path, qhm):
     """An STL is flattened into a GLB, which is certified in single precision; lost data is reported first."""
     trimesh = pytest.importorskip("trimesh", reason="an independent writer of STL")
@@ -259,6 +261,7 @@ def test_seams_cannot_be_written_to_an_off_file(tmp_path, qhm):
     assert not (tmp_path / "out.off").exists()
 
 
+@pytest.mark.slow
 def test_a_model_is_drawn_with_its_own_texture(tmp_path, qhm):
     V, F = cat(4)
     texture = io.read_texture(gradient(tmp_path / "photo.png"))

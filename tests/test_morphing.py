@@ -32,6 +32,7 @@ def test_quality_of_known_triangles():
         assert mean_ratio(points * unit, F) == pytest.approx([1, np.sqrt(3) / 2, -1, 0])
 
 
+@pytest.mark.slow
 def test_a_deep_dent_stays_valid_where_springs_invert_triangles():
     points, F = surfaces.grid(16, 16)
     moved, positions = dented(points, 0.9)

@@ -89,6 +89,7 @@ def test_a_step_is_newtons_for_the_new_boundary():
     assert errors[1] < 0.3 * errors[0]
 
 
+@pytest.mark.slow
 def test_vertices_slide_along_walls(ring):
     points, F, walls, hole = ring
     held, gliding = (MovingMesh(points, F, hole, slide=slide) for slide in (False, True))
@@ -105,6 +106,7 @@ def test_vertices_slide_along_walls(ring):
     assert mean_ratio(there, F).min() > 1.2 * mean_ratio(held.points, F).min()
 
 
+@pytest.mark.slow
 def test_curved_walls_do_not_change():
     """A round wall: vertices that slide along the polygon of the first mesh never cut its corners."""
     points, F = disk(8)

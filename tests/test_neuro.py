@@ -65,6 +65,7 @@ def test_a_patch_is_flattened_by_the_command(tmp_path, capsys):
     assert main(["check", str(flat)]) == 0
 
 
+@pytest.mark.slow
 def test_a_patch_needs_its_surface(tmp_path, capsys):
     sphere_with_patch(tmp_path)
     patch = tmp_path / "lh.half.patch.3d"
@@ -85,6 +86,7 @@ def test_a_patch_needs_its_surface(tmp_path, capsys):
         io.read_patch(patch, small)
 
 
+@pytest.mark.slow
 def test_a_closed_surface_is_cut_where_vertices_are_left_out(tmp_path, capsys):
     _, F, _ = sphere_with_patch(tmp_path)
     assert main(["flatten", str(tmp_path / "lh.inflated"), "-o", str(tmp_path / "lh.flat.gii")]) == 2

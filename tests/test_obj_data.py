@@ -119,6 +119,7 @@ def test_long_runs_of_faces_are_written_in_order(tmp_path):
     assert both_readers_agree(tmp_path / "out.obj")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(arrays(np.float64, (4, 3), elements=finite), arrays(np.float64, (4, 2), elements=finite))
 def test_every_double_is_preserved(tmp_path_factory, V, uv):

@@ -94,6 +94,7 @@ for index in (b"2147483648", b"-2147483648", b"999999999999999999"):
     assert len(done.stdout.splitlines()) == 5 + 12
 
 
+@pytest.mark.slow
 def test_import_is_light():
     script = "import sys, quasiharmonic.io; print(*sorted({m.split('.')[0] for m in sys.modules}))"
     done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True)

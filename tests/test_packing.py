@@ -139,6 +139,7 @@ def test_the_unit_of_length_does_not_matter(scale, six):
     assert found.texels_per_unit * scale == pytest.approx(wanted.texels_per_unit)
 
 
+@pytest.mark.slow
 def test_a_given_density_is_kept():
     charts = grids(6)
     largest = pack_charts(charts, resolution=512).texels_per_unit
@@ -152,6 +153,7 @@ def test_a_given_density_is_kept():
     check(charts, pack_charts(charts, resolution=sufficient, texels_per_unit=3 * largest), [sufficient] * 2, 4)
 
 
+@pytest.mark.slow
 def test_several_tiles():
     charts = grids(12)
     packing = pack_charts(charts, resolution=256, tiles=12)
@@ -163,6 +165,7 @@ def test_several_tiles():
         assert (np.floor(uv) == [placement.tile % 10, placement.tile // 10]).all()
 
 
+@pytest.mark.slow
 def test_congruent_charts_share_their_position():
     V, F = surfaces.disk(4)
     V = V[:, :2] * [1, 0.5] + 0.1 * V[:, :2] ** 2

@@ -65,6 +65,7 @@ def test_map_is_red_only_where_it_is_inverted(planar):
     assert red(image).sum() > 100
 
 
+@pytest.mark.slow
 def test_inverted_triangles_can_be_given(planar):
     V, F, _ = planar
     one = red(pixels(plot_map(V, F, V, inverted=[17]).figure))
@@ -75,6 +76,7 @@ def test_inverted_triangles_can_be_given(planar):
     assert not red(pixels(plot_map(V, F, planar[2], inverted=[]).figure)).any()
 
 
+@pytest.mark.slow
 def test_triangles_too_small_to_be_visible_are_marked():
     V, F = surfaces.grid(40, 40)
     uv = V.copy()
@@ -87,6 +89,7 @@ def test_triangles_too_small_to_be_visible_are_marked():
     assert flips(F, uv).sum() >= 8
 
 
+@pytest.mark.slow
 def test_interior_pins_are_drawn_and_boundary_vertices_are_not(planar):
     V, F, _ = planar
     boundary = np.arange(int(np.unique(F).size ** 0.5))[:5]
@@ -103,6 +106,7 @@ def test_before_after(planar):
     assert not image[:, 450:].any()
 
 
+@pytest.mark.slow
 def test_saved_figure_has_three_panels_or_two(planar, tmp_path):
     V, F, folded = planar
     save_map_figure(tmp_path / "three.png", V, F, V, folded)
@@ -119,6 +123,7 @@ def test_saved_figure_has_three_panels_or_two(planar, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["three.png", "two.png"]
 
 
+@pytest.mark.slow
 def test_given_inverted_triangles_are_marked_on_the_map_only(planar, tmp_path):
     V, F, folded = planar
     save_map_figure(tmp_path / "map.png", V, F, V, folded, inverted=[3], fixed=[0])
@@ -127,6 +132,7 @@ def test_given_inverted_triangles_are_marked_on_the_map_only(planar, tmp_path):
     assert columns[800:].any()
 
 
+@pytest.mark.slow
 def test_the_surface_hides_what_is_behind():
     V, F = surfaces.cat(16)
     seen = view(V, F)
@@ -200,6 +206,7 @@ def test_distortion_shows_inverted_triangles(planar):
     assert tuple(LABELS) == MEASURES
 
 
+@pytest.mark.slow
 def test_the_histogram_of_distortion_contains_the_whole_area(planar):
     V, F, _ = planar
     bars = plot_distortion(V, F, V * (3, 1), "conformal").axes[2]
@@ -226,6 +233,7 @@ def test_colour_bars_have_labels(planar, measure):
     assert len(bar.patches) == (2 if measure in ("sigma1", "sigma2", "area_ratio") else 1)
 
 
+@pytest.mark.slow
 def test_distortion_of_flat_triangles_and_without_values():
     V, F = np.array([[0, 0], [1, 0], [2, 0], [0, 1.0]]), np.array([[0, 1, 2], [0, 1, 3]])
     uv = np.array([[0, 0], [1, 0], [2, 0.5], [0, 1.0]])
@@ -272,6 +280,7 @@ def test_texture_shows_the_closer_of_two_sheets():
     assert np.abs(both[middle] - both[300, 300, :3]).max() < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
 def test_animation(planar, tmp_path, suffix):
     V, F, folded = planar
@@ -295,6 +304,7 @@ def test_animation(planar, tmp_path, suffix):
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.slow
 def test_an_animation_shows_every_frame_completely(planar, tmp_path):
     """One frame leaves the window of the first, and only a frame in the middle has inverted triangles."""
     V, F, folded = planar
@@ -317,6 +327,7 @@ def test_an_animation_shows_every_frame_completely(planar, tmp_path):
     assert durations == [30, 40, 30, 30 + 1000]
 
 
+@pytest.mark.slow
 def test_settings_of_matplotlib_do_not_change_the_size(planar, tmp_path):
     V, F, _ = planar
     with rc_context({"savefig.dpi": 30, "savefig.bbox": "tight"}):

@@ -145,6 +145,7 @@ def test_invalid_ply(data, message, tmp_path):
         io.read_mesh(path)
 
 
+@pytest.mark.slow
 def test_stl_vertices_are_merged(tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="an independent writer of STL")
     V, F = cat(6)
@@ -200,6 +201,7 @@ def with_floats(data):
     return text + np.hstack([data, data[:, :2], data]).tobytes() + faces
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "order", "data"),
     [

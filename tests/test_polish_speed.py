@@ -34,6 +34,7 @@ def test_near_is_the_first_step_within_two_per_cent():
     assert run.near(1.0) is None
 
 
+@pytest.mark.slow
 def test_tables(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(phases, "clock", phases.clock)  # the script changes this
     polish_speed.main(["--triangles", "500", "-r", "1", "--solvers", "superlu", "-o", str(tmp_path / "table.md")])

@@ -48,6 +48,7 @@ def test_file_names_are_valid_everywhere(folder):
     assert not [name for name in names if devices.search(name) or re.search(r'[<>:"\\|?*]|[. ](/|$)', name)]
 
 
+@pytest.mark.slow
 def test_no_type_of_system_dependent_size():
     assert SIZED_BY_THE_SYSTEM.search("np.zeros(3, dtype=int)")
     assert not SIZED_BY_THE_SYSTEM.search("np.zeros(3, dtype=np.int64)")

@@ -40,6 +40,7 @@ lattice = st.integers(-3, 3).map(float)
 point_of = {name: st.tuples(x, x) for name, x in (("any", any_float), ("sparse", sparse_float), ("lattice", lattice))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", point_of)
 def test_orientation_is_exact_for_all_doubles(kind):
     @given(st.lists(st.tuples(*[point_of[kind]] * 3), min_size=1, max_size=20))
@@ -50,6 +51,7 @@ def test_orientation_is_exact_for_all_doubles(kind):
     check()
 
 
+@pytest.mark.slow
 @given(
     st.tuples(any_float, any_float, any_float, any_float),
     st.floats(0, 1),
@@ -76,6 +78,7 @@ def test_orientation_at_any_scale(rng, scale, offset):
     agrees(a, b, rng.permutation(c))
 
 
+@pytest.mark.slow
 def test_orientation_where_every_stage_is_needed(rng):
     size = 3000
     exponents = rng.integers(-430, 500, (3, size, 2)) * rng.integers(0, 2, (3, size, 2))
@@ -150,6 +153,7 @@ def test_signs_that_floating_point_is_sure_of_are_exact(rng, scale):
     assert [int(sure_orientation(*corners[k])) for k in ([0, 1, 2], [2, 0, 1], [0, 2, 1])] == [1, 1, -1]
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_exactly_collinear_triples(rng):
     x = rng.random((3, 100_000)) + 0.1
     # With a slope of one and no rounding, the points lie on the diagonal, even with inexact differences.
@@ -236,6 +240,7 @@ def test_twice_the_area_has_48_bits_even_if_triangles_are_thin(rng):
 lattice_segments = st.lists(st.tuples(*[st.tuples(st.integers(0, 4), st.integers(0, 4))] * 4), min_size=1, max_size=30)
 
 
+@pytest.mark.slow
 @given(lattice_segments, st.sampled_from([1.0, 0.1, 1e-200, 1e299, 5e-324]), st.sampled_from([0.0, 1e8]))
 @examples(50)
 def test_segment_relation_is_exact(segments, scale, offset):
@@ -272,6 +277,7 @@ def test_box_pairs_within_groups(rng, starts, least):
     assert len(meeting) >= least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_are_those_that_intersect(rng, monkeypatch, chunk):
     monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
@@ -289,6 +295,7 @@ def test_box_pairs_are_those_that_intersect(rng, monkeypatch, chunk):
         assert set(found) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_between_two_groups(rng, monkeypatch, chunk):
     monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)

@@ -153,6 +153,7 @@ class TestTopology:
         assert [2, 0] in found.boundary.tolist()
         assert edges(np.array([[0, 1, 2], [0, 1, 3]]), 4).inconsistent.tolist() == [[0, 1]]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("loaded", [True, False])
     def test_edges_of_many_triangles_agree_with_a_dictionary(self, loaded, monkeypatch, rng):
         """For both sorting methods, also if the triangles are not a surface."""

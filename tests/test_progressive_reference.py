@@ -78,6 +78,7 @@ def test_no_reference_if_rest_is_close():
     assert reference_energy(energy, energy.deform(in_units(uv, 0))) is None
 
 
+@pytest.mark.slow
 def test_it_takes_a_fraction_of_newtons_steps(monkeypatch):
     V, F, uv, fixed = shrunken(8)
     seen = []

@@ -46,6 +46,7 @@ def test_recording_changes_nothing_and_is_off_by_default():
     assert plain.history == recorded.history
 
 
+@pytest.mark.slow
 def test_counting_continues_through_the_stages():
     stages = [VectorAdam(iterations=4), Newton(iterations=6, resume=True)]
     result = solve(Problem(*turned_ring()), strategy=stages, record_every=1)

@@ -37,6 +37,7 @@ def test_the_given_mesh_comes_first():
     assert np.array_equal(result.uv, injective_map(V, F, loop, V[loop] * [2, 1]).uv)
 
 
+@pytest.mark.slow
 def test_the_construction_precedes_the_whole_search():
     """If it adds no vertex, refinement ends with a map of the given mesh after the first stages."""
     haste = [VectorAdam(iterations=1), Newton()]
@@ -50,6 +51,7 @@ def test_the_construction_precedes_the_whole_search():
     assert [stage.name for stage in result.stages] == [haste[0].name, "constructed"]
 
 
+@pytest.mark.slow
 def test_vertices_are_added_if_there_is_no_map_without_them():
     V, F, fixed, target = chevron()
     assert injective_map(V, F, fixed, target).status is Status.IMPOSSIBLE
@@ -69,6 +71,7 @@ def test_vertices_are_added_if_there_is_no_map_without_them():
     assert "refinement_attempts" not in injective_map(V, F, fixed, target).to_dict()
 
 
+@pytest.mark.slow
 def test_the_refined_mesh_is_polished():
     V, F, fixed, target = chevron()
     result = injective_map(V, F, fixed, target, refine=True, polish="symmetric-dirichlet")
@@ -123,6 +126,7 @@ def test_too_many_splits_are_reported(monkeypatch):
     assert np.array_equal(result.F, problem.F)
 
 
+@pytest.mark.slow
 def test_targets_that_cross_themselves_are_not_refined():
     """No refinement solves such a target, and the result is about the given mesh."""
     V, F = disk(3)
@@ -136,6 +140,7 @@ def test_targets_that_cross_themselves_are_not_refined():
     assert result.diagnosis.forbids_injective
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_any_attempt():
     """The returned map fits its own mesh, whenever the search is stopped."""
     V, F, fixed, target = chevron()
@@ -159,6 +164,7 @@ def interrupting(*_):
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_no_restarts_after_a_constructed_map(monkeypatch):
     """Quick stages, then the construction, then the whole search with a time limit and without random restarts."""
     problem, searches = onto_polygon(9, "grid"), []
@@ -204,6 +210,7 @@ class TestCtrlCWithAMapInHand:
         assert np.array_equal(result.uv[problem.fixed], problem.target)
         assert [(rung.name, rung.added) for rung in result.refinement_attempts[-1:]] == [("constructed", result.added)]
 
+    @pytest.mark.slow
     def test_after_the_construction(self):
         problem, first = onto_polygon(9, "grid"), []
 
@@ -241,6 +248,7 @@ def test_an_invalid_energy_is_named_for_sliding_vertices():
         solve(Problem(V, F, fixed, target), refine=True, slide=True)
 
 
+@pytest.mark.slow
 def test_the_command_uses_the_same_refinement(tmp_path, capsys):
     V, F, fixed, target = chevron()
     uv = target

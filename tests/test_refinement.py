@@ -154,6 +154,7 @@ def refined_problem(name):
     return refine_problem(OBSTRUCTED[name][0])
 
 
+@pytest.mark.slow
 def test_refining_the_named_edges_leaves_only_obstructions_that_no_refinement_removes():
     incurable = {"COLLAPSED_EDGE", "PIN", "NESTING", "NEGATIVE_WINDING", "TURNING_NUMBER", "CROSSING"}
     rounds = {name: refined_problem(name).rounds for name in OBSTRUCTED}
@@ -200,6 +201,7 @@ def test_problems_are_refined_until_no_obstruction_is_named():
     assert most >= 2
 
 
+@pytest.mark.slow
 def test_rounds_are_limited():
     problem, _ = next(case for name, case in OBSTRUCTED.items() if refined_problem(name).rounds > 1)
     result = refine_problem(problem, max_rounds=1)

@@ -47,6 +47,7 @@ def test_a_field_without_folds_is_returned():
     assert "does not fold" in mended.summary()
 
 
+@pytest.mark.slow
 def test_one_fold_is_repaired_and_the_rest_does_not_change():
     field = wobble(50, 60, 10) + bump(50, 60, 30, 25, 2.5, (6, 1))
     kept = field.copy()
@@ -74,6 +75,7 @@ def test_one_fold_is_repaired_and_the_rest_does_not_change():
     assert apart < 0.5 * np.sqrt(((smooth - field) ** 2).sum(axis=2).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("push", [(2.4, 0.3), (-0.9, 2.2)])
 def test_other_methods_find_no_nearer_field(push):
     field = bump(7, 7, 3.1, 2.9, 1.1, push)
@@ -116,6 +118,7 @@ def test_a_fold_that_one_diagonal_does_not_detect():
     assert fold_free(nearest_invertible(field).field).all()
 
 
+@pytest.mark.slow
 def test_fixed_pixels_do_not_move():
     field = bump(24, 24, 3, 12, 2.0, (-4, 2))
     border = np.ones((24, 24), dtype=bool)
@@ -133,6 +136,7 @@ def test_fixed_pixels_do_not_move():
         nearest_invertible(swapped, fixed=np.hypot(swapped[..., 0], swapped[..., 1]) > 0)
 
 
+@pytest.mark.slow
 def test_the_unit_of_length_does_not_matter():
     field = bump(30, 30, 15, 15, 2.0, (5, 2))
     one, other = nearest_invertible(field), nearest_invertible(4 * field, spacing=4)
@@ -142,6 +146,7 @@ def test_the_unit_of_length_does_not_matter():
     assert fold_free(stretched.field, spacing=(0.5, 2)).all()
 
 
+@pytest.mark.slow
 def test_noise_with_a_large_offset_is_repaired_in_double_precision():
     field = np.random.default_rng(3).normal(size=(14, 15, 2)) * 0.3 + 1e6
     assert not fold_free(field, spacing=0.1).all()

@@ -114,6 +114,7 @@ def test_batched_problems_are_solved_as_if_alone(rng):
         np.testing.assert_allclose(together[starts[k] : starts[k + 1]], alone, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_any_number_of_vertices_with_any_neighbours(rng):
     """In large batches, vertices with five triangles around them are placed separately from those with ten."""
     meshes = [random_delaunay(60, seed=n) for n in range(25)]
@@ -153,6 +154,7 @@ class TestInDescent:
         cases = [problems.make(*problems.parse(name), triangles=400) for name in self.NAMES]
         return [Problem(case.V, case.F, case.fixed, case.target) for case in cases]
 
+    @pytest.mark.slow
     def test_a_descent_ends_sooner_with_the_tensors_of_its_map(self):
         fewer = 0
         for problem in self.made():
@@ -165,6 +167,7 @@ class TestInDescent:
             np.testing.assert_allclose(quasi_harmonic_map(problem, helped.mu), helped.uv, atol=1e-8)
         assert fewer >= 2
 
+    @pytest.mark.slow
     def test_batched_descents_agree_with_single_ones(self):
         for problem, together in zip(self.made(), injective_maps(self.made()), strict=True):
             alone = solve(problem)

@@ -50,6 +50,7 @@ class TestRepair:
             with pytest.raises(ValueError, match=message):
                 repair(V, F, start, fixed=wrong)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("count", "scale"), [(1, 0.4), (12, 0.05), (12, 0.4), (120, 0.05)])
     def test_only_displaced_vertices_move(self, count, scale):
         V, F = random_delaunay(400, seed=2)
@@ -68,6 +69,7 @@ class TestRepair:
         assert len(np.setdiff1d(result.moved_vertices, pushed)) <= count // 20
         assert np.array_equal(result.FT, F)
 
+    @pytest.mark.slow
     def test_no_vertex_moves_without_need(self):
         V, F = random_delaunay(400, seed=2)
         start, _ = damaged(V, inner_rows(F), 30, 0.1)
@@ -120,6 +122,7 @@ class TestRepair:
         changed = np.flatnonzero((result.uv != start).any(axis=1))
         assert np.array_equal(changed, inner_rows(FT, strip == 1))
 
+    @pytest.mark.slow
     def test_texture_coordinates_per_corner(self):
         V, F = random_delaunay(100, seed=2)
         start, _ = damaged(V, inner_rows(F), 5, 0.2)
@@ -184,6 +187,7 @@ class TestRepair:
         assert result.islands[0].bijective
         assert np.array_equal(result.uv[boundary_of(F)], V[boundary_of(F)])
 
+    @pytest.mark.slow
     def test_boundary_that_crosses_itself(self):
         """A map without inverted triangles exists and is found; its overlap is reported."""
         V, F = grid(60, 4)
@@ -377,6 +381,7 @@ class TestCommand:
         assert run("repair", uv_file, "-o", uv_file) == 0
         assert uv_file.read_bytes() == repaired
 
+    @pytest.mark.slow
     def test_check_agrees_where_there_are_no_seams(self, tmp_path, capsys):
         V, F = random_delaunay(200, seed=2)
         start, _ = damaged(V, inner_rows(F), 10, 0.2)

@@ -94,6 +94,7 @@ def test_discarded_stages_do_not_change_the_energy(surface):
     assert result.energy == result.history[0].energy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", [qh.polish, qh.harmonise])
 def test_the_boundary_is_fixed_by_default(surface, solved, call):
     V, F, loop = surface
@@ -150,6 +151,7 @@ def test_a_missing_or_interrupted_frame_fails_an_animation(surface):
     assert not replace(complete, interrupted=True)
 
 
+@pytest.mark.slow
 def test_an_atlas_is_a_success_if_all_islands_are(surface):
     V, F, _ = surface
     two = SeamedMesh(np.concatenate([V, V + 5]), np.concatenate([F, F + len(V)]))
@@ -178,6 +180,7 @@ def test_repairs_and_morphs_have_success_and_message(surface, solved):
     assert not qh.morph(flat, G, rim, flat[rim[::-1]])
 
 
+@pytest.mark.slow
 def test_distortion_converts_to_a_dataframe(surface, solved, tmp_path):
     V, F, _ = surface
     measured = distortion(V, F, solved.uv)

@@ -64,6 +64,7 @@ def test_is_not_made_without_a_positive_definite_laplacian():
     assert RotationPath.of(F, ENERGY.g, len(V) + 1, FIXED) is None
 
 
+@pytest.mark.slow
 def test_a_coil_is_unrolled_in_few_steps():
     square, F = grid(400, 2)
     angle = 20 * square[:, 0]

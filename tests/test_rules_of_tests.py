@@ -80,6 +80,7 @@ def facts(path):
     return [module for module, _ in imports(nodes)], list(private_names(nodes)), list(optional_packages(nodes))
 
 
+@pytest.mark.slow
 def test_no_file_is_long():
     lines = {path.name: path.read_text(encoding="utf-8").count("\n") for path in MODULES}
     assert not {name: count for name, count in lines.items() if count > MAX_LINES}, "split it by behaviour"
@@ -119,6 +120,7 @@ def test_files_named_in_scripts_exist():
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
 
 
+@pytest.mark.slow
 def test_packages_that_tests_skip_without_are_installed_somewhere():
     """Every package is required, is part of an extra that `.ci/test` installs, or is installed by `.ci/optional`."""
     wanted = {package for path in MODULES for package in facts(path)[2]}

@@ -82,6 +82,7 @@ def test_the_frame_has_the_given_distance():
         assert np.all(frame.max(0) <= np.asarray(high) + 1.5 * longer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [1e-2, 1e-4, 1e-6, 1e-9])
 def test_thin_gaps_are_filled(gap, way):
     F, uv = blocks(gap)

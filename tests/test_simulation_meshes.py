@@ -52,6 +52,7 @@ def test_small_steps_end_like_one_large_step(flap):
     assert np.abs(careless - whole.points).max() > 100 * away
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slide", [False, True])
 def test_a_closed_path_returns_to_the_start(flap, slide):
     points, F, body = flap
@@ -64,6 +65,7 @@ def test_a_closed_path_returns_to_the_start(flap, slide):
         assert np.abs(here - points).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["quadrilaterals", "second order"])
 def test_chains_of_other_elements_return_to_the_start(flap, kind):
     if kind == "quadrilaterals":
@@ -135,6 +137,7 @@ def test_quadrilaterals_stay_convex(depth, waves):
     assert not inverted_elements(F, morphed.points).size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slide", [False, True])
 def test_both_diagonals_are_checked(slide):
     points, F, body = channel(16)
@@ -183,6 +186,7 @@ def test_quadrilaterals_inverted_by_the_boundary_are_named():
     assert json.loads(json.dumps(morphed.to_dict()))["forbidden"] == [35]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [surfaces.grid, quadrilaterals, lambda n, m: second_order(*surfaces.grid(n, m))], ids=["3", "4", "6"]
 )
@@ -236,6 +240,7 @@ def test_mid_side_nodes_follow_straight_sides(flap):
     assert np.array_equal(morphed.points[still], flat[still])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mirror", [False, True])
 def test_sides_bend_where_a_curved_boundary_requires_it(mirror):
     points, F = second_order(*surfaces.grid(8, 8))
@@ -274,6 +279,7 @@ def test_a_bent_mesh_keeps_its_shape():
     assert np.abs(whole.points - turned(points, 90)).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_elements_that_remain_inverted_are_reported():
     points, F = second_order(*surfaces.grid(4, 4))
     # A mid-side node at three quarters of its side inverts the element at an end, wherever the others move.
@@ -297,6 +303,7 @@ def test_failed_repair_causes_no_warning():
     assert morphed.inverted.tolist() == [k for k, row in enumerate(F) if min_jacobian(morphed.points[row]) <= 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slide", [True, "rails"])
 def test_mid_side_nodes_slide_too(flap, slide):
     points, F = second_order(*flap[:2])

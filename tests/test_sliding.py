@@ -40,6 +40,7 @@ def slid(text):
 # Results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("character", ["G", "S", *(pytest.param(c, marks=pytest.mark.nightly) for c in "PH")])
 def test_a_letter_is_better_with_its_boundary_sliding(character):
     (V, F, fixed, target, curves), result = slid(f"letter:{character}")
@@ -90,6 +91,7 @@ def test_a_word_slides_along_the_curves_of_its_letters():
     assert np.isin(held @ (1, 1j), places @ (1, 1j)).all()
 
 
+@pytest.mark.slow
 def test_a_boundary_on_a_circle_rotates_back():
     V, F, uv, loop = turned()
     held = polish(V, F, uv, fixed=loop)
@@ -135,6 +137,7 @@ def test_vertices_slide_across_small_bends():
     assert result.certificate.bijective
 
 
+@pytest.mark.slow
 def test_vertices_stop_at_bends():
     """The surface extends beyond the polygon's bends, so vertices are pushed into them, exactly."""
     V, F = surfaces.disk(6)
@@ -152,6 +155,7 @@ def test_vertices_stop_at_bends():
     assert sum(tuple(p) in at for p in polygon.position(polygon.corners(1.0)).tolist()) == 18
 
 
+@pytest.mark.slow
 def test_an_edge_does_not_cut_off_a_bend():
     """A curved letter with few vertices: without bounds, the last two jump across, for a lower energy."""
     (_, _, fixed, target, curves), result = slid("letter:S")
@@ -166,6 +170,7 @@ def test_an_edge_does_not_cut_off_a_bend():
     assert strays(result.uv) < 1.5 * strays(start)
 
 
+@pytest.mark.slow
 def test_holes_slide_independently():
     V, F = surfaces.annulus(12)
     outer, inner = sorted(boundary_loops(F, len(V)), key=lambda loop: -np.abs(V[loop]).max())

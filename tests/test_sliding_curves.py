@@ -118,6 +118,7 @@ def test_coincident_handles_have_a_direction():
     assert curve.corners(20.0).size == 2
 
 
+@pytest.mark.slow
 def test_nearest_points(rng):
     for curve in (Curve(MIXED), Curve.circle(0.7, (3, 1)), *outline_curves("letter:R")):
         s = np.sort(rng.random(300)) * curve.length
@@ -171,6 +172,7 @@ def test_malformed_polygons():
         Curve.polyline([(0, 0), (np.nan, 0)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["letter:G", "letter:R", "letter:@", "disk", "ellipse:2x1", "ring:0.5", "star:5"])
 def test_outlines_lie_on_their_curves(text):
     curves = outline_curves(text)
@@ -187,6 +189,7 @@ LONG_WORDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["QH", "G", "R8", *LONG_WORDS])
 def test_a_word_follows_the_curves_of_its_letters(text):
     pytest.importorskip("shapely")
@@ -208,6 +211,7 @@ def test_a_word_follows_the_curves_of_its_letters(text):
     assert away[left].max() < 1e-14
 
 
+@pytest.mark.slow
 def test_letters_of_a_word_meet_where_their_curves_do():
     pytest.importorskip("shapely")
     (outer,) = sorted(outline_curves("word:OO"), key=lambda curve: -curve.length)[:1]
@@ -220,6 +224,7 @@ def test_letters_of_a_word_meet_where_their_curves_do():
     assert ring.nearest(corners - (right[0] - right[1], 0))[1].max() < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("curve", [Curve(MIXED), Curve.circle(2.0), Curve([*MIXED[:2]])])
 def test_a_section_is_a_part_of_its_curve(curve, rng):
     for start, end in np.sort(rng.random((20, 2)), axis=1) * curve.length:

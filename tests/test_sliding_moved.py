@@ -35,6 +35,7 @@ def channel(n=14):
     return V, F, walls, body, turn
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slide", [True, BoundaryCurves([np.array(SQUARE) * 2.0 - 1])])
 def test_a_rotated_body_moves_the_wall_vertices(slide):
     V, F, walls, body, turn = channel()
@@ -59,6 +60,7 @@ def test_a_rotated_body_moves_the_wall_vertices(slide):
             assert (np.diff(sliding.points[run, 1 - axis]) > 0).all()
 
 
+@pytest.mark.slow
 def test_moved_vertices_slide_on_given_curves():
     V, F, _, body, turn = channel()
     square = points_of(z_of(np.array(SQUARE) * 1.2 - 0.6) * np.exp(0.5j))
@@ -179,6 +181,7 @@ def test_a_map_that_overlaps_itself_may_slide():
 # The command
 
 
+@pytest.mark.slow
 def test_map_slides(tmp_path):
     V, F = surfaces.random_delaunay(150, seed=2)
     _write(tmp_path / "in.obj", lift(V), F)
@@ -217,6 +220,7 @@ def test_errors_of_the_command(tmp_path, capsys):
     assert "add --slide" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_command_names_vertices_off_the_outline(tmp_path, capsys):
     V, F = surfaces.disk(6)
     source = tmp_path / "in.obj"
@@ -235,6 +239,7 @@ def test_the_command_names_vertices_off_the_outline(tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_vertices_have_given_sides(tmp_path, capsys):
     V, F = surfaces.grid(10, 10)
     # With the diagonal before the corner (1, 0) flipped, there is space beside it for the next vertex of the right
@@ -282,6 +287,7 @@ def test_vertices_have_given_sides(tmp_path, capsys):
     assert "cannot be read" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_morph_slides(tmp_path):
     V, F, walls, body, turn = channel(10)
     shift = np.zeros((len(V), 3))

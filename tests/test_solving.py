@@ -32,6 +32,7 @@ class TestFinds:
         assert result.n_iterations == len(result.history) - 1 == sum(s.n_iterations for s in result.stages)
         assert result.linear_solver in quasiharmonic.linsolve.available()
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("degrees", [90, 180, -135])
     def test_turned_rings(self, degrees):
         V, F, fixed, target = turned_ring(degrees)
@@ -60,6 +61,7 @@ class TestFinds:
         assert result.injective
         assert result.uv[middle].tolist() == [0.2, 0.5]
 
+    @pytest.mark.slow
     def test_two_regions_swapped(self):
         """Small regional handles in place of points (§10.3)."""
         V, F = grid(24, 24)
@@ -71,12 +73,14 @@ class TestFinds:
         assert len(fixed) > len(rim) + 8
         assert result.injective
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("functional", ["neumann", "sobolev", "dirichlet"])
     def test_every_functional_turns_the_ring(self, functional):
         """Figure 6 for an eighth of a turn, by the functional's own descent alone."""
         stages = [VectorAdam(functional=functional, iterations=400)]
         assert injective_map(*turned_ring(45), strategy=stages).injective
 
+    @pytest.mark.slow
     def test_ends_close_to_the_least_area_if_no_map_exists(self):
         """Figure 18: the map covers a pin outside the target and little other area."""
         V, F = disk(7)

@@ -39,6 +39,7 @@ class TestNoMap:
         assert len(result.certificate.inverted) > 0
         np.testing.assert_array_equal(result.uv[fixed], target * [1, -1])
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
     @pytest.mark.parametrize("squash", [(0, 0), (1, 0), (1, 1e-200), (1e-300, 1e-300)])
     def test_target_without_area(self, squash, reference):
@@ -49,6 +50,7 @@ class TestNoMap:
             # Any area suffices, if the spacing of doubles around it is fine enough.
             assert result.injective == (squash[1] > 0 and not shift)
 
+    @pytest.mark.slow
     def test_the_map_of_least_area_is_returned(self):
         """On an uneven eight, no map covers less area than its two lobes."""
         V, F = disk(9)
@@ -81,6 +83,7 @@ class TestNoMap:
         assert result.status is Status.IMPOSSIBLE
         assert result.n_iterations < 300
 
+    @pytest.mark.slow
     def test_impossible_pins_are_diagnosed(self):
         """Two pins of one triangle are swapped, so that it is always inverted."""
         V, F = random_delaunay(80, seed=3)
@@ -93,6 +96,7 @@ class TestNoMap:
         named = np.concatenate([o.triangles for o in result.diagnosis.obstructions])
         assert any(np.array_equal(np.sort(F[t]), np.sort(inner)) for t in named)
 
+    @pytest.mark.slow
     def test_stalls_where_no_vertex_moves(self):
         """The alternation stalls at once far from a solution (§7.1)."""
         result = injective_map(*turned_ring(180), strategy=[Alternating(iterations=10**6)])
@@ -164,6 +168,7 @@ class TestNoMap:
             result = solve(problem, strategy=[method()], max_iterations=most)
             assert result.n_iterations <= most
 
+    @pytest.mark.slow
     def test_l_bfgs_counts_iterations_within_a_line_search(self):
         """Where nothing lowers the energy, line searches are long."""
         problem, _ = OBSTRUCTED["chord over a notch"]
@@ -171,6 +176,7 @@ class TestNoMap:
             result = solve(problem, strategy=[LBFGS(iterations=most)])
             assert result.stages[0].n_iterations <= most
 
+    @pytest.mark.slow
     def test_untangling_stops_if_all_vertices_coincide(self, monkeypatch):
         """No ε is far below a determinant of zero."""
         V, F = grid(4, 4)
@@ -394,6 +400,7 @@ def copied():
     return problem, solve(problem), injective_map(*star_problem(n=60))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("again", [lambda x: pickle.loads(pickle.dumps(x)), copy.deepcopy, copy.copy])
 def test_read_only_arrays_stay_read_only_in_copies(again):
     problem, result, found = copied()

@@ -77,6 +77,7 @@ class TestLocalRepair:
         objective, start = self.displaced()
         assert path(LocalRepair(tries=5), objective, start) == [start]
 
+    @pytest.mark.slow
     def test_one_wide_patch_repairs_what_takes_many_narrow_ones(self):
         V, F = grid(80, 80)
         problem = Problem(V, F, boundary_of(F), V[boundary_of(F)])
@@ -185,6 +186,7 @@ class TestRandomRestarts:
         np.testing.assert_array_equal(first.w, again.w)
         assert first.inverted == 0
 
+    @pytest.mark.slow
     def test_untangles_first_if_local_repair_cannot_succeed(self):
         objective = Objective(Problem(*star_problem(depth=0.2, n=1000)))
         seen = path(RandomRestarts(max_failures=3), objective)

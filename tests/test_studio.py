@@ -114,6 +114,7 @@ def test_many_movements_leave_no_extra_memory():
     assert grown < 50_000
 
 
+@pytest.mark.slow
 def test_pins_stay_exactly_at_their_position_and_can_be_dragged():
     one = Visitor()
     one.does("pin", vertex=5)

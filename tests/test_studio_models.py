@@ -12,6 +12,7 @@ from quasiharmonic.ui.studio.session.surface import MAX_TRIANGLES, make_sheet
 from shared.pages import Visitor
 
 
+@pytest.mark.slow
 def test_holes_closed_surfaces_and_planes_are_accepted():
     ring = Visitor(*annulus(8))
     assert ring.last("map").header["bijective"]
@@ -63,6 +64,7 @@ def test_too_many_triangles_are_rejected():
         make_sheet(io.MeshData(V, many, source="big.obj"), "big.obj")
 
 
+@pytest.mark.slow
 def test_several_parts_are_shown_together_and_changed_one_by_one():
     (V, F), (W, G) = cat(6), cat(5)
     one = Visitor(np.concatenate([V, W + 3]), np.concatenate([F, G + len(V)]))
@@ -91,6 +93,7 @@ def test_several_parts_are_shown_together_and_changed_one_by_one():
     assert 0.3 < one.last("map").header["used"] < 1
 
 
+@pytest.mark.slow
 def test_overlapping_islands_are_reported():
     (V, F), (W, G) = cat(6), cat(5)
     one = Visitor(np.concatenate([V, W + 3]), np.concatenate([F, G + len(V)]))
@@ -103,6 +106,7 @@ def test_overlapping_islands_are_reported():
     assert "1 pair overlaps" in shown["verdict"]
 
 
+@pytest.mark.slow
 def test_seams_have_one_number_on_both_sides():
     one = Visitor(*starfish(3, 8))
     seams = one.last("seams")
@@ -136,6 +140,7 @@ def test_seams_are_drawn_along_the_shortest_path_and_erased():
     assert one.last("map").header["count"] == 1
 
 
+@pytest.mark.slow
 def test_a_model_that_is_inside_out_is_recognised_and_turned():
     V, F = starfish(3, 8)
     one = Visitor(V, F[:, ::-1])
@@ -148,6 +153,7 @@ def test_a_model_that_is_inside_out_is_recognised_and_turned():
     assert one.last("map").header["inward"] == 1
 
 
+@pytest.mark.slow
 def test_the_surface_is_shown_before_its_map_and_every_step_reports_progress():
     one = Visitor(*starfish(3, 8))
     kinds = [frame.header["kind"] for frame in one.frames]
@@ -161,6 +167,7 @@ def test_the_surface_is_shown_before_its_map_and_every_step_reports_progress():
     assert {"clean", "cut", "pack", "certify"} <= phases
 
 
+@pytest.mark.slow
 def test_a_large_model_that_must_be_cut_opens_without_a_map(monkeypatch):
     monkeypatch.setattr("quasiharmonic.ui.studio.session.setup.MAX_AUTOMATIC", 100)
     one = Visitor(*starfish(3, 8))

@@ -158,6 +158,7 @@ def draw(one):
     assert one.last("map").header["drawn"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "step"),
     [
@@ -193,6 +194,7 @@ def test_the_command_and_the_script_make_the_map_of_the_page(model, step, opened
     check_repeated(one, tmp_path, monkeypatch)
 
 
+@pytest.mark.slow
 def test_a_map_with_inverted_triangles_is_made_again_too(opened, tmp_path, monkeypatch):
     """A point of the boundary goes across the opposite side, so that one island of two has no map."""
     one = opened("two parts")
@@ -217,6 +219,7 @@ def test_the_final_map_does_not_depend_on_the_path_of_the_drag(opened):
     assert np.array_equal(one.session.state.uv, other.session.state.uv)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "form"),
     [

@@ -87,6 +87,7 @@ def test_pages_are_independent_and_a_crash_ends_only_its_page(running):
     nobody_is_left()
 
 
+@pytest.mark.slow
 def test_a_socket_closed_during_a_drag_leaves_no_process(running):
     with running.page() as page:
         shown = hear(page, "map", state="settled").header
@@ -207,6 +208,7 @@ def first_word(page):
         return closed.rcvd.code
 
 
+@pytest.mark.slow
 def test_pages_opened_at_once_count_like_pages_opened_one_by_one(stuck):
     with contextlib.ExitStack() as opened, ThreadPoolExecutor(20) as threads:
         pages = [opened.enter_context(page) for page in threads.map(lambda _: stuck.page(), range(20))]
@@ -235,6 +237,7 @@ def test_a_page_whose_process_cannot_start_gets_the_reason(running, monkeypatch,
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_unprocessed_messages_are_not_read(stuck):
     """Two of them wait in the server, and one or two more on the way; the page keeps the others."""
     message = encode({"do": "load"}, {"content": np.zeros(16 << 20, dtype=np.uint8)})

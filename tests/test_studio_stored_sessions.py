@@ -14,6 +14,7 @@ from quasiharmonic.ui.studio.server import server as served
 from shared.studio_server import children, hear, nobody_is_left, session_page
 
 
+@pytest.mark.slow
 def test_a_session_continues_after_a_reload_and_after_a_crash(running):
     name = "0123456789abcdef" * 2
     with session_page(running, name) as page:
@@ -38,6 +39,7 @@ def test_a_session_continues_after_a_reload_and_after_a_crash(running):
     nobody_is_left()
 
 
+@pytest.mark.slow
 def test_a_session_opened_elsewhere_ends_here(running):
     name = "f" * 32
     with session_page(running, name) as one:
@@ -49,6 +51,7 @@ def test_a_session_opened_elsewhere_ends_here(running):
             assert closed.value.rcvd.code == served.ELSEWHERE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -102,6 +102,7 @@ def test_each_ring_of_a_disk_is_a_polygon_with_six_sides_per_ring_number():
     assert np.array_equal(boundary_loops(F, len(V))[0], np.arange(61, 91))
 
 
+@pytest.mark.slow
 def test_random_disks_have_no_chords_and_no_slivers():
     for n in (5, 8, 13, 21, 34, 55, 144, 377):
         for seed in range(4):
@@ -123,6 +124,7 @@ def test_the_seed_determines_the_surface():
     assert not np.array_equal(V, surfaces.random_delaunay(60, seed=2)[0])
 
 
+@pytest.mark.slow
 def test_the_cat_faces_the_viewer():
     V, F = surfaces.cat()
     assert (len(V), len(F)) == (7651, 15000)

@@ -246,6 +246,7 @@ def test_entity_bombs_and_external_files(read, tmp_path):
     assert len(read(dtd + drawing('<rect width="1" height="1"/>'))) == 1
 
 
+@pytest.mark.slow
 def test_huge_drawings(read, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="more than 1,000,000 points"):
         read(drawing('<path d="M0 0' + "c1 9 9 1 0 0" * 9000 + 'z"/>'), tolerance=1e-7)

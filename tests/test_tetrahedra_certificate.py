@@ -47,6 +47,7 @@ def check_tiny_meshes(seeds):
     return good
 
 
+@pytest.mark.slow
 def test_signs_agree_with_rational_numbers():
     rng = np.random.default_rng(1)
     for trial in range(300):
@@ -66,6 +67,7 @@ def test_signs_agree_with_rational_numbers():
         assert tetrahedron_signs(np.arange(4)[None], p)[0][0] == (expected > 0) - (expected < 0), p
 
 
+@pytest.mark.slow
 def test_tiny_meshes_agree_with_the_oracle():
     assert 15 < check_tiny_meshes(range(100)) < 85
 
@@ -88,6 +90,7 @@ def test_a_ball_covered_twice_is_not_injective():
     assert certify_tetrahedra(T, X).injective
 
 
+@pytest.mark.slow
 def test_components_inside_each_other():
     X, T = box(2, 2, 2)
     for scale, away, injective in ((0.1, 0.4, False), (0.1, 2.0, True), (1.0, 1.0, False), (1.0, 1.5, True)):
@@ -98,6 +101,7 @@ def test_components_inside_each_other():
         assert bool(len(found.crossings)) == (scale == away)
 
 
+@pytest.mark.slow
 def test_a_cavity_is_no_overlap():
     X, T = box(5, 5, 5)
     shell = T[np.abs(X[T].mean(axis=1) - 0.5).max(axis=1) > 0.1]

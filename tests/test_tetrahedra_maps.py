@@ -105,6 +105,7 @@ def test_the_regularisation_parameter():
     assert reduce_epsilon(0.3, 0.5, 0.5) == 0.0
 
 
+@pytest.mark.slow
 def test_a_turned_cavity():
     X, T, cavity = shell()
     start = X.copy()
@@ -133,6 +134,7 @@ def test_a_turned_cavity():
     np.testing.assert_array_equal(mesh.points, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("while_inverted", [True, False])
 def test_ctrl_c_returns_the_best_mesh_so_far(while_inverted):
     X, T, cavity = shell()
@@ -156,6 +158,7 @@ def turned_by_40():
     return morph(X, T, cavity, turned(X[cavity], 40))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-100, 1e100])
 def test_the_scale_does_not_matter(scale):
     X, T, cavity = shell(4)
@@ -165,6 +168,7 @@ def test_the_scale_does_not_matter(scale):
     np.testing.assert_allclose(scaled.points / scale, plain.points, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [5e5, 1e8])
 def test_the_origin_does_not_matter(offset):
     X, T, cavity = shell(4)
@@ -175,6 +179,7 @@ def test_the_origin_does_not_matter(offset):
     assert moved.energy == pytest.approx(plain.energy, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_mesh_that_stays_where_it_is_has_converged():
     X, T, cavity = shell(4)
     result = morph(X, T, cavity, X[cavity])
@@ -192,6 +197,7 @@ def test_a_mesh_that_overlaps_itself_is_no_success():
     assert result.status is TetrahedraStatus.OVERLAPPING
 
 
+@pytest.mark.slow
 def test_a_known_diffeomorphism_is_found():
     X, T = box(4, 4, 4)
     boundary = np.unique(certify_tetrahedra(T, X).boundary)
@@ -211,6 +217,7 @@ def test_a_known_diffeomorphism_is_found():
     assert again.success
 
 
+@pytest.mark.slow
 def test_a_boundary_that_crosses_itself_is_reported_before_any_search():
     X, T, cavity = shell()
     result = morph(X, T, cavity, X[cavity] + (0.5, 0, 0))
@@ -232,6 +239,7 @@ def test_a_tetrahedron_of_fixed_vertices_is_named():
     assert result.to_dict()["status"] == "IMPOSSIBLE"
 
 
+@pytest.mark.slow
 def test_a_vertex_without_a_position_is_named():
     """One inner vertex is joined to the whole surface of a body; of the bent body no point sees the whole surface."""
     from scipy.spatial import ConvexHull
@@ -249,6 +257,7 @@ def test_a_vertex_without_a_position_is_named():
     assert "Free vertex 50 has no position" in result.summary()
 
 
+@pytest.mark.slow
 def test_edges_that_meet_triangles_agree_with_rational_numbers():
     rng = np.random.default_rng(0)
     hits = 0
@@ -264,6 +273,7 @@ def test_edges_that_meet_triangles_agree_with_rational_numbers():
     assert 25 < hits < 125
 
 
+@pytest.mark.slow
 def test_needles_and_malformed_meshes():
     X, T, cavity = shell(4)
     thin = X.copy()
@@ -310,6 +320,7 @@ def test_quality():
     assert tetrahedron_quality(row[:, [1, 0, 2, 3]], 1e100 * regular)[0] == pytest.approx(-sign[0])
 
 
+@pytest.mark.slow
 def test_mesh_objects_and_files(tmp_path):
     X, T, cavity = shell(4)
     there = turned(X[cavity], 10)
@@ -339,6 +350,7 @@ def displaced():
     return displacement, points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh"])
 def test_qhm_morph_keeps_everything_but_positions(suffix, tmp_path, capsys):
     X, T, _ = shell(4)
@@ -360,6 +372,7 @@ def test_qhm_morph_keeps_everything_but_positions(suffix, tmp_path, capsys):
     assert main(["check", str(out)]) == 0
 
 
+@pytest.mark.slow
 def test_qhm_morph_reads_positions(tmp_path):
     X, T, cavity = shell(4)
     path, out = tmp_path / "mesh.vtu", tmp_path / "moved.vtu"

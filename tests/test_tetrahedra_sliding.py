@@ -31,6 +31,7 @@ def rotation():
     return np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 
 
+@pytest.mark.slow
 def test_walls_follow_a_piston_only_if_they_slide():
     X, T, top = cube()
     target = X[top] - (0, 0, 0.9)
@@ -51,6 +52,7 @@ def test_walls_follow_a_piston_only_if_they_slide():
         assert (result.points[bottom] == X[bottom]).all() == (slide is not True)
 
 
+@pytest.mark.slow
 def test_sliding_does_not_depend_on_the_orientation_of_the_mesh():
     X, T, top = cube()
     target = X[top] - (0, 0, 0.5)
@@ -63,6 +65,7 @@ def test_sliding_does_not_depend_on_the_orientation_of_the_mesh():
     np.testing.assert_allclose((turned.points @ Q)[:, :2][on[:, :2]], X[:, :2][on[:, :2]], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_the_energy_is_minimal_along_the_walls():
     """With sliding walls the energy is lower, and no small motion of one sliding vertex lowers it further."""
     X, T, top = cube(3)
@@ -92,6 +95,7 @@ def test_vertices_of_a_curved_boundary_are_fixed():
     np.testing.assert_array_equal(result.points[:60], X[:60])
 
 
+@pytest.mark.slow
 def test_a_mesh_moved_in_steps_slides():
     X, T, top = cube()
     mesh = MovingMesh(X, T, top, slide=True)
@@ -133,6 +137,7 @@ def pressed():
     return morph(X, T, top, X[top] - (0, 0, 0.5), slide=WALLS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-150, 1e150])
 def test_planes_at_any_scale(scale):
     X, T, top = cube()
@@ -159,6 +164,7 @@ def test_malformed_planes():
         morph(X[top, :2], [[0, 1, 2]], [0], X[:1, :2], slide=WALLS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [["--slide"], [f for w in WALLS for f in ("--slide-plane", *map(str, w))]])
 def test_qhm_morph_slides(options, tmp_path, capsys):
     X, T, top = cube()

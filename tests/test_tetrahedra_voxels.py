@@ -37,6 +37,7 @@ def mended():
     return result
 
 
+@pytest.mark.slow
 def test_folds_agree_with_rational_numbers():
     rng = np.random.default_rng(0)
     for trial in range(12):
@@ -48,6 +49,7 @@ def test_folds_agree_with_rational_numbers():
         np.testing.assert_array_equal(found, folds_exactly(field, spacing))
 
 
+@pytest.mark.slow
 def test_folds_are_mended_and_nothing_else_changes():
     field = folded_volume(24, 4)
     repaired = nearest_invertible(field)
@@ -70,6 +72,7 @@ def test_folds_are_mended_and_nothing_else_changes():
     assert certify_tetrahedra(grid.tetrahedra(cells), points).injective
 
 
+@pytest.mark.slow
 def test_the_distance_is_close_to_the_least():
     """One voxel moved through its neighbour: it returns to where the determinant is the bound."""
     field = np.zeros((5, 5, 5, 3))
@@ -80,6 +83,7 @@ def test_the_distance_is_close_to_the_least():
     assert repaired.field[2, 2, 2] == pytest.approx((0.99, 0, 0), abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_spacing_scales_the_field():
     field = folded_volume(12, 1)
     plain, scaled = mended(), nearest_invertible(1e-3 * field, spacing=1e-3)
@@ -87,6 +91,7 @@ def test_the_spacing_scales_the_field():
     assert scaled.folds == plain.folds
 
 
+@pytest.mark.slow
 def test_the_inverse_returns_to_every_voxel():
     _, y, x = np.indices((12, 12, 12)) / 12
     field = 0.8 * np.stack([np.sin(3 * y), np.cos(2 * x), np.sin(2 * x + 3 * y)], axis=-1) * (1, 2, 3)
@@ -133,6 +138,7 @@ def test_bad_input():
     np.testing.assert_array_equal(left.field, field)
 
 
+@pytest.mark.slow
 def test_cells_below_the_bound_remain():
     field = np.zeros((6, 6, 6, 3))
     field[3, 5, 0, 2] = -0.5
@@ -143,6 +149,7 @@ def test_cells_below_the_bound_remain():
     assert nearest_invertible(field, min_jacobian=0.4).folds == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [2.0**-500, 2.0**500])
 def test_the_scale_of_a_volume_does_not_matter(scale):
     field = folded_volume(12, 1)

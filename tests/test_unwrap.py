@@ -31,6 +31,7 @@ def test_iterates_as_three_arrays_that_reproduce_the_model(result):
     assert uvs.max() <= 1
 
 
+@pytest.mark.slow
 def test_every_triangle_is_positive(result):
     _, indices, uvs = result
     assert all(exact_orientation(*uvs[triangle].tolist()) > 0 for triangle in indices)
@@ -45,6 +46,7 @@ def test_coordinates_are_exact_in_single_precision_in_both_conventions(result):
         np.testing.assert_array_equal(values.astype(np.float32).astype(np.float64), values)
 
 
+@pytest.mark.slow
 def test_input_is_not_modified():
     points, triangles = V.copy(), F.copy()
     unwrap(points, triangles, resolution=256)
@@ -52,11 +54,13 @@ def test_input_is_not_modified():
     np.testing.assert_array_equal(triangles, F)
 
 
+@pytest.mark.slow
 def test_equal_input_gives_equal_results(result):
     for one, other in zip(result, unwrap(V, F, resolution=512), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_single_precision_and_unsigned_indices():
     points = V.astype(np.float32)
     vmapping, indices, _ = unwrap(points, F.astype(np.uint32), resolution=256)
@@ -113,6 +117,7 @@ def spoil(V, F):
     return fin, np.concatenate([spoilt[:50], more, spoilt[50:]])
 
 
+@pytest.mark.slow
 def test_defective_models_are_accepted():
     points, triangles = spoil(V, F)
     result = unwrap(points, triangles, resolution=512)
@@ -141,6 +146,7 @@ def test_degenerate_models_are_an_error():
         unwrap(V, np.array([[0, 0, 1], [2, 3, 3]]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exponent", [-700, 700])
 def test_extreme_units(exponent, result):
     other = unwrap(np.ldexp(V, exponent), F, resolution=512)
@@ -176,6 +182,7 @@ def test_edge_costs_move_seams():
     assert above(after) < above(before)
 
 
+@pytest.mark.slow
 def test_identical_components_are_stacked():
     points, triangles = annulus(6)
     points = lift(points)
@@ -188,6 +195,7 @@ def test_identical_components_are_stacked():
     assert stacked.texels_per_unit > 1.1 * apart.texels_per_unit
 
 
+@pytest.mark.slow
 def test_planar_meshes():
     points, triangles = annulus(8)
     result = unwrap(points, triangles, resolution=256)
@@ -195,6 +203,7 @@ def test_planar_meshes():
     assert result.stretch.worst == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_mesh_objects_and_trimesh():
     trimesh = pytest.importorskip("trimesh")
     result = unwrap(trimesh.Trimesh(V, F, process=False), resolution=256)
@@ -205,6 +214,7 @@ def test_mesh_objects_and_trimesh():
     np.testing.assert_array_equal(made.visual.uv, result.uvs)
 
 
+@pytest.mark.slow
 def test_progress_by_phase_and_exceptions_of_the_callback():
     steps = []
     unwrap(V, F, resolution=256, callback=steps.append)
@@ -308,6 +318,7 @@ class TestCertificate:
         assert not self.certify(charts, stacked=True).disjoint
 
 
+@pytest.mark.slow
 def test_rounding_keeps_triangles_positive_where_it_can():
     points, triangles = random_delaunay(3000, seed=2)
     uv = 0.5 + 3e-6 * points
@@ -326,6 +337,7 @@ def quads(columns, rows):
     return flat, triangles, np.all(np.abs(head - tail) > 1e-9, axis=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["hills", "strip", "closed"])
 def test_sides_with_large_costs_are_not_cut(shape):
     if shape == "hills":

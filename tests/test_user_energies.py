@@ -67,6 +67,7 @@ class Spoilt(SymmetricDirichlet):
         return values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("value", "how"), [(np.nan, r"NaN"), (np.inf, "infinite")])
 @pytest.mark.parametrize("part", WORDS)
 @pytest.mark.parametrize("function", FUNCTIONS)

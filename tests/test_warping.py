@@ -15,6 +15,7 @@ def blobs(height, width, centres):
     return sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 8) for a, b in centres)
 
 
+@pytest.mark.slow
 def test_landmarks_reach_their_targets_and_the_border_stays():
     before = np.array([(30, 30), (70, 40), (50, 60)], dtype=float)
     after = np.array([(40, 22), (60, 55), (30, 68)], dtype=float)
@@ -31,12 +32,14 @@ def test_landmarks_reach_their_targets_and_the_border_stays():
         assert side == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_landmarks_that_pass_each_other():
     before = np.array([(40, 50), (60, 50)], dtype=float)
     warped = warp_by_landmarks(np.zeros((100, 100), np.uint8), before, before[::-1], resolution=32)
     assert warped.result.certificate.bijective
 
 
+@pytest.mark.slow
 def test_without_moved_landmarks_the_image_does_not_change():
     rng = np.random.default_rng(5)
     for image in (rng.integers(0, 255, (33, 48, 3), dtype=np.uint8), rng.normal(size=(40, 30)).astype(np.float32)):
@@ -103,6 +106,7 @@ def test_landmarks_on_the_border_move_it():
         warp_by_landmarks(image, [[31.5, 63]], [[31.5, -10]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [None, (90, 150)])
 def test_rasterised_triangles_agree_with_located_points(shape, monkeypatch):
     rng = np.random.default_rng(2)
@@ -182,6 +186,7 @@ def test_stretch_does_not_grow_with_the_resolution():
     assert stretch(64, smoothness=0) > 1.5 * stretch(16, smoothness=0)
 
 
+@pytest.mark.slow
 def test_a_slight_warp_is_a_thin_plate_with_a_pin():
     at, by = np.array([40.0, 60.0]), np.array([0.5, 0.2])
     warped = warp_by_landmarks(np.zeros((101, 101)), [at], [at + by], smoothness=1e4, resolution=48)
@@ -195,6 +200,7 @@ def test_a_slight_warp_is_a_thin_plate_with_a_pin():
     assert warped.positions - warped.points == pytest.approx(lift[:, None] * by, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_soft_landmarks_may_miss_their_targets():
     before, after = [[30, 30], [50, 30]], [[45, 30], [32, 33]]
     missed = []
@@ -210,6 +216,7 @@ def test_soft_landmarks_may_miss_their_targets():
     assert np.abs(both.positions[-2:] - (40, 30)).max() < 3
 
 
+@pytest.mark.slow
 def test_curves_are_mapped_to_curves():
     t = np.linspace(0, 1, 40)
     line = np.stack([20 + 50 * t, 0 * t + 40], axis=1)

@@ -46,6 +46,7 @@ def in_use(attempts):
     return replace
 
 
+@pytest.mark.slow
 def test_a_file_that_another_program_has_open_is_tried_again(tmp_path, monkeypatch):
     path = tmp_path / "file"
     path.write_bytes(b"old")

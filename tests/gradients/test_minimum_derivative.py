@@ -119,6 +119,7 @@ def dome():
     return surface, F, fixed, injective_map(surface, F, fixed, V[fixed], polish="symmetric-dirichlet").uv
 
 
+@pytest.mark.slow
 def test_sliding_along_straight_sides():
     V, F = grid(7, 6)
     surface = np.column_stack([V + 0.01 * np.sin(5 * V[:, ::-1]), 0.3 * np.cos(3 * V[:, 0])])
@@ -147,6 +148,7 @@ def test_sliding_along_straight_sides():
     assert ((here.uv[boundary] == V.min(axis=0)) | (here.uv[boundary] == V.max(axis=0))).any(axis=1).all()
 
 
+@pytest.mark.slow
 def test_sliding_along_a_circle(dome):
     """The barrier that keeps edges near the circle has a hundredth of the energy's weight, treated as constant."""
     surface, F, fixed, uv = dome
@@ -161,6 +163,7 @@ def test_sliding_along_a_circle(dome):
     assert np.abs((ahead - behind) / 2 - moved).max() < 0.01 * np.abs(moved).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [pytest.param(1.3, marks=pytest.mark.nightly), 1.5])
 def test_sliding_along_an_ellipse_converges(dome, width):
     """The parameters are uneven along it: gradients of the barrier match its values only if they are exact."""
@@ -208,6 +211,7 @@ def test_two_equally_good_maps_make_the_derivative_doubtful():
     assert np.allclose(derivative.jvp(target=np.ones((ends.size, 2))), 1, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_near_a_bifurcation_of_the_map():
     """At the onset of buckling, straight and bent strips coincide; and a disk may rotate in a circle."""
     V, F = grid(20, 4)
@@ -255,11 +259,13 @@ class Creased(Isotropic):
         )
 
 
+@pytest.mark.slow
 def test_a_map_that_does_not_converge_is_doubtful():
     V, F, _, _, uv = flattened_ring()
     assert Doubt.NOT_AT_REST in flatten_derivative(V, F, uv, energy=Creased()).doubts
 
 
+@pytest.mark.slow
 def test_a_boundary_in_contact_with_itself_is_doubtful():
     """A strip around more than the full circle of a cone that is flatter than the plane allows."""
     square, F = grid(45, 3)
