@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic.apps.tetrahedra.certificate import certify_tetrahedra
-from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
+from quasiharmonic.apps.tetrahedra.contacts import find_contacts
+from quasiharmonic.apps.tetrahedra.signs import ExactSigns, tetrahedron_signs
 from quasiharmonic.io.fem.files import read_volume
 from quasiharmonic.ui.cli import main
 from shared.exact_space import contact, cross, determinant, dot, exact, minus, overlap
@@ -23,17 +24,21 @@ def is_injective(T, X):
     if any(overlap([p[v] for v in s], [p[v] for v in t]) for s, t in combinations(T.tolist(), 2)):
         return False
     faces = sorted({tuple(sorted(face)) for t in T.tolist() for face in combinations(t, 3)})
-    for f, g in combinations(faces, 2):
-        common = [p[v] for v in set(f) & set(g)]
-        for point in contact([p[v] for v in f], [p[v] for v in g]):
-            if len(common) < 2 and point not in common:
-                return False
-            if len(common) == 2 and (
-                any(cross(minus(common[1], common[0]), minus(point, common[0])))
-                or dot(minus(point, common[0]), minus(point, common[1])) > 0
-            ):
-                return False
-    return True
+    return not any(meet_elsewhere(f, g, p) for f, g in combinations(faces, 2))
+
+
+def meet_elsewhere(f, g, p):
+    """Oracle: whether two triangles meet outside their common vertices and edge."""
+    common = [p[v] for v in set(f) & set(g)]
+    for point in contact([p[v] for v in f], [p[v] for v in g]):
+        if len(common) < 2 and point not in common:
+            return True
+        if len(common) == 2 and (
+            any(cross(minus(common[1], common[0]), minus(point, common[0])))
+            or dot(minus(point, common[0]), minus(point, common[1])) > 0
+        ):
+            return True
+    return False
 
 
 def check_tiny_meshes(seeds):
@@ -65,6 +70,22 @@ def test_signs_agree_with_rational_numbers():
             p[3] = p[0] + p[1] - p[2]
         expected = determinant(exact(p))
         assert tetrahedron_signs(np.arange(4)[None], p)[0][0] == (expected > 0) - (expected < 0), p
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("common", [0, 1, 2])
+def test_contacts_of_two_triangles_agree_with_the_oracle(rng, common):
+    """Also of triangles in one plane, which are every third pair."""
+    F = np.array([[0, 1, 2], [*range(common), *range(3, 6 - common)]])
+    counts = [0, 0]
+    for trial in range(200):
+        X = rng.integers(-2, 3, (6 - common, 3)) * (1.0, 1.0, trial % 3 > 0)
+        p = exact(X)
+        if all(any(cross(minus(p[j], p[i]), minus(p[k], p[i]))) for i, j, k in F.tolist()):
+            expected = meet_elsewhere(*F.tolist(), p)
+            assert len(find_contacts(F, X, ExactSigns(X))) == expected, X
+            counts[expected] += 1
+    assert min(counts) > 20
 
 
 @pytest.mark.slow
