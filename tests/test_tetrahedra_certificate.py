@@ -88,6 +88,14 @@ def test_contacts_of_two_triangles_agree_with_the_oracle(rng, common):
     assert min(counts) > 20
 
 
+@pytest.mark.parametrize("turn", [0, 1, 2])
+def test_one_edge_of_each_triangle_meets_the_other(turn):
+    """Like two links of a chain; the same edge of both, so that no edge can be left out."""
+    X = np.array([[1, 1, 1], [1, 0, 0], [-1, 0, -1], [-1, -1, 0], [-1, 0, 0], [0, 1, -1]], dtype=float)
+    F = np.roll([[0, 1, 2], [3, 4, 5]], turn, axis=1)
+    assert find_contacts(F, X, ExactSigns(X)).tolist() == [[0, 1]]
+
+
 @pytest.mark.slow
 def test_tiny_meshes_agree_with_the_oracle():
     assert 15 < check_tiny_meshes(range(100)) < 85
