@@ -59,7 +59,11 @@ def pytest_configure(config):
     settings.load_profile("exploring" if config.getoption("nightly") else "repeatable")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker("slow")
     if not config.getoption("nightly"):
         left = [item for item in items if item.get_closest_marker("nightly")]
         config.hook.pytest_deselected(items=left)

@@ -11,7 +11,7 @@ import problems
 from quasiharmonic import Problem, boundary_loops, certify
 from quasiharmonic.geometry.exact.loops import check_loops
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 UNKNOWN = "snowflake", "filling"
 

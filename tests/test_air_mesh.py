@@ -84,7 +84,7 @@ def test_shapes_push_each_other():
     assert right[:, 0].mean() > left[:, 0].mean() + 0.6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_are_deterministic_and_inputs_do_not_change():
     V, F = surfaces.disk(2)
     kept = V.copy()
@@ -175,7 +175,7 @@ def test_shapes_that_touch_at_a_vertex_are_named(offset, obstacle, names):
         AirMesh(np.concatenate([box, box + offset]), np.concatenate([F, F + 4]), [container, box + obstacle])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(1, 6))])
 def test_impossible_frames_are_reported_in_one_way(seed):
     rng = np.random.default_rng(seed)

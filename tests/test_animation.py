@@ -83,7 +83,7 @@ def test_searched_frames_stay_close_to_the_previous_one(pinned, most):
     assert animation.largest_move <= most
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_polished_frames_do_not_jump(head):
     V, F, loop = head
     targets = turning_stars(len(loop), 16)
@@ -95,7 +95,7 @@ def test_polished_frames_do_not_jump(head):
     assert animation.energies.mean() <= 1.1 * np.mean(alone)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_sweeps_shorten_jumps(head):
     """The limit on motion cannot be met by the forward sweep alone."""
     V, F, loop = head
@@ -276,7 +276,7 @@ def run(*arguments):
     return main([str(a) for a in arguments])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command(head, tmp_path, capsys):
     V, F, loop = head
     targets = turning_stars(len(loop), 5)

@@ -37,7 +37,7 @@ from shared.damaged_files import VALID, damaged
 from shared.examples import examples
 from shared.meshes import boundary_of, signed_areas
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 often = examples(35, suppress_health_check=[HealthCheck.too_slow])
 seldom = examples(15, suppress_health_check=[HealthCheck.too_slow])

@@ -98,7 +98,7 @@ def test_no_other_modules_are_next_to_the_packages():
     assert len(modules - {"__init__", "__main__"}) <= 7
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_import_outside_the_plan():
     assert [f"{file} imports from {other}" for one, other, file in imports() if other not in PLAN[one]] == []
 

@@ -176,7 +176,7 @@ class TestMirroredAndStacked:
 
 
 class TestCut:
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_a_closed_surface_stays_watertight(self, tmp_path):
         V, F = starfish(3, 8)
         (tmp_path / "in.obj").write_text(
@@ -235,7 +235,7 @@ class TestSeenFromOutside:
         assert vertices.max() < len(io.read_mesh(source).V)
         assert len(np.unique(vertices)) < len(vertices)
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_a_batch_with_seams_has_a_report(self, source, tmp_path, quick_workers):
         assert run("batch", tmp_path, "-o", tmp_path / "out", "--flatten", "-j", "1") == 0
         assert run("batch", "-o", tmp_path / "out", "--report") == 0

@@ -19,7 +19,7 @@ from quasiharmonic.ui.batch.supervisor import Finished
 from quasiharmonic.ui.cli import main
 from shared.datasets import record_of, star_of, write_problem, write_stars
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_workers")]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
 
 
 class TestRun:

@@ -209,7 +209,7 @@ def strip(record):
 
 
 @pytest.mark.usefixtures("quick_workers")
-@pytest.mark.slow
+@pytest.mark.long
 class TestRun:
     def test_as_from_folders(self, tmp_path, stars):
         source, expected = stars
@@ -332,7 +332,7 @@ class TestPlaces:
 
 
 @pytest.mark.usefixtures("quick_workers")
-@pytest.mark.slow
+@pytest.mark.long
 class TestUrls:
     @pytest.mark.parametrize("kind", ["memory", "file", "s3"])
     def test_inputs_and_outputs(self, tmp_path, stars, kind, request):

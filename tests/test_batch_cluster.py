@@ -15,7 +15,7 @@ from quasiharmonic.ui.cli import main
 from shared.dask_cluster import cluster
 from shared.datasets import lasting, record_of, write_stars
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 pytest.importorskip("distributed")
 

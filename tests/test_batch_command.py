@@ -12,7 +12,7 @@ import pytest
 from quasiharmonic.ui.cli import commands, main
 from shared.datasets import write_stars
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_workers")]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
 
 
 class TestCommand:

@@ -19,7 +19,7 @@ from quasiharmonic.ui.cli import main
 from shared.commands import FAILING_WORKER, linux
 from shared.datasets import lasting, record_of, star_of, write_problem, write_stars
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 WORKER = supervisor.COMMAND
 

@@ -11,7 +11,7 @@ import pytest
 from quasiharmonic import batch
 from shared.datasets import record_of, write_stars
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_workers")]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
 
 
 def names(source, **options):

@@ -17,7 +17,7 @@ from quasiharmonic.ui.batch.settings import Orders
 from shared.datasets import lasting, record_of, star_of, write_problem, write_stars
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.long,
     pytest.mark.usefixtures("quick_workers"),
     pytest.mark.skipif("qdldl" not in available(), reason="where there is no QDLDL, each problem is solved by itself"),
 ]

@@ -19,7 +19,7 @@ from quasiharmonic.ui.report import charts, page, statistics, write_report
 from quasiharmonic.ui.report.style import STYLE
 from shared.datasets import star_of, write_problem, write_stars
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_workers")]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
 
 VILE = '<script>alert(1)</script>"><img src=x onerror=alert(2)>&amp;\u202egnp'
 

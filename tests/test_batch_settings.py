@@ -15,7 +15,7 @@ from quasiharmonic.targets import outline, outline_curves, signed_area
 from quasiharmonic.ui.cli import main
 from shared.datasets import record_of, star_of
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_workers")]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
 
 
 OCTAHEDRON = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])

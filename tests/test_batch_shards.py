@@ -48,7 +48,7 @@ class TestShards:
 
 
 @pytest.mark.usefixtures("quick_workers")
-@pytest.mark.slow
+@pytest.mark.long
 class TestArray:
     def test_out_of_order_and_merged(self, tmp_path, capsys):
         names = [f"{k // 4}/{k:02d}" for k in range(12)]
@@ -138,7 +138,7 @@ class TestSlots:
         assert set(log[1:3]) == {"a", "b"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @linux
 def test_a_problem_that_was_killed_is_solved_again_alone(tmp_path, failing_worker, quick_workers):
     """As when other processes took the memory that it needs."""

@@ -9,7 +9,7 @@ import pytest
 from quasiharmonic import batch, io
 from quasiharmonic.ui.batch import driver, records
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_workers")]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
 
 
 class TestTables:

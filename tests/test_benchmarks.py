@@ -20,7 +20,7 @@ from quasiharmonic import Problem, boundary_loops, certify, certify_tetrahedra, 
 from quasiharmonic.solver.search.strategy import stages_of
 from quasiharmonic.util import kernels
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 FEASIBLE = ["noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"]
 

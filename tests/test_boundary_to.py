@@ -202,7 +202,7 @@ def test_outlines_that_bound_no_region_are_rejected_at_once():
         boundary_to(V, F, [])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_too_few_vertices_for_the_shape_are_rejected():
     """A thin spiral, cut off by a straight side between two vertices."""
     turn = np.linspace(0, 4 * np.pi, 200)
@@ -314,7 +314,7 @@ def test_distance_between_a_contour_and_its_sides():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("character", "GC352")
 @pytest.mark.parametrize("size", [(12, 8), (40, 20)])
 def test_corners_move_only_up_to_a_limit(character, size):
@@ -342,7 +342,7 @@ def test_flattened_edges_are_named_and_splitting_them_helps():
     assert injective_map(refined.V, refined.F, fixed, target).injective
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_flattened_edges_agree_with_the_exact_diagnosis():
     """On coordinates without rounding, an edge is flat exactly if the diagnosis finds no space beside it."""
     V, F = plain_grid(4, 4)

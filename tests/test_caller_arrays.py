@@ -107,7 +107,7 @@ CALLS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seconds", [0.08, pytest.param(1, marks=pytest.mark.nightly)])
 def test_triangles_that_another_thread_overwrites(seconds):
     text = REWRITTEN.format(calls=CALLS, seconds=seconds)

@@ -130,7 +130,7 @@ def test_a_limit_on_charts_is_kept_and_what_it_costs_is_reported():
         assert chart.misses == pytest.approx(max(quantile - 1.02, worst - 3, 0), rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_bound_that_no_charts_keep_is_reported():
     V, F = sphere(2)
     charts = find_charts(V, F, max_stretch=1.0)
@@ -193,7 +193,7 @@ def test_seams_avoid_sides_with_high_costs():
     assert share_below(directed) > share_below(plain) + 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("count", [1_000, pytest.param(10_000, marks=pytest.mark.nightly)])
 def test_thousands_of_boxes_take_seconds(count):
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)

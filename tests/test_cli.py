@@ -235,7 +235,7 @@ class TestDemo:
         assert run("demo", "-o", tmp_path / "file" / "demo") == 2
         assert f"cannot create the folder {tmp_path / 'file' / 'demo'}" in capsys.readouterr().err
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_writes_three_files(self, tmp_path, capsys):
         assert run("demo", "-o", tmp_path / "d") == 0
         assert sorted(p.name for p in (tmp_path / "d").iterdir()) == ["demo.json", "demo.obj", "demo.png"]

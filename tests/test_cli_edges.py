@@ -247,7 +247,7 @@ def shell(call, streams, *, unbuffered=False):
     return done.returncode, done.stderr.decode()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @posix
 @pytest.mark.parametrize(
     ("call", "unbuffered"),
@@ -279,7 +279,7 @@ def test_closed_standard_output_is_no_failure_if_the_report_goes_elsewhere(folde
     assert ("usage" in said) == (call == "--help")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @posix
 @pytest.mark.parametrize(
     ("call", "status", "streams"),
@@ -305,7 +305,7 @@ def test_json_output_stays_valid_without_standard_error(folder):
     assert done.stdout.count(b"\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @posix
 @pytest.mark.parametrize(
     ("call", "unbuffered"),

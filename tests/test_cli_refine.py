@@ -176,7 +176,7 @@ class TestRejects:
         assert sorted(p.name for p in tmp_path.iterdir()) == ["handles.txt", "input.obj"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills outright")
 def test_kill_9_leaves_each_file_complete_old_or_new(tmp_path):
     write(tmp_path, "nothing sees all")

@@ -29,7 +29,7 @@ class TestReportFailures:
         assert "Traceback" not in done.stderr
         assert run("check", tmp_path / "o.obj") == 0
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.parametrize(("arguments", "both"), [("map {} -o {}", True), ("measure {} --export {}", False)])
     def test_full_standard_error_and_exports(self, star, tmp_path, arguments, both):
         if os.name != "posix" or not Path("/dev/full").exists():
@@ -41,7 +41,7 @@ class TestReportFailures:
         assert done.returncode == 3
         assert written.exists()
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.skipif(os.name != "posix", reason="closes a stream by the shell")
     @pytest.mark.parametrize(("more", "status"), [("| true", 3), (">&-", 0), ("--json - >&-", 3)])
     def test_closed_standard_output(self, star, tmp_path, more, status):
@@ -92,7 +92,7 @@ class TestReportFailures:
         assert done.returncode == 1
         assert done.stdout.isascii()
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.skipif(os.name != "posix", reason="closes a stream by the shell")
     def test_closed_standard_error(self, star, tmp_path):
         command = f"{sys.executable} -m quasiharmonic map {star} -o {tmp_path / 'o.obj'} 2>&-"
@@ -120,7 +120,7 @@ class TestReportFailures:
         assert (tmp_path / "p.png").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_progress_on_a_terminal_only(star, tmp_path, monkeypatch):
     """On a pseudo-terminal, progress lines are overwritten, and nothing remains."""
     pty = pytest.importorskip("pty")

@@ -79,7 +79,7 @@ def test_polygons_of_every_kind_are_targets(kind, seed):
     check(problem, construct(problem, thin=seed > 1))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(KINDS))
 def test_random_polygons_are_targets(seed, kind):

@@ -192,7 +192,7 @@ def test_no_single_corner_has_a_better_position_between_its_neighbours(loop, cou
         assert reached <= min(straightness(lengths, turning, sorted([*others, k])) for k in between) + 1e-8 * none
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_runs_are_almost_as_straight_as_possible():
     """Compare with all choices: nine of ten random loops get the best corners, and few get much worse ones."""
     rng = np.random.default_rng(0)

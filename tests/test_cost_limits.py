@@ -172,7 +172,7 @@ class TestAllocations:
         # 24 of these bytes are the read-only copy of F.
         assert peak(certify, F, V[:, :2].copy())[0] / len(F) < 214
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_peak_memory_grows_linearly_with_the_triangles(self):
         small, large = (posed(rings, "C") for rings in (60, 120))
         solve(Problem(*small))
@@ -198,7 +198,7 @@ class TestImports:
         assert not found & {"numpy", "scipy", "matplotlib", "quasiharmonic.solver.search.solving"}
         assert len(found - self.modules("pass")) < 140
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_workers_of_a_data_set_start_without_slow_imports(self):
         found = self.modules("import quasiharmonic.ui.batch.worker")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.fft", "shapely", "pyarrow"}
@@ -208,7 +208,7 @@ class TestImports:
         found = self.modules("from quasiharmonic import injective_map")
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.parametrize("letter", [None, "R", pytest.param("C", marks=pytest.mark.nightly)])
     def test_the_command_maps_a_small_mesh_without_slow_imports(self, letter, tmp_path):
         """No time is measured; SciPy's subpackages and matplotlib would take longer than the map."""

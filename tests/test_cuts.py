@@ -57,7 +57,7 @@ class TestDisks:
         V[F[100, 1]] = V[F[100, 0]]
         assert parts(V, F, find_cuts(V, F)) == [(1, 1)]
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.parametrize("seed", range(40))
     def test_random_surfaces(self, seed):
         """Any number of handles, holes and touching components, random edges, and any proportions."""
@@ -157,7 +157,7 @@ class TestGain:
         w = Shrinking(graph).of(graph.rim_vertices)
         np.testing.assert_allclose(w[:-1], V[:-1, 2], rtol=5e-3, atol=1e-9)
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.parametrize("gain", [0.1, np.inf])
     def test_predicted_energy_is_close_to_that_of_the_map(self, gain):
         for V, F in (surfaces.starfish(5, 10), surfaces.starfish(3, 10), double_torus()):
@@ -168,7 +168,7 @@ class TestGain:
             told, true = shrinking.energy(shrinking.of(open_at | graph.rim_vertices)), energy_of(V, F, cut)
             assert 0.4 * true < told < 2.5 * true + 0.2
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_cuts_reach_arms(self):
         V, F = surfaces.starfish(5, 12)
         cut = find_cuts(V, F)
@@ -180,14 +180,14 @@ class TestGain:
         assert length_of(V, cut) < 5 * 1.3
         assert energy_of(V, F, cut) < 0.1 * energy_of(V, F, find_cuts(V, F, min_gain=np.inf))
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_a_larger_required_gain_makes_cuts_shorter(self):
         V, F = surfaces.starfish(5, 12)
         lengths = [length_of(V, find_cuts(V, F, min_gain=gain)) for gain in (0.02, 0.2, 2, np.inf)]
         assert lengths == sorted(lengths, reverse=True)
         assert lengths[0] > 1.5 * lengths[-1]
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_unit_position_and_orientation_do_not_matter(self):
         V, F = surfaces.starfish(4, 12)
         V = jittered(V)

@@ -8,7 +8,7 @@ import pytest
 
 import damaged_files
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 CALLS = [(kind, call) for kind, calls in damaged_files.CALLS.items() for call in calls]
 

@@ -192,7 +192,9 @@ def test_lbfgs_descends(functional):
 def test_lbfgs_stays_within_the_bound():
     objective = Objective(Problem(*turned_ring(180)))
     start = objective.evaluate(TANH.bound * np.exp(1j * np.arange(len(objective.problem.F))))
-    for iterate in path(LBFGS(iterations=10), objective, start):
+    iterates = list(path(LBFGS(iterations=10), objective, start))
+    assert len(iterates) > 3
+    for iterate in iterates:
         assert np.abs(iterate.xi).max() <= TANH.bound * (1 + 1e-12)
 
 

@@ -40,7 +40,7 @@ def test_every_kind_has_a_problem():
     assert {kind for _, (kind, _, _) in OBSTRUCTED.values()} == {kind.name for kind in Kind}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", OBSTRUCTED)
 def test_scale_and_location_do_not_matter(name):
     problem, _ = OBSTRUCTED[name]

@@ -97,7 +97,7 @@ def seen(here, eye, corners):
     return result
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("polygon", [pytest.param(k, marks=[pytest.mark.nightly] * (k % 3 > 0)) for k in range(12)])
 def test_wedges_contain_exactly_the_visible_points(polygon, rng):
     corners = polygons()[polygon]
@@ -224,7 +224,7 @@ def found(problem):
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fast_tests_of_the_diagnosis_agree_with_slow_ones(monkeypatch):
     problems = [*random_problems(), *(problem for problem, _ in OBSTRUCTED.values())]
     quick = [found(problem) for problem in problems]
@@ -248,7 +248,7 @@ def crooked_wheel(n, mesh=wheel):
     return onto(mesh(n), circle(n) * np.exp(2 * np.random.default_rng(0).normal(size=n))[:, None])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("mesh", [wheel, loose_wheel])
 def test_hubs_with_a_thousand_neighbours_are_placed(mesh):
     problem = crooked_wheel(1_000, mesh)
@@ -260,7 +260,7 @@ def test_hubs_with_a_thousand_neighbours_are_placed(mesh):
     assert not any("sees" in words for words in diagnosis.unchecked)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_position_is_sought_for_any_number_of_neighbours(monkeypatch):
     # There are more nested visibility regions than Python allows nested calls.
     monkeypatch.setattr(examine, "find_unplaced", lambda stars, *_: np.arange(len(stars)))
@@ -289,7 +289,7 @@ def test_five_thousand_neighbours_take_a_few_seconds():
     assert time.process_time() - began < 40
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "kind", ["wobble", "spiral", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("star", "gear"))]
 )

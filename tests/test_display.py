@@ -172,7 +172,7 @@ def test_a_certificate_copies_its_arrays():
     assert not pickle.loads(pickle.dumps(certificate)).uv.flags.writeable
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["map", "distortion", "texture", "convergence"])
 def test_every_kind_of_plot_of_a_result(kind):
     figure = RESULT.plot(kind)
@@ -265,7 +265,7 @@ def test_dir_lists_public_names_only():
         quasiharmonic.arrays_of_nothing  # noqa: B018
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_matplotlib_is_imported_only_for_plots():
     """Neither the package nor a search imports matplotlib; only plots do, and none imports its window."""
     code = """

@@ -48,7 +48,7 @@ CASES = [
 OPTIONAL = "no dependency, not even of the tests: .ci/optional installs it"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("code", CASES)
 def test_block_runs(code, tmp_path, monkeypatch, capsys):
     for name in ("SimpleITK", "nibabel", "nilearn", "skfem", "datasets", "ray"):
@@ -76,7 +76,7 @@ def demo(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorials/first_shape.md", "docs/tutorials/textured_model.md"])
 def test_commands_run(page, demo, tmp_path, monkeypatch):
     lines = re.findall(r"^    (qhm .*)$", (FOLDER / page).read_text(encoding="utf-8"), re.MULTILINE)

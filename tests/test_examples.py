@@ -16,7 +16,7 @@ from PIL import Image
 
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 FOLDER = Path(__file__).parent.parent / "examples"

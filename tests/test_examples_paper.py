@@ -6,7 +6,7 @@ import importlib
 
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 def test_figure_03(example):

@@ -67,7 +67,7 @@ def obstructions_of(name):
 
 
 class TestScales:
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.parametrize("scale", SCALES)
     @pytest.mark.parametrize("reference", [None, "rest", "corrected"])
     def test_of_the_rest_mesh(self, scale, reference):

@@ -360,7 +360,7 @@ VECTORS u float
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("count", [300, pytest.param(1000, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("name", "whole"),

@@ -277,7 +277,7 @@ def test_errors_in_vtu_files_are_described(tmp_path, data, message):
         mesh.point_field("u", [0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("coder", [ZLIB, LZMA], ids=["zlib", "lzma"])
 @pytest.mark.parametrize("form", ["inline", "raw"])
 def test_nothing_larger_than_the_memory_limit_is_decompressed(tmp_path, form, coder):

@@ -91,7 +91,7 @@ def test_a_far_start_with_a_guarded_boundary_takes_few_steps():
     assert worst(V, F, result.uv) < 5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_descent_that_does_not_end_is_replaced_by_another_start():
     V, F = cut_starfish(5)
     disk = flatten(V, F, max_iterations=0).uv

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -50,14 +52,25 @@ def test_contacts_agree_with_all_pairs():
     V = V + 0.004 * rng.normal(size=V.shape)
     (loop,) = boundary_loops(F, len(V))
     found = Rim([loop]).contacts(in_units(V, 0))
-    # Brute force: near pairs whose connecting segment leaves the vertex and reaches the edge from outside.
     shapely = pytest.importorskip("shapely")
     polygon = shapely.Polygon(V[loop])
-    for v, a, b in found.corners.T.tolist():
-        edge = shapely.LineString([V[a], V[b]])
-        near = edge.interpolate(edge.project(shapely.Point(V[v])))
-        middle = shapely.Point((np.array(near.coords[0]) + V[v]) / 2)
-        assert not polygon.contains(middle)
+    after = dict(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
+    before = {b: a for a, b in after.items()}
+    length = {a: np.linalg.norm(V[a] - V[b]) for a, b in after.items()}
+    expected = set()
+    for v, (a, b) in itertools.product(loop.tolist(), after.items()):
+        edge, point = shapely.LineString([V[a], V[b]]), shapely.Point(V[v])
+        along = edge.project(point) / edge.length
+        # The reach is twice the smaller length of the edge and of those around the vertex.
+        near = edge.distance(point) < 2 * min(length[a], (length[v] + length[before[v]]) / 2)
+        end = {0: a, 1: b}.get(along)
+        if near and v not in (a, b) and end not in (after[v], before[v]):
+            # The segment between them leaves the vertex and reaches the edge from outside.
+            foot = np.array(edge.interpolate(along, normalized=True).coords[0])
+            beside = (shapely.Point(foot + (V[v] - foot) * t) for t in (1e-6, 1 - 1e-6))
+            if not any(polygon.contains(place) for place in beside):
+                expected.add((v, a, b))
+    assert {*map(tuple, found.corners.T.tolist())} == expected != set()
 
 
 def test_gradient_and_curvature(pairs):

@@ -278,7 +278,7 @@ def coarse(folded, asked):
 RINGS, LEAST = 13, 800
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_coarse_mesh_helps_the_fine_one(folded, asked, coarse):
     found, _ = coarse
     plain = flatten(folded.V, folded.F)
@@ -301,7 +301,7 @@ def test_too_few_rings_for_a_coarser_mesh(folded, asked):
     assert lower_coarse_distance_error(folded, 20, asked, least=len(folded.V)) is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_callbacks_and_records_on_a_coarse_mesh(folded, coarse):
     found, steps = coarse
     assert steps == found.history
@@ -312,7 +312,7 @@ def test_callbacks_and_records_on_a_coarse_mesh(folded, coarse):
     assert np.array_equal(last.uv, np.ldexp(found.uv, folded.exponent))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ctrl_c_on_the_coarse_mesh_returns_a_map_of_the_surface(folded, asked):
     def stop(step):
         if step.iteration == 1:
@@ -324,7 +324,7 @@ def test_ctrl_c_on_the_coarse_mesh_returns_a_map_of_the_surface(folded, asked):
     assert certify(folded.F, found.uv).bijective
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("rings", [20, pytest.param(120, marks=pytest.mark.nightly)])
 def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh(rings, monkeypatch):
     if rings < 120:
@@ -384,7 +384,7 @@ def test_flatten_ends_with_the_descent_of_distances():
     assert [lower_distance_error.iteration for lower_distance_error in result.path] == [*range(len(result.history))]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_flatten_preserves_the_distances_of_each_piece(dome):
     V, F = dome
     both = np.concatenate([V, 0.5 * V + [5, 0, 0]]), np.concatenate([F, F + len(V)])

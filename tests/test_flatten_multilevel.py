@@ -150,7 +150,7 @@ def cut_starfish(arms, rings, gain):
     return cut.V / np.abs(cut.V).max(), cut.F
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("arms", [3, pytest.param(5, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("guarded", [False, True])
 def test_a_coarse_start_separates_the_two_sides_of_a_seam(arms, guarded):
@@ -164,7 +164,7 @@ def test_a_coarse_start_separates_the_two_sides_of_a_seam(arms, guarded):
 
 
 # Above 50,000 triangles a surface is flattened by way of a coarse mesh.
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("linear_solver", "rings"),
     [

@@ -261,7 +261,7 @@ def test_a_map_that_overlaps_itself_has_the_more_specific_status(ended, told):
     assert result.status is told
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_if_another_scaffold_does_not_help_the_search_restarts():
     V, F = random_delaunay(38, 14)
     target = np.array([[1.115, 0.998], [0.849, 1.151], [1.933, 0.916], [1.675, 0.112], [0.771, 1.121]])

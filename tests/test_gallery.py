@@ -22,7 +22,7 @@ def scripts(tmp_path_factory):
     return {path.stem: path.read_text(encoding="utf-8") for path in folder.rglob("*.py")}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["repair", "morph", "transfer"])
 def test_script_runs_when_pasted(name, scripts, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

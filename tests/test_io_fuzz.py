@@ -22,7 +22,7 @@ from shared.gltf_files import SQUARE, square
 quick = examples(60)
 
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 def held(mesh):

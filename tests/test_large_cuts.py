@@ -67,7 +67,7 @@ class TestLevels:
         outer = ~np.isin(graph.ends[own], ring).all(axis=1)
         assert np.array_equal(np.isinf(part.cost), outer)
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_a_large_torus(self):
         """The inner equator and a ring are nearly the shortest cuts."""
         V, F = torus(210, 76, radius=3)
@@ -84,7 +84,7 @@ class TestLevels:
         assert parts(V, F, cut) == [(1, 1)]
         assert not np.isin(edge_keys(*cut.T, len(V)), edge_keys(*diagonals.T, len(V))).any()
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_large_arms(self):
         """On a fine mesh, cuts are about as long as on a coarse one, which reach all arms."""
         V, F = surfaces.starfish(3, 24)

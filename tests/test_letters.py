@@ -354,7 +354,7 @@ def test_invalid_curves_are_rejected(loop, outline, options, message):
         targets.arc_length(loop, outline, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("font", ["DejaVuSans-Bold", "cmr10", "STIXGeneral"])
 def test_letters_agree_with_freetype_up_to_its_rounding(font):
     """Letters, ligatures, combined accents, Greek, Cyrillic, symbols: read by this package and by matplotlib."""

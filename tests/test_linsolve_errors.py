@@ -287,7 +287,7 @@ print(megabytes() - before)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads memory from /proc")
 @pytest.mark.parametrize("factorisations", [300, pytest.param(10_000, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", ALL, indirect=True)

@@ -102,7 +102,7 @@ print(len(os.listdir("/proc/self/task")))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_mkl
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts threads by /proc")
 @pytest.mark.parametrize("way", ["limit", "OMP_NUM_THREADS", "MKL_NUM_THREADS"])
@@ -141,7 +141,7 @@ for round in range(4):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_mkl
 def test_pardiso_survives_changes_of_threads_between_its_phases():
     """Many factorisations, single and several right-hand sides; the residual of every solution is checked."""
@@ -162,7 +162,7 @@ print(laplacian.solver.handle.threads)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_mkl
 @pytest.mark.parametrize(
     ("name", "value", "threads"),

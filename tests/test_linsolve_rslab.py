@@ -205,7 +205,7 @@ with make_solver(indptr, indices, name="rslab") as solver:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_rslab
 def test_rslab_gives_the_same_bits_on_any_number_of_threads(tmp_path):
     A = stiffness(174, contrast=1.0)
@@ -272,7 +272,7 @@ def finished(code):
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=600).stdout.split()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @needs_rslab
 @pytest.mark.parametrize("trial", _ENDING)
 def test_rslab_works_after_its_first_thread_has_ended(trial):

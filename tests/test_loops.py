@@ -39,7 +39,7 @@ def simple(places):
     return all(tuple(p) != tuple(q) for p, q in ends)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @coordinates
 def test_simple_loops(number):
     @given(st.lists(st.lists(st.tuples(number, number), min_size=3, max_size=9), min_size=1, max_size=3))

@@ -142,7 +142,7 @@ def test_to_a_word(qhm):
     assert qhm(surfaces.cat(20), "--to", "word:QH")[0] == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rejection_and_refinement(qhm):
     V, F = surfaces.disk(2)
     ring = np.arange(len(V) - 12, len(V))
@@ -165,7 +165,7 @@ def test_rejection_and_refinement(qhm):
     assert len(written.V) == len(V) + facts["added_vertices"] == facts["vertices"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_refine_without_to(tmp_path, capsys):
     """It treats positions in the file like an outline."""
     V, F = plain_grid(4, 4)

@@ -121,7 +121,7 @@ def test_a_written_obj_refers_to_its_image(tmp_path, qhm):
     np.testing.assert_allclose(seen, there.vertices[:, :2], atol=1 / 32)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".glb", ".gltf"])
 def test_another_library_draws_a_glb_with_its_image(suffix, tmp_path):
     """The colours at vertices, as read by the other library and as drawn here, are those of the image."""
@@ -160,7 +160,7 @@ def test_the_checkerboard_is_a_repeating_image(tmp_path):
     assert len(np.unique(pixels @ (1 << 16, 1 << 8, 1))) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_image_repeats_and_its_transparent_parts_are_white(tmp_path):
     from PIL import Image
 
@@ -199,7 +199,7 @@ def test_a_damaged_image_is_named(tmp_path):
     assert not (tmp_path / "out.png").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_image_is_drawn_on_the_surface_only(tmp_path, qhm):
     (tmp_path / "in.obj").write_text(SQUARE + HALVES)
     asked = "plot", tmp_path / "in.obj", "-o", tmp_path / "out.png", "--texture", gradient(tmp_path / "photo.png")

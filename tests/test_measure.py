@@ -122,7 +122,7 @@ def test_measure_of_inverted_and_flat_triangles(tmp_path, capsys):
     assert (tmp_path / "faces.csv").read_text().splitlines()[1].split(",")[1] == "nan"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "size"), [("map", (450, 800)), ("distortion", (450, 1350)), ("texture", (480, 960))])
 def test_plot(stretched, tmp_path, kind, size):
     picture = tmp_path / "picture.png"
@@ -158,7 +158,7 @@ def test_invalid_outputs(stretched, tmp_path, monkeypatch, capsys, arguments, me
     assert [file.name for file in tmp_path.iterdir()] == ["map.obj"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_vertices_without_a_triangle_have_no_position(stretched, tmp_path):
     path, V, F, uv = stretched
     spaced = np.concatenate([[[9, 9]], V])

@@ -37,7 +37,7 @@ def test_the_code_is_that_of_the_readme():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_figures_appear_in_a_new_kernel(tmp_path):
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

@@ -109,7 +109,7 @@ def test_a_third_texture_coordinate_is_dropped(put):
     assert mesh.vt.tolist() == [[0, 0], [2, 0], [2, 2], [0, 2]]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_long_runs_of_faces_are_written_in_order(tmp_path):
     F = np.random.default_rng(0).integers(0, 50, (150_000, 3))
     mesh = MeshData(np.zeros((50, 3)), F, statements=b"g a\ng b\n", statement_faces=np.array([99_999, 150_000]))

@@ -58,7 +58,7 @@ def test_errors_can_be_pickled_and_contain_odd_names():
     assert str(MeshFileError("\udcff.obj", "what")).encode() == b"\\udcff.obj: what"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @posix
 def test_memory_stays_bounded_for_malicious_files(tmp_path):
     # Long lines, which would need many times their size if split into tokens, and indices and counts that would

@@ -78,7 +78,7 @@ def problems(draw):
     return charts, size, draw(st.sampled_from([0, 1.5, 8])), draw(st.integers(1, 2)), draw(st.booleans())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @given(problems())
 @settings(max_examples=6, deadline=None)
 def test_packing_has_its_promised_properties(problem):
@@ -204,7 +204,7 @@ def test_nothing_to_pack():
     assert pack_charts([]).uv == ()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "seconds"),
     [
@@ -223,7 +223,7 @@ def test_packing_time_is_limited(count, seconds):
     check(charts, packing, [1024 if count < 10_000 else 2048] * 2, 4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_textures_too_small():
     charts = grids(64)
     with pytest.raises(ValueError, match="64 charts with a padding of 4 texels do not fit into 32 ×") as raised:

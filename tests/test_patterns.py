@@ -69,7 +69,7 @@ def test_drawing_is_true_to_scale(ring, tmp_path, unit):
         assert (loop * [1, -1] <= paper).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dxf_is_true_to_scale_and_deterministic(ring, tmp_path):
     ezdxf = pytest.importorskip("ezdxf")
     pytest.importorskip("shapely")

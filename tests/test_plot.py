@@ -199,7 +199,7 @@ def test_degenerate_map_is_drawn(planar):
     assert red(image).any()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_distortion_shows_inverted_triangles(planar):
     V, F, folded = planar
     assert red(pixels(plot_distortion(V, F, folded, "isometric"))).any()
@@ -216,7 +216,7 @@ def test_the_histogram_of_distortion_contains_the_whole_area(planar):
     assert max(heights) == pytest.approx(100)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("measure", LABELS)
 def test_colour_bars_have_labels(planar, measure):
     """Five values at the colour bar, those of the histogram; its ends are open if values may lie beyond."""
@@ -246,7 +246,7 @@ def test_distortion_of_flat_triangles_and_without_values():
         plot_distortion(V, F, uv, "beauty")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_texture_shows_the_checkerboard_and_inverted_triangles(planar, tmp_path):
     V, F, folded = planar
     figure = plot_texture(V, F, V, squares=4)
@@ -267,7 +267,7 @@ def test_texture_shows_the_checkerboard_and_inverted_triangles(planar, tmp_path)
         plot_texture(V, F, V, squares=0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_texture_shows_the_closer_of_two_sheets():
     # Two overlapping squares; only the upper one, mapped far to the right, is visible.
     V = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
@@ -370,7 +370,7 @@ def test_maps_and_triangles_that_do_not_match_are_rejected(planar, plot):
         plot(V, F + len(V), V)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("plot", [plot_map, pytest.param(plot_texture, marks=pytest.mark.nightly)])
 def test_pictures_do_not_depend_on_scale(planar, plot):
     V, F, folded = planar

@@ -44,7 +44,7 @@ class TestTriangulation:
             assert areas(V, F).min() > 0.1
             assert areas(V, F).sum() == pytest.approx(6.0)
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @examples(40)
     @given(st.integers(4, 60), st.integers(0, 10**6))
     def test_a_star_shaped_polygon_is_triangulated_without_inversion(self, size, seed):

@@ -92,7 +92,7 @@ io.open = builtins.open = opens
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_data_set_is_solved_on_a_system_without_unix_features(tmp_path):
     """The encoding has few characters, and some names contain others."""
     (tmp_path / "elsewhere").mkdir()

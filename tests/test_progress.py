@@ -168,7 +168,7 @@ def crossing():
     return V, F, loop, target + 0.3 * np.random.default_rng(0).standard_normal(target.shape)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seconds", [1.5, pytest.param(12, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     "run",

@@ -108,3 +108,11 @@ def test_a_release_is_one_step(tmp_path):
     assert (tmp_path / "CITATION.cff").read_text("utf-8").count("date-released") == 1
     with pytest.raises(SystemExit, match="no version"):
         prepare(tmp_path, "8", "2031-02-05")
+
+
+@pytest.mark.slow
+def test_the_trial_of_a_built_wheel_runs(capsys):
+    """The script that `scripts/release-check` runs in each environment."""
+    script = re.findall(r"<<'PYTHON'\n(.*?)\nPYTHON\n", text("scripts/release-check"), re.DOTALL)[-1]
+    exec(compile(script, "release-check", "exec"), {})
+    assert "iterations" in capsys.readouterr().out

@@ -63,7 +63,7 @@ def test_base_requirements_leave_out_solvers_without_a_wheel():
     assert {one.name for one in needed} - there == {"qdldl", "rslab"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_maps_without_threads_and_processes(tmp_path):
     environment = simulate(tmp_path)
     environment["PYTHONPATH"] += os.pathsep + SOURCE

@@ -19,7 +19,7 @@ def turned_ring(rows=8):
     return V, F, fixed, target
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("k", "rows"), [(1, 12), (3, 8), pytest.param(7, 12, marks=pytest.mark.nightly)])
 def test_every_kth_map_is_recorded(k, rows):
     V, F, fixed, target = turned_ring(rows)
@@ -37,7 +37,7 @@ def test_every_kth_map_is_recorded(k, rows):
     assert len({s.uv.ctypes.data for s in result.path}) == len(result.path)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_recording_changes_nothing_and_is_off_by_default():
     problem = Problem(*turned_ring())
     plain, recorded = solve(problem), solve(problem, record_every=2)

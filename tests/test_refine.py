@@ -81,7 +81,7 @@ def test_the_refined_mesh_is_polished():
     assert len(result.refinement_attempts) > 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_holes_and_pins_at_other_positions_than_in_the_mesh():
     problem = with_holes(np.random.default_rng(0), 2, 2, size=7)
     result = solve(problem, refine=True, max_iterations=30)
@@ -98,7 +98,7 @@ def without_room():
     return V, F, target, injective_map(V, F, [0, 1, 2], target, refine=True, max_iterations=60)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_precision_limit_is_reported(without_room):
     result = without_room[-1]
     assert result.status is Status.PRECISION_LIMIT
@@ -270,7 +270,7 @@ def test_the_command_uses_the_same_refinement(tmp_path, capsys):
     assert certify(written.F, io.map_of(written)).bijective
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_names_the_precision_limit(without_room, tmp_path, capsys, monkeypatch):
     V, F, target, result = without_room
     uv = np.vstack([target, [1, 1]])

@@ -175,7 +175,7 @@ def rounds_by_hand(problem):
     return V, F, values, number
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_problems_are_refined_until_no_obstruction_is_named():
     most = 0
     for name, (problem, _) in OBSTRUCTED.items():

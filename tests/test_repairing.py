@@ -353,7 +353,7 @@ class TestCommand:
         assert f"wrote {out}: 3 islands: {facts['inverted_before']} triangles inverted before, 0 now" in said.out
         assert said.err == ""
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_the_other_commands_accept_seams(self, uv_file, tmp_path, capsys):
         out, report, faces = tmp_path / "repaired.obj", tmp_path / "report.json", tmp_path / "faces.npz"
         assert run("check", uv_file, "--json", report) == 1

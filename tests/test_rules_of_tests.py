@@ -80,13 +80,12 @@ def facts(path):
     return [module for module, _ in imports(nodes)], list(private_names(nodes)), list(optional_packages(nodes))
 
 
-@pytest.mark.slow
 def test_no_file_is_long():
     lines = {path.name: path.read_text(encoding="utf-8").count("\n") for path in MODULES}
     assert not {name: count for name, count in lines.items() if count > MAX_LINES}, "split it by behaviour"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(FOLDER).as_posix())
 def test_rules(path):
     text, (modules, private, _) = path.read_text(encoding="utf-8"), facts(path)

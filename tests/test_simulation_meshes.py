@@ -33,7 +33,7 @@ def dent(points, depth, waves=1):
 # ---- chains ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_small_steps_end_like_one_large_step(flap):
     points, F, body = flap
     whole = morph(points, F, body, turned(points[body], 50))
@@ -290,7 +290,7 @@ def test_elements_that_remain_inverted_are_reported():
     assert side[0] in F[morphed.inverted[0]]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_failed_repair_causes_no_warning():
     points, F = second_order(*surfaces.grid(5, 5))
     side = np.flatnonzero(((points == 0) | (points == 1)).any(axis=1))

@@ -70,7 +70,7 @@ def test_a_letter_is_better_with_its_boundary_sliding(character):
     assert not (steps == 0).any()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_word_slides_along_the_curves_of_its_letters():
     pytest.importorskip("shapely")
     V, F, fixed, target, curves = lettered("word:OC")

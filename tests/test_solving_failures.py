@@ -104,7 +104,7 @@ class TestNoMap:
         assert result.history[-1].energy > 1e-3
         assert not result.diagnosis.obstructions
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_local_repair_has_a_limit(self, monkeypatch):
         """Almost nothing is inverted, and no number of restarts helps."""
         V, F = disk(2)
@@ -301,7 +301,7 @@ class TestLinearSolver:
         monkeypatch.setattr(solver, "factor", fail_twice, raising=False)
         assert solve(problem).injective
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_permanent_indefiniteness_has_a_status(self, monkeypatch):
         problem = Problem(*turned_ring(180))
         solver = problem.domain.laplacian("superlu").solver
@@ -321,7 +321,7 @@ class TestLinearSolver:
         assert np.sum(signed_areas(problem.F, result.uv) <= 0) < result.history[2].inverted
         assert np.all(np.isfinite(result.uv))
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_another_backend_replaces_a_failing_one(self, monkeypatch):
         problem = Problem(*turned_ring(120))
         best, *others = quasiharmonic.linsolve.available(problem.domain.laplacian().solver.nnz)

@@ -165,7 +165,7 @@ class TestRandomRestarts:
         assert nearest(square, 3 + 3j) == 1 + 1j
         assert nearest(square, 0.9 + 0.5j) == 1 + 0.5j
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_moves_a_vertex_around_a_fold(self):
         """A free vertex must lie in a wedge behind a fold of the target, and starts in front of it."""
         case = problems.make(*problems.parse("jam:81:0.943"))
@@ -208,7 +208,7 @@ def stuck():
 
 
 class TestReweighting:
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_repairs_what_the_same_number_of_unweighted_descents_does_not(self, stuck):
         patch, start = stuck
         assert signed_areas(patch.F, start).min() < 0
@@ -222,7 +222,7 @@ class TestReweighting:
             np.testing.assert_array_equal(end[patch.fixed], start[patch.fixed])
             assert np.sum(signed_areas(patch.F, end) <= 0) <= np.sum(signed_areas(patch.F, start) <= 0)
 
-    @pytest.mark.slow
+    @pytest.mark.long
     @pytest.mark.parametrize("spoilt", [False, True])
     def test_returns_the_start_if_nothing_is_better(self, stuck, spoilt, monkeypatch):
         """Return the last map of the rounds that is no worse than the given one; if all are worse, the given one."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+
 import numpy as np
 import pytest
 
@@ -52,7 +54,7 @@ def test_invalid_meshes_are_rejected_with_a_message_about_the_users_file(name, c
     # The reason comes last, because a surface hides what was said before.
     text = visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name=name)[-1].header["text"]
     assert says in text
-    assert "/tmp" not in text
+    assert tempfile.gettempdir() not in text
     assert "dropped" not in text
     assert visitor.session.state is before
 

@@ -69,7 +69,7 @@ def test_a_socket_of_another_site_is_rejected(running, options):
     assert refused.value.response.status_code == 403
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pages_are_independent_and_a_crash_ends_only_its_page(running):
     with running.page() as one, running.page() as other:
         for socket in (one, other):
@@ -98,7 +98,7 @@ def test_a_socket_closed_during_a_drag_leaves_no_process(running):
     nobody_is_left()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_messages_that_are_too_large_or_invalid_close_only_their_page(running):
     with running.page() as other:
         hear(other, "map", state="settled")
@@ -122,7 +122,7 @@ def test_messages_that_are_too_large_or_invalid_close_only_their_page(running):
         assert hear(other, "map").header["injective"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_number_of_pages_is_limited(running, monkeypatch):
     nobody_is_left()
     time.sleep(0.2)

@@ -262,7 +262,7 @@ def test_huge_drawings(read, tmp_path, monkeypatch):
         targets.read_svg(tmp_path / "none.svg")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.1, pytest.param(1, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("start", "part", "count", "end", "message"),
@@ -297,7 +297,7 @@ SAMPLE = drawing(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_damaged_drawings_are_read_or_rejected(tmp_path):
     outcomes = {"read": 0, "rejected": 0}
 

@@ -72,7 +72,7 @@ def test_signs_agree_with_rational_numbers():
         assert tetrahedron_signs(np.arange(4)[None], p)[0][0] == (expected > 0) - (expected < 0), p
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("common", [0, 1, 2])
 def test_contacts_of_two_triangles_agree_with_the_oracle(rng, common):
     """Also of triangles in one plane, which are every third pair."""

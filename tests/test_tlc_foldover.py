@@ -63,7 +63,7 @@ def test_letters():
     assert all(float(row["ours_polished_mips"]) < float(row["foldover_free_mips"]) for row in rows)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_repeated_run():
     rows = dict(list(tlc_foldover.on_common_problems(tlc_foldover.read_records()).items())[1:2])
     ((name, row),) = rows.items()

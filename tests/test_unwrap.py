@@ -96,7 +96,7 @@ def test_stretch_is_that_of_singular_values(result):
     assert result.utilisation == pytest.approx(image / 2 / 512**2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_bound_that_cannot_be_kept_is_reported():
     result = unwrap(V, F, max_stretch=1.0, max_charts=2, resolution=256)
     assert result.misses
@@ -168,7 +168,7 @@ def test_seams_of_existing_coordinates_are_used():
     assert unwrap(points, triangles, uv=points, resolution=256).n_charts == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_edge_costs_move_seams():
     costs = np.ones(F.shape)
     upper = V[F, 2].mean(axis=1) > 0
@@ -370,7 +370,7 @@ def test_a_single_long_polygon_is_not_divided():
     assert unwrap(points, triangles, resolution=512, edge_costs=np.where(inside, 1000.0, 1.0)).n_charts == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_separation_of_a_large_chart_moves_only_vertices_close_to_the_overlap():
     """A strip around a circle whose ends overlap a little in the plane."""
     V, F = grid(100, 220)

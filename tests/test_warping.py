@@ -74,7 +74,7 @@ def test_another_shape():
     assert drawn[0].sum() == drawn[:, :2].sum() == drawn[:, 6].sum() == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("shape", [(30, 1000), (1000, 30)])
 def test_narrow_images_can_be_warped(shape):
     size = np.array(shape[::-1]) - 1.0
@@ -84,7 +84,7 @@ def test_narrow_images_can_be_warped(shape):
     assert warped.positions[-1] == pytest.approx((0.5 + along) * size)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_landmarks_on_the_border_move_it():
     image = np.tile(np.arange(1, 65, dtype=np.int16), (64, 1))
     # The lower side bends up, the right upper corner moves in; the left side stays.
@@ -131,7 +131,7 @@ def test_points_without_a_position_are_named():
             warp_along(np.zeros((4, 4)), before, [[0, 1, 2], [0, 2, 3]], after)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_impossible_warp_has_advice():
     with pytest.raises(RuntimeError, match="Move them less, or give more landmarks"):
         warp_by_landmarks(np.zeros((50, 50)), [[31.5, 49], [20, 20]], [[31.5, 30], [31.5, 40]], resolution=16)
@@ -175,7 +175,7 @@ def worst_stretch(warped):
     return np.maximum(measured.sigma1, 1 / measured.sigma2).max()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_stretch_does_not_grow_with_the_resolution():
     def stretch(resolution, **options):
         return worst_stretch(

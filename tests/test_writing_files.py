@@ -153,7 +153,7 @@ except OutputError as error:
     assert path.read_bytes() == b"old"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @posix
 def test_kill_9_leaves_the_complete_old_or_new_file(tmp_path):
     path = tmp_path / "mesh.obj"

@@ -67,7 +67,7 @@ def lab(tmp_path):
             server.kill()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_drag_in_jupyterlab_moves_the_map_of_the_kernel(browser, lab, tmp_path):
     page = browser.new_page(viewport={"width": 1200, "height": 900})
     page.set_default_timeout(60_000)

@@ -265,7 +265,7 @@ def test_the_keyboard_moves_vertices(address, opened, settled):
     assert page.evaluate("studio.view.hands.space().yaw") == pytest.approx(0.12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_thousand_frames_leak_no_memory(address, opened):
     page = opened(address)
     vertex = corner(page, 2)
