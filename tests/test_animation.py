@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, animate, boundary_loops, certify, io, polish
-from quasiharmonic.apps.animation.frames import FrameStep
 from quasiharmonic.energies.newton.proximal import ProximalPenalty
+from quasiharmonic.results import FrameStep
 from quasiharmonic.surfaces import cat, disk
 from quasiharmonic.ui.cli import main
 

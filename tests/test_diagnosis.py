@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, diagnose, injective_map, refine
-from quasiharmonic.problem.diagnosis import Forbids, Kind
+from quasiharmonic.results import Forbids, Kind
 from quasiharmonic.surfaces import disk
 from shared.infeasible_problems import HOUSE, OBSTRUCTED, moved, onto
 from shared.polygons import circle

@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay
 from quasiharmonic import Problem, diagnose
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.topology import edges
-from quasiharmonic.problem.diagnosis import Forbids, Kind
+from quasiharmonic.results import Forbids, Kind
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.infeasible_problems import OBSTRUCTED, moved, onto
 from shared.meshes import bend, boundary_of

@@ -15,11 +15,12 @@ from quasiharmonic import Problem, diagnose
 from quasiharmonic.geometry.exact.loops import contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation, segment_relation
 from quasiharmonic.geometry.exact.sweep import triangulate
-from quasiharmonic.problem.diagnosis import Kind, examine, shortcuts
+from quasiharmonic.problem.diagnosis import examine, shortcuts
 from quasiharmonic.problem.diagnosis.clearance import clear
 from quasiharmonic.problem.diagnosis.clipping import Lattice
 from quasiharmonic.problem.diagnosis.effort import Effort
 from quasiharmonic.problem.diagnosis.views import Views
+from quasiharmonic.results import Kind
 from quasiharmonic.surfaces import annulus, disk, grid
 from shared.infeasible_problems import OBSTRUCTED, onto
 from shared.meshes import boundary_of

@@ -32,7 +32,7 @@ from quasiharmonic import (
     polish,
     solve,
 )
-from quasiharmonic.problem.result import Step
+from quasiharmonic.results import Step
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.display.markup import MAX_TRIANGLES, html

@@ -25,7 +25,7 @@ from quasiharmonic import (
     refine_problem,
 )
 from quasiharmonic.linsolve import available
-from quasiharmonic.problem.diagnosis import Kind
+from quasiharmonic.results import Kind
 from quasiharmonic.surfaces import cat, disk, grid, random_delaunay
 from quasiharmonic.targets import boundary_to
 from quasiharmonic.ui.cli import main

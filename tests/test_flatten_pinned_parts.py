@@ -7,7 +7,7 @@ import pytest
 
 from quasiharmonic import Status, boundary_loops, certify, flatten
 from quasiharmonic.io import MeshData, map_of, read_mesh, write_obj
-from quasiharmonic.problem.diagnosis import Forbids, Kind
+from quasiharmonic.results import Forbids, Kind
 from quasiharmonic.surfaces import annulus, disk
 from quasiharmonic.ui.cli import main
 

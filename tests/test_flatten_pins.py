@@ -12,7 +12,7 @@ from quasiharmonic.apps.flattening.piece import Piece, Settings
 from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
 from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, move_onto_pins
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
-from quasiharmonic.problem.diagnosis import Forbids, Kind
+from quasiharmonic.results import Forbids, Kind
 from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"

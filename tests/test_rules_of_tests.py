@@ -85,7 +85,6 @@ def test_no_file_is_long():
     assert not {name: count for name, count in lines.items() if count > MAX_LINES}, "split it by behaviour"
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(FOLDER).as_posix())
 def test_rules(path):
     text, (modules, private, _) = path.read_text(encoding="utf-8"), facts(path)

@@ -7,7 +7,7 @@ import meshlane
 import numpy as np
 import pytest
 
-from quasiharmonic.apps.tetrahedra.certificate import certify_tetrahedra
+from quasiharmonic import certify_tetrahedra
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns, tetrahedron_signs
 from quasiharmonic.io.fem.files import read_volume

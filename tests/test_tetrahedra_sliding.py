@@ -8,10 +8,9 @@ import meshlane
 import numpy as np
 import pytest
 
-from quasiharmonic import MovingMesh, certify_tetrahedra, morph
+from quasiharmonic import BoundaryCurves, MovingMesh, certify_tetrahedra, morph
 from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
 from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus
-from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.io.fem.files import read_volume
 from quasiharmonic.ui.cli import main
 from shared.tetrahedral_meshes import box, sphere_points
