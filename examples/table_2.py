@@ -20,7 +20,7 @@ COLUMNS = ("SBP's energy", "si-log", "tanh + MIPS")
 def main(output: Path, size: int = 48, problems: int = 7) -> dict[str, Any]:
     figure, axes = panels(len(COLUMNS), 1 + problems, (1.8, 2.1))
     numbers: dict[str, Any] = {}
-    for j, (name, problem) in enumerate(list(seven(size).items())[:problems]):
+    for j, (name, problem) in enumerate(seven(size, problems).items()):
         tanh, si_log = solve(problem).uv, first_map(problem, "si-log").uv
         maps = dict(
             zip(

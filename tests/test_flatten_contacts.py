@@ -67,8 +67,8 @@ def test_contacts_agree_with_all_pairs():
         if near and v not in (a, b) and end not in (after[v], before[v]):
             # The segment between them leaves the vertex and reaches the edge from outside.
             foot = np.array(edge.interpolate(along, normalized=True).coords[0])
-            beside = (shapely.Point(foot + (V[v] - foot) * t) for t in (1e-6, 1 - 1e-6))
-            if not any(polygon.contains(place) for place in beside):
+            ends = (shapely.Point(foot + (V[v] - foot) * t) for t in (1e-6, 1 - 1e-6))
+            if not any(polygon.contains(place) for place in ends):
                 expected.add((v, a, b))
     assert {*map(tuple, found.corners.T.tolist())} == expected != set()
 

@@ -29,11 +29,11 @@ def run_command(kind, arguments, settings):
 def cluster(folder, workers, **settings):
     """A scheduler and single-threaded workers: address, scheduler process, worker processes."""
     context = quick_context()
-    told = folder / "scheduler.json"
+    scheduler_file = folder / "scheduler.json"
 
     def start(kind, *arguments):
         process = context.Process(
-            target=run_command, args=(kind, ["--scheduler-file", str(told), *arguments], settings)
+            target=run_command, args=(kind, ["--scheduler-file", str(scheduler_file), *arguments], settings)
         )
         process.start()
         stack.callback(process.join)
@@ -45,9 +45,9 @@ def cluster(folder, workers, **settings):
         options = "--no-nanny", "--nthreads", "1", "--no-dashboard", "--preload", str(PRELOAD)
         running = [start("worker", *options, "--local-directory", str(folder)) for _ in range(workers)]
         deadline = time.monotonic() + 60
-        while not told.exists() or not told.read_text():
+        while not scheduler_file.exists() or not scheduler_file.read_text():
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        address = json.loads(told.read_text())["address"]
+        address = json.loads(scheduler_file.read_text())["address"]
         assert address.startswith("tcp://")
         yield address, scheduler, running
