@@ -44,6 +44,8 @@ _NOTHING = 1e-5
 _LEAST_ENERGY = 0.1
 # From mean energies below this, Newton steps are used directly.
 _NEAR = 1.0
+# Boundary vertices are rounded to this multiple of the root of the area before contacts are sought.
+_GAP = 2.0**-20
 
 
 class EvenStretch(Isotropic):
@@ -100,9 +102,9 @@ class WorkingChart:
     stretch : (k,) float64
         The larger of σ₁ and 1/σ₂ on each triangle, if the map has the surface's area; infinite without a map.
     crossings : (c, 4) int64
-        Pairs of boundary edges that intersect.
+        Pairs of boundary edges that intersect or almost touch.
     bijective : bool
-        Whether the map covers no point twice.
+        Whether the map covers no point twice, and its boundary stays away from itself.
     """
 
     triangles: IntArray
@@ -141,7 +143,9 @@ class WorkingChart:
         """Use an injective map (m, 2), scaled to the surface's area, and measure it."""
         self.uv = _fit_scale(self.piece, uv)
         self.stretch = measure_stretch(self.piece.energy(SymmetricDirichlet(), None), self.uv)
-        self.crossings, reasons = check_loops(self.piece.loops, self.uv)
+        # Boundaries that are closer than this would touch in the precision of texture coordinates.
+        unit = _GAP * np.sqrt(self.piece.area)
+        self.crossings, reasons = check_loops(self.piece.loops, np.rint(self.uv / unit) * unit)
         self.bijective = not reasons
 
 

@@ -31,6 +31,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import (
 )
 from quasiharmonic.apps.unwrapping.joining import join_small_charts
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
+from quasiharmonic.apps.unwrapping.slits import close_slits
 from quasiharmonic.util.threads import HAS_THREADS, count_cores, make_executor
 
 T = TypeVar("T")
@@ -150,11 +151,12 @@ def search_charts(
                 _Job(here[k], stretched, rank < room or (max_charts is None and not here[k].bijective))
                 for rank, (k, stretched) in enumerate(chosen)
             ]
-            found = workers.map("improve", partial(_improve, goal, workers), jobs)
+            found = workers.map("improve", partial(_improve, goal, workers, joinable), jobs)
             changed = {k: parts for (k, _), (parts, same) in zip(chosen, found, strict=True) if not same}
             here = [part for k, chart in enumerate(here) for part in changed.get(k, [chart])]
             if not changed:
                 break
+    here = [_close(chart, joinable) for chart in here]
     overlapping = [chart for chart in here if not chart.bijective]
     workers.map("separate", partial(guard_chart, check_wanted=workers.check_wanted), overlapping)
     return join_small_charts(here, aim, total_area, workers.check_wanted) if joinable else here
@@ -190,9 +192,16 @@ def _flatten(bound: float, workers: Workers, chart: WorkingChart) -> list[Workin
     return [part for half in divide(chart, bound) for part in _flatten(bound, workers, half)]
 
 
-def _improve(bound: float, workers: Workers, job: _Job) -> tuple[list[WorkingChart], bool]:
+def _close(chart: WorkingChart, joinable: bool) -> WorkingChart:
+    """Close the slits of a chart that touches itself, if its cuts may be closed."""
+    return chart if chart.bijective or not joinable else close_slits(chart) or chart
+
+
+def _improve(bound: float, workers: Workers, joinable: bool, job: _Job) -> tuple[list[WorkingChart], bool]:
     """Cut a chart once and flatten its parts, or separate overlaps; the flag says that the chart is unchanged."""
-    chart = job.chart
+    chart = _close(job.chart, joinable)
+    if chart is not job.chart:
+        return [chart], False
     apart = chart.bijective or overlapping_share(chart) < _SMALL_OVERLAP
     if apart and not job.stretched:
         if separate(chart, bound, workers.check_wanted):
@@ -206,5 +215,5 @@ def _improve(bound: float, workers: Workers, job: _Job) -> tuple[list[WorkingCha
         return parts, False
     if not job.divisible or len(chart.F) < 2:
         return [chart], True
-    parts = divide(chart, bound) if apart else divide_overlap(chart)
+    parts = divide(chart, bound) if apart or not len(chart.crossings) else divide_overlap(chart)
     return [done for part in parts for done in _flatten(bound, workers, part)], False

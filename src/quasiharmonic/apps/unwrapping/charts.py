@@ -57,6 +57,21 @@ class Chart:
     stretch: FloatArray
     misses: float
 
+    def open(self, V: FloatArray, cost: FloatArray) -> WorkingChart:
+        """Return the chart for further cuts, given positions (n, 3) and costs (f, 3) of the whole mesh."""
+        rows = self.triangles
+        working = WorkingChart(rows, self.vertices, V[self.vertices], self.F, cost[rows])
+        working.uv, working.stretch = np.ldexp(self.uv, -working.piece.exponent), self.stretch
+        return working
+
+    def part(self, working: WorkingChart, bound: float) -> Chart:
+        """Return a part of the chart, which was cut off with its map."""
+        assert working.uv is not None
+        stretch = self.stretch[np.searchsorted(self.triangles, working.triangles)]
+        uv = np.ldexp(working.uv, working.piece.exponent)
+        missed = self.misses if (stretch > bound).any() else 0.0
+        return Chart(working.triangles, working.F, working.vertices, uv, stretch, missed)
+
 
 def find_charts(
     V: FloatArray,

@@ -52,10 +52,12 @@ class CleanedMesh:
     flipped : (f',) bool
         Whether the orientation is reversed.
     widened : (f',) bool
-        Whether the triangle has a height of less than 1e-7 of its longest side, or none, in the model. A vertex of it
-        was moved, so that the triangle can have a shape in the plane.
+        Whether the triangle has no height in the model, or less than 1e-7 of its longest side, or less than 2.4e-7 of
+        the root of the model's area if that is below 1e-3 of its longest side. A vertex of it was moved, so that the
+        triangle can have a shape in the plane and in a texture.
     moved : (n',) bool
-        Whether the vertex was moved, by less than 1e-3 of the shortest edge there, or 1e-7 of a thin triangle.
+        Whether the vertex was moved, by at most the largest of 1e-3 of the shortest edge there, 4e-7 of the longest
+        side of a thin triangle, and 7.6e-6 of the root of the model's area.
     component : (f',) int64
         Component of each triangle. Components are numbered by their first vertices.
     facing : (c,) int64

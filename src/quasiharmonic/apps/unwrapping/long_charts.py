@@ -8,7 +8,6 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import find_smallest_box, make_shape
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
-from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.charts import Chart
 from quasiharmonic.util.arrays import FloatArray
 
@@ -64,11 +63,11 @@ def divide_long_charts(
         if full or len(chart.F) < 2 or not _is_too_long(chart, side):
             done.append(chart)
             continue
-        working = WorkingChart(chart.triangles, chart.vertices, V[chart.vertices], chart.F, cost[chart.triangles])
+        working = chart.open(V, cost)
         if is_undivided(working):
             done.append(chart)
         else:
-            waiting += _divide(chart, working, bound)
+            waiting += [chart.part(part, bound) for part in divide(working, bound)]
     return sorted(done, key=lambda chart: int(chart.triangles[0]))
 
 
@@ -82,16 +81,3 @@ def _is_too_long(chart: Chart, side: float) -> bool:
     width, height = shape.extent(find_smallest_box(shape))
     loose = shape.area < _LOOSE * width * height
     return max(width, height) > side * (_LONGEST_LOOSE if loose else _LONGEST)
-
-
-def _divide(chart: Chart, working: WorkingChart, bound: float) -> list[Chart]:
-    """Divide a chart across its middle."""
-    working.uv, working.stretch = np.ldexp(chart.uv, -working.piece.exponent), chart.stretch
-    parts = []
-    for part in divide(working, bound):
-        assert part.uv is not None
-        stretch = chart.stretch[np.searchsorted(chart.triangles, part.triangles)]
-        uv = np.ldexp(part.uv, part.piece.exponent)
-        missed = chart.misses if (stretch > bound).any() else 0.0
-        parts.append(Chart(part.triangles, part.F, part.vertices, uv, stretch, missed))
-    return parts

@@ -31,11 +31,6 @@ class UnwrapStatus(Enum):
         "Every chart is bijective and no two charts overlap, verified exactly. Some charts exceed the bound on the "
         "stretch: see misses. Raise max_stretch, or max_charts if it was given."
     )
-    ROUNDED = (
-        "Rounding to the stored coordinates inverts some extremely thin triangles: see certificate. All other "
-        "triangles are positive, and no two charts overlap."
-    )
-    OVERLAPPING = "Some charts overlap or are not bijective: see certificate."
 
 
 class Stretch(NamedTuple):

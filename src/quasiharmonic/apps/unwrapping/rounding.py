@@ -35,9 +35,7 @@ def round_positions(F: IntArray, uv: FloatArray) -> FloatArray:
     -------
     (n, 2) float64
     """
-    largest = float(np.abs(uv).max(initial=1.0))
-    # Numbers beyond 1 need a larger unit.
-    unit = _UNIT * 2.0 ** int(np.ceil(np.log2(max(largest, 1.0))))
+    unit = grid_unit(uv)
     grid = np.rint(uv / unit).astype(np.int64)
     for _ in range(_PASSES):
         wrong = np.flatnonzero(_twice_areas(grid[F]) <= 0)
@@ -45,6 +43,12 @@ def round_positions(F: IntArray, uv: FloatArray) -> FloatArray:
             break
     rounded: FloatArray = grid.astype(np.float64) * unit
     return rounded
+
+
+def grid_unit(uv: FloatArray) -> float:
+    """Return the unit of which `round_positions` makes positions (n, 2) multiples."""
+    # Numbers beyond 1 need a larger unit.
+    return _UNIT * 2.0 ** int(np.ceil(np.log2(np.abs(uv).max(initial=1.0))))
 
 
 def _repair(F: IntArray, grid: IntArray, wrong: IntArray) -> bool:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.pack import check_texture, pack_charts
-from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
+from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import MAX_STRETCH, find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
 from quasiharmonic.apps.unwrapping.layout import ChartLayout, find_differing_edges, find_seams, join_charts
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
+from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
@@ -68,7 +69,8 @@ def unwrap(
         Bound on the stretch max(σ₁, 1/σ₂), at least 1. 99 % of the surface keep it. No triangle is stretched by more
         than 3, except triangles with an angle below 1°. Lower values need more seams.
     max_charts : int, optional
-        Maximum number of charts. Every connected part has at least one chart.
+        Maximum number of charts. It is exceeded only by connected parts, and by parts that have no bijective map
+        otherwise.
     resolution : int or (int, int)
         Side of the texture in texels, or width and height.
     padding : float
@@ -100,8 +102,8 @@ def unwrap(
     Returns
     -------
     UnwrapResult
-        Iterates as ``vmapping, indices, uvs``, the arrays of ``xatlas.parametrize``. If the bound is not kept, the
-        result lists the charts (`UnwrapResult.misses`).
+        Iterates as ``vmapping, indices, uvs``, the arrays of ``xatlas.parametrize``. All charts are bijective. If the
+        bound is not kept, the result lists the charts (`UnwrapResult.misses`).
 
     Raises
     ------
@@ -153,19 +155,26 @@ def unwrap(
     charts = divide_long_charts(
         charts, points, cost, bound=float(max_stretch), size=size, tiles=tiles, max_charts=max_charts
     )
-    report("pack")
-    packing = pack_charts(
-        [(chart.uv, chart.F) for chart in charts],
-        resolution=size,
-        padding=float(padding),
-        texels_per_unit=None if texels_per_unit is None else float(np.ldexp(texels_per_unit, exponent)),
-        tiles=tiles,
-        rotate=rotate,
-        stack=stack,
-    )
-    report("certify")
-    layout = join_charts(charts, packing, len(cleaned.F))
-    certificate = certify_charts(layout, cleaned.triangles, size=size, padding=float(padding), stacked=stack)
+    while True:
+        report("pack")
+        packing = pack_charts(
+            [(chart.uv, chart.F) for chart in charts],
+            resolution=size,
+            padding=float(padding),
+            texels_per_unit=None if texels_per_unit is None else float(np.ldexp(texels_per_unit, exponent)),
+            tiles=tiles,
+            rotate=rotate,
+            stack=stack,
+        )
+        report("certify")
+        layout = join_charts(charts, packing, len(cleaned.F))
+        certificate = certify_charts(layout, cleaned.triangles, size=size, padding=float(padding), stacked=stack)
+        assert certificate.disjoint, "packed charts keep a distance larger than the rounding"
+        faulty = np.flatnonzero(~certificate.bijective_charts)
+        if not faulty.size:
+            break
+        scale = packing.texels_per_unit / max(size)
+        charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=cost, bound=float(max_stretch))
     # Rows of texture coordinates are ordered by vertex, then by chart.
     key, indices = np.unique(F * len(layout.uv) + cleaned.restore_corners(layout.rows), return_inverse=True)
     vmapping, row = np.divmod(key, len(layout.uv))
@@ -190,7 +199,7 @@ def unwrap(
         misses=tuple(misses),
         utilisation=packing.utilisation,
         cleaned=cleaned,
-        status=_find_status(certificate, misses),
+        status=UnwrapStatus.STRETCHED if misses else UnwrapStatus.UNWRAPPED,
         resolution=size,
         texels_per_unit=float(np.ldexp(packing.texels_per_unit, -exponent)),
         V=V,
@@ -234,12 +243,6 @@ def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
     position = np.nan_to_num(position, nan=np.finfo(np.float64).max) + 0.0
     rows = np.unique(position.reshape(-1, 2), axis=0, return_inverse=True)[1]
     return find_differing_edges(cleaned.F, rows.reshape(-1, 3), len(cleaned.V))
-
-
-def _find_status(certificate: UnwrapCertificate, misses: Sequence[Miss]) -> UnwrapStatus:
-    if certificate.bijective:
-        return UnwrapStatus.STRETCHED if misses else UnwrapStatus.UNWRAPPED
-    return UnwrapStatus.ROUNDED if certificate.disjoint and not certificate.injective else UnwrapStatus.OVERLAPPING
 
 
 def _measure(

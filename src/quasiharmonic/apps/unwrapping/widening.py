@@ -13,11 +13,14 @@ from quasiharmonic.geometry.mesh.reference import flat_triangles, rest_frames
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-# A triangle is thin if its height is smaller than this multiple of its longest side. Flattening copes with larger ones.
-_THIN = 1e-7
-
-# A vertex moves by about this multiple of the shortest edge there.
-_SHIFT = 1e-3
+# A triangle is thin if its height is smaller than this multiple of its longest side, which flattening cannot cope with,
+# or of the root of the surface's area, which is a few units of the precision of texture coordinates.
+_THIN, _LOW = 1e-7, 2.0**-22
+# Its vertex moves by about this multiple of the shortest edge there. The new height is at least this multiple of the
+# root of the area, except where the longest side is small.
+_SHIFT, _HIGH = 1e-3, 2.0**-17
+# Triangles with a larger height, relative to their longest side, are small and not thin.
+_SMALL = 1e-3
 
 
 class Widened(NamedTuple):
@@ -62,7 +65,9 @@ def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
     area = base * tip.imag
     sides = np.stack([base, np.abs(tip - base), np.abs(tip)], axis=1)
     flat = (base == 0) | (tip.imag == 0)
-    thin = flat | (area < _THIN * (sides**2).max(axis=1))
+    size = np.sqrt(np.abs(area).sum() / 2)
+    longest = sides.max(axis=1)
+    thin = flat | (area < np.maximum(_THIN * longest, np.minimum(_LOW * size, _SMALL * longest)) * longest)
     moved = np.zeros(len(points), dtype=bool)
     if not thin.any():
         return Widened(points, moved, thin, flat, area)
@@ -75,20 +80,31 @@ def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
         degenerate |= proper & ~_joins(F, sides, proper, ~degenerate)
     thin &= ~degenerate
     rows = np.flatnonzero(thin)
-    longest = sides[rows].argmax(axis=1)
+    side = sides[rows].argmax(axis=1)
     # Side k runs from corner k to the next, so the corner before k is opposite.
-    apex = F[rows, (longest + 2) % 3]
+    apex = F[rows, side - 1]
     moved[apex] = True
     near = np.flatnonzero(moved[F].any(axis=1) & ~degenerate)
     shortest = np.full(len(points), np.inf)
     for k in range(3):
         np.minimum.at(shortest, F[near, k], np.minimum(sides[near, k], sides[near, k - 1]))
-    # At least twice the height of a thin triangle, so that none is thin afterwards.
-    length = np.maximum(_SHIFT * shortest[apex], 4 * _THIN * sides[rows].max(axis=1))
-    along = points[F[rows, (longest + 1) % 3]] - points[F[rows, longest]]
+    # More than the height of a thin triangle, so that none is thin afterwards.
+    base = longest[rows]
+    length = np.maximum(
+        _SHIFT * shortest[apex], np.maximum(4 * _THIN * base, np.minimum(_HIGH * size, 4 * _SMALL * base))
+    )
+    start, end = F[rows, side], F[rows, (side + 1) % 3]
+    along = points[end] - points[start]
     points = points.copy()
+    # Away from the triangle at the longest side, or towards that at another side: in their planes, so flat faces stay
+    # flat.
+    ordinary = F[~thin & ~degenerate]
+    across = -_towards_tips(points, ordinary, start, end)
+    for one, other in ((end, apex), (apex, start)):
+        across = np.where(np.isnan(across), _towards_tips(points, ordinary, one, other), across)
+    across = np.where(np.isnan(across), _across(along, dimension), across)
     # Random shifts do not put several vertices on one line again. The seed is fixed, so that results are reproducible.
-    points[apex] += _across(along, dimension) * (length * np.random.default_rng(0).uniform(0.5, 1, rows.size))[:, None]
+    points[apex] += across * (length * np.random.default_rng(0).uniform(0.5, 1, rows.size))[:, None]
     degenerate[near[flat_triangles(points, F[near])]] = True
     return Widened(points, moved, thin & ~degenerate, degenerate, area)
 
@@ -115,6 +131,23 @@ def _joins(F: IntArray, sides: FloatArray, flat: BoolArray, present: BoolArray) 
     joins = np.zeros(len(F), dtype=bool)
     joins[near] = good & has_area[part] & flat[near]
     return joins
+
+
+def _towards_tips(points: FloatArray, F: IntArray, start: IntArray, end: IntArray) -> FloatArray:
+    """Return unit vectors perpendicular to edges (k,), each to the tip of a triangle of F; NaN where there is none."""
+    keys = edge_keys(F, F[:, (1, 2, 0)], len(points)).ravel()
+    wanted = edge_keys(start, end, len(points))
+    few = np.flatnonzero(np.isin(keys, wanted))
+    few = few[np.argsort(keys[few], kind="stable")]
+    found = np.isin(wanted, keys[few])
+    side = few[np.searchsorted(keys[few], wanted[found])]
+    along = points[end[found]] - points[start[found]]
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    ahead = points[F[side // 3, side % 3 - 1]] - points[start[found]]
+    ahead -= (ahead * along).sum(axis=1)[:, None] * along
+    towards = np.full((len(wanted), 3), np.nan)
+    towards[found] = ahead / np.linalg.norm(ahead, axis=1)[:, None]
+    return towards
 
 
 def _across(along: FloatArray, dimension: int) -> FloatArray:
