@@ -12,6 +12,7 @@ from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.apps.unwrapping.rounding import round_positions
 from quasiharmonic.apps.unwrapping.separation import separate
 from quasiharmonic.surfaces import annulus, grid, random_delaunay, starfish
+from shared.closed_surfaces import torus
 from shared.exact import exact_orientation
 from shared.meshes import lift
 
@@ -388,3 +389,35 @@ def test_separation_of_a_large_chart_moves_only_vertices_close_to_the_overlap():
     scale = np.ptp(chart.uv[far], axis=0) / np.ptp(before[far], axis=0)
     moved = (chart.uv - chart.uv[far].mean(axis=0)) / scale - (before - before[far].mean(axis=0))
     assert np.abs(moved[far]).max() < 1e-12 < 1e-6 < np.abs(moved).max()
+
+
+@pytest.mark.parametrize("height", [1e-8, 1e-300])
+def test_a_model_of_thin_triangles_alone_has_no_measured_stretch(height):
+    points = [[0, 0, 0], [1, 0, 0], [0.5, height, 0]]
+    result = unwrap(points, [[0, 1, 2]], resolution=64)
+    assert result.certificate.bijective
+    assert np.isnan(result.stretch).all()
+    assert "not measured" in result.summary()
+    assert result.to_dict()["stretch"] == {"median": None, "p99": None, "worst": None}
+
+
+def test_seams_are_edges_of_the_model_where_vertices_are_split():
+    apart, own = V[F].reshape(-1, 3), np.arange(F.size).reshape(-1, 3)
+    split, joined = (unwrap(*mesh, resolution=256) for mesh in ((apart, own), (V, F)))
+    sides = {tuple(sorted((a, b))) for row in own.tolist() for a, b in zip(row, row[1:] + row[:1], strict=True)}
+    assert {tuple(edge) for edge in split.seams.tolist()} <= sides
+    assert split.seam_length == pytest.approx(joined.seam_length)
+
+
+def test_an_edge_of_three_triangles_is_named_by_vertices_of_the_model():
+    points = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, 1], [0, 0, 0], [1, 0, 0]])
+    result = unwrap(points, [[0, 6, 2], [6, 0, 3], [5, 6, 4]], resolution=64)
+    assert result.seams.tolist() in ([[0, 6]], [[5, 6]])
+
+
+@pytest.mark.slow
+def test_seams_that_keep_the_bound_are_kept_as_they_are():
+    points, triangles = torus(24, 10, 1.5)
+    first = unwrap(points, triangles, resolution=256)
+    again = unwrap(points, triangles, uv=first.uvs[first.indices], resolution=256)
+    np.testing.assert_array_equal(again.seams, first.seams)

@@ -129,7 +129,8 @@ def search_charts(
     total_area : float
         Area of the surface, which may have further charts.
     joinable : bool
-        Whether small charts may be joined to any neighbour.
+        Whether no cut is demanded. Then small charts may be joined to any neighbour, slits may be closed, and the search
+        goes beyond the bound while that takes few charts.
     workers : Workers
 
     Returns
@@ -137,7 +138,7 @@ def search_charts(
     list of WorkingChart
         All have bijective maps.
     """
-    aim = 1 + _AIM * (bound - 1)
+    aim = 1 + (_AIM if joinable else 1.0) * (bound - 1)
     root = sum(len(chart.F) for chart in charts) ** 0.5
     few, many = (len(charts) + round(base + share * root) for base, share in (_FEW_CHARTS, _MANY_CHARTS))
     here = [part for parts in workers.map("flatten", partial(_flatten, aim, workers), charts) for part in parts]

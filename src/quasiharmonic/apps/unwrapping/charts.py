@@ -126,7 +126,8 @@ def find_charts(
     charts += unfolded
     rest = np.flatnonzero(~flat & ~small)
     cut = partial(_cut, V, F, given=given, cost=cost)
-    working = [chart for some in workers.map("cut", cut, [rest] if rest.size else []) for chart in some]
+    groups = _group_by_cuts(F, rest, given, len(V))
+    working = [chart for some in workers.map("cut", cut, groups) for chart in some]
     areas = [chart.surface_area for chart in working]
     total = sum(areas) + sum(float(signed_areas(chart.F, in_units(chart.uv, 0)).sum()) for chart in charts)
     divisible = None if max_charts is None else max_charts - len(charts)
@@ -181,8 +182,18 @@ def _unfold_small(
     return mask, charts
 
 
+def _group_by_cuts(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[IntArray]:
+    """Divide triangles (k,) into those of surfaces without and with demanded cuts; no group is empty."""
+    demanded = np.isin(edge_keys(F[rows], F[rows][:, (1, 2, 0)], n), _keys(cut, n)).any(axis=1)
+    if not demanded.any():
+        return [rows] if rows.size else []
+    surface = fans(F[rows])[1]
+    with_cuts = np.isin(surface, surface[demanded])
+    return [group for group in (rows[~with_cuts], rows[with_cuts]) if group.size]
+
+
 def _cut(V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: FloatArray) -> list[WorkingChart]:
-    """Cut triangles into disks; return them as charts without maps."""
+    """Cut triangles into disks; return them as charts without maps. Demanded cuts are extended only to make disks."""
     n = len(V)
     sides = edge_keys(F[rows], F[rows][:, (1, 2, 0)], n)
     there = given[np.isin(_keys(given, n), sides)]
@@ -193,7 +204,7 @@ def _cut(V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: Floa
             own.reshape(-1, 3),
             edges=np.searchsorted(vertices, there),
             edge_costs=cost[rows],
-            min_gain=_MIN_GAIN,
+            min_gain=np.inf if len(there) else _MIN_GAIN,
         )
     ]
     parts = _split(F[rows], rows, cut, n)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.apps.unwrapping.exclusion import exclude
 from quasiharmonic.apps.unwrapping.sheets import join_sheets
 from quasiharmonic.apps.unwrapping.widening import widen
-from quasiharmonic.geometry.mesh.topology import boundary_edges, components
+from quasiharmonic.geometry.mesh.topology import boundary_edges, components, edge_keys
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.inspection import MeshReport, inspect_mesh, tabulate_elements
 from quasiharmonic.util.arrays import (
@@ -236,7 +236,7 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
         substitutes=exclusion.substitutes,
         # Reversing a triangle exchanges its corners 1 and 2.
         substitute_corners=np.where(flipped[exclusion.substitutes, None], -matched % 3, matched),
-        seams=sheets.seams,
+        seams=_find_edges(joint[corners], corners, sheets.seams),
         report=report,
     )
 
@@ -260,6 +260,15 @@ def _number(fan: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:
     number = np.empty(label.size, dtype=np.int64)
     number[first[order]] = np.arange(first.size)
     return number[fan], owner[order]
+
+
+def _find_edges(joint: IntArray, corners: IntArray, pairs: IntArray) -> IntArray:
+    """Return for edges (k, 2) of triangles ``joint`` (f, 3) the vertices of ``corners`` (f, 3) at one of their sides."""
+    n = int(joint.max()) + 1
+    keys, side = np.unique(edge_keys(joint, joint[:, (1, 2, 0)], n), return_index=True)
+    side = side[np.searchsorted(keys, edge_keys(pairs[:, 0], pairs[:, 1], n))]
+    ends = np.stack([corners.ravel()[side], corners[:, (1, 2, 0)].ravel()[side]], axis=1)
+    return np.unique(np.sort(ends, axis=1), axis=0)
 
 
 def _turn(F: IntArray, turned: BoolArray) -> IntArray:

@@ -57,13 +57,20 @@ def join_charts(charts: Sequence[Chart], packing: Packing, count: int) -> ChartL
 
 
 def find_seams(cleaned: CleanedMesh, layout: ChartLayout) -> IntArray:
-    """Return the model's edges (s, 2) at which triangles meet that are not joined in the texture, ascending."""
-    cut = cleaned.vertices[find_differing_edges(cleaned.F, layout.rows, len(cleaned.V))]
+    """Return the model's edges (s, 2) at which triangles meet that are not joined in the texture, ascending.
+
+    Of an edge whose two sides have different vertices at the same positions, one side is listed.
+    """
+    side = find_differing_sides(cleaned.F, layout.rows, len(cleaned.V))
+    cut = np.stack([cleaned.corners.ravel()[side], cleaned.corners[:, (1, 2, 0)].ravel()[side]], axis=1)
     return np.unique(np.sort(np.concatenate([cut, cleaned.seams]), axis=1), axis=0)
 
 
-def find_differing_edges(F: IntArray, rows: IntArray, n: int) -> IntArray:
-    """Return the edges (k, 2) of triangles (f, 3) whose two sides have different ``rows`` (f, 3) at an end."""
+def find_differing_sides(F: IntArray, rows: IntArray, n: int) -> IntArray:
+    """Return one side (k,) of each edge of triangles (f, 3) whose two sides have different ``rows`` (f, 3) at an end.
+
+    Side ``3 t + k`` runs from corner ``k`` of triangle ``t`` to the next corner.
+    """
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
     here, there = rows.ravel(), rows[:, (1, 2, 0)].ravel()
     upwards = tail < head
@@ -71,5 +78,4 @@ def find_differing_edges(F: IntArray, rows: IntArray, n: int) -> IntArray:
     key = edge_keys(tail, head, n)
     order = np.argsort(key, kind="stable")
     key, low, high = key[order], low[order], high[order]
-    at = order[1:][(key[1:] == key[:-1]) & ((low[1:] != low[:-1]) | (high[1:] != high[:-1]))]
-    return np.stack([tail[at], head[at]], axis=1)
+    return order[1:][(key[1:] == key[:-1]) & ((low[1:] != low[:-1]) | (high[1:] != high[:-1]))]

@@ -39,7 +39,8 @@ class Stretch(NamedTuple):
     Attributes
     ----------
     median, p99, worst : float
-        Half and 99 % of the surface are stretched by at most this factor, and the maximum over all triangles.
+        Half and 99 % of the surface are stretched by at most this factor, and the maximum over all triangles. NaN if
+        all triangles are too thin to be measured.
     """
 
     median: float
@@ -173,7 +174,9 @@ class UnwrapResult(Outcome):
             f"{count_of('chart', 'charts', self.n_charts)}, {count_of('seam edge', 'seam edges', len(self.seams))} of "
             f"length {self.seam_length:.4g}",
             f"stretch {stretch.median:.3f} in the median, {stretch.p99:.3f} at 99 % of the surface, "
-            f"{stretch.worst:.3g} at most",
+            f"{stretch.worst:.3g} at most"
+            if np.isfinite(stretch.worst)
+            else "stretch not measured, because all triangles are too thin",
             f"{100 * self.utilisation:.1f} % of the texture used, {self.texels_per_unit:.4g} texels per unit",
             f"certificate: {self.certificate.summary()}",
         ]
@@ -192,8 +195,8 @@ class UnwrapResult(Outcome):
             "charts": self.n_charts,
             "seam_edges": len(self.seams),
             "seam_length": self.seam_length,
-            "stretch": {key: value if np.isfinite(value) else None for key, value in self.stretch._asdict().items()},
-            "misses": [miss._asdict() for miss in self.misses],
+            "stretch": _finite(self.stretch),
+            "misses": [miss._asdict() | {"stretch": _finite(miss.stretch)} for miss in self.misses],
             "utilisation": self.utilisation,
             "texels_per_unit": self.texels_per_unit,
             "resolution": list(self.resolution),
@@ -205,5 +208,5 @@ class UnwrapResult(Outcome):
 
 
 def _finite(stretch: Stretch) -> dict[str, float | None]:
-    """Return a stretch for JSON, which has no infinity."""
+    """Return a stretch for JSON, which has neither infinity nor NaN."""
     return {key: value if np.isfinite(value) else None for key, value in stretch._asdict().items()}

@@ -12,7 +12,7 @@ from quasiharmonic.apps.atlas.packing.pack import check_texture, pack_charts
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import MAX_STRETCH, find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
-from quasiharmonic.apps.unwrapping.layout import ChartLayout, find_differing_edges, find_seams, join_charts
+from quasiharmonic.apps.unwrapping.layout import ChartLayout, find_differing_sides, find_seams, join_charts
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
@@ -242,7 +242,8 @@ def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
     # Corners without coordinates count as one position.
     position = np.nan_to_num(position, nan=np.finfo(np.float64).max) + 0.0
     rows = np.unique(position.reshape(-1, 2), axis=0, return_inverse=True)[1]
-    return find_differing_edges(cleaned.F, rows.reshape(-1, 3), len(cleaned.V))
+    side = find_differing_sides(cleaned.F, rows.reshape(-1, 3), len(cleaned.V))
+    return np.stack([cleaned.F.ravel()[side], cleaned.F[:, (1, 2, 0)].ravel()[side]], axis=1)
 
 
 def _measure(
@@ -262,8 +263,10 @@ def _measure(
 
 
 def _summarise(stretch: FloatArray, area: FloatArray) -> Stretch:
-    """Return median, 99 % and maximum of values, weighted by area; NaN is ignored."""
+    """Return median, 99 % and maximum of values, weighted by area. NaN is ignored, unless there is nothing else."""
     order = np.argsort(stretch, kind="stable")[: np.count_nonzero(~np.isnan(stretch))]
+    if not order.size:
+        return Stretch(np.nan, np.nan, np.nan)
     below = np.cumsum(area[order])
     at = np.minimum(np.searchsorted(below, np.array([0.5, 0.99]) * below[-1]), len(order) - 1)
     median, p99 = stretch[order[at]].tolist()
