@@ -182,3 +182,47 @@ def test_the_default_bound_is_that_of_the_function():
     ):
         assert getattr(options, name) == inspect.signature(unwrap).parameters[name].default
     assert options.resolution == (2048, 2048)
+
+
+@pytest.mark.slow
+def test_a_soup_is_reported_with_a_remedy(tmp_path, capsys):
+    V, F = starfish(3, 4)
+    corners, own = V[F].reshape(-1, 3), np.arange(F.size).reshape(-1, 3)
+    jitter = 1e-7 * np.random.default_rng(0).normal(size=corners.shape)
+    for name, points, close in (("equal", corners, False), ("moved", corners + jitter, True)):
+        path = tmp_path / f"{name}.obj"
+        lines = ["v {!r} {!r} {!r}\n".format(*point) for point in points.tolist()]
+        path.write_text("".join([*lines, *("f {} {} {}\n".format(*row) for row in (own + 1).tolist())]))
+        assert run("unwrap", path, "-o", tmp_path / "out.obj", "--resolution", 256, "--json", tmp_path / "r.json") == 0
+        # Vertices at the same position are merged.
+        assert ("Merge these vertices" in capsys.readouterr().out) == close
+        assert bool(json.loads((tmp_path / "r.json").read_text())["close_vertices"]) == close
+        run("flatten", path, "-o", tmp_path / "out.obj", "--max-iterations", 1)
+        assert "Merge these vertices" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_tangents_are_dropped_and_textures_that_do_not_fit_are_named(tmp_path, capsys):
+    V, F = starfish(3, 4)
+    model = tmp_path / "model.glb"
+    first = unwrap(V, F, resolution=256, max_stretch=2)
+    texture = io.checkerboard()
+    io.write_mapped(model, io.MeshData(V, F, vt=first.uvs, FT=first.indices, texture=texture))
+    read = io.read_mesh(model)
+    # The file gets tangents: those of another attribute of the same number of vertices.
+    document = read.carried.document
+    for shape in document.tree["meshes"]:
+        for primitive in shape["primitives"]:
+            primitive["attributes"]["TANGENT"] = document.add(np.ones((read.carried.pools[0].count, 4), np.float32))
+    model.write_bytes(document.encode(binary=True))
+    assert b"TANGENT" in model.read_bytes()
+    kept, new = tmp_path / "kept.glb", tmp_path / "new.glb"
+    io.write_mapped(kept, io.read_mesh(model))
+    assert b"TANGENT" in kept.read_bytes()
+    assert run("unwrap", model, "-o", new, "--resolution", 256) == 0
+    out, err = capsys.readouterr()
+    assert b"TANGENT" not in new.read_bytes()
+    assert "tangents, because the texture coordinates changed" in err
+    assert "do not fit the textures of the file: image 0" in out
+    assert run("unwrap", model, "-o", new, "--resolution", 256, "--texture", "checkerboard") == 0
+    assert "do not fit" not in capsys.readouterr().out

@@ -187,3 +187,22 @@ class TestCommand:
         status, facts = self.check(capsys, tmp_path / "mirrored.obj")
         assert (status, facts["injective"]) == (1, False)
         assert facts["diagnosis"]["forbids_injective"]
+
+
+@pytest.mark.parametrize("exponent", [0, -600, 600])
+def test_close_vertices_of_a_soup_are_listed_with_a_remedy(exponent):
+    V, F = disk(3)
+    corners = V[F].reshape(-1, 2)
+    jitter = 1e-8 * np.random.default_rng(0).normal(size=corners.shape)
+    soup = inspect_mesh(np.ldexp(corners + jitter, exponent), np.arange(F.size).reshape(-1, 3))
+    # A vertex of the boundary may have one triangle only.
+    times = np.bincount(F.ravel())
+    assert soup.close.tolist() == np.flatnonzero(times[F.ravel()] > 1).tolist()
+    assert f"{soup.close.size} vertices are within 1e-06" in soup.summary()
+    assert "Merge" in soup.summary()
+    assert not inspect_mesh(V, F).close.size
+
+
+def test_separate_triangles_far_from_each_other_are_no_soup():
+    V = np.array([[0, 0], [1, 0], [0, 1]]) + 2 * np.arange(5)[:, None, None]
+    assert not inspect_mesh(V.reshape(-1, 2), np.arange(15).reshape(-1, 3)).close.size

@@ -391,7 +391,7 @@ def test_separation_of_a_large_chart_moves_only_vertices_close_to_the_overlap():
     assert np.abs(moved[far]).max() < 1e-12 < 1e-6 < np.abs(moved).max()
 
 
-@pytest.mark.parametrize("height", [1e-8, 1e-300])
+@pytest.mark.parametrize("height", [1e-8, 1e-15])
 def test_a_model_of_thin_triangles_alone_has_no_measured_stretch(height):
     points = [[0, 0, 0], [1, 0, 0], [0.5, height, 0]]
     result = unwrap(points, [[0, 1, 2]], resolution=64)

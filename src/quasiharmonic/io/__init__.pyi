@@ -18,6 +18,7 @@ from .formats.obj import write_obj as write_obj
 from .formats.off import read_off as read_off
 from .formats.off import write_off as write_off
 from .formats.own_texture import own_texture as own_texture
+from .formats.own_texture import texture_names as texture_names
 from .formats.per_triangle import write_per_triangle as write_per_triangle
 from .formats.ply import read_ply as read_ply
 from .formats.ply import write_ply as write_ply

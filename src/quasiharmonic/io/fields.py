@@ -12,6 +12,7 @@ import dataclasses
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,8 +22,10 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io.errors import MeshFileError, check_path
 from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.lowlevel.itk_headers import check_header
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.untrusted import check_size, read_npy
 
 NIFTI = ".nii", ".nii.gz"
 ITK = ".mha", ".nrrd"
@@ -125,11 +128,10 @@ def read_field(path: str | os.PathLike[str]) -> DisplacementField:
 
 
 def _read_npy(path: str | os.PathLike[str]) -> DisplacementField:
-    with open(path, "rb") as file:
-        try:
-            array = np.lib.format.read_array(file, allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise MeshFileError(path, f"is not an array of numbers in NumPy's format .npy: {error}") from error
+    try:
+        array = read_npy(path)
+    except ValueError as error:
+        raise MeshFileError(path, f"is not an array of numbers in NumPy's format .npy: {error}") from error
 
     def encode(components: FloatArray, suffix: str) -> bytes:
         from io import BytesIO
@@ -150,6 +152,7 @@ def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
     try:
         # Damaged files cause errors of many types.
         image: Any = nibabel.load(path)
+        check_size(8 * prod(image.shape), "its header announces")
         data = np.asarray(image.dataobj, dtype=np.float64)
         affine = np.asarray(image.affine, dtype=np.float64)
         intent = int(image.header["intent_code"])
@@ -186,9 +189,13 @@ def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
         import SimpleITK
     except ImportError as error:
         raise ImportError(f"ITK's files need SimpleITK ({error}): pip install SimpleITK") from error
-    read_bytes(path)
     try:
+        check_header(read_bytes(path), field_suffix(path))
         image = SimpleITK.ReadImage(os.fspath(path))
+    except MeshFileError:
+        raise
+    except ValueError as error:
+        raise MeshFileError(path, str(error)) from error
     except RuntimeError as error:
         raise MeshFileError(path, f"SimpleITK cannot read it: {str(error).splitlines()[-1]}") from error
     n, count = image.GetDimension(), image.GetNumberOfComponentsPerPixel()

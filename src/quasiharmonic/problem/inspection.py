@@ -27,6 +27,8 @@ from quasiharmonic.util.arrays import (
 
 # Maximum number of elements that the text lists for a class of defects.
 _LISTED = 5
+# Vertices are close if their distance is at most this multiple of the diagonal of the bounding box.
+_CLOSE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +56,9 @@ class MeshReport:
         (k, 2) int64. Empty arrays for classes that do not occur.
     coincident : (k,) int64
         Vertices at the position of an earlier vertex. They are not a defect: files often store seams this way.
+    close : (k,) int64
+        If most components have one or two triangles, the vertices that are close to another one; otherwise empty. See
+        `find_close_vertices`.
     """
 
     vertices: int
@@ -65,6 +70,7 @@ class MeshReport:
     inward: int
     defects: dict[str, IntArray]
     coincident: IntArray
+    close: IntArray
 
     def __repr__(self) -> str:
         return f"<MeshReport: {self.summary().partition(chr(10))[0]}>"
@@ -89,6 +95,8 @@ class MeshReport:
                 f"{count_of('vertex', 'vertices', self.coincident.size)} at the position of an earlier vertex, "
                 f"first {_first(self.coincident)}"
             )
+        if self.close.size:
+            lines.append(describe_soup(self.close))
         return "\n".join([*lines, *(tabulate_elements("defect", self.defects) or ["no defects"])])
 
     def to_dict(self) -> dict[str, Any]:
@@ -102,6 +110,7 @@ class MeshReport:
             "genus": self.genus,
             "inward_components": self.inward,
             "coincident_vertices": self.coincident.tolist(),
+            "close_vertices": self.close.tolist(),
             "defects": {name: found.tolist() for name, found in self.defects.items()},
         }
 
@@ -198,6 +207,35 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike) -> MeshReport:
         inward=int(np.count_nonzero(inward)),
         defects=defects,
         coincident=_coincident(V),
+        close=find_close_vertices(V, np.bincount(part)),
+    )
+
+
+def find_close_vertices(V: FloatArray, triangles: IntArray) -> IntArray:
+    """Return the vertices of a soup of triangles that are close to another vertex, ascending; none for other meshes.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float64
+    triangles : (c,) int64
+        Number of triangles of each component. The mesh is a soup if most components have one or two.
+    """
+    if len(V) < 2 or np.count_nonzero(triangles <= 2) <= max(len(triangles) / 2, 1):
+        return np.empty(0, dtype=np.int64)
+    from scipy.spatial import KDTree
+
+    # In this unit, squares neither overflow nor underflow.
+    points = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
+    distance, _ = KDTree(points).query(points, k=2)
+    return np.flatnonzero(distance[:, 1] <= _CLOSE * np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def describe_soup(close: IntArray) -> str:
+    """Return a sentence on close vertices of a soup of triangles, with a remedy."""
+    return (
+        f"Most components have one or two triangles, and {count_of('vertex is', 'vertices are', len(close))} within "
+        f"{_CLOSE:g} of the mesh's size from another vertex. Merge these vertices first, for example with "
+        "merge_vertices of trimesh or with Merge by Distance of Blender."
     )
 
 

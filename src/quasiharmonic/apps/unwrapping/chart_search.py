@@ -129,7 +129,7 @@ def search_charts(
     total_area : float
         Area of the surface, which may have further charts.
     joinable : bool
-        Whether no cut is demanded. Then small charts may be joined to any neighbour, slits may be closed, and the search
+        Whether no cut is demanded. Then small charts may be joined to any neighbour, slits are closed, and the search
         goes beyond the bound while that takes few charts.
     workers : Workers
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,7 @@ from quasiharmonic.apps.unwrapping.sheets import join_sheets
 from quasiharmonic.apps.unwrapping.widening import widen
 from quasiharmonic.geometry.mesh.topology import boundary_edges, components, edge_keys
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.problem.inspection import MeshReport, inspect_mesh, tabulate_elements
+from quasiharmonic.problem.inspection import MeshReport, find_close_vertices, inspect_mesh, tabulate_elements
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -75,6 +75,9 @@ class CleanedMesh:
         Edges of the model, by its vertices, that several triangles share and at which the surface has a boundary.
     report : MeshReport
         Topology and defects of the model.
+    close : (k,) int64
+        Vertices of the model, after merging, that are close to another one if most components have one or two
+        triangles; see `MeshReport`.
     """
 
     V: FloatArray
@@ -93,6 +96,7 @@ class CleanedMesh:
     substitute_corners: IntArray
     seams: IntArray
     report: MeshReport
+    close: IntArray
 
     def __repr__(self) -> str:
         return f"<CleanedMesh: {self._size()}, {count_of('triangle', 'triangles', self.excluded.size)} excluded>"
@@ -120,7 +124,9 @@ class CleanedMesh:
     def summary(self) -> str:
         """Return the report on the model and, unless nothing changes, a table of the changes."""
         table = self.tabulate_changes()
-        return f"{self.report.summary()}\ncleaned: {self._size()}\n{table}" if table else self.report.summary()
+        # The report counts vertices at the same position, which are merged.
+        lines = [replace(self.report, close=self.close).summary()]
+        return "\n".join([*lines, f"cleaned: {self._size()}", table] if table else lines)
 
     def tabulate_changes(self) -> str:
         """Return a table of the changes with the first elements of each class; empty if nothing changes."""
@@ -220,6 +226,7 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
         flipped = flipped ^ (facing < 0)[component]
         facing = np.abs(facing)
     matched = exclusion.substitute_corners
+    distinct = np.unique(joint[corners])
     return CleanedMesh(
         V=positions,
         F=_turn(number, flipped),
@@ -238,6 +245,7 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
         substitute_corners=np.where(flipped[exclusion.substitutes, None], -matched % 3, matched),
         seams=_find_edges(joint[corners], corners, sheets.seams),
         report=report,
+        close=distinct[find_close_vertices(V[distinct], np.bincount(component))],
     )
 
 
@@ -263,7 +271,7 @@ def _number(fan: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _find_edges(joint: IntArray, corners: IntArray, pairs: IntArray) -> IntArray:
-    """Return for edges (k, 2) of triangles ``joint`` (f, 3) the vertices of ``corners`` (f, 3) at one of their sides."""
+    """Return edges (k, 2) of triangles ``joint`` (f, 3) by the vertices ``corners`` (f, 3) at one of their sides."""
     n = int(joint.max()) + 1
     keys, side = np.unique(edge_keys(joint, joint[:, (1, 2, 0)], n), return_index=True)
     side = side[np.searchsorted(keys, edge_keys(pairs[:, 0], pairs[:, 1], n))]

@@ -11,6 +11,7 @@ import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.io.adapters.trimesh import make_trimesh
+from quasiharmonic.problem.inspection import describe_soup
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
 from quasiharmonic.util.outcome import Outcome
 
@@ -184,6 +185,8 @@ class UnwrapResult(Outcome):
             shown = ", ".join(f"chart {miss.chart} by {miss.excess:.3g}" for miss in self.misses[:_LISTED])
             more = f", … ({len(self.misses)} charts)" if len(self.misses) > _LISTED else ""
             lines.append(f"beyond the bound on the stretch: {shown}{more}")
+        if self.cleaned.close.size:
+            lines.append(describe_soup(self.cleaned.close))
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
@@ -203,6 +206,7 @@ class UnwrapResult(Outcome):
             "certificate": self.certificate.to_dict(),
             "reversed": int(self.cleaned.flipped.sum()),
             "excluded": self.cleaned.excluded.tolist(),
+            "close_vertices": self.cleaned.close.tolist(),
             "mesh": self.cleaned.report.to_dict(),
         }
 

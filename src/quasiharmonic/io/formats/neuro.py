@@ -11,7 +11,6 @@ import gzip
 import os
 import re
 import warnings
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,6 +24,7 @@ from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
+from quasiharmonic.util.untrusted import check_gifti, unpack_gzip
 
 # The intents that the standard has for points and triangles.
 _POINTS, _TRIANGLES = 1008, 1009
@@ -75,12 +75,13 @@ def _read_gifti(path: str | os.PathLike[str]) -> Any:
     nibabel, data = _nibabel(), read_bytes(path)
     if os.fspath(path).lower().endswith(".gz"):
         try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError, zlib.error) as error:
+            data = unpack_gzip(data)
+        except ValueError as error:
             raise MeshFileError(path, f"is not a complete gzip file: {error}") from error
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
+            check_gifti(data)
             # The parser raises errors of many types for damaged files.
             return nibabel.gifti.GiftiImage.from_bytes(data)
         except Exception as error:

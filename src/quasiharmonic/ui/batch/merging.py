@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.lock import lock_folder, lock_name
 from quasiharmonic.ui.batch.problems import MARKER
 from quasiharmonic.ui.batch.shards import WHOLE, Shard, shard_of, table_name
+from quasiharmonic.util.untrusted import parse_json
 
 
 class Merged(NamedTuple):
@@ -116,7 +116,7 @@ def _common_marker(folders: Sequence[Path]) -> bytes:
     for folder in folders:
         try:
             here = (folder / MARKER).read_bytes()
-            settings = json.loads(here)["settings"]
+            settings = parse_json(here)["settings"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{folder} is not the folder of a run: it has no valid {MARKER}") from error
         if first is None:

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 
 from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole
+from quasiharmonic.util.untrusted import parse_json
 
 Record = dict[str, Any]
 
@@ -121,7 +122,7 @@ def read_record(folder: Path) -> Record | None:
 def parse_record(data: bytes) -> Record | None:
     """Return the record in the contents of a file; None if it is incomplete."""
     try:
-        record = json.loads(data)
+        record = parse_json(data)
     except ValueError:
         return None
     return record if isinstance(record, dict) and _is_whole(record) else None

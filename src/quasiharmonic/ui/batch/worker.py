@@ -40,6 +40,7 @@ from quasiharmonic.solver.refine.attempts import on_refinement
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.util.standard_input import detach_input
+from quasiharmonic.util.untrusted import bounded
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"
@@ -134,7 +135,8 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callabl
     """Read, solve, write, certify and measure a problem; each result is recorded as soon as it is known."""
     settings = job["settings"]
     with metadata.time_phase(record, "read"):
-        mesh = io.read_mesh(job["mesh"])
+        with bounded(job["record"].get("memory_limit")):
+            mesh = io.read_mesh(job["mesh"])
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
     with metadata.time_phase(record, "setup"):
         if not settings["flatten"] and settings["to"] is None and mesh.FT is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -17,6 +16,7 @@ from quasiharmonic.ui.report import charts, statistics
 from quasiharmonic.ui.report.statistics import PHASES, Run
 from quasiharmonic.ui.report.style import STYLE
 from quasiharmonic.ui.report.thumbnails import thumbnail
+from quasiharmonic.util.untrusted import parse_json
 
 # Maximum number of problems per list of certified maps.
 _PICTURES = 12
@@ -108,7 +108,7 @@ def _origin(run: Run) -> str:
         words.append("Settings: " + ", ".join(f"{shown(k)} {shown(v)}" for k, v in settings.items()) + ".")
     for versions in sorted({str(row["versions"]) for row in run.rows if row.get("versions")}):
         try:
-            words.append(", ".join(f"{shown(k)} {shown(v)}" for k, v in json.loads(versions).items()) + ".")
+            words.append(", ".join(f"{shown(k)} {shown(v)}" for k, v in parse_json(versions).items()) + ".")
         except (ValueError, AttributeError):
             continue
     return f'<p class="quiet">{" ".join(words)}</p>' if words else ""

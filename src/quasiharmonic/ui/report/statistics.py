@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Iterable
@@ -17,6 +16,7 @@ from quasiharmonic.ui.batch.archives.results import find_records
 from quasiharmonic.ui.batch.problems import MARKER
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.untrusted import parse_json
 
 PHASES = "read", "setup", "map", "polish", "write", "measure"
 
@@ -68,7 +68,7 @@ def load(source: str | os.PathLike[str]) -> Run:
 def _about(folder: Path) -> Record:
     """Return the contents of a run's marker file; empty if it is missing or invalid."""
     try:
-        about = json.loads((folder / MARKER).read_bytes())
+        about = parse_json((folder / MARKER).read_bytes())
     except (OSError, ValueError):
         return {}
     return about if isinstance(about, dict) and isinstance(about.get("settings"), dict) else {}

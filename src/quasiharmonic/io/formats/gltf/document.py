@@ -12,13 +12,13 @@ import json
 import os
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError, printable
 from quasiharmonic.io.lowlevel.textual import read_bytes
+from quasiharmonic.util.untrusted import beside
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}
@@ -285,15 +285,6 @@ def _buffer(path: str | os.PathLike[str], buffer: dict[str, Any], chunk: bytes |
     if data is None or len(data) < size:
         raise ValueError("a buffer is shorter than its length states")
     return data[:size]
-
-
-def beside(folder: Path, uri: str) -> Path:
-    """Return the path of a file in the document's folder or in a folder below it."""
-    name = unquote(uri)
-    inside = Path(os.path.normpath(folder / name))
-    if ":" in name or "\\" in name or name.startswith("/") or ".." in Path(name).parts:
-        raise ValueError(f"{ascii(uri)[:80]} is not in the folder of the file")
-    return inside
 
 
 def _view(view: dict[str, Any], buffers: list[bytes]) -> bytes | memoryview:

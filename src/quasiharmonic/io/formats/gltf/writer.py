@@ -56,6 +56,8 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
     carried, lost = mesh.carried, materials_lost(mesh)
     if isinstance(carried, CarriedGltf) and carried.fits(mesh):
         missing = embed_pictures(carried.document.copy(), carried.folder)
+        if _has_old_tangents(carried, mesh):
+            lost.append("tangents, because the texture coordinates changed")
         lost += [f"the image {name}, which is not an image file in the folder of {mesh.source}" for name in missing]
         return lost
     lost += ["digits beyond single precision"] if carried is None else carried.further()
@@ -92,6 +94,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
         if (FT < 0).any() or mesh.vt is None:
             raise ValueError("some faces of a primitive have no texture coordinates, which glTF does not support")
         places = _convert_places(mesh.vt)[FT]
+        old_places = _places_of(document, pool, carried.rows[faces] - pool.first)
         rows, origin, corner = _split(carried.rows[faces] - pool.first, _bits(places), pool.count)
         table = places.reshape(-1, 2)[corner]
         if PLACES in pool.attributes:
@@ -104,7 +107,36 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
                 primitive["mode"] = 4
                 primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
         _set_attribute(document, pool, primitives, PLACES, table, users)
+        if old_places is None or not np.array_equal(old_places, places):
+            _drop_tangents(primitives)
     return document
+
+
+def _places_of(document: Document, pool: VertexPool, rows: IntArray) -> NDArray[np.float32] | None:
+    """Return the texture coordinates (f, 3, 2) of a pool's triangles; None if there are none."""
+    if PLACES not in pool.attributes:
+        return None
+    return document.reals(pool.attributes[PLACES]).astype(np.float32)[rows]
+
+
+def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
+    """Remove tangents, which depend on the texture coordinates."""
+    for primitive in primitives:
+        for attributes in (primitive["attributes"], *primitive.get("targets", [])):
+            attributes.pop("TANGENT", None)
+
+
+def _has_old_tangents(carried: CarriedGltf, mesh: MeshData) -> bool:
+    """Whether the file has tangents, and the mesh has other texture coordinates."""
+    numbers = [number for number, pool in enumerate(carried.pools) if "TANGENT" in pool.attributes]
+    if not numbers or mesh.FT is None or mesh.vt is None:
+        return False
+    for part in (part for part in carried.parts if part.pool in numbers):
+        pool, faces = carried.pools[part.pool], np.arange(part.begin, part.end)
+        old = _places_of(carried.document, pool, carried.rows[faces] - pool.first)
+        if old is None or not np.array_equal(old, _convert_places(mesh.vt)[mesh.FT[faces]]):
+            return True
+    return False
 
 
 def _paint(document: Document, texture: Texture) -> None:

@@ -147,7 +147,7 @@ class ArchivedProblems:
             opened = _OpenArchive(archive, stamp, Journal(self._outputs.path(name)), copy)
             self._opened.append(opened)
         try:
-            for sample in read_samples(path):
+            for sample in read_samples(path, self.orders.memory_limit):
                 files = self._extract(opened, sample)
                 if files is not None:
                     yield files

@@ -13,6 +13,7 @@ from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives import results
 from quasiharmonic.ui.batch.archives.tar_stream import Damage, pack_member, read_members
 from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.util.untrusted import parse_json
 
 # Keys of a record that are kept, to decide whether it is still valid, and to count it in the archive's metadata.
 _KEPT = "key", "outcome", "time_limit", "memory_limit", "seconds"
@@ -130,7 +131,7 @@ def _unpacked(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator
             for member in read_members(io.BytesIO(packed))
             if not isinstance(member, Damage)
         }
-        yield key, json.loads(data[results.RECORD]), data.get(results.MAP)
+        yield key, parse_json(data[results.RECORD]), data.get(results.MAP)
 
 
 def _cannot_write(path: Path, error: OSError) -> OutputError:

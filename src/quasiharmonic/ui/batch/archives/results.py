@@ -27,6 +27,7 @@ from quasiharmonic.ui.batch.archives.tar_stream import (
     read_members,
 )
 from quasiharmonic.ui.batch.records import Record, load_pyarrow
+from quasiharmonic.util.untrusted import parse_json
 
 #: Suffix of the name of unfinished results.
 PART = ".part"
@@ -72,7 +73,7 @@ def parse_about(start: bytes) -> dict[str, Any] | None:
 
 def _parse(text: str) -> dict[str, Any] | None:
     try:
-        about = json.loads(text)
+        about = parse_json(text)
     except ValueError:
         return None
     return about if isinstance(about, dict) and {"stamp", "settings", "outcomes"} <= set(about) else None

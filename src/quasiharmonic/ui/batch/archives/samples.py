@@ -12,6 +12,7 @@ from typing import Any
 from quasiharmonic.io import suffixes
 from quasiharmonic.ui.batch.archives.tar_stream import Damage, open_tar, read_members
 from quasiharmonic.ui.batch.records import load_pyarrow
+from quasiharmonic.util.untrusted import MAX_BYTES
 
 #: Suffixes of archives.
 TAR = ".tar", ".tar.gz", ".tgz"
@@ -59,8 +60,8 @@ def is_archive(name: str) -> bool:
     return name.lower().endswith((*TAR, PARQUET))
 
 
-def read_samples(path: Path) -> Iterator[Sample]:
-    """Read the problems of an archive, in order; constant memory.
+def read_samples(path: Path, limit: int | None = None) -> Iterator[Sample]:
+    """Read the problems of an archive, in order; constant memory. Members of a tar file have at most ``limit`` bytes.
 
     Consecutive members of a tar file with the same name up to the first dot are one problem, as in WebDataset. So are
     the members ``input.obj`` and ``handles.txt`` of a folder. In a Parquet file each row is a problem: the columns are
@@ -72,7 +73,9 @@ def read_samples(path: Path) -> Iterator[Sample]:
         A problem that cannot be read has an ``error``. OSError if the archive cannot be opened.
     """
     seen: set[str] = set()
-    for sample in _parquet_samples(path) if path.name.lower().endswith(PARQUET) else _tar_samples(path):
+    for sample in (
+        _parquet_samples(path) if path.name.lower().endswith(PARQUET) else _tar_samples(path, limit or MAX_BYTES)
+    ):
         if sample.error is None:
             _check(sample, seen)
         seen.add(sample.key)
@@ -106,11 +109,17 @@ _MESHES = frozenset(suffixes("read"))
 
 def _split(name: str) -> tuple[str, str]:
     """Return key and extension of a member's name."""
-    folder, base = posixpath.split(name.removeprefix("./"))
+    folder, base = posixpath.split(_within(name))
     if base in _FOLDER_FILES and folder:
         return folder, _FOLDER_FILES[base]
     stem, _, extension = base.partition(".")
     return posixpath.join(folder, stem), extension
+
+
+def _within(name: str) -> str:
+    """Return a name without the parts that lead out of a folder, because results repeat it."""
+    parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
+    return "/".join(parts)
 
 
 def _is_wanted(name: str) -> bool:
@@ -118,11 +127,11 @@ def _is_wanted(name: str) -> bool:
     return extension in _FIXED or _is_mesh(extension)
 
 
-def _tar_samples(path: Path) -> Iterator[Sample]:
+def _tar_samples(path: Path, limit: int) -> Iterator[Sample]:
     sample: Sample | None = None
     lists = after_damage = False  # Whether problems have lists of fixed vertices; whether damage precedes the problem
     with open_tar(os.fspath(path)) as file:
-        for member in read_members(file, _is_wanted):
+        for member in read_members(file, _is_wanted, limit):
             damaged = isinstance(member, Damage)
             key, extension = ("", "") if isinstance(member, Damage) else _split(member.name)
             if sample is not None and (damaged or key != sample.key):
@@ -171,7 +180,7 @@ def _parquet_samples(path: Path) -> Iterator[Sample]:
 def _row_sample(row: Mapping[str, Any], key: str | None, number: int) -> Sample:
     """Return the problem of a row; lists of fixed vertices may be text or lists of integers."""
     named = None if key is None else row[key]
-    sample = Sample(f"{number:09d}" if named is None else str(named))
+    sample = Sample(f"{number:09d}" if named is None else _within(str(named)) or f"{number:09d}")
     for name, value in row.items():
         if name == key or value is None:
             continue

@@ -8,6 +8,8 @@ import zlib
 from collections.abc import Callable, Iterator
 from typing import BinaryIO, NamedTuple
 
+from quasiharmonic.util.untrusted import MAX_BYTES
+
 _BLOCK = tarfile.BLOCKSIZE
 _CHUNK = 1 << 20
 # Types of headers about the next member: its long name (GNU), extended attributes (POSIX), and attributes of all.
@@ -43,7 +45,9 @@ def open_tar(path: str) -> BinaryIO:
     return gzip.open(path, "rb") if compressed else open(path, "rb")  # type: ignore[return-value]
 
 
-def read_members(file: BinaryIO, wanted: Callable[[str], bool] = lambda name: True) -> Iterator[Member | Damage]:
+def read_members(
+    file: BinaryIO, wanted: Callable[[str], bool] = lambda name: True, limit: int = MAX_BYTES
+) -> Iterator[Member | Damage]:
     """Read the files of a tar file one after another, in constant memory.
 
     Parameters
@@ -52,15 +56,18 @@ def read_members(file: BinaryIO, wanted: Callable[[str], bool] = lambda name: Tr
         The tar file, at its start.
     wanted : callable, optional
         Whether to read the data of a member of this name.
+    limit : int
+        Largest number of bytes of a member that is read.
 
     Yields
     ------
     Member or Damage
-        Regular files, and parts that cannot be read; after a damaged header the next valid one is searched.
+        Regular files, and parts that cannot be read: damaged and too large ones. After a damaged header the next valid
+        one is searched.
     """
     reader = _Reader(file)
     try:
-        yield from reader.members(wanted)
+        yield from reader.members(wanted, limit)
     except _ShortReadError:
         yield Damage(reader.start, "the archive ends within this member")
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
@@ -73,7 +80,7 @@ class _Reader:
         self._offset = 0
         self.start = 0
 
-    def members(self, wanted: Callable[[str], bool]) -> Iterator[Member | Damage]:
+    def members(self, wanted: Callable[[str], bool], limit: int) -> Iterator[Member | Damage]:
         damaged = ended = False
         attributes: dict[str, str] = {}
         self.start = 0
@@ -105,6 +112,10 @@ class _Reader:
             attributes = {}
             if not info.isreg():
                 self._skip(info.size if info.type in (_GLOBAL, tarfile.GNUTYPE_LONGLINK) else 0)
+            elif wanted(name) and size > limit:
+                self._skip(size)
+                what = f"the member {ascii(name)[:80]} has {size:,} bytes, more than the bound of {limit:,}"
+                yield Damage(self.start, what)
             elif wanted(name):
                 data = self._read(size)
                 yield Member(name, data, self.start, self._offset)

@@ -200,19 +200,16 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
 
 
 def _array(path: Path, n: int, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
-    import numpy as np
-
     from quasiharmonic import io
     from quasiharmonic.util.arrays import real_array
+    from quasiharmonic.util.untrusted import read_npy
 
     try:
-        array = np.load(path, allow_pickle=False)
+        array = read_npy(path)
     except FileNotFoundError as error:
         raise io.MeshFileError(path, "there is no such file") from error
-    except (ValueError, EOFError, MemoryError) as error:
-        # The first line names the error; further lines address programmers.
-        reason = str(error).partition("\n")[0]
-        raise ValueError(f"{path}: not an array of numbers in NumPy's format: {reason}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: not an array of numbers in NumPy's format: {error}") from error
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, fixed.size) and array.shape[2] == 2
     if not shaped or array.dtype.kind not in "iuf":
         raise ValueError(

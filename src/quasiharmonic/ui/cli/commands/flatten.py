@@ -89,11 +89,14 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, flatten, write, read back, certify, report."""
+    import numpy as np
+
     from quasiharmonic import io
     from quasiharmonic.apps.atlas import island_functions as atlas
     from quasiharmonic.apps.flattening.patterns import write_pattern
     from quasiharmonic.energies.measures import distortion
-    from quasiharmonic.ui.cli import arguments, material, progress_line, report, seam_options, written_map
+    from quasiharmonic.problem.inspection import describe_soup, find_close_vertices
+    from quasiharmonic.ui.cli import arguments, material, progress_line, report, seam_options, streams, written_map
 
     began = time.perf_counter()
     seam_options.check_options(options)
@@ -122,6 +125,9 @@ def run(options: argparse.Namespace) -> int:
     if options.weights is not None:
         given["weights"] = _weights(options.weights)
     found = seam_options.surface(options, mesh, disks_too=True)
+    triangles = np.array([len(island.F) for island in found.mesh.islands])
+    if (close := find_close_vertices(mesh.V, triangles)).size:
+        streams.tell(describe_soup(close))
     with report.about(options.input), progress_line.line() as show:
         mapped = atlas.flatten(
             found.mesh,

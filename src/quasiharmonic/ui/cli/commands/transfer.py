@@ -251,6 +251,7 @@ def _read_table(path: Path) -> NDArray[np.float64]:
 
     from quasiharmonic import io
     from quasiharmonic.util.arrays import real_array
+    from quasiharmonic.util.untrusted import read_npy
 
     form = io.format_of(path)
     if form is not None and form.name == "GIFTI":
@@ -259,7 +260,7 @@ def _read_table(path: Path) -> NDArray[np.float64]:
         raise ValueError(f"--values {path}: supported: {', '.join(_TABLES)}, .gii")
     try:
         if path.suffix.lower() == ".npy":
-            return real_array(str(path), np.load(path, allow_pickle=False))
+            return real_array(str(path), read_npy(path))
         lines = [line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
         rows = [line.replace(",", " ").split() for line in lines if line]
         # A first line without numbers is a heading.

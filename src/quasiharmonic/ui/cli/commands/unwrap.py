@@ -102,11 +102,13 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.ui.cli import material, progress_line, report, written_map
     from quasiharmonic.util.arrays import count_of
+    from quasiharmonic.util.untrusted import bounded
 
     began = time.perf_counter()
     io.find_format(options.output, "write_map", "seams")
     report.check_outputs(options.output, None, options.json, inputs=(options.input, options.edge_costs))
-    mesh = material.read_mesh(options, options.input)
+    with bounded(options.memory):
+        mesh = material.read_mesh(options, options.input)
     with report.about(options.input), progress_line.line(_words) as show:
         result = unwrap(
             mesh.V,
@@ -144,6 +146,9 @@ def run(options: argparse.Namespace) -> int:
         lines = [f"wrote {options.output}: {result.message}", result.summary(), *_cleaning(result)]
         if divided:
             lines.append(f"{count_of('polygon', 'polygons', divided)} written as triangles, because seams cross them")
+        if named := [] if mesh.texture is not None else io.texture_names(mesh):
+            facts["old_textures"] = named
+            lines.append(f"the new coordinates do not fit the textures of the file: {', '.join(named)}")
         if not same:
             lines.append(f"{options.output} has other coordinates than were certified")
         report.emit(facts, options.json, "\n".join(lines))
