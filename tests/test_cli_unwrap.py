@@ -226,3 +226,46 @@ def test_tangents_are_dropped_and_textures_that_do_not_fit_are_named(tmp_path, c
     assert "do not fit the textures of the file: image 0" in out
     assert run("unwrap", model, "-o", new, "--resolution", 256, "--texture", "checkerboard") == 0
     assert "do not fit" not in capsys.readouterr().out
+
+
+def spoilt(F):
+    """Triangles with mixed winding, a repeated and a degenerate one."""
+    G = F.copy()
+    G[3] = G[3, ::-1]
+    return np.concatenate([G, G[7:8], [[G[9, 0], G[9, 1], G[9, 0]]]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".obj", ".glb", ".ply"])
+def test_written_models_with_defects_pass_the_check_chart_by_chart(tmp_path, capsys, suffix):
+    V, F = starfish(3, 4)
+    G = spoilt(F)
+    source, out = tmp_path / "model.obj", tmp_path / f"out{suffix}"
+    lines = ["v {!r} {!r} {!r}\n".format(*point) for point in V.tolist()]
+    source.write_text("".join([*lines, *("f {} {} {}\n".format(*row) for row in (G + 1).tolist())]))
+    assert run("unwrap", source, "-o", out, "--resolution", 256) == 0
+    capsys.readouterr()
+    assert run("check", out, "--json", tmp_path / "r.json") == 0
+    said = capsys.readouterr().out
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["injective"]
+    assert report["reversed_triangles"] == [3]
+    # In GLB files, a triangle that uses a vertex twice is kept, too.
+    assert report["repeated_triangles"] == [len(F)]
+    assert report["degenerate_triangles"] == [len(F) + 1]
+    assert "triangle 3: verified with the winding of the neighbours" in said
+    assert run("plot", out, "-o", tmp_path / "out.png") == 0
+
+
+@pytest.mark.slow
+def test_an_inverted_triangle_in_a_model_with_defects_is_found(tmp_path):
+    V, F = starfish(3, 4)
+    G = spoilt(F)
+    result = unwrap(V, G, resolution=256)
+    # A vertex far from its neighbours inverts triangles; the repeated triangle may also have coordinates of its own.
+    moved, own = result.uvs.copy(), result.indices.copy()
+    moved[result.indices[12, 0]] += 0.3
+    own[len(F)] = own[20]
+    for vt, FT in ((moved, result.indices), (result.uvs, own)):
+        io.write_mapped(tmp_path / "m.obj", io.MeshData(V, G, vt=vt, FT=FT))
+        assert run("check", tmp_path / "m.obj") == 1

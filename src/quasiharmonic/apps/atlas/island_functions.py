@@ -22,6 +22,7 @@ from quasiharmonic.apps.flattening import free_boundary
 from quasiharmonic.apps.flattening.layout import fit_unit_square, place_in_row
 from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.polishing import PolishOptions, polish_map
+from quasiharmonic.geometry.curves.boundary_curves import sliding_curves
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.objects import MeshLike, seamed_mesh
@@ -59,7 +60,8 @@ def polish(
     free : bool
         Let the boundaries move. The centre, direction and area of each island are kept. Islands may then overlap.
     fixed : (k,) array of int, optional
-        Fixed vertices of the mesh, on all islands that contain them; the boundaries by default. Not with ``free``.
+        Fixed vertices of the mesh, on all islands that contain them; the boundaries by default. Not with ``free``. With
+        ``slide``, these vertices do not slide, and boundary vertices that are not listed slide; by default all do.
     weights : (f,) array, optional
         Weight of each triangle's distortion.
     islands : collection of int, optional
@@ -89,7 +91,13 @@ def polish(
         if free:
             result = free_boundary.flatten(island.V, island.F, start=island.uv, **own, **rest)
             return replace(result, uv=fit_in_place(island, result.uv))
-        return polish_map(_domain(island, checked), island.uv, PolishOptions(**own, **rest))
+        slide = rest.get("slide", False)
+        if slide is False or checked is None:
+            return polish_map(_domain(island, checked), island.uv, PolishOptions(**own, **rest))
+        held = _select_fixed(island, checked)
+        domain = Domain(island.V, island.F, np.union1d(held, _select_fixed(island, None)))
+        curves = sliding_curves(slide, domain.loops, island.uv).keeping(held)
+        return polish_map(domain, island.uv, PolishOptions(**own, **rest | {"slide": curves}))
 
     return each_island(mesh, lower, only=islands)
 

@@ -109,6 +109,10 @@ class BoundaryCurves:
         """Return a copy with more fixed vertices, except those in ``on``."""
         return self._with(self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on)))))
 
+    def keeping(self, vertices: IntArray) -> BoundaryCurves:
+        """Return a copy with more fixed vertices, also such that are in ``on``."""
+        return self._with(self.on, np.union1d(self.fixed, vertices))
+
     def among(self, used: IntArray) -> BoundaryCurves:
         """Return a copy for a submesh with the given vertices, ascending."""
         known = np.concatenate([index_array("on", list(self.on)), self.fixed])

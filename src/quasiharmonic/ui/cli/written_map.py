@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,37 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
+class SetApart:
+    """Triangles of a model with defects that the verdict on its charts reverses or leaves out, as `unwrap` does.
+
+    A triangle is left out only if it has the texture coordinates of the triangle that replaces it.
+    """
+
+    reversed: NDArray[np.int64]
+    repeated: NDArray[np.int64]
+    degenerate: NDArray[np.int64]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the triangles for JSON."""
+        return {
+            "reversed_triangles": self.reversed.tolist(),
+            "repeated_triangles": self.repeated.tolist(),
+            "degenerate_triangles": self.degenerate.tolist(),
+        }
+
+    def summary(self) -> str:
+        """Return one line for each kind."""
+        from quasiharmonic.util.arrays import names_of
+
+        kinds = (
+            (self.reversed, "verified with the winding of the neighbours, which is the opposite one"),
+            (self.repeated, "left out, because an earlier triangle has the same vertices"),
+            (self.degenerate, "left out, because there is no area on the model"),
+        )
+        return "\n".join(f"{names_of('triangle', 'triangles', found)}: {what}" for found, what in kinds if found.size)
+
+
+@dataclass(frozen=True, eq=False)
 class WrittenMap:
     """Exact certificate of a file's map."""
 
@@ -25,6 +56,7 @@ class WrittenMap:
     certificate: Certificate  # Certificate of the whole map in the plane
     verdict: AtlasVerdict | None  # Certificates of the islands; None for a single island
     faces: int  # Number of faces in the file
+    set_apart: SetApart | None = None  # Triangles that the verdict reverses or leaves out; None if there are none
 
     @property
     def injective(self) -> bool:
@@ -60,7 +92,7 @@ class WrittenMap:
         text = self.certificate.summary() if self.verdict is None else self.verdict.summary()
         if self.faces < len(self.F):
             text += f"\nThe verdict is on the {len(self.F)} triangles that stand for its {self.faces} faces."
-        return text
+        return text if self.set_apart is None else f"{text}\n{self.set_apart.summary()}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as the first entries of the JSON report."""
@@ -73,6 +105,7 @@ class WrittenMap:
             "faces": self.faces,
             "certificate": self.certificate.to_dict(),
             **({"verdict": apart} if apart else {}),
+            **({} if self.set_apart is None else self.set_apart.to_dict()),
         }
 
 
@@ -94,7 +127,42 @@ def certify_map(mesh: MeshData, *, precision: str = "float64") -> WrittenMap:
     part = components(F, len(V))[F[:, 0]]
     alone = bool((part == part[:1]).all())
     verdict = None if alone else certify_islands(SeamedMesh(V, F, F, uv))
-    return WrittenMap(V, F, uv, certify(F, uv), verdict, mesh.faces)
+    found = WrittenMap(V, F, uv, certify(F, uv), verdict, mesh.faces)
+    if found.certificate.injective or mesh.vt is None:
+        return found
+    return _certify_charts(mesh, found) or found
+
+
+def _certify_charts(mesh: MeshData, found: WrittenMap) -> WrittenMap | None:
+    """Certify the charts of a model with defects, with the triangles that `clean` keeps; None if it changes nothing."""
+    import numpy as np
+
+    from quasiharmonic.apps.atlas.atlas_verdict import certify as certify_islands
+    from quasiharmonic.apps.unwrapping.cleaning import clean
+    from quasiharmonic.io.seamed_mesh import SeamedMesh
+
+    try:
+        cleaned = clean(mesh.V, mesh.F)
+    except ValueError:
+        return None
+    corner_uv = found.uv[found.F]
+    uv = corner_uv[cleaned.triangles]
+    uv[cleaned.flipped] = uv[cleaned.flipped][:, (0, 2, 1)]
+    changed = cleaned.flipped.any() or cleaned.excluded.size > 0
+    if not changed or not np.array_equal(cleaned.restore_corners(uv), corner_uv):
+        return None
+    corners = np.arange(uv[..., 0].size).reshape(-1, 3)
+    verdict = certify_islands(SeamedMesh(cleaned.V, cleaned.F, corners, uv.reshape(-1, 2)))
+    apart = SetApart(
+        cleaned.triangles[cleaned.flipped],
+        cleaned.excluded[cleaned.repeated],
+        cleaned.excluded[~cleaned.repeated],
+    )
+    islands = tuple(
+        replace(one, triangles=cleaned.triangles[one.triangles], inverted=cleaned.triangles[one.inverted])
+        for one in verdict.islands
+    )
+    return replace(found, verdict=replace(verdict, islands=islands), set_apart=apart)
 
 
 def tell_losses(output: Path, mesh: MeshData) -> None:

@@ -118,23 +118,20 @@ def _clean(mesh: MeshData) -> tuple[dict[str, Any], str]:
 
 def _verify(mesh: MeshData, options: argparse.Namespace) -> tuple[bool, dict[str, Any], list[str]]:
     """Certify the map of a mesh; return whether it passes, the entries of the report, and its text."""
+    from quasiharmonic import io
     from quasiharmonic.ui.cli import written_map
 
     precision = options.precision or "float64"
     certified = written_map.certify_map(mesh, precision=precision)
     further = len(certified.V) - len(mesh.V)
-    good = certified.certificate.injective
+    good = certified.injective
     facts = {
         **certified.to_dict(),
-        # Mirrored triangles count as inverted here.
-        "injective": good,
         "precision": precision,
         "triangles": len(mesh.F),
         "further_places": further,
     }
-    lines = [certified.certificate.summary()]
-    if certified.summary() != certified.certificate.summary():
-        lines.append(certified.summary().removeprefix(certified.certificate.summary()).strip())
+    lines = [certified.summary()]
     if further:
         lines.append(f"The map has seams: vertices from {len(mesh.V)} on are copies of vertices on the seams.")
     if options.any_triangulation:
@@ -142,7 +139,8 @@ def _verify(mesh: MeshData, options: argparse.Namespace) -> tuple[bool, dict[str
         facts["not_convex"] = bent.tolist()
         good = good and not bent.size
         lines.append(text)
-    diagnosis = None if certified.certificate.injective else _diagnose(mesh, options.fixed)
+    fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
+    diagnosis = None if good else _diagnose(mesh, fixed)
     facts["diagnosis"] = None if diagnosis is None else diagnosis.to_dict()
     return good, facts, lines if diagnosis is None else [*lines, diagnosis.summary()]
 
@@ -162,19 +160,18 @@ def _convexity(mesh: MeshData, certified: WrittenMap) -> tuple[NDArray[np.int64]
     return bent, f"Every one of {faces} is convex in the plane: the result holds for any triangulation."
 
 
-def _diagnose(mesh: MeshData, fixed_path: Path | None) -> Diagnosis | None:
+def _diagnose(mesh: MeshData, fixed: NDArray[np.int64] | None) -> Diagnosis | None:
     """Return the obstructions to a map with these fixed vertices; None if the file is not such a problem.
 
-    A file of fixed vertices must be valid. Without one, meshes that are not a surface with one map are skipped.
+    Without fixed vertices, meshes that are not a surface with one map are skipped.
     """
     from quasiharmonic import io
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.diagnosis import diagnose
 
-    fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     try:
         return diagnose(Problem(*io.problem_arrays(mesh, fixed), reference="equilateral"))
     except ValueError:
-        if fixed_path is not None:
+        if fixed is not None:
             raise
         return None

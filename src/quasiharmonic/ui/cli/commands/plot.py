@@ -53,8 +53,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read and draw."""
     from quasiharmonic import io
-    from quasiharmonic.geometry.exact.certificate import inverted_triangles
-    from quasiharmonic.ui.cli import arguments, finite_elements, report
+    from quasiharmonic.ui.cli import arguments, finite_elements, report, written_map
     from quasiharmonic.ui.cli.material import CHECKERBOARD
     from quasiharmonic.ui.plot import save_distortion_figure, save_map_figure, save_texture_figure
 
@@ -75,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
             texture = io.own_texture(mesh) if options.texture is None else image
             save_texture_figure(options.output, V, F, uv, texture=texture)
         else:
-            save_map_figure(options.output, V, F, uv, inverted=inverted_triangles(F, uv))
+            save_map_figure(options.output, V, F, uv, inverted=written_map.certify_map(mesh).inverted)
     with report.after_writing(options.output):
         print(f"wrote {options.output}", flush=True)
     return 0

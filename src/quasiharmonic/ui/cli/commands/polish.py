@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
         "--fixed",
         type=Path,
         metavar="FILE",
-        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
+        help="file of fixed vertices, 0-based, one per line (default: the boundary; with --slide none but the corners)",
     )
     parser.add_argument(
         "--energy", choices=arguments.ENERGIES, default="symmetric-dirichlet", help="(default: symmetric-dirichlet)"

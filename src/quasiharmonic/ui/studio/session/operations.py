@@ -168,7 +168,7 @@ def map_in_place(
 def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
     """Lower an energy of the selected islands until it converges."""
     only, source = choose(state), find_source(state, with_map=True)
-    fixed = _list_fixed(state, only)
+    fixed = _list_fixed(state, only, slide=slide)
     outline = state.active.outline if slide and len(state.islands) == 1 else None
     curves: bool | BoundaryCurves = slide if outline is None else BoundaryCurves(outline.curves())
     given: dict[str, Any] = {"energy": energy, "max_iterations": POLISHING_STEPS}
@@ -350,15 +350,18 @@ def _still(state: SessionState, islands: Sequence[IslandState]) -> tuple[int, ..
     return state.selected if len(islands) == len(state.islands) else tuple(range(len(islands)))
 
 
-def _list_fixed(state: SessionState, only: Sequence[int] | None) -> list[int] | None:
-    """Return the fixed vertices of the selected islands, in the surface's numbering; None if these are the boundary."""
+def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> list[int] | None:
+    """Return the fixed vertices of the selected islands, in the surface's numbering; None if these are the boundary.
+
+    With ``slide``, only the pins are fixed.
+    """
     chosen = state.islands if only is None else [state.islands[k] for k in only]
     if not any(one.pins for one in chosen):
         return None
-    rows = [
-        one.island.vertices[np.union1d(boundary_edges(one.island.F, len(one.island.vertices)), np.array(one.pins, int))]
-        for one in chosen
-    ]
+    rows = []
+    for one in chosen:
+        boundary = boundary_edges(one.island.F, len(one.island.vertices))[: 0 if slide else None]
+        rows.append(one.island.vertices[np.union1d(boundary, np.array(one.pins, int))])
     return np.unique(np.concatenate(rows)).tolist()
 
 
