@@ -8,12 +8,15 @@ import subprocess
 import sys
 import time
 import tomllib
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 import quasiharmonic
-from quasiharmonic.ui.cli import main
+from quasiharmonic import io
+from quasiharmonic.surfaces import cat
+from quasiharmonic.ui.cli import main, progress_line
 from quasiharmonic.ui.cli.commands import measure
 
 # Calls the command in a process and interrupts it when a module with a given name is imported.
@@ -140,3 +143,51 @@ def test_after_the_last_output():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("qhm ")
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_signals_of_schedulers_and_terminals_are_interrupts(monkeypatch, capsys, name):
+    if not hasattr(signal, name):
+        pytest.skip("the system has no such signal")
+    number = getattr(signal, name)
+    monkeypatch.setattr(measure, "run", lambda options: signal.raise_signal(number) or 0)
+    for ignored in (False, True):
+        # Shells ignore Ctrl-C for background processes.
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+        try:
+            assert main(["measure", "map.obj"]) == 2
+        finally:
+            signal.signal(signal.SIGINT, before)
+        assert capsys.readouterr().err == "qhm measure: interrupted, nothing was written\n"
+        assert signal.getsignal(number) is signal.SIG_DFL
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        assert main(["measure", "map.obj"]) == 0
+    finally:
+        signal.signal(number, before)
+
+
+@pytest.mark.slow
+def test_sigterm_keeps_the_map(tmp_path, monkeypatch, capsys):
+    V, F = cat(8)
+    io.write_mapped(tmp_path / "in.obj", io.MeshData(V, F).with_map(V[:, :2]))
+    steps = []
+
+    @contextmanager
+    def line(*_):
+        def show(step):
+            steps.append(step)
+            if len(steps) == 4:
+                signal.raise_signal(signal.SIGTERM)
+
+        yield show
+
+    monkeypatch.setattr(progress_line, "line", line)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert main(["flatten", str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj")]) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "best map so far" in capsys.readouterr().out
+    assert len(steps) == 4
+    assert main(["check", str(tmp_path / "out.obj")]) == 0

@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import io, refine
+from quasiharmonic.geometry.exact.convexity import find_inverted_fans
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
 from quasiharmonic.io import MeshFileError
+from quasiharmonic.ui.cli import main
 from shared.examples import examples
 
 
@@ -202,3 +204,21 @@ class TestFiles:
         assert counts.sum() == 9
         assert counts.min() >= 1
         assert len(parent) == 12 + 2
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_faces_that_a_reader_splits_into_inverted_triangles_are_named(tmp_path, capsys, turn):
+    # In the plane the quadrilateral has a reflex corner at (0.4, 0.4). On the surface its diagonal there is the shorter.
+    places = np.array([[0, 0], [1, 0], [0.4, 0.4], [0, 1]])
+    points = np.array([[0, 0, 0], [2, 0, 0], [0.5, 0.5, 0], [0, 2, 0]])
+    ring = np.roll(np.arange(1, 5), -turn)
+    lines = ["v {} {} {}\n".format(*at) for at in points] + ["vt {} {}\n".format(*at) for at in places]
+    path = tmp_path / "m.obj"
+    path.write_text("".join([*lines, "f " + " ".join(f"{k}/{k}" for k in ring) + "\n"]))
+    mesh = io.read_mesh(path)
+    fans = [[ring[0] - 1, ring[k] - 1, ring[k + 1] - 1] for k in (1, 2)]
+    bent = [0] if areas(places, np.array(fans)).min() <= 0 else []
+    assert bent == ([0] if turn in (1, 3) else [])
+    assert find_inverted_fans(mesh.polygons, mesh.FT, mesh.vt).tolist() == bent
+    assert main(["check", str(path)]) == 0
+    assert ("splits faces at their first corner" in capsys.readouterr().out) == bool(bent)

@@ -29,3 +29,19 @@ def find_concave(polygons: Polygons | None, F: IntArray, uv: FloatArray) -> IntA
     fan = orientation_or_nonfinite(uv[ring[first]], uv[ring], uv[ring[ahead]])[0] > 0
     fan |= (at == first) | (at == last)
     return np.unique(face[~(turns & fan)])
+
+
+def find_inverted_fans(polygons: Polygons, F: IntArray, uv: FloatArray) -> IntArray:
+    """Find polygons that get an inverted or degenerate triangle if they are split at their first corner, ascending.
+
+    A triangle is inverted if its orientation differs from that of the polygon's own triangles.
+    """
+    ring = F.ravel()[polygons.corners]
+    face = repeat_each(np.arange(len(polygons)), polygons.sizes)
+    inner = np.ones(len(ring), dtype=bool)
+    inner[polygons.starts[:-1]] = inner[polygons.starts[1:] - 1] = False
+    at = np.flatnonzero(inner)
+    own = np.zeros(len(polygons), dtype=np.int64)
+    own[polygons.of_triangle] = orientation_or_nonfinite(*uv[F].swapaxes(0, 1))[0]
+    fan = orientation_or_nonfinite(uv[ring[polygons.starts[:-1]][face[at]]], uv[ring[at]], uv[ring[at + 1]])[0]
+    return np.unique(face[at[fan != own[face[at]]]])

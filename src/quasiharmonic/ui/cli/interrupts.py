@@ -1,4 +1,4 @@
-"""Handle Ctrl-C reliably.
+"""Handle Ctrl-C reliably, and SIGTERM and SIGHUP like Ctrl-C: schedulers and terminals end commands with them.
 
 Python raises `KeyboardInterrupt` at any point of the main thread. In a finaliser Python reports it and drops it.
 During the initialisation of an extension module it can turn into another exception.
@@ -10,11 +10,12 @@ import signal
 import sys
 import threading
 from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
+_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 # Seconds after which a lost interrupt is repeated.
 _RETRY_SECONDS = 0.01
 
@@ -22,7 +23,7 @@ _RETRY_SECONDS = 0.01
 class Interrupts:
     """Context manager that records interrupts and repeats those that Python lost.
 
-    It does nothing if another handler is installed, interrupts are ignored, or this is not the main thread.
+    It does nothing about a signal that has another handler or is ignored, and nothing outside the main thread.
 
     Attributes
     ----------
@@ -32,21 +33,25 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.happened = False
-        self._installed = False
+        self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
         mine = threading.current_thread() is threading.main_thread()
-        if mine and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self._installed = True
+        handlers = {number: signal.getsignal(number) for number in _SIGNALS} if mine else {}
+        usual = signal.default_int_handler, signal.SIG_DFL
+        self._before = {number: handler for number, handler in handlers.items() if handler in usual}
+        if self._before:
             self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
-            signal.signal(signal.SIGINT, self._interrupt)
+        for number in self._before:
+            signal.signal(number, self._interrupt)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._installed:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if self._before:
             sys.unraisablehook = self._hook
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:

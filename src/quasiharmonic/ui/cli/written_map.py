@@ -56,6 +56,7 @@ class WrittenMap:
     certificate: Certificate  # Certificate of the whole map in the plane
     verdict: AtlasVerdict | None  # Certificates of the islands; None for a single island
     faces: int  # Number of faces in the file
+    bent: NDArray[np.int64]  # Faces with inverted triangles for a reader that splits faces at their first corner
     set_apart: SetApart | None = None  # Triangles that the verdict reverses or leaves out; None if there are none
 
     @property
@@ -92,6 +93,8 @@ class WrittenMap:
         text = self.certificate.summary() if self.verdict is None else self.verdict.summary()
         if self.faces < len(self.F):
             text += f"\nThe verdict is on the {len(self.F)} triangles that stand for its {self.faces} faces."
+        if self.bent.size:
+            text += f"\n{describe_bent(self.bent)}"
         return text if self.set_apart is None else f"{text}\n{self.set_apart.summary()}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -105,6 +108,7 @@ class WrittenMap:
             "faces": self.faces,
             "certificate": self.certificate.to_dict(),
             **({"verdict": apart} if apart else {}),
+            "bent_faces": self.bent.tolist(),
             **({} if self.set_apart is None else self.set_apart.to_dict()),
         }
 
@@ -127,10 +131,30 @@ def certify_map(mesh: MeshData, *, precision: str = "float64") -> WrittenMap:
     part = components(F, len(V))[F[:, 0]]
     alone = bool((part == part[:1]).all())
     verdict = None if alone else certify_islands(SeamedMesh(V, F, F, uv))
-    found = WrittenMap(V, F, uv, certify(F, uv), verdict, mesh.faces)
+    found = WrittenMap(V, F, uv, certify(F, uv), verdict, mesh.faces, find_bent(mesh, F, uv))
     if found.certificate.injective or mesh.vt is None:
         return found
     return _certify_charts(mesh, found) or found
+
+
+def find_bent(mesh: MeshData, F: NDArray[np.int64], uv: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the faces that get inverted triangles if a reader splits them at their first corner."""
+    import numpy as np
+
+    from quasiharmonic.geometry.exact.convexity import find_inverted_fans
+
+    return np.empty(0, dtype=np.int64) if mesh.polygons is None else find_inverted_fans(mesh.polygons, F, uv)
+
+
+def describe_bent(bent: NDArray[np.int64]) -> str:
+    """Return a sentence on the faces of `find_bent`."""
+    from quasiharmonic.util.arrays import names_of
+
+    where = names_of("face", "faces", bent)
+    return (
+        f"A reader that splits faces at their first corner gets inverted triangles in {where}. "
+        "qhm check --any-triangulation lists all faces that are not convex."
+    )
 
 
 def _certify_charts(mesh: MeshData, found: WrittenMap) -> WrittenMap | None:

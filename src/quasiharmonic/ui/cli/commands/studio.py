@@ -66,6 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
     # asyncio ends cleanly on Ctrl-C only if Python's default handler is installed.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     with suppress(KeyboardInterrupt):
         asyncio.run(Studio(source).run(options.port, ready))
     return 0

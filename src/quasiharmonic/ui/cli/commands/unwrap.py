@@ -149,6 +149,12 @@ def run(options: argparse.Namespace) -> int:
         if named := [] if mesh.texture is not None else io.texture_names(mesh):
             facts["old_textures"] = named
             lines.append(f"the new coordinates do not fit the textures of the file: {', '.join(named)}")
+        assert unwrapped.FT is not None
+        assert unwrapped.vt is not None
+        bent = written_map.find_bent(unwrapped, unwrapped.FT, unwrapped.vt)
+        facts["bent_faces"] = bent.tolist()
+        if bent.size:
+            lines.append(written_map.describe_bent(bent))
         if not same:
             lines.append(f"{options.output} has other coordinates than were certified")
         report.emit(facts, options.json, "\n".join(lines))
