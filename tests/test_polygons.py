@@ -208,7 +208,7 @@ class TestFiles:
 
 @pytest.mark.parametrize("turn", range(4))
 def test_faces_that_a_reader_splits_into_inverted_triangles_are_named(tmp_path, capsys, turn):
-    # In the plane the quadrilateral has a reflex corner at (0.4, 0.4). On the surface its diagonal there is the shorter.
+    # In the plane the quadrilateral has a reflex corner at (0.4, 0.4). On the surface the diagonal there is shorter.
     places = np.array([[0, 0], [1, 0], [0.4, 0.4], [0, 1]])
     points = np.array([[0, 0, 0], [2, 0, 0], [0.5, 0.5, 0], [0, 2, 0]])
     ring = np.roll(np.arange(1, 5), -turn)

@@ -292,3 +292,22 @@ WHOLE = encode({"do": "x"}, {"a": np.arange(9.0)})
 def test_damaged_frames_are_rejected(data):
     with pytest.raises(ProtocolError):
         decode(data)
+
+
+@pytest.mark.parametrize("error", [IndexError("index 9"), MemoryError("too large"), KeyError("a"), ValueError("bad")])
+def test_an_exception_of_any_type_is_reported_and_the_state_stays(monkeypatch, error):
+    one = Visitor()
+    before = one.session.state
+
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr("quasiharmonic.ui.studio.session.session.turn_over", fail)
+    one.does("turn")
+    note = one.last("note").header
+    assert note["level"] == "error"
+    assert str(error) in note["text"]
+    assert (type(error).__name__ in note["text"]) == (type(error) is not ValueError)
+    assert one.session.state is before
+    one.does("select", islands=[0])
+    assert one.session.state.selected == (0,)

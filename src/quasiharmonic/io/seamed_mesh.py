@@ -269,6 +269,8 @@ class SeamedMesh:
             position, the vertex gets a new row at the end. Without ``uv``, the result has one row for each used row of
             ``FT``.
         """
+        if len(places) != len(self.islands):
+            raise ValueError(f"places must have one array for each of {len(self.islands)} islands, not {len(places)}")
         if self.uv is not None:
             return self._move(self.uv, places)
         FT = np.full_like(self.FT, -1)

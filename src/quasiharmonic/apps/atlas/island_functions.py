@@ -191,7 +191,8 @@ def flatten(
     Returns
     -------
     MappedAtlas
-        In the surface's unit of length, or in the unit square.
+        In the surface's unit of length, or in the unit square. After Ctrl-C the remaining islands keep their positions,
+        and the others keep their centre, direction and area.
     """
     mesh = seamed_mesh(mesh)
     check_bool("start", start)
@@ -226,6 +227,10 @@ def flatten(
         return _flatten_together(mesh, checked, weights, start, {"gap": gap, **rest})
     mapped = each_island(mesh, lay, reflect=start)
     uv = [island.result.uv for island in mapped.islands]
+    if left := [island.uv for island in mesh.islands[len(uv) :]]:
+        # After Ctrl-C the remaining islands keep their maps, so the others return to their places.
+        uv = [fit_in_place(island, places) for island, places in zip(mesh.islands, uv, strict=False)]
+        return replace(mapped, mesh=mesh.with_places([*uv, *left]))
     if checked is None and len(uv) > 1:
         uv = place_in_row(uv, gap)
     if unit_square:

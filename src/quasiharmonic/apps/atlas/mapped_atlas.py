@@ -137,8 +137,9 @@ def each_island(
     ``lower`` maps an island to a result with a position for every vertex of it, and perhaps further vertices at the
     end. With ``reflect``, mirrored ones of several islands are passed as their reflection and stay mirrored. A single
     mirrored island is treated as inverted. Islands whose indices are not in ``only`` keep their positions. After Ctrl-C
-    the remaining islands keep their positions; KeyboardInterrupt is raised if they have none. ValueError as
-    `orient_islands`, if an index in ``only`` has no island, or if ``lower`` rejects an island; the message names it.
+    the remaining islands keep their positions, and so does an injective island whose new map is not injective yet;
+    KeyboardInterrupt is raised if the remaining ones have no positions. ValueError as `orient_islands`, if an index in
+    ``only`` has no island, or if ``lower`` rejects an island; the message names it.
     """
     islands = orient_islands(mesh, reflect=reflect)
     chosen = check_island_choice(mesh, only)
@@ -152,6 +153,8 @@ def each_island(
         if k in chosen:
             with name_island(island, len(islands)):
                 result = lower(island)
+            if result.status is Status.INTERRUPTED and not result.injective and is_injective(island.F, island.uv):
+                result = replace(_keep(island), status=Status.INTERRUPTED)
         else:
             result = _keep(island)
         # A refined island has further vertices at the end.

@@ -27,9 +27,9 @@ def add_parser(commands: Commands) -> None:
         "OBJ; a planar mesh without vt is its own map), verify it exactly. A map with seams is verified in the plane. "
         "Tetrahedra are verified in space. "
         "If the map is not injective, look for obstructions: conditions that no map with these fixed vertices meets.",
-        epilog="Exit status: 0 every island of the map is injective (every triangle strictly positive, or negative in a "
-        "mirrored island; without seams every triangle strictly positive), or there is no map and the "
-        "mesh has no defect, or the boundary is listed; 1 otherwise; 2 the file cannot be read.",
+        epilog="Exit status: 0 every island of the map is injective (every triangle strictly positive; of several "
+        "islands some may be mirrored), or there is no map and the mesh has no defect, or the boundary is listed; "
+        "1 otherwise; 2 the file cannot be read.",
         examples=(
             "qhm check model.obj",
             "qhm check problem/ --json report.json",

@@ -107,7 +107,7 @@ class Session:
         return True
 
     def handle(self, frame: Frame) -> None:
-        """Execute the command of a message; errors are sent to the page."""
+        """Execute the command of a message; errors of any type are sent to the page, and the state stays."""
         what = frame.header.get("do")
         do = self._HANDLERS.get(what) if isinstance(what, str) else None
         try:
@@ -116,12 +116,14 @@ class Session:
             do(self, frame)
         except KeyboardInterrupt:
             self._show()
-        except (ValueError, OSError, ArithmeticError, RuntimeError, ImportError) as error:
+        except Exception as error:
             self._drag_state = None
             if self._history and (self._working or not isinstance(error, RequestError)):
                 self._show()
             # The surface of another model hides what was said before.
-            self._tell({"kind": "note", "level": "error", "text": str(error)}, {})
+            known = isinstance(error, ValueError | OSError | ArithmeticError | RuntimeError | ImportError)
+            text = str(error) if known else f"unexpected {type(error).__name__}: {error}"
+            self._tell({"kind": "note", "level": "error", "text": text}, {})
 
     # --- models, selection and seams ---------------------------------------------------------------------------------
 
