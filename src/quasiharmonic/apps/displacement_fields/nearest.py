@@ -18,6 +18,7 @@ from quasiharmonic.apps.displacement_fields.patches import (
     grow,
     label_patches,
 )
+from quasiharmonic.apps.tetrahedra.trilinear import trilinear_fold_free
 from quasiharmonic.apps.tetrahedra.voxel_fields import (
     InvertibleVolume,
     check_volume_field,
@@ -27,9 +28,11 @@ from quasiharmonic.apps.tetrahedra.voxel_fields import (
 )
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, count_of
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, check_choice, count_of
 from quasiharmonic.util.outcome import Outcome
 
+#: How a field on voxels is sampled between them.
+INTERPOLATIONS = "linear", "trilinear"
 # Pixels closer than this to their original position, in pixels, return to it.
 _RETURN_DISTANCE = 1e-6
 # Patches whose border moved grow by this number of pixels.
@@ -110,9 +113,10 @@ def nearest_invertible(
     spacing : float, (float, float) or (float, float, float)
         Distance between neighbouring pixels, along x, along y, and along z.
     min_jacobian : float
-        Lower bound of the determinants at the four corners of each cell; at least 0 and less than 1. Cells below it
-        count as folds. Smaller values than the rounding error of a determinant are raised to it. A field with
-        determinants slightly above the bound stays without folds in single precision.
+        Lower bound of the determinants at the four corners of each cell, or of the volume ratios of the six tetrahedra
+        of each cell of voxels; at least 0 and less than 1. Cells below it count as folds. Smaller values than the
+        rounding error of a determinant are raised to it. A field with determinants slightly above the bound stays
+        without folds in single precision.
     fixed : (h, w) or (d, h, w) array of bool, optional
         Pixels that keep their displacements; none by default, so border pixels may also move.
 
@@ -185,16 +189,23 @@ def nearest_invertible(
     )
 
 
-def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> BoolArray:
-    """Decide exactly for each cell of a displacement field whether it does not fold; (h − 1, w − 1) bool.
+def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0, interpolation: str = "linear") -> BoolArray:
+    """Decide for each cell of a displacement field whether it does not fold; (h − 1, w − 1) bool.
 
-    All four corner triangles of the mapped pixels, as stored in doubles, must be positive. On voxels (d, h, w, 3) all
-    six tetrahedra of a cell must be positive, and the result has shape (d − 1, h − 1, w − 1). Arguments and errors are
-    those of `nearest_invertible`.
+    All four corner triangles of the mapped pixels, as stored in doubles, must be positive. On voxels (d, h, w, 3) the
+    result has shape (d − 1, h − 1, w − 1) and depends on ``interpolation``. With ``"linear"``, all six tetrahedra of a
+    cell must be positive, decided exactly. ITK and ANTs sample fields with ``"trilinear"`` interpolation. Then a cell
+    is free of folds if all Bernstein coefficients of its Jacobian determinant are positive. This is sufficient, not
+    necessary. Other arguments and errors are those of `nearest_invertible`.
     """
+    check_choice("interpolation", interpolation, INTERPOLATIONS)
     if np.ndim(field) == 4:
         volume, scaled, _ = in_units(check_volume_field(field), spacing)
+        if interpolation == "trilinear":
+            return trilinear_fold_free(volume, scaled)
         return ~find_folded_cells(volume, scaled, None)
+    if interpolation != "linear":
+        raise ValueError("trilinear interpolation is that of volumes: omit interpolation")
     given = check_field(field)
     return _is_fold_free(check_grid(given.shape, spacing), given)
 

@@ -268,6 +268,16 @@ def _voxels_of(cells: BoolArray) -> BoolArray:
     return voxels
 
 
+def describe_fixed(remaining: BoolArray, fixed: BoolArray) -> str:
+    """Return a sentence on remaining cells (d − 1, h − 1, w − 1) whose eight voxels are all fixed; empty if none."""
+    d, h, w = (count - 1 for count in fixed.shape)
+    corners = [fixed[z : z + d, y : y + h, x : x + w] for z, y, x in np.ndindex(2, 2, 2)]
+    unrepairable = remaining & np.logical_and.reduce(corners)
+    if not unrepairable.any():
+        return ""
+    return f" All eight voxels of some of these cells are fixed; the first of each is {_name_voxels(unrepairable)}."
+
+
 def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArray, min_jacobian: float) -> None:
     """Change a field in place in patches around folded cells; patches that still fold grow."""
     from scipy.ndimage import find_objects

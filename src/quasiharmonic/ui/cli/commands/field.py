@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
+    from quasiharmonic.apps.displacement_fields.nearest import INTERPOLATIONS
     from quasiharmonic.ui.cli import arguments
 
     parser = commands.add_parser(
@@ -24,7 +25,8 @@ def add_parser(commands: Commands) -> None:
         "the field is unchanged, bit for bit. A .npy array has shape (height, width, 2), with displacements "
         "along x (to the right) and y (down) in the unit of --spacing, or (depth, height, width, 3) on a volume. NIfTI "
         "files (.nii, .nii.gz) need nibabel, ITK's files (.mha, .nrrd) need SimpleITK; their vectors are along the "
-        "axes of space, as ITK, ANTs and elastix write them.",
+        "axes of space, as ITK, ANTs and elastix write them. On volumes, six tetrahedra per cell are certified; "
+        "ITK and ANTs interpolate trilinearly, for which --interpolation trilinear gives a certificate.",
         epilog="Exit status: 0 the written field is certified without folds; 1 written, but the inverse that "
         "--inverse requests does not exist, because the border overlaps itself; 2 wrong input or call, or no such "
         "field was found, nothing written; 3 written, but the report failed.",
@@ -54,7 +56,15 @@ def add_parser(commands: Commands) -> None:
         type=float,
         default=0.01,
         metavar="DET",
-        help="lower bound of all Jacobian determinants (default: 0.01)",
+        help="lower bound of the Jacobian determinants at the corners of pixels, or of the volume ratios of the six "
+        "tetrahedra of each cell of a volume (default: 0.01)",
+    )
+    parser.add_argument(
+        "--interpolation",
+        choices=INTERPOLATIONS,
+        default="linear",
+        help="for volumes: trilinear also verifies that no cell folds between the voxels if they are interpolated "
+        "trilinearly; if one may fold, no file is written (default: linear)",
     )
     parser.add_argument("--fix-border", action="store_true", help="keep the displacements of the border's pixels")
     arguments.add_report(parser)
@@ -64,6 +74,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, make invertible, write, report."""
     from quasiharmonic.apps.displacement_fields.nearest import InvertibleField, fold_free, nearest_invertible
+    from quasiharmonic.apps.tetrahedra.voxel_fields import describe_fixed
     from quasiharmonic.io.fields import field_suffix, read_field
     from quasiharmonic.ui.cli import report
 
@@ -82,13 +93,18 @@ def run(options: argparse.Namespace) -> int:
         except RuntimeError as error:
             raise ValueError(str(error)) from error
     if not repaired.success:
-        raise ValueError(f"no field without folds was found. {repaired.summary()}")
+        fixed = (
+            "" if held is None or isinstance(repaired, InvertibleField) else describe_fixed(repaired.remaining, held)
+        )
+        raise ValueError(f"no field without folds was found. {repaired.summary()}{fixed}")
+    if options.interpolation != "linear":
+        _check_interpolation(repaired.field, spacing, options.interpolation)
     given.write(options.output, repaired.field)
     invertible = bool(repaired.certificate.bijective if isinstance(repaired, InvertibleField) else repaired.bijective)
     with report.after_writing(options.output):
         # Rotation to the axes of space rounds, so the file is verified.
         written = read_field(options.output).field
-        if not fold_free(written, spacing=spacing).all():
+        if not fold_free(written, spacing=spacing, interpolation=options.interpolation).all():
             raise ValueError("rounding has folded the field: give a larger --min-jacobian")
         facts: dict[str, Any] = {
             "injective": repaired.success,
@@ -119,6 +135,22 @@ def _spacing(options: argparse.Namespace, given: DisplacementField) -> float | l
         return [float(length) for length in given.spacing]
     lengths: list[float] = options.spacing or [1.0]
     return lengths if len(lengths) > 1 else lengths[0]
+
+
+def _check_interpolation(field: NDArray[np.float64], spacing: float | list[float], interpolation: str) -> None:
+    """Raise ValueError if a field may fold between its voxels."""
+    import numpy as np
+
+    from quasiharmonic.apps.displacement_fields.nearest import fold_free
+    from quasiharmonic.util.arrays import count_of
+
+    doubtful = np.argwhere(~fold_free(field, spacing=spacing, interpolation=interpolation))
+    if len(doubtful):
+        first = ", ".join(str(tuple(cell)) for cell in doubtful[:5].tolist())
+        raise ValueError(
+            f"{count_of('cell', 'cells', len(doubtful))} may fold with {interpolation} interpolation; the first voxels "
+            f"(slice, row, column) of the first ones are {first}: give a larger --min-jacobian"
+        )
 
 
 def _invert(path: Path, given: DisplacementField, field: NDArray[np.float64], spacing: float | list[float]) -> str:

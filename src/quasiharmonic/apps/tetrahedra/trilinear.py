@@ -1,0 +1,53 @@
+"""Folds of a displacement field on voxels that is sampled with trilinear interpolation, as ITK and ANTs do."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from quasiharmonic.apps.tetrahedra.voxel_fields import VoxelGrid
+from quasiharmonic.util.arrays import BoolArray, FloatArray
+from quasiharmonic.util.progress import heartbeat
+
+# Coefficients of at most this multiple of a bound of their terms may be rounding errors.
+_ROUNDING = 2.0**-46
+
+
+def least_coefficients(grid: VoxelGrid, field: FloatArray) -> FloatArray:
+    """Return the smallest Bernstein coefficient of the Jacobian determinant of each cell, (d − 1, h − 1, w − 1).
+
+    On a cell, a derivative of the trilinear map is bilinear in the other two coordinates, so the determinant is a
+    polynomial of degree two in each coordinate. It is at least its smallest Bernstein coefficient. Coefficients that
+    may be rounding errors are lowered, so that positive ones are certain. A cell at rest has coefficients of 1.
+    """
+    d, h, w = (count - 1 for count in grid.shape)
+    least = np.empty((d, h, w))
+    scale = grid.spacing[:, None, None, None]
+    for z in range(d):
+        heartbeat()
+        p = np.moveaxis(grid.positions(field, z, z + 2), -1, 0)
+        by_x, by_y, by_z = (np.diff(p, axis=axis) / scale for axis in (3, 2, 1))
+        total = np.zeros((3, 3, 3, h, w))
+        bound = np.zeros((3, 3, 3, h, w))
+        for j, k in product(range(2), repeat=2):
+            a = by_x[:, k, j : j + h]
+            for i, n in product(range(2), repeat=2):
+                b = by_y[:, n, :, i : i + w]
+                cross = np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+                size = np.abs(a).sum(axis=0) * np.abs(b).sum(axis=0)
+                for m, q in product(range(2), repeat=2):
+                    c = by_z[:, 0, q : q + h, m : m + w]
+                    at = k + n, j + q, i + m
+                    total[at] += (cross * c).sum(axis=0)
+                    bound[at] += size * np.abs(c).sum(axis=0)
+        # A coefficient is the sum of its terms divided by three binomial coefficients.
+        share = np.array([1.0, 0.5, 1.0])
+        factor = (share[:, None, None] * share[:, None] * share)[..., None, None]
+        least[z] = (factor * (total - _ROUNDING * bound)).min(axis=(0, 1, 2))
+    return least
+
+
+def trilinear_fold_free(grid: VoxelGrid, field: FloatArray) -> BoolArray:
+    """Return the cells (d − 1, h − 1, w − 1) whose determinant is certainly positive everywhere."""
+    return np.asarray(least_coefficients(grid, field) > 0)
