@@ -30,7 +30,7 @@ class TestCommand:
         sliding = ["--polish", "mips", "--slide"]
         assert main(["batch", str(stars / "b"), "-o", out, "-j", "1", "--to", "disk", *sliding]) == 0
         assert main(["batch", str(stars / "b"), "-o", out, "--slide"]) == 2
-        assert "give an energy as well, by polish" in capsys.readouterr().err
+        assert "give an energy as well, by --polish" in capsys.readouterr().err
         assert main(["batch", str(tmp_path / "none"), "-o", out]) == 2
         assert "there is no folder" in capsys.readouterr().err
 

@@ -227,7 +227,7 @@ def test_wrong_arguments_are_named_briefly(value, folder):
         ("batch . -o o --flatten --strategy speed", "--strategy"),
         ("batch . -o o --to disk --energy mips", "flatten"),
         ("batch . -o o --to disk --slide", "polish"),
-        ("batch . -o o --corners auto", "give the outline by to"),
+        ("batch . -o o --corners auto", "give the outline by --to"),
     ],
 )
 def test_an_option_without_effect_is_rejected(folder, capsys, call, needs):

@@ -233,7 +233,7 @@ class TestImports:
 
 
 @pytest.mark.slow
-def test_repairs_cost_less_where_the_target_meets_itself():
+def test_repairs_cost_less_where_boundary_vertices_share_a_position():
     V, F = disk(2)
     (loop,) = boundary_loops(F, len(V))
     simple, touching = Problem(V, F, loop, V[loop]), V.copy()

@@ -208,7 +208,7 @@ class TestOptions:
         V, F = grid(4, 4)
         start = V.copy()
         start[12] = (2, 2)
-        with pytest.raises(ValueError, match="start is not injective: triangles"):
+        with pytest.raises(ValueError, match=r"\(start\) is not injective: triangles"):
             flatten(V, F, start=start)
 
     def test_heavily_weighted_triangles_are_distorted_less(self):

@@ -194,7 +194,7 @@ def test_patterns_are_true_to_scale(tmp_path, allowance):
         (["--pattern", "p.svg", "--allowance", "-1"], "allowance must be a finite number of at least 0"),
         (["--pattern", "nowhere/p.svg"], "nowhere"),
         (["--allowance", "1"], "--allowance needs --pattern"),
-        (["--energy", "distances", "--fixed", "held.txt"], "omit fixed and weights"),
+        (["--energy", "distances", "--fixed", "held.txt"], "omit --fixed and --weights"),
     ],
 )
 def test_invalid_patterns_and_distances(head, tmp_path, capsys, monkeypatch, options, words):

@@ -287,8 +287,8 @@ def _check_start(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:
     inverted = inverted_triangles(F, array)
     if inverted.size:
         raise ValueError(
-            f"start is not injective: {names_of('triangle', 'triangles', inverted)} inverted or degenerate; "
-            "omit it, or make it injective first (quasiharmonic.repair)"
+            f"the initial map (start) is not injective: {names_of('triangle', 'triangles', inverted)} inverted or "
+            "degenerate; make it injective first (quasiharmonic.repair, qhm repair)"
         )
     return array
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from quasiharmonic.energies.polishing import PolishOptions, polish_map
-from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Frame, Problem
@@ -31,9 +30,9 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 if TYPE_CHECKING:
     from quasiharmonic.problem.diagnosis import Diagnosis
 
-# Maximum cost of failed patch repairs in all stages together, in units of the search's iteration budget. Few problems
-# whose target meets itself have a map, and for them repairs hardly ever help.
-_FAILED_REPAIRS, _FAILED_REPAIRS_OF_CROSSING = 16, 2
+# Maximum cost of failed patch repairs in all stages together, in units of the search's iteration budget. If boundary
+# vertices share a target position, V₃ is almost zero at folded maps, too, and repairs hardly ever help.
+_FAILED_REPAIRS, _FAILED_REPAIRS_OF_TOUCHING = 16, 2
 # Fraction of inverted triangles above which a stage `IfManyInverted` runs.
 MANY_INVERTED = 0.02
 # Stages that untangle the last few triangles.
@@ -56,10 +55,10 @@ class _State(NamedTuple):
 
 def allowed_repairs(problem: Problem, options: SearchOptions) -> int:
     """Return the iterations that failed patch repairs of a search may cost."""
-    positions = np.zeros((problem.n, 2))
-    positions[problem.fixed] = problem.target
-    crossing = bool(check_loops(problem.domain.loops, positions)[1])
-    return options.max_iterations * (_FAILED_REPAIRS_OF_CROSSING if crossing else _FAILED_REPAIRS)
+    boundary = np.unique(np.concatenate(problem.domain.loops))
+    target = problem.target[np.isin(problem.fixed, boundary)]
+    touching = len(np.unique(target, axis=0)) < len(target)
+    return options.max_iterations * (_FAILED_REPAIRS_OF_TOUCHING if touching else _FAILED_REPAIRS)
 
 
 class Search:

@@ -27,6 +27,7 @@ from quasiharmonic.ui.cli.interrupts import Interrupts
 from quasiharmonic.ui.cli.report import ReportError, describe_error
 from quasiharmonic.ui.cli.streams import NO_READER, output_failed, tell
 from quasiharmonic.ui.cli.version import Version
+from quasiharmonic.ui.cli.wording import in_options, use_options
 
 # The subcommands by group, in the order of the help. Each is a module of `commands`.
 GROUPS = {
@@ -89,6 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except OSError as error:
             # The parser prints the version and the help.
             return output_failed(error)
+        use_options(parser, options.command)
         run: Callable[[argparse.Namespace], int] = options.run
         try:
             with _parent_surface(getattr(options, "parent_surface", None)):
@@ -127,7 +129,7 @@ def _fail(command: str, why: str | Exception, status: int) -> int:
     """Print why a command failed, unless standard output has no reader; return the exit status."""
     if isinstance(why, BrokenPipeError):
         return NO_READER
-    tell(f"qhm {command}: {why if isinstance(why, str) else describe_error(why)}")
+    tell(f"qhm {command}: {why if isinstance(why, str) else in_options(describe_error(why))}")
     return status
 
 

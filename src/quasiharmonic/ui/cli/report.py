@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli.streams import require_output, tell
+from quasiharmonic.ui.cli.wording import in_options
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
@@ -43,6 +44,7 @@ def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str
 
 def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
     """Print the text and write the JSON; with ``--json -`` standard output contains only the JSON."""
+    text = in_options(text)
     if destination == "-":
         if sys.stdout is None:
             raise OSError("standard output is closed")
@@ -171,6 +173,9 @@ def about(source: Path | str) -> Iterator[None]:
     except ValueError as error:
         if str(error).endswith(_COUNTING):
             # An inner block has already added the prefix.
+            raise
+        if str(error).startswith(f"{source}:"):
+            # The error already names its file.
             raise
         numbered = _NUMBERED.search(str(error)) and not _NEEDS_NO_NOTE.search(str(error))
         counting = f" {_COUNTING}" if numbered else ""

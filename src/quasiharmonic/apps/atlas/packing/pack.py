@@ -139,14 +139,16 @@ def pack_charts(
     if layout is None:
         width, height = find_sufficient_size(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
         if max(width, height) > MAX_SIZE:
+            wished = "" if texels_per_unit is None else f" and {texels_per_unit:g} texels per unit"
             raise ValueError(
-                f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels"
-                f"{'' if texels_per_unit is None else f' and {texels_per_unit:g} texels per unit'} need a texture of "
-                f"more than {MAX_SIZE:,} texels a side: use {'less padding' if texels_per_unit is None else 'fewer'}"
+                f"the texture needs more than {MAX_SIZE:,} texels a side for "
+                f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels{wished}: "
+                f"use less padding{'' if texels_per_unit is None else ', or fewer texels per unit'}"
             )
         sufficient = f"{width} × {height} texels" if width != height else f"resolution={width}"
         raise ValueError(
-            f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels do not fit into "
+            f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels "
+            f"{'does' if len(shapes) == 1 else 'do'} not fit into "
             f"{f'{tiles} tiles of ' if tiles > 1 else ''}{size[0]} × {size[1]} texels: {sufficient} suffices"
         )
     placed = {i: _place(shape, layout, k) for k, (i, shape) in enumerate(zip(originals, shapes, strict=True))}

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.apps.displacement_fields.nearest import INTERPOLATIONS
     from quasiharmonic.ui.cli import arguments
 
     parser = commands.add_parser(
@@ -61,7 +60,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--interpolation",
-        choices=INTERPOLATIONS,
+        choices=("linear", "trilinear"),
         default="linear",
         help="for volumes: trilinear also verifies that no cell folds between the voxels if they are interpolated "
         "trilinearly; if one may fold, no file is written (default: linear)",
