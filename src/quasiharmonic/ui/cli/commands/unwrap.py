@@ -72,7 +72,9 @@ def add_parser(commands: Commands) -> None:
         "--outward", action="store_true", help="treat closed components that are inside out as turned outward"
     )
     parser.add_argument(
-        "--keep-seams", action="store_true", help="use the seams of the input's texture coordinates (vt)"
+        "--keep-seams",
+        action="store_true",
+        help="keep the seams of the input's texture coordinates (vt), and add seams only where necessary",
     )
     parser.add_argument(
         "--edge-costs",
