@@ -16,6 +16,8 @@ from quasiharmonic.geometry.coarsening.prolongation import prolong
 from quasiharmonic.linsolve import LinearSolver, available
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import VectorAdam
+from quasiharmonic.solver.search.options import SearchOptions
+from quasiharmonic.solver.search.search import allowed_repairs
 from quasiharmonic.surfaces import disk
 from quasiharmonic.targets import arc_length, letter, rectangle
 from quasiharmonic.util.kernels import extension
@@ -228,3 +230,16 @@ class TestImports:
         if letter == "R":
             # Modules needed for a map to it; without them, the absence of Qhull would prove nothing.
             assert "composite" in (tmp_path / "j").read_text()
+
+
+@pytest.mark.slow
+def test_repairs_cost_less_where_the_target_meets_itself():
+    V, F = disk(2)
+    (loop,) = boundary_loops(F, len(V))
+    simple, touching = Problem(V, F, loop, V[loop]), V.copy()
+    touching[15] = touching[8]
+    crossing = Problem(lift(V), F, loop, touching[loop])
+    options = SearchOptions(max_iterations=100)
+    assert 8 * allowed_repairs(crossing, options) == allowed_repairs(simple, options)
+    result = solve(crossing)
+    assert not result.injective

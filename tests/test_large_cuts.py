@@ -93,3 +93,10 @@ class TestLevels:
         cut = find_cuts(V, F)
         assert parts(V, F, cut) == [(1, 1)]
         assert length_of(V, cut) < 1.2 * length_of(*surfaces.starfish(3, 24)[:1], few)
+
+
+@pytest.mark.slow
+def test_a_large_surface_that_needs_no_cut():
+    V, F = surfaces.grid(130, 130)
+    assert len(V) > 15_000
+    assert find_cuts(np.column_stack([V, 0.1 * V[:, 0] * V[:, 1]]), F).shape == (0, 2)

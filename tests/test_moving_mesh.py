@@ -245,3 +245,24 @@ def test_invalid_positions(places, message):
     mesh = MovingMesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]], [0])
     with pytest.raises(ValueError, match=message):
         mesh.advance(places)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [7, 17])
+def test_a_body_that_comes_close_to_a_sliding_wall_does_not_slide_on_it(seed):
+    points, F = annulus(12)
+    walls, body = sorted(boundary_loops(F, len(points)), key=lambda loop: -np.abs(points[loop]).max())
+    angle = np.random.default_rng(seed).uniform(0, 2 * np.pi)
+    mesh, ahead, gap = MovingMesh(points, F, body, slide=True), 0.0, np.inf
+    corners = points[walls]
+    for _ in range(200):
+        there = points[body] + ahead * np.array([np.cos(angle), np.sin(angle)])
+        try:
+            here = mesh.advance(there)
+        except RuntimeError:
+            # Triangles between the body and the wall are too small: a documented outcome.
+            break
+        np.testing.assert_array_equal(here[body], there)
+        gap = np.linalg.norm(corners, axis=1).max() - np.linalg.norm(there, axis=1).max()
+        ahead += 0.3 * gap
+    assert gap < 0.2 * np.ptp(corners)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic import is_injective, surfaces
+from quasiharmonic import is_injective, surfaces, unwrap
+from quasiharmonic.apps.atlas.packing import layout
 from quasiharmonic.atlas import pack_charts
 
 shapely = pytest.importorskip("shapely")
@@ -254,3 +255,59 @@ def test_invalid_calls(change, message):
     call = {"charts": [(V[:, :2], F)] * 2, "resolution": 1024, **change}
     with pytest.raises(ValueError, match=message):
         pack_charts(call.pop("charts"), **call)
+
+
+def test_tiles_that_are_not_needed_cost_no_time(monkeypatch):
+    opened = []
+    board = layout.Board
+
+    def counted(*arguments, **named):
+        opened.append(arguments)
+        return board(*arguments, **named)
+
+    monkeypatch.setattr(layout, "Board", counted)
+    points, F = np.array([[0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
+    few = pack_charts([(points, F)] * 3, resolution=64, tiles=3)
+    count = len(opened)
+    many = pack_charts([(points, F)] * 3, resolution=64, tiles=10_000)
+    assert len(opened) <= 4 * count
+    assert many.texels_per_unit > 0.99 * few.texels_per_unit
+    assert {one.tile for one in many.placements} == {0, 1, 2}
+
+
+def test_small_charts_fill_many_tiles_in_order():
+    points, F = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), np.array([[0, 1, 2], [0, 2, 3]])
+    # More charts than are placed as bitmaps; those in boxes need further tiles, too.
+    packing = pack_charts([(points, F)] * 700, resolution=64, padding=0, texels_per_unit=7, tiles=20, rotate=False)
+    tiles = np.array([one.tile for one in packing.placements])
+    assert np.array_equal(np.unique(tiles), np.arange(tiles.max() + 1))
+    assert tiles.max() < 19
+    with pytest.raises(ValueError, match="do not fit"):
+        pack_charts([(points, F)] * 700, resolution=64, padding=0, texels_per_unit=7, tiles=5, rotate=False)
+
+
+@pytest.mark.parametrize(
+    ("density", "words"),
+    [
+        (1e300, "more than 16,777,216 texels a side: use fewer"),
+        (1e5, "resolution=.* suffices"),
+        (1e-300, "smaller than a texel: use more texels per unit"),
+    ],
+)
+def test_extreme_densities_are_refused_without_drawing(monkeypatch, density, words):
+    points, F = np.array([[0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
+    drawn = []
+    draw = layout.draw
+    monkeypatch.setattr(layout, "draw", lambda *a: drawn.append(draw(*a)) or drawn[-1])
+    with pytest.raises(ValueError, match=words):
+        pack_charts([(points, F)] * 3, resolution=128, texels_per_unit=density)
+    assert sum(bitmap.size for bitmap in drawn) < 2e8
+
+
+@pytest.mark.slow
+def test_charts_in_later_tiles_keep_apart_without_padding():
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) + 3.0 * np.arange(300)[:, None, None]
+    F = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(300)[:, None, None]
+    result = unwrap(points.reshape(-1, 3), F.reshape(-1, 3), padding=0, tiles=40, resolution=256, texels_per_unit=80)
+    assert result.uvs.max() > 2
+    assert result.certificate.bijective

@@ -258,6 +258,7 @@ def test_progress_by_phase_and_exceptions_of_the_callback():
         ((V, F), {"seed": -1}, "seed"),
         ((V, F), {"jobs": 0}, "jobs"),
         ((V, F), {"uv": np.zeros((3, 2))}, "uv"),
+        ((V, F), {"uv": np.where(np.arange(len(V))[:, None] == 7, np.inf, V[:, :2])}, r"infinite .* index \(7, 0\)"),
         ((V, F), {"callback": 1}, "callback"),
     ],
 )

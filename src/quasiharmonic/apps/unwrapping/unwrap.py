@@ -223,6 +223,9 @@ def _check_options(max_stretch: float, max_charts: int | None, seed: int, jobs: 
 def _corner_positions(uv: ArrayLike, F: IntArray, n: int) -> FloatArray:
     """Return given texture coordinates for every corner, (f, 3, 2); NaN where there are none."""
     array = real_array("uv", getattr(uv, "uv", uv))
+    infinite = np.argwhere(np.isinf(array))
+    if len(infinite):
+        raise ValueError(f"uv has infinite values, the first at index {tuple(infinite[0].tolist())}")
     if array.shape == (n, 2):
         return array[F]
     if array.shape != (*F.shape, 2):

@@ -30,7 +30,7 @@ from quasiharmonic.solver.construction.opening import thin_refinement
 from quasiharmonic.solver.construction.simplicity import is_simple
 from quasiharmonic.solver.refine.refining import refine_problem
 from quasiharmonic.solver.search.options import FailedRepairs, SearchOptions
-from quasiharmonic.solver.search.search import FAILED_REPAIRS
+from quasiharmonic.solver.search.search import allowed_repairs
 from quasiharmonic.solver.search.solving import search_map
 from quasiharmonic.solver.search.stages import Stages
 from quasiharmonic.solver.search.strategy import quick_stages, stages_of, without_restarts
@@ -62,7 +62,7 @@ def search_refining(problem: Problem, options: SearchOptions) -> MapResult:
     ``start`` and ``record_every`` apply to the given mesh.
     """
     left = options.max_iterations
-    repairs = FAILED_REPAIRS * options.max_iterations
+    repairs = allowed_repairs(problem, options)
 
     def search(on: Problem, first: FloatArray | None, budget: int, select: _Selection) -> MapResult:
         nonlocal left, repairs

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from quasiharmonic.energies.polishing import PolishOptions, polish_map
+from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Frame, Problem
@@ -30,8 +31,9 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 if TYPE_CHECKING:
     from quasiharmonic.problem.diagnosis import Diagnosis
 
-# Maximum cost of failed patch repairs in all stages together, in units of the search's iteration budget.
-FAILED_REPAIRS = 16
+# Maximum cost of failed patch repairs in all stages together, in units of the search's iteration budget. Few problems
+# whose target meets itself have a map, and for them repairs hardly ever help.
+_FAILED_REPAIRS, _FAILED_REPAIRS_OF_CROSSING = 16, 2
 # Fraction of inverted triangles above which a stage `IfManyInverted` runs.
 MANY_INVERTED = 0.02
 # Stages that untangle the last few triangles.
@@ -50,6 +52,14 @@ class _State(NamedTuple):
     best_field: TensorField | None
     best_reference: Reference
     lowest_energy: Iterate | None
+
+
+def allowed_repairs(problem: Problem, options: SearchOptions) -> int:
+    """Return the iterations that failed patch repairs of a search may cost."""
+    positions = np.zeros((problem.n, 2))
+    positions[problem.fixed] = problem.target
+    crossing = bool(check_loops(problem.domain.loops, positions)[1])
+    return options.max_iterations * (_FAILED_REPAIRS_OF_CROSSING if crossing else _FAILED_REPAIRS)
 
 
 class Search:
@@ -83,7 +93,7 @@ class Search:
         self._other_solvers: tuple[str, ...] | None = None if options.linear_solver == "auto" else ()
         self._callback = options.callback
         self._budget = options.max_iterations
-        self.failed_repairs = options.failed_repairs or FailedRepairs(FAILED_REPAIRS * options.max_iterations)
+        self.failed_repairs = options.failed_repairs or FailedRepairs(allowed_repairs(problem, options))
         self._record_every = options.record_every
         self.path: list[Snapshot] = []
         self.history: list[Step] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, pi, sqrt
+from math import ceil, hypot, pi, sqrt
 
 import numpy as np
 
@@ -36,6 +36,8 @@ _TRIALS = 300
 _TURNS = 16
 # Angles compared for the direction of a single chart, and the precision of the best one.
 _ANGLES, _ANGLE_PRECISION = 256, 1e-6
+#: Largest side of a texture in texels: single precision stores no more positions.
+MAX_SIZE = 1 << 24
 # Relative precision of the scale of many charts.
 _COARSE = 0.04
 # Relative precision of the sufficient size.
@@ -92,9 +94,11 @@ def find_layout(
     if len(shapes) == 1 and rotate and scale is None:
         return _place_one(shapes[0], size, padding)
     if scale is not None:
+        if not _may_fit(shapes, size, tiles, scale):
+            return None
         search = _Search(shapes, size, padding, tiles, scale, rotate=rotate)
         return search.place_in(search.cells)
-    expected, least = _expected_scale(shapes, size, padding, tiles), _least_scale(shapes)
+    expected, least = _expected_scale(shapes, size, padding, tiles), least_scale(shapes)
     while expected > least:
         search = _Search(shapes, size, padding, tiles, expected, rotate=rotate)
         if len(shapes) > _MANY:
@@ -107,6 +111,13 @@ def find_layout(
             return fine.enlarge_finely(order) or layout
         expected /= _MORE_CELLS
     return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
+
+
+def _may_fit(shapes: Sequence[Shape], size: tuple[int, int], tiles: int, scale: float) -> bool:
+    """Whether neither the areas nor a length of shapes exclude that they fit into tiles at a scale."""
+    area = sum(shape.area for shape in shapes) * scale * scale
+    longest = max(max(shape.extent(find_smallest_box(shape))) for shape in shapes) * scale
+    return area <= tiles * size[0] * size[1] and longest <= hypot(*size)
 
 
 def _place_one(shape: Shape, size: tuple[int, int], padding: float) -> Layout | None:
@@ -127,7 +138,7 @@ def _place_one(shape: Shape, size: tuple[int, int], padding: float) -> Layout | 
     while width > _ANGLE_PRECISION:
         near = best + width * np.linspace(-1, 1, 9)[[4, 0, 1, 2, 3, 5, 6, 7, 8]]
         best, width = float(near[np.argmax(scales(near))]), width / 4
-    scale, least = float(scales(np.array([best]))[0]), _least_scale([shape])
+    scale, least = float(scales(np.array([best]))[0]), least_scale([shape])
     if scale < least:
         return None
     if not max(shape.extent(1)):
@@ -138,7 +149,10 @@ def _place_one(shape: Shape, size: tuple[int, int], padding: float) -> Layout | 
 def find_sufficient_size(
     shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool, scale: float | None
 ) -> tuple[int, int]:
-    """Width and height of tiles, of the same ratio, into which shapes fit that do not fit into tiles of a size."""
+    """Width and height of tiles, of the same ratio, into which shapes fit that do not fit into tiles of a size.
+
+    A side above `MAX_SIZE` means that none was found.
+    """
 
     def enlarge(factor: float) -> tuple[int, int]:
         return ceil(size[0] * factor), ceil(size[1] * factor)
@@ -151,6 +165,8 @@ def find_sufficient_size(
     low, high = 1.0, 2.0
     while not fits(enlarge(high)):
         low, high = high, 2 * high
+        if high * max(size) > MAX_SIZE:
+            return enlarge(high)
     while enlarge(low) != enlarge(high) and high - low > _SIZE_PRECISION * high:
         middle = (low + high) / 2
         low, high = (low, middle) if fits(enlarge(middle)) else (middle, high)
@@ -161,11 +177,11 @@ def _place_boxes(
     shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool
 ) -> Layout | None:
     """Place shapes as boxes at the least scale."""
-    search = _Search(shapes, size, padding, tiles, _least_scale(shapes), rotate=rotate, bitmaps=0)
+    search = _Search(shapes, size, padding, tiles, least_scale(shapes), rotate=rotate, bitmaps=0)
     return search.place_in(min(4 * max(size), _MOST_CELLS))
 
 
-def _least_scale(shapes: Sequence[Shape]) -> float:
+def least_scale(shapes: Sequence[Shape]) -> float:
     """Scale at which the longest side of all boxes is one texel."""
     return 1 / (max(max(shape.extent(find_smallest_box(shape))) for shape in shapes) or 1.0)
 
@@ -281,7 +297,19 @@ class _Search:
         """Place the bitmaps on boards with a number of cells along the longer side; None if one does not fit."""
         texels = max(self._size) / cells
         columns, rows = (int(side / texels * (1 + 1e-12)) for side in self._size)
-        boards = [Board(rows, columns, windows=self._windows) for _ in range(self._tiles)]
+        boards: list[Board] = []
+
+        def open_board() -> Board:
+            boards.append(Board(rows, columns, windows=self._windows))
+            return boards[-1]
+
+        def find(bitmaps: Bitmaps) -> tuple[int, Spot] | None:
+            for tile, board in enumerate(boards):
+                if spot := board.find(bitmaps):
+                    return tile, spot
+            spot = open_board().find(bitmaps) if len(boards) < self._tiles else None
+            return None if spot is None else (len(boards) - 1, spot)
+
         n = len(self._areas)
         directions, centres, tiles = np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64)
         placed: tuple[int, ...] = (cells,)
@@ -291,12 +319,13 @@ class _Search:
             # Orders of few shapes often begin alike.
             placed = (*placed, i)
             if placed not in self._spots:
-                spots = ((tile, spot) for tile, board in enumerate(boards) if (spot := board.find(bitmaps)))
-                self._spots[placed] = next(spots, None)
+                self._spots[placed] = find(bitmaps)
             found = self._spots[placed]
             if found is None:
                 return None
             tile, spot = found
+            while tile >= len(boards):
+                open_board()
             bitmap = bitmaps.cells[spot.direction]
             boards[tile].put(bitmap, spot.row, spot.column)
             directions[i], tiles[i] = bitmaps.directions[spot.direction], tile
@@ -305,11 +334,16 @@ class _Search:
         directions[rest] = self._lying
         boxes = np.ceil(self._boxes + self._padding / texels).astype(np.int64)
         waiting = np.arange(len(rest))
-        for tile, board in enumerate(boards):
+        for tile in range(self._tiles):
+            if not waiting.size:
+                break
+            board = boards[tile] if tile < len(boards) else open_board()
             corners = board.fill_rows(boxes[waiting])
             done = waiting[corners[:, 0] >= 0]
             tiles[rest[done]] = tile
             centres[rest[done]] = (corners[corners[:, 0] >= 0] + boxes[done] / 2) @ [1j, 1] * texels
+            if tile + 1 == len(boards) and not done.size:
+                break
             waiting = waiting[corners[:, 0] < 0]
         return None if waiting.size else Layout(texels / self._cell, directions, centres, tiles)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.copies import Copy, Motion, find_copies
-from quasiharmonic.apps.atlas.packing.layout import Layout, find_layout, find_sufficient_size
+from quasiharmonic.apps.atlas.packing.layout import MAX_SIZE, Layout, find_layout, find_sufficient_size, least_scale
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -123,14 +123,27 @@ def pack_charts(
     # Scale by a power of two to about unit size, so that squares do not overflow.
     exponent = int(np.frexp(max(float(np.abs(uv).max()) for uv, _ in pairs))[1])
     pairs = [(np.ldexp(uv, -exponent), F) for uv, F in pairs]
-    wanted = None if texels_per_unit is None else float(np.ldexp(texels_per_unit, exponent))
+    with np.errstate(over="ignore", under="ignore"):
+        wanted = None if texels_per_unit is None else float(np.ldexp(texels_per_unit, exponent))
     copies = find_copies(pairs) if stack else {}
     originals = [i for i in range(len(pairs)) if i not in copies]
     shapes = [make_shape(*pairs[i]) for i in originals]
-    spaced = padding + max(size) * (_ROUNDING + _deviation(pairs, copies))
+    # Coordinates of later tiles are larger, and so are their rounding errors.
+    reach = max(min(tiles, 10), -(-tiles // 10))
+    spaced = padding + max(size) * (_ROUNDING * 2.0 ** (reach - 1).bit_length() + _deviation(pairs, copies))
+    if wanted is not None and wanted < least_scale(shapes):
+        raise ValueError(
+            f"with {texels_per_unit:g} texels per unit, all charts are smaller than a texel: use more texels per unit"
+        )
     layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
     if layout is None:
         width, height = find_sufficient_size(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+        if max(width, height) > MAX_SIZE:
+            raise ValueError(
+                f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels"
+                f"{'' if texels_per_unit is None else f' and {texels_per_unit:g} texels per unit'} need a texture of "
+                f"more than {MAX_SIZE:,} texels a side: use {'less padding' if texels_per_unit is None else 'fewer'}"
+            )
         sufficient = f"{width} × {height} texels" if width != height else f"resolution={width}"
         raise ValueError(
             f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels do not fit into "
