@@ -20,6 +20,7 @@ from quasiharmonic.util.arrays import (
     check_integer,
     check_range,
     count_of,
+    repeat_each,
     triangle_array,
     triangle_rows,
     vertex_array,
@@ -232,7 +233,7 @@ def find_close_vertices(V: FloatArray, triangles: IntArray) -> IntArray:
     places, times = points[order[first]], np.diff(first, append=len(order))
     distance, _ = KDTree(places).query(places, k=2)
     near = (times > 1) | (distance[:, 1] <= _CLOSE * np.linalg.norm(np.ptp(points, axis=0)))
-    return np.sort(order[np.repeat(near, times)])
+    return np.sort(order[repeat_each(near, times)])
 
 
 def describe_soup(close: IntArray) -> str:
