@@ -206,3 +206,13 @@ def test_close_vertices_of_a_soup_are_listed_with_a_remedy(exponent):
 def test_separate_triangles_far_from_each_other_are_no_soup():
     V = np.array([[0, 0], [1, 0], [0, 1]]) + 2 * np.arange(5)[:, None, None]
     assert not inspect_mesh(V.reshape(-1, 2), np.arange(15).reshape(-1, 3)).close.size
+
+
+@pytest.mark.slow
+def test_thousands_of_vertices_at_one_position_are_close():
+    """A tree of equal points takes quadratic time: minutes here."""
+    V = np.random.default_rng(0).normal(size=(300_000, 3))
+    V[1::3] = V[2::3] = 0
+    V[0] = V[3] + 1e-9
+    close = inspect_mesh(V, np.arange(len(V)).reshape(-1, 3)).close
+    np.testing.assert_array_equal(close, np.flatnonzero((np.arange(len(V)) % 3 > 0) | (np.arange(len(V)) < 4)))

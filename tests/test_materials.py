@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,8 @@ from quasiharmonic import flatten, io
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io import MeshData, MeshFileError
 from quasiharmonic.plot import plot_texture, save_texture_figure
-from quasiharmonic.surfaces import cat, grid
+from quasiharmonic.surfaces import cat, disk, grid
+from quasiharmonic.ui.cli import main
 from shared.commands import run
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -294,3 +297,67 @@ def test_models_without_a_usable_texture_have_none(tmp_path):
     assert io.own_texture(io.read_mesh(tmp_path / "b.obj")) is None
     (tmp_path / "b.mtl").write_text("newmtl m\nmap_Kd missing.png\nmap_Kd b.mtl\n")
     assert io.own_texture(io.read_mesh(tmp_path / "b.obj")) is None
+
+
+def test_names_of_textures_include_all_kinds_of_images(tmp_path):
+    V, F = disk(2)
+    model = tmp_path / "m.obj"
+    io.write_mapped(model, MeshData(V, F).with_map(V[:, :2]))
+    entries = (
+        "newmtl a\nKd 1 1 1\nmap_Kd -s 2 2 2 ../colour.png\nmap_aat on\nnorm C:\\all\\normal.png\nbump -bm 1 b.png\n"
+    )
+    (tmp_path / "m.mtl").write_text(f"{entries}newmtl b\nMap_Kd ../colour.png\n")
+    model.write_text(f"mtllib m.mtl\n{model.read_text()}")
+    assert io.texture_names(io.read_mesh(model)) == ["colour.png", "normal.png", "b.png"]
+
+
+def test_names_of_textures_are_those_that_use_the_map(tmp_path):
+    V, F = disk(2)
+    model = tmp_path / "m.glb"
+    io.write_mapped(model, MeshData(V, F, texture=io.checkerboard()).with_map(V[:, :2]))
+    mesh = io.read_mesh(model)
+    tree = mesh.carried.document.tree
+    tree["images"] = [{"uri": f"{k}.png"} for k in range(6)] + [{"name": "seven", "uri": "7.png"}, {"bufferView": 0}]
+    tree["textures"] = [{"source": k} for k in range(8)]
+    tree["textures"][5]["extensions"] = {"EXT_texture_webp": {"source": 4}}
+    tree["materials"] = [
+        {
+            "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
+            "occlusionTexture": {"index": 1, "texCoord": 1},
+            "normalTexture": {"index": 2, "texCoord": 1, "extensions": {"KHR_texture_transform": {"texCoord": 0}}},
+            "extensions": {"KHR_materials_clearcoat": {"clearcoatTexture": {"index": 5}}},
+            "emissiveTexture": {"index": 6},
+        },
+        {"emissiveTexture": {"index": 7}},
+    ]
+    assert io.texture_names(mesh) == ["0.png", "2.png", "5.png", "4.png", "seven", "image 7"]
+    for damaged in ({"index": 99}, {"index": "x"}, {"index": 0, "extensions": 3}):
+        tree["materials"] = [{"normalTexture": damaged}]
+        assert io.texture_names(mesh) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [["flatten"], ["polish"], ["map", "--to", "disk"], ["repair", "--whole"]])
+def test_commands_name_textures_that_do_not_fit_a_new_map(tmp_path, capsys, words):
+    V, F = disk(4)
+    model, out = tmp_path / "m.obj", tmp_path / "out.obj"
+    uv = V[:, :2] * [1, 2]
+    uv[0] += 9 if words[0] == "repair" else 0
+    io.write_mapped(
+        model, MeshData(np.column_stack([V[:, :2], V[:, 0] ** 2]), F, texture=io.checkerboard()).with_map(uv)
+    )
+    assert main([words[0], str(model), *words[1:], "-o", str(out), "--json", str(tmp_path / "r.json")]) == 0
+    sentence = "the new coordinates do not fit the textures of the file: m-texture.png"
+    assert sentence in capsys.readouterr().out
+    assert json.loads((tmp_path / "r.json").read_text())["old_textures"] == ["m-texture.png"]
+    assert main([words[0], str(model), *words[1:], "-o", str(out), "--texture", "checkerboard"]) == 0
+    assert "do not fit" not in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_textures_fit_a_map_that_does_not_change(tmp_path, capsys):
+    V, F = disk(4)
+    model = tmp_path / "m.glb"
+    io.write_mapped(model, MeshData(V, F, texture=io.checkerboard()).with_map(V[:, :2]))
+    assert main(["repair", str(model), "-o", str(tmp_path / "out.glb")]) == 0
+    assert "do not fit" not in capsys.readouterr().out

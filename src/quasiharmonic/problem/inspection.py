@@ -20,6 +20,7 @@ from quasiharmonic.util.arrays import (
     check_integer,
     check_range,
     count_of,
+    repeat_each,
     triangle_array,
     triangle_rows,
     vertex_array,
@@ -226,8 +227,13 @@ def find_close_vertices(V: FloatArray, triangles: IntArray) -> IntArray:
 
     # In this unit, squares neither overflow nor underflow.
     points = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
-    distance, _ = KDTree(points).query(points, k=2)
-    return np.flatnonzero(distance[:, 1] <= _CLOSE * np.linalg.norm(np.ptp(points, axis=0)))
+    # A tree takes quadratic time for many points at the same position, so each position is in it once.
+    order = np.lexsort(points.T)
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(points[order], axis=0) != 0).any(axis=1)]))
+    places, times = points[order[first]], np.diff(first, append=len(order))
+    distance, _ = KDTree(places).query(places, k=2)
+    near = (times > 1) | (distance[:, 1] <= _CLOSE * np.linalg.norm(np.ptp(points, axis=0)))
+    return np.sort(order[repeat_each(near, times)])
 
 
 def describe_soup(close: IntArray) -> str:

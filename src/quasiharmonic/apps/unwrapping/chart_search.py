@@ -122,6 +122,7 @@ def search_charts(
     Parameters
     ----------
     charts : sequence of WorkingChart
+        Without maps, or with bijective ones that stretch no triangle too much.
     bound : float
         See `find_charts`.
     max_charts : int or None
@@ -141,7 +142,7 @@ def search_charts(
     aim = 1 + (_AIM if joinable else 1.0) * (bound - 1)
     root = sum(len(chart.F) for chart in charts) ** 0.5
     few, many = (len(charts) + round(base + share * root) for base, share in (_FEW_CHARTS, _MANY_CHARTS))
-    here = [part for parts in workers.map("flatten", partial(_flatten, aim, workers), charts) for part in parts]
+    here = [part for parts in workers.map("flatten", partial(_flatten_first, aim, workers), charts) for part in parts]
     for goal, rounds, most in ((aim, _FEW_ROUNDS, few), (bound, _MANY_ROUNDS, many)):
         for _ in range(rounds):
             room = (most if max_charts is None else min(max_charts, most)) - len(here)
@@ -182,6 +183,16 @@ def _select(charts: Sequence[WorkingChart], bound: float, total_area: float) -> 
     stretched = [bool(chart.too_long.any() or missed[k]) for k, chart in enumerate(charts)]
     chosen = [k for k, chart in enumerate(charts) if stretched[k] or not chart.bijective]
     return [(k, stretched[k]) for k in sorted(chosen, key=lambda k: (charts[k].bijective, -share[k], k))]
+
+
+def _flatten_first(bound: float, workers: Workers, chart: WorkingChart) -> list[WorkingChart]:
+    """Flatten a chart; if it already has a bijective map, the new one must be bijective and keep the bound as well."""
+    given = chart.uv
+    share = 0.0 if given is None else chart.share_over(bound)
+    parts = _flatten(bound, workers, chart)
+    if given is not None and (not chart.bijective or chart.too_long.any() or chart.share_over(bound) > share):
+        chart.use(given)
+    return parts
 
 
 def _flatten(bound: float, workers: Workers, chart: WorkingChart) -> list[WorkingChart]:

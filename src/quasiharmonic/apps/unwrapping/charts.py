@@ -16,6 +16,7 @@ from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
 from quasiharmonic.apps.unwrapping.unfolding import unfold
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
+from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.targets.cuts.find import find_cuts
@@ -81,6 +82,7 @@ def find_charts(
     max_charts: int | None = None,
     edge_costs: FloatArray | None = None,
     uv_cuts: ArrayLike | None = None,
+    uv: FloatArray | None = None,
     seed: int = 0,
     callback: Callable[[str, int, int], object] | None = None,
     jobs: int | None = None,
@@ -105,7 +107,11 @@ def find_charts(
         Positive factor on the cost of cutting each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0. Two
         triangles stay together at factors of at least `UNDIVIDED_COST`, where possible.
     uv_cuts : (l, 2) array of int, optional
-        Edges that are cut in any case, such as the seams of existing texture coordinates.
+        Edges that are cut in any case, such as the seams of existing texture coordinates. Further cuts are then made
+        only in closed parts, in parts with handles, and where the bound requires it.
+    uv : (f, 3, 2) float64, optional
+        Existing texture coordinates of the corners, with ``uv_cuts`` as seams; NaN where there are none. A part of them
+        that is bijective, with stretches up to 3, is the initial map of its chart.
     seed : int
         Unused: the search has no random choices.
     callback : callable, optional
@@ -125,14 +131,14 @@ def find_charts(
     small, unfolded = _unfold_small(V, F, np.flatnonzero(~flat), given, cost >= UNDIVIDED_COST)
     charts += unfolded
     rest = np.flatnonzero(~flat & ~small)
+    working, rest = ([], rest) if uv_cuts is None else _keep_parts(V, F, rest, given, cost, uv)
     cut = partial(_cut, V, F, given=given, cost=cost)
-    groups = _group_by_cuts(F, rest, given, len(V))
-    working = [chart for some in workers.map("cut", cut, groups) for chart in some]
+    working += [chart for some in workers.map("cut", cut, [rest] if rest.size else []) for chart in some]
     areas = [chart.surface_area for chart in working]
     total = sum(areas) + sum(float(signed_areas(chart.F, in_units(chart.uv, 0)).sum()) for chart in charts)
     divisible = None if max_charts is None else max_charts - len(charts)
     found = search_charts(
-        working, max_stretch, max_charts=divisible, total_area=total, joinable=not len(given), workers=workers
+        working, max_stretch, max_charts=divisible, total_area=total, joinable=uv_cuts is None, workers=workers
     )
     return sorted(charts + _finish(found, max_stretch, total), key=lambda chart: int(chart.triangles[0]))
 
@@ -182,14 +188,35 @@ def _unfold_small(
     return mask, charts
 
 
-def _group_by_cuts(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[IntArray]:
-    """Divide triangles (k,) into those of surfaces without and with demanded cuts; no group is empty."""
-    demanded = np.isin(edge_keys(F[rows], F[rows][:, (1, 2, 0)], n), _keys(cut, n)).any(axis=1)
-    if not demanded.any():
-        return [rows] if rows.size else []
-    surface = fans(F[rows])[1]
-    with_cuts = np.isin(surface, surface[demanded])
-    return [group for group in (rows[~with_cuts], rows[with_cuts]) if group.size]
+def _keep_parts(
+    V: FloatArray, F: IntArray, rows: IntArray, cut: IntArray, cost: FloatArray, uv: FloatArray | None
+) -> tuple[list[WorkingChart], IntArray]:
+    """Return the parts of triangles (k,) between demanded cuts as charts, and the triangles of all other parts."""
+    charts, others = list[WorkingChart](), [rows[:0]]
+    for of, own, origin in _split(F[rows], rows, cut, len(V)) if rows.size else []:
+        try:
+            chart = WorkingChart(of, origin, V[origin], own, cost[of])
+        except ValueError:
+            # The part is closed or has handles.
+            others.append(of)
+            continue
+        charts.append(chart)
+        if uv is not None and np.isfinite(uv[of]).all():
+            _try_map(chart, uv[of])
+    return charts, np.sort(np.concatenate(others))
+
+
+def _try_map(chart: WorkingChart, corner_uv: FloatArray) -> None:
+    """Use texture coordinates (k, 3, 2) as the map of a chart if they are bijective without extreme stretch."""
+    uv = np.empty((len(chart.V), 2))
+    uv[chart.F] = corner_uv
+    # In this unit, areas neither overflow nor underflow.
+    uv = np.ldexp(uv, -int(np.frexp(np.abs(uv).max())[1]))
+    uv[:, 0] *= np.sign(signed_areas(chart.F, in_units(uv, 0)).sum())
+    if is_injective(chart.F, uv):
+        chart.use(uv)
+        if not chart.bijective or chart.too_long.any():
+            chart.uv = None
 
 
 def _cut(V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: FloatArray) -> list[WorkingChart]:

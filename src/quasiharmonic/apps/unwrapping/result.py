@@ -100,7 +100,8 @@ class UnwrapResult(Outcome):
     charts : (f,) int64
         Chart of each triangle, from 0.
     seams : (s, 2) int64
-        Edges of the model along which the map is cut, by vertices, smaller vertex first, ascending.
+        Edges of the model along which the map is cut, by vertices, smaller vertex first, ascending. Of several edges
+        at the same positions, the first one is listed.
     certificate : UnwrapCertificate
         The exact verdict on ``uvs``.
     triangle_stretch : (f,) float64
@@ -176,7 +177,7 @@ class UnwrapResult(Outcome):
             f"length {self.seam_length:.4g}",
             f"stretch {stretch.median:.3f} in the median, {stretch.p99:.3f} at 99 % of the surface, "
             f"{stretch.worst:.3g} at most"
-            if np.isfinite(stretch.worst)
+            if not np.isnan(stretch.worst)
             else "stretch not measured, because all triangles are too thin",
             f"{100 * self.utilisation:.1f} % of the texture used, {self.texels_per_unit:.4g} texels per unit",
             f"certificate: {self.certificate.summary()}",

@@ -91,7 +91,8 @@ def unwrap(
         Large values keep seams away from visible parts. Values of at least 1,000 keep two triangles together where
         possible, such as the triangles of a polygon.
     uv : (n, 2) or (f, 3, 2) array, optional
-        Texture coordinates of each vertex, or of each corner, whose seams are used. By default all seams are new.
+        Texture coordinates of each vertex, or of each corner, whose seams are kept. Further seams are made only in
+        closed parts, in parts with handles, and where the bound requires it. By default all seams are new.
     seed : int
         Seed of random choices. Equal input and seed give equal results.
     callback : callable, optional
@@ -141,20 +142,23 @@ def unwrap(
     exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)
+    kept_uv = None if corner_uv is None else _turn_corners(corner_uv, cleaned)
     charts = find_charts(
         points,
         cleaned.F,
         max_stretch=float(max_stretch),
         max_charts=max_charts,
         edge_costs=cost,
-        uv_cuts=None if corner_uv is None else _find_uv_cuts(corner_uv, cleaned),
+        uv_cuts=None if kept_uv is None else _find_uv_cuts(kept_uv, cleaned),
+        uv=kept_uv,
         seed=seed,
         callback=report,
         jobs=jobs,
     )
-    charts = divide_long_charts(
-        charts, points, cost, bound=float(max_stretch), size=size, tiles=tiles, max_charts=max_charts
-    )
+    if corner_uv is None:
+        charts = divide_long_charts(
+            charts, points, cost, bound=float(max_stretch), size=size, tiles=tiles, max_charts=max_charts
+        )
     while True:
         report("pack")
         packing = pack_charts(
@@ -182,7 +186,7 @@ def unwrap(
     misses = [
         Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), chart.misses)
         for k, chart in enumerate(charts)
-        if chart.misses > 0
+        if chart.misses > 0 and not cleaned.widened[chart.triangles].all()
     ]
     misses.sort(key=lambda miss: -miss.excess)
     every = np.full(len(F), np.nan)
@@ -192,7 +196,7 @@ def unwrap(
         indices=indices.reshape(-1, 3),
         uvs=layout.uv[row],
         charts=cleaned.restore_corners(np.repeat(layout.chart[:, None], 3, axis=1))[:, 0],
-        seams=find_seams(cleaned, layout),
+        seams=find_seams(cleaned, layout, V),
         certificate=certificate,
         triangle_stretch=every,
         stretch=_summarise(stretch, area),
@@ -237,13 +241,18 @@ def _turn_sides(costs: FloatArray, cleaned: CleanedMesh) -> FloatArray:
     return turned
 
 
-def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
-    """Return the edges (k, 2) of the cleaned mesh at which given texture coordinates differ."""
+def _turn_corners(corner_uv: FloatArray, cleaned: CleanedMesh) -> FloatArray:
+    """Return the texture coordinates of the corners of the cleaned triangles."""
     position = corner_uv[cleaned.triangles]
     # Reversing a triangle exchanges its last two corners.
     position[cleaned.flipped] = position[cleaned.flipped][:, (0, 2, 1)]
+    return position
+
+
+def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
+    """Return the edges (k, 2) of the cleaned mesh at which texture coordinates (f', 3, 2) differ."""
     # Corners without coordinates count as one position.
-    position = np.nan_to_num(position, nan=np.finfo(np.float64).max) + 0.0
+    position = np.nan_to_num(corner_uv, nan=np.finfo(np.float64).max) + 0.0
     rows = np.unique(position.reshape(-1, 2), axis=0, return_inverse=True)[1]
     side = find_differing_sides(cleaned.F, rows.reshape(-1, 3), len(cleaned.V))
     return np.stack([cleaned.F.ravel()[side], cleaned.F[:, (1, 2, 0)].ravel()[side]], axis=1)

@@ -6,7 +6,8 @@ import base64
 import binascii
 import os
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
+from typing import Any
 from urllib.parse import quote
 
 from quasiharmonic.io.errors import MeshFileError
@@ -17,36 +18,56 @@ from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.models.textures import Texture, read_texture, texture_of
 from quasiharmonic.util.untrusted import beside
 
+_GLTF = ".glb", ".gltf"
+# Keywords of images in material libraries that do not begin with "map_".
+_FURTHER_MAPS = b"bump", b"decal", b"disp", b"norm"
+
 
 def own_texture(mesh: MeshData) -> Texture | None:
     """Return the colour texture of the file of a mesh: a PNG or JPEG named by its .mtl, or in its glTF or GLB.
 
-    None if the file names none, or the image is missing or has another format.
+    None if the file names none, or the image is missing or has another format. No file is opened outside the folder of
+    the mesh's file.
     """
-    if Path(mesh.source).suffix.lower() in (".glb", ".gltf"):
+    if Path(mesh.source).suffix.lower() in _GLTF:
         return _of_gltf(Path(mesh.source))
-    for path in _images_of_libraries(mesh):
+    folder = Path(mesh.source).parent
+    for keyword, within, name in _images_of_libraries(mesh):
+        if keyword != b"map_Kd" or not _is_beside(folder, str(within / name)):
+            continue
         try:
-            return read_texture(path)
+            return read_texture(folder / within / name)
         except MeshFileError:
             continue
     return None
 
 
 def texture_names(mesh: MeshData) -> list[str]:
-    """Return the names of the images that the materials of a mesh's file show, in order, each once."""
-    if Path(mesh.source).suffix.lower() not in (".glb", ".gltf"):
-        return list(dict.fromkeys(path.name for path in _images_of_libraries(mesh)))
-    if not isinstance(mesh.carried, CarriedGltf):
-        return []
-    images = mesh.carried.document.tree.get("images", [])
-    named = [image.get("name") or image.get("uri") for image in images if isinstance(image, dict)]
-    named = [name if isinstance(name, str) and not name.startswith("data:") else None for name in named]
-    return list(dict.fromkeys(name or f"image {k}" for k, name in enumerate(named)))
+    """Return the names of the images that materials of a mesh's file show by its map, in order, each once.
+
+    No image is opened.
+    """
+    if Path(mesh.source).suffix.lower() in _GLTF:
+        tree = mesh.carried.document.tree if isinstance(mesh.carried, CarriedGltf) else {}
+        try:
+            return list(dict.fromkeys(_names_in_gltf(tree)))
+        except (*gltf.DAMAGE, RecursionError):
+            # A damaged description of a material does not prevent other work.
+            return []
+    textures = (name for keyword, _, name in _images_of_libraries(mesh) if _shows_image(keyword.lower()))
+    # Names in libraries can have the separators of any system.
+    return list(dict.fromkeys(PureWindowsPath(name).name for name in textures))
 
 
-def _images_of_libraries(mesh: MeshData) -> Iterator[Path]:
-    """Yield the paths of the images in the OBJ file's material libraries; all are in the folder of the file."""
+def _shows_image(keyword: bytes) -> bool:
+    return keyword in _FURTHER_MAPS or (keyword.startswith(b"map_") and keyword != b"map_aat")
+
+
+def _images_of_libraries(mesh: MeshData) -> Iterator[tuple[bytes, Path, str]]:
+    """Yield the entries of the OBJ file's material libraries: keyword, folder of the library, and name of the image.
+
+    Only libraries in the folder of the file are opened. Their folders are relative to it.
+    """
     folder = Path(mesh.source).parent
     for line in mesh.statements.split(b"\n"):
         keyword, _, rest = line.partition(b" ")
@@ -58,11 +79,35 @@ def _images_of_libraries(mesh: MeshData) -> Iterator[Path]:
             within = library.parent.relative_to(folder)
             for entry in read_bytes(library).splitlines():
                 words = entry.split()
-                if len(words) > 1 and words[0] == b"map_Kd":
+                if len(words) > 1:
                     # Options such as -s precede the name.
-                    image = os.fsdecode(words[-1])
-                    if _is_beside(folder, str(within / image)):
-                        yield folder / within / image
+                    yield words[0], within, os.fsdecode(words[-1])
+
+
+def _names_in_gltf(tree: dict[str, Any]) -> Iterator[str]:
+    """Yield the names of the images that the materials of a glTF document show by the first texture coordinates."""
+    for number in _find_textures(tree.get("materials", [])):
+        texture = tree["textures"][number]
+        # Extensions name images of other formats.
+        for variant in (texture, *texture.get("extensions", {}).values()):
+            if "source" in variant:
+                image = tree["images"][variant["source"]]
+                name = image.get("name") or image.get("uri", "data:")
+                yield f"image {variant['source']}" if name.startswith("data:") else name
+
+
+def _find_textures(materials: Any) -> Iterator[int]:
+    """Yield the numbers of the textures that materials show by the first texture coordinates, at any depth."""
+    if isinstance(materials, list):
+        for part in materials:
+            yield from _find_textures(part)
+    elif isinstance(materials, dict):
+        if "index" in materials:
+            moved = materials.get("extensions", {}).get("KHR_texture_transform", {})
+            if moved.get("texCoord", materials.get("texCoord", 0)) == 0:
+                yield materials["index"]
+        else:
+            yield from _find_textures([part for key, part in materials.items() if key != "extras"])
 
 
 def _is_beside(folder: Path, name: str) -> bool:

@@ -189,6 +189,27 @@ def _certify_charts(mesh: MeshData, found: WrittenMap) -> WrittenMap | None:
     return replace(found, verdict=replace(verdict, islands=islands), set_apart=apart)
 
 
+def add_old_textures(facts: dict[str, Any], lines: list[str], before: MeshData, after: MeshData) -> None:
+    """Add the names of the file's textures to a report if the texture coordinates changed, so that these do not fit."""
+    import numpy as np
+
+    from quasiharmonic import io
+    from quasiharmonic.io.errors import printable
+
+    if after.texture is not None or not (named := io.texture_names(before)):
+        return
+    if before.FT is not None and after.FT is not None and before.FT.shape == after.FT.shape:
+        assert before.vt is not None
+        assert after.vt is not None
+        known = before.FT >= 0
+        same = np.array_equal(known, after.FT >= 0)
+        if same and np.array_equal(before.vt[before.FT[known]], after.vt[after.FT[known]]):
+            return
+    facts["old_textures"] = named
+    names = ", ".join(map(printable, named))
+    lines.append(f"the new coordinates do not fit the textures of the file: {names}")
+
+
 def tell_losses(output: Path, mesh: MeshData) -> None:
     """Report on standard error which data of a mesh the output format cannot store."""
     from quasiharmonic import io

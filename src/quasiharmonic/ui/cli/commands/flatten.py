@@ -142,7 +142,8 @@ def run(options: argparse.Namespace) -> int:
             callback=show,
             **given,
         )
-    certified = written_map.write(options.output, mesh.with_places(seam_options.pack_islands(options, mapped.mesh)))
+    flattened = mesh.with_places(seam_options.pack_islands(options, mapped.mesh))
+    certified = written_map.write(options.output, flattened)
     with report.after_writing(options.output):
         # Some formats hold the map alone; their vertices have the numbers of the surface's.
         V = mesh.V if len(mesh.V) == len(certified.V) else certified.V
@@ -171,6 +172,7 @@ def run(options: argparse.Namespace) -> int:
             write_pattern(options.pattern, *flat[1:], unit=options.unit, allowance=options.allowance)
             lines.append(f"wrote {options.pattern}, true to scale")
         lines.append(mapped.status.value)
+        written_map.add_old_textures(facts, lines, mesh, flattened)
         report.emit(facts, options.json, "\n".join(lines))
     return 0 if certified.apart else 1
 

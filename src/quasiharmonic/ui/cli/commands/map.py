@@ -155,6 +155,7 @@ def run(options: argparse.Namespace) -> int:
             for island, one in zip(islands, mapped.islands, strict=False)
             if one.result.crowded.size
         ]
+        written_map.add_old_textures(facts, notes, mesh, written)
         report.emit(facts, options.json, "\n".join([report.describe_maps(mapped, certified, options.output), *notes]))
     return 0 if certified.injective else 1
 

@@ -126,7 +126,8 @@ def lower_distortion(
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input), progress_line.line() as show:
         after = lower(before, fixed, show)
-    written = written_map.write(options.output, mesh.with_places(seam_options.pack_islands(options, after.mesh)))
+    lowered = mesh.with_places(seam_options.pack_islands(options, after.mesh))
+    written = written_map.write(options.output, lowered)
     with report.after_writing(options.output):
         # Each map is cut at its own seams, which may differ.
         opened = reflect_mirrored(before).opened(), reflect_mirrored(after.mesh).opened()
@@ -144,6 +145,7 @@ def lower_distortion(
         lines = [report.describe_maps(after, written, options.output)]
         if written.injective:
             lines += [*notes, _change(*measured), *([] if written.mirrored else [after.status.value])]
+        written_map.add_old_textures(facts, lines, mesh, lowered)
         report.emit(facts, options.json, "\n".join(lines))
     return 0 if written.injective else 1
 

@@ -99,5 +99,7 @@ def run(options: argparse.Namespace) -> int:
             "vertices": len(mesh.V),
             "triangles": len(mesh.F),
         }
-        report.emit(facts, options.json, f"wrote {options.output}: {result.summary()}")
+        lines = [f"wrote {options.output}: {result.summary()}"]
+        written_map.add_old_textures(facts, lines, mesh, repaired)
+        report.emit(facts, options.json, "\n".join(lines))
     return 0 if verdict.injective else 1

@@ -72,7 +72,9 @@ def add_parser(commands: Commands) -> None:
         "--outward", action="store_true", help="treat closed components that are inside out as turned outward"
     )
     parser.add_argument(
-        "--keep-seams", action="store_true", help="use the seams of the input's texture coordinates (vt)"
+        "--keep-seams",
+        action="store_true",
+        help="keep the seams of the input's texture coordinates (vt), and add seams only where necessary",
     )
     parser.add_argument(
         "--edge-costs",
@@ -146,9 +148,7 @@ def run(options: argparse.Namespace) -> int:
         lines = [f"wrote {options.output}: {result.message}", result.summary(), *_cleaning(result)]
         if divided:
             lines.append(f"{count_of('polygon', 'polygons', divided)} written as triangles, because seams cross them")
-        if named := [] if mesh.texture is not None else io.texture_names(mesh):
-            facts["old_textures"] = named
-            lines.append(f"the new coordinates do not fit the textures of the file: {', '.join(named)}")
+        written_map.add_old_textures(facts, lines, mesh, unwrapped)
         assert unwrapped.FT is not None
         assert unwrapped.vt is not None
         bent = written_map.find_bent(unwrapped, unwrapped.FT, unwrapped.vt)
