@@ -136,7 +136,7 @@ def rough(random: np.random.Generator) -> Mesh:
         noise: NDArray[np.float64] = np.sin(x @ waves.T + phase).sum(axis=-1)
         return np.linalg.norm(x, axis=-1) - 0.7 + weight * noise
 
-    return surface_net(field, [-1.2] * 3, [1.2] * 3, float(random.choice([0.3, 0.2, 0.12])))
+    return surface_net(field, [-1.9] * 3, [1.9] * 3, float(random.choice([0.4, 0.25, 0.15])))
 
 
 FAMILIES: tuple[Callable[[np.random.Generator], Mesh], ...] = (
