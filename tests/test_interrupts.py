@@ -151,20 +151,20 @@ def test_signals_of_schedulers_and_terminals_are_interrupts(monkeypatch, capsys,
         pytest.skip("the system has no such signal")
     number = getattr(signal, name)
     monkeypatch.setattr(measure, "run", lambda options: signal.raise_signal(number) or 0)
-    for ignored in (False, True):
-        # Shells ignore Ctrl-C for background processes.
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+    # Shells ignore Ctrl-C for background processes, and nohup ignores SIGHUP.
+    for interrupt, handler, status in (
+        (signal.default_int_handler, signal.SIG_DFL, 2),
+        (signal.SIG_IGN, signal.SIG_DFL, 2),
+        (signal.default_int_handler, signal.SIG_IGN, 0),
+    ):
+        before = signal.signal(signal.SIGINT, interrupt), signal.signal(number, handler)
         try:
-            assert main(["measure", "map.obj"]) == 2
+            assert main(["measure", "map.obj"]) == status
+            assert signal.getsignal(number) is handler
         finally:
-            signal.signal(signal.SIGINT, before)
-        assert capsys.readouterr().err == "qhm measure: interrupted, nothing was written\n"
-        assert signal.getsignal(number) is signal.SIG_DFL
-    before = signal.signal(number, signal.SIG_IGN)
-    try:
-        assert main(["measure", "map.obj"]) == 0
-    finally:
-        signal.signal(number, before)
+            signal.signal(signal.SIGINT, before[0])
+            signal.signal(number, before[1])
+        assert capsys.readouterr().err == ("qhm measure: interrupted, nothing was written\n" if status else "")
 
 
 @pytest.mark.slow
