@@ -220,3 +220,7 @@ def test_a_blend_is_one_energy(theta):
 def test_springs_reject_flat_triangles():
     with pytest.raises(ValueError, match="triangle 0 of zero area"):
         MassSpring([[0, 0], [1, 0], [2, 0]], np.array([[0, 1, 2]]))
+
+
+def test_a_function_that_is_never_a_number_has_a_wrong_derivative():
+    assert derivative_error(lambda x: np.nan * x.sum(), lambda x, d: d.sum(), np.ones(3)) == np.inf
