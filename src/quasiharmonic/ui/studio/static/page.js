@@ -37,7 +37,7 @@ class Page {
       if (event.code === 1009) status.note("That file is too large. The page restarts.");
       else if (event.code === 1013) status.refused(event.reason);
       else if (event.code === 4001) status.elsewhere();
-      else if (event.code === 1006) status.disconnected();
+      else if (event.code === 1006 || event.code === 1001) status.disconnected();
       if (event.code !== 1009 && event.code !== 1011) return;
       status.restarting();
       setTimeout(() => this.connect(), 1500);
