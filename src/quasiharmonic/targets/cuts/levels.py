@@ -57,6 +57,8 @@ def cut_by_levels(
     factors = [None] * (len(coarsening.rounds) + 1) if costs is None else _vertex_costs(F, costs, coarsening.rounds, n)
     vertices, graph = _part(V, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
     cut = vertices[graph.ends[find(graph)]]
+    if not cut.size:
+        return cut
     for k in reversed(range(len(coarsening.rounds))):
         cut = insert_vertices(cut, coarsening.rounds[k], n)
         if k in coarsening.levels:
