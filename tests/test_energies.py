@@ -58,6 +58,10 @@ def test_derivatives_agree_with_differences(energy):
     assert np.isfinite(found.curvature)
 
 
+def test_a_function_that_is_nowhere_finite_has_no_derivative():
+    assert derivative_error(lambda x: np.nan * x, lambda x, d: d, np.ones(2)) == np.inf
+
+
 @pytest.mark.parametrize("energy", INVERTIBLE, ids=name_of)
 def test_derivatives_of_inverted_triangles(energy):
     assert check_energy(energy, inverted_deformation()).passed

@@ -84,6 +84,10 @@ class TestLevels:
         assert parts(V, F, cut) == [(1, 1)]
         assert not np.isin(edge_keys(*cut.T, len(V)), edge_keys(*diagonals.T, len(V))).any()
 
+    @pytest.mark.slow
+    def test_a_large_disk_needs_no_cut(self):
+        assert find_cuts(*surfaces.grid(150, 150), min_gain=np.inf).shape == (0, 2)
+
     @pytest.mark.long
     def test_large_arms(self):
         """On a fine mesh, cuts are about as long as on a coarse one, which reach all arms."""

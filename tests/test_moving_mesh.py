@@ -107,6 +107,20 @@ def test_vertices_slide_along_walls(ring):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("way", [(1, 0.1), (0.6, -1), (-1, 1)])
+def test_a_body_close_to_a_wall_is_not_a_part_of_the_wall(ring, way):
+    points, F, walls, hole = ring
+    mesh = MovingMesh(points, F, hole, slide=True)
+    room = np.array(way) * (1 - np.abs(points[hole]).max())
+    for share in np.linspace(0.1, 0.9997, 20):
+        there = mesh.advance(points[hole] + share * room)
+    np.testing.assert_array_equal(there[hole], points[hole] + share * room)
+    assert np.all(np.abs(there[walls]).max(axis=1) == 1)
+    assert np.abs(there[walls] - points[walls]).max() > 1e-3
+    assert certify(mesh.F, there).bijective
+
+
+@pytest.mark.slow
 def test_curved_walls_do_not_change():
     """A round wall: vertices that slide along the polygon of the first mesh never cut its corners."""
     points, F = disk(8)

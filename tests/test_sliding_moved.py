@@ -73,6 +73,21 @@ def test_moved_vertices_slide_on_given_curves():
     assert np.abs(morphed.points[body] - turn).max() > 0.01
 
 
+@pytest.mark.slow
+def test_a_body_close_to_a_given_wall_is_not_a_part_of_the_wall():
+    V, F, walls, body, _ = channel(8)
+    there, square = V[body] + (0.3997, 0.01), BoundaryCurves([np.array(SQUARE) * 2.0 - 1])
+    morphed = morph(V, F, body, there, slide=square)
+    assert morphed.result.certificate.bijective
+    np.testing.assert_array_equal(morphed.points[body], there)
+    assert np.all(np.abs(morphed.points[walls]).max(axis=1) == 1)
+    loops = boundary_loops(F, len(V))
+    held = BoundaryCurves(square.curves, fixed=body)
+    np.testing.assert_array_equal(held.off(loops, morphed.points), np.sort(body))
+    # A loop with a vertex that the caller assigns to a curve is on it, although all are fixed.
+    assert BoundaryCurves(square.curves, on={int(walls[0]): 0}, fixed=walls).off(loops, V).size == body.size
+
+
 def test_vertices_of_no_triangle_are_numbered_as_well():
     V, F, walls, body, turn = channel(8)
     V, F = np.concatenate([[(9, 9)], V]), F + 1

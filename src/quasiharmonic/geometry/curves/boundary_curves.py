@@ -47,7 +47,8 @@ class BoundaryCurves:
         Contours, or single sides; arrays are closed polygons.
     on : mapping from int to int, optional
         Index of the curve for some boundary vertices. Each other vertex is on the nearest curve. It is fixed if no
-        curve is within ``tolerance``.
+        curve is within ``tolerance``. If all vertices of a boundary loop are in ``fixed`` and none is in ``on``, the
+        loop is on no curve, however near one is.
     fixed : sequence of int
         Boundary vertices that are fixed although they could slide.
     corner_angle : float
@@ -143,8 +144,7 @@ class BoundaryCurves:
             If a vertex in ``on`` is not on its curve or not on the boundary, or no vertex is on any curve. Also if two
             vertices have the same position, or neighbours on the boundary are not neighbours on the curve.
         """
-        boundary = np.concatenate(loops)
-        curve, s = self._assign_curves(boundary, uv)
+        boundary, curve, s = self._assign_curves(loops, uv)
         corners = [self._corners(one, uv[boundary]) for one in self.curves]
         slides = ~np.isin(boundary, self.fixed)
         slides[[member for taken in corners for member in taken]] = False
@@ -166,9 +166,8 @@ class BoundaryCurves:
 
     def off(self, loops: Sequence[IntArray], uv: FloatArray) -> IntArray:
         """Boundary vertices that are on no curve and are fixed; checks the vertices in ``on`` as `lay` does."""
-        boundary = np.concatenate(loops)
-        curve, _ = self._assign_curves(boundary, uv)
-        return boundary[curve < 0]
+        boundary, curve, _ = self._assign_curves(loops, uv)
+        return np.setdiff1d(np.concatenate(loops), boundary[curve >= 0])
 
     def _corners(self, one: Curve, positions: FloatArray) -> dict[int, float]:
         """Rows of the boundary positions (b, 2) that are at corners of a curve, with their lengths along it.
@@ -186,8 +185,13 @@ class BoundaryCurves:
                 taken.setdefault(member, mark)
         return taken
 
-    def _assign_curves(self, boundary: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Index of the curve of each boundary vertex, -1 if there is none, and its length along the curve."""
+    def _assign_curves(self, loops: Sequence[IntArray], uv: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+        """Boundary vertices, the index of the curve of each, -1 if there is none, and its length along the curve.
+
+        Loops whose vertices are all fixed are left out, because a body close to a wall is not a part of the wall.
+        """
+        free = [loop for loop in loops if not np.isin(loop, self.fixed).all() or not self.on.keys().isdisjoint(loop)]
+        boundary = np.concatenate(free or loops)
         assigned = index_array("on", list(self.on))
         check_range("on", assigned, len(uv))
         check_range("fixed", self.fixed, len(uv))
@@ -218,7 +222,7 @@ class BoundaryCurves:
                 f"no boundary vertex is within {allowed:.3g} of the curves to slide along: check the scale and the "
                 "position of the curves"
             )
-        return curve, s
+        return boundary, curve, s
 
 
 def sliding_curves(slide: bool | BoundaryCurves, loops: Sequence[IntArray], uv: FloatArray) -> BoundaryCurves:
