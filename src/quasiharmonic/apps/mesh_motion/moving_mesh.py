@@ -158,7 +158,7 @@ class MovingMesh:
         rest = np.setdiff1d(boundary_edges(F, len(self._points)), self._moved)
         self._domain = Domain(self._points, F, np.concatenate([self._moved, rest]))
         self._linear_solver = linear_solver
-        still = self._still = [loop for loop in self._domain.loops if not np.isin(loop, self._moved).any()]
+        still = [loop for loop in self._domain.loops if not np.isin(loop, self._moved).any()]
         # Walls without moved vertices keep the curves of the first mesh, so that sliding vertices do not cut corners.
         self._walls = BoundaryCurves.around(still, self._points, fixed=self._moved) if slide and still else None
         # Scale to the mesh's size, so that no area overflows or underflows.
@@ -241,13 +241,11 @@ class MovingMesh:
 
     def _make_sliding_model(self, here: FloatArray) -> SlidingModel:
         """Return a model with sliding walls; reuse the matrix of the last one if the same vertices slide."""
-        domain, curves, loops = self._domain, self._walls, self._still
+        domain, curves = self._domain, self._walls
         mixed = any(0 < np.isin(loop, self._moved).sum() < loop.size for loop in domain.loops)
         if curves is None or mixed:
-            loops = domain.loops
-            curves = BoundaryCurves.around(loops, here, fixed=self._moved)
-        # Moved loops may come close to a wall, and do not belong on it.
-        track = move_boundary(curves, domain, here, loops)
+            curves = BoundaryCurves.around(domain.loops, here, fixed=self._moved)
+        track = move_boundary(curves, domain, here)
         deformation, exponent = scale_energy(domain, track.uv, self._energy, self._weights)
         model = SlidingModel(
             deformation, track, domain.fixed, domain.loops, exponent, self._linear_solver, self._system

@@ -44,15 +44,12 @@ _WEIGHT = 1e-2
 _LEAST_ROOM = 0.3
 
 
-def move_boundary(
-    slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray, loops: Sequence[IntArray] | None = None
-) -> Track:
-    """Move the boundary of an injective map, or only some loops of it, onto the curves it slides along.
+def move_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) -> Track:
+    """Move the boundary of an injective map onto the curves it slides along.
 
     Raise a ValueError as `BoundaryCurves.lay`, or if moving the boundary onto the curves inverts triangles.
     """
-    loops = domain.loops if loops is None else loops
-    track = sliding_curves(slide, loops, uv).lay(loops, uv)
+    track = sliding_curves(slide, domain.loops, uv).lay(domain.loops, uv)
     inverted = inverted_triangles(domain.F, track.uv)
     if inverted.size:
         raise ValueError(
