@@ -61,7 +61,7 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
     -------
     AtlasVerdict and SetApart, or None
         The indices are those of ``F``. None if all triangles are verified as they are, if no triangle has an area, or
-        if a repeated triangle has coordinates of its own that overlap a chart.
+        if a chart consists of excluded triangles alone and overlaps another.
     """
     try:
         cleaned = clean(V, F)
@@ -87,12 +87,12 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
         verdict = certify(SeamedMesh(points, G[:, ::-1], G[:, ::-1], uv))
     elif not (left.any() or turned.any()):
         return None
-    own = cleaned.excluded[cleaned.repeated & ~left[cleaned.excluded]]
+    own = cleaned.excluded[~left[cleaned.excluded]]
     islands = tuple(
         replace(one, triangles=rows[one.triangles], inverted=rows[one.inverted], mirrored=one.mirrored or inward)
         for one in verdict.islands
     )
-    unsure = [k for k, one in enumerate(islands) if np.isin(one.triangles, own).any()] if own.size else []
+    unsure = [k for k, one in enumerate(islands) if np.isin(one.triangles, own).all()] if own.size else []
     if np.isin(verdict.overlapping, unsure).any():
         return None
     repeated = cleaned.excluded[cleaned.repeated & left[cleaned.excluded]]

@@ -130,6 +130,16 @@ def describe_bent(bent: NDArray[np.int64]) -> str:
     )
 
 
+def add_bent(facts: dict[str, Any], lines: list[str], mesh: MeshData) -> None:
+    """Add the faces of `find_bent` of a mesh with texture coordinates to a report."""
+    assert mesh.FT is not None
+    assert mesh.vt is not None
+    bent = find_bent(mesh, mesh.FT, mesh.vt)
+    facts["bent_faces"] = bent.tolist()
+    if bent.size:
+        lines.append(describe_bent(bent))
+
+
 def add_old_textures(facts: dict[str, Any], lines: list[str], before: MeshData, after: MeshData) -> None:
     """Add the names of the file's textures to a report if the texture coordinates changed, so that these do not fit."""
     import numpy as np
