@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic import distortion, io
+from quasiharmonic import boundary_loops, distortion, io
+from quasiharmonic.surfaces import disk
 from shared.commands import run, write_input
 from shared.solvable_problems import star_problem
 
@@ -127,3 +128,21 @@ class TestHarmonise:
         error = capsys.readouterr().err
         assert "of zero area in the rest mesh: distortion is undefined there" in error
         assert "reference" not in error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("outline", [[], ["--to", "disk"]])
+def test_listed_vertices_do_not_slide(tmp_path, outline):
+    V, F = disk(4)
+    uv = V.copy()
+    # The inner vertices are moved, so that the boundary slides.
+    uv[np.hypot(*uv.T) < 0.5] += [0.2, 0.05]
+    io.write_mapped(tmp_path / "m.obj", io.MeshData(V, F).with_map(uv))
+    (rim,) = boundary_loops(F)
+    fixed = np.append(rim[::3], 0)
+    (tmp_path / "fixed.txt").write_text("".join(f"{k}\n" for k in fixed))
+    options = ["--slide", *outline, "--fixed", tmp_path / "fixed.txt"]
+    assert run("polish", tmp_path / "m.obj", "-o", tmp_path / "o.obj", *options) == 0
+    found = io.map_of(io.read_mesh(tmp_path / "o.obj"))
+    np.testing.assert_array_equal(found[fixed], uv[fixed])
+    assert np.abs(found - uv)[np.setdiff1d(rim, fixed)].max() > 1e-4

@@ -269,3 +269,65 @@ def test_an_inverted_triangle_in_a_model_with_defects_is_found(tmp_path):
     for vt, FT in ((moved, result.indices), (result.uvs, own)):
         io.write_mapped(tmp_path / "m.obj", io.MeshData(V, G, vt=vt, FT=FT))
         assert run("check", tmp_path / "m.obj") == 1
+
+
+def round_sphere(count):
+    """A sphere whose vertices at the poles almost coincide."""
+    u, v = np.meshgrid(np.arange(count) * 2 * np.pi / count, np.linspace(0, np.pi, count // 2 + 1), indexing="ij")
+    a = (np.arange(count)[:, None] * (count // 2 + 1) + np.arange(count // 2)).ravel()
+    b = (a + count // 2 + 1) % u.size
+    V = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], axis=-1).reshape(-1, 3)
+    return V, np.concatenate([np.c_[a, a + 1, b + 1], np.c_[a, b + 1, b]])
+
+
+def write_obj(path, V, F):
+    lines = ["v {!r} {!r} {!r}\n".format(*point) for point in V.tolist()]
+    path.write_text("".join([*lines, *("f {} {} {}\n".format(*row) for row in (F + 1).tolist())]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mixed", [False, True])
+def test_triangles_without_area_in_single_precision_are_verified_with_their_charts(tmp_path, mixed):
+    V, F = round_sphere(12)
+    if mixed:
+        F[::5] = F[::5, ::-1]
+    write_obj(tmp_path / "m.obj", V * [1, 1.3, 0.7] + [0.1, -0.7, 0.9], F)
+    assert run("unwrap", tmp_path / "m.obj", "-o", tmp_path / "o.glb", "--resolution", 256) == 0
+    assert run("check", tmp_path / "o.glb", "--json", tmp_path / "r.json") == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["bijective"]
+    read = io.read_mesh(tmp_path / "o.glb")
+    collapsed = np.flatnonzero((np.roll(read.F, 1, axis=1) == read.F).any(axis=1))
+    corners = read.vt[read.FT[collapsed]]
+    sides = corners[:, 1:] - corners[:, :1]
+    own = collapsed[np.linalg.det(sides) != 0]
+    # Some of these triangles have an area in the texture, and none of them is left out.
+    assert own.size
+    assert not np.isin(own, report["degenerate_triangles"]).any()
+    # The file fails if one of them is folded over, or lies on a chart.
+    one = read.FT[own[0]]
+    (first, second), (apex,) = ((one[read.F[own[0]] == k]) for k in (np.bincount(read.F[own[0]]).argsort()[[-1, -2]]))
+    folded = read.vt.copy()
+    folded[first] += 1.5 * (folded[second] - folded[first])
+    lying = np.append(read.vt, [read.vt[read.FT[0]].mean(axis=0)], axis=0)
+    FT = read.FT.copy()
+    FT[own[0]] = np.where(one == apex, len(read.vt), one)
+    for vt, rows in ((folded, read.FT), (lying, FT)):
+        io.write_mapped(tmp_path / "w.obj", io.MeshData(read.V, read.F, vt=vt, FT=rows))
+        assert run("check", tmp_path / "w.obj") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".obj", ".glb", ".ply"])
+def test_the_only_chart_of_an_inside_out_model_may_be_mirrored(tmp_path, capsys, suffix):
+    V, F = round_sphere(8)
+    V, inverse = np.unique(np.round(V, 9), axis=0, return_inverse=True)
+    F = inverse.reshape(-1)[F]
+    F = F[(np.roll(F, 1, axis=1) != F).all(axis=1)][:, ::-1]
+    write_obj(tmp_path / "m.obj", V, F)
+    options = ["--outward", "--max-charts", 1, "--resolution", 256]
+    out = tmp_path / f"o{suffix}"
+    assert run("unwrap", tmp_path / "m.obj", "-o", out, *options) == 0
+    capsys.readouterr()
+    assert run("check", out) == 0
+    assert "1 island: 1 injective, 1 bijective.\nMirrored" in capsys.readouterr().out

@@ -177,6 +177,19 @@ class TestCommand:
         assert main(["check", str(tmp_path / "a.obj"), *option]) == 2
         assert "has no map" in capsys.readouterr().err
 
+    @pytest.mark.parametrize("mapped", [False, True])
+    @pytest.mark.parametrize("text", [None, "", "hello\n", "99999\n"])
+    def test_the_list_of_fixed_vertices_is_always_read(self, tmp_path, capsys, mapped, text):
+        V, F = cat(3)
+        mesh = MeshData(V, F)
+        io.write_obj(tmp_path / "a.obj", mesh.with_map(flatten(V, F).uv) if mapped else mesh)
+        assert main(["check", str(tmp_path / "a.obj")]) == 0
+        if text is not None:
+            (tmp_path / "fixed.txt").write_text(text)
+        capsys.readouterr()
+        assert main(["check", str(tmp_path / "a.obj"), "--fixed", str(tmp_path / "fixed.txt")]) == 2
+        assert "fixed.txt" in capsys.readouterr().err
+
     def test_obstructions_are_named_if_the_map_is_not_injective(self, tmp_path, capsys):
         V, F = cat(3)
         uv = flatten(V, F).uv

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -222,3 +224,13 @@ def test_faces_that_a_reader_splits_into_inverted_triangles_are_named(tmp_path, 
     assert find_inverted_fans(mesh.polygons, mesh.FT, mesh.vt).tolist() == bent
     assert main(["check", str(path)]) == 0
     assert ("splits faces at their first corner" in capsys.readouterr().out) == bool(bent)
+
+
+@pytest.mark.slow
+def test_repair_names_faces_that_a_reader_splits_into_inverted_triangles(tmp_path, capsys):
+    points, places = "v 0 0 0\nv 2 0 0\nv .5 .5 0\nv 0 2 0\n", "vt 0 0\nvt 1 0\nvt .4 .4\nvt 0 1\n"
+    (tmp_path / "m.obj").write_text(points + places + "f 2/2 3/3 4/4 1/1\n")
+    assert main(["repair", str(tmp_path / "m.obj"), "-o", str(tmp_path / "o.obj"), "--json", "-"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["bent_faces"] == [0]
+    assert "--any-triangulation" in err

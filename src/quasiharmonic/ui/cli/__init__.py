@@ -93,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         use_options(parser, options.command)
         run: Callable[[argparse.Namespace], int] = options.run
         try:
-            with _parent_surface(getattr(options, "parent_surface", None)):
+            with _parent_surface(options):
                 return run(options)
         except ReportError as error:
             return _fail(options.command, error, 3)
@@ -111,12 +111,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _parent_surface(path: Path | None) -> Iterator[None]:
-    """Take the triangles of FreeSurfer's patches from a surface."""
+def _parent_surface(options: argparse.Namespace) -> Iterator[None]:
+    """Take the triangles of FreeSurfer's patches from the surface of ``--surface``."""
+    path: Path | None = getattr(options, "parent_surface", None)
     if path is None:
         yield
         return
     from quasiharmonic.io.formats.neuro import set_parent_surface
+    from quasiharmonic.io.registry import format_of
+
+    given = [value if isinstance(value, list) else [value] for value in vars(options).values() if value is not path]
+    formats = [format_of(one) for several in given for one in several if isinstance(one, Path)]
+    if not any(form is not None and form.suffix == ".patch.3d" for form in formats):
+        raise ValueError("--surface gives the triangles of FreeSurfer's patches, but no file is a patch: omit it")
+    if not path.is_file():
+        raise ValueError(f"--surface {path}: there is no such file")
 
     set_parent_surface(path)
     try:

@@ -34,6 +34,7 @@ class Interrupts:
     def __init__(self) -> None:
         self.happened = False
         self._before: dict[int, Any] = {}
+        self._last: int = signal.SIGINT
 
     def __enter__(self) -> Self:
         mine = threading.current_thread() is threading.main_thread()
@@ -55,21 +56,21 @@ class Interrupts:
             sys.unraisablehook = self._hook
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        self.happened = True
+        self.happened, self._last = True, number
         raise KeyboardInterrupt
 
     def _unraisable(self, lost: UnraisableHookArgs) -> None:
         if isinstance(lost.exc_value, KeyboardInterrupt):
-            again = threading.Timer(_RETRY_SECONDS, _interrupt_main)
+            again = threading.Timer(_RETRY_SECONDS, _interrupt_main, [self._last])
             again.daemon = True
             again.start()
         else:
             self._hook(lost)
 
 
-def _interrupt_main() -> None:
-    """Interrupt the main thread, also while it waits."""
+def _interrupt_main(number: int) -> None:
+    """Interrupt the main thread by a signal, also while it waits."""
     if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
     else:  # Windows, where `_thread.interrupt_main` does not wake a thread that sleeps
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)

@@ -11,39 +11,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
+    from quasiharmonic.apps.unwrapping.defective_charts import SetApart
     from quasiharmonic.geometry.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
-
-
-@dataclass(frozen=True, eq=False)
-class SetApart:
-    """Triangles of a model with defects that the verdict on its charts reverses or leaves out, as `unwrap` does.
-
-    A triangle is left out only if it has the texture coordinates of the triangle that replaces it.
-    """
-
-    reversed: NDArray[np.int64]
-    repeated: NDArray[np.int64]
-    degenerate: NDArray[np.int64]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the triangles for JSON."""
-        return {
-            "reversed_triangles": self.reversed.tolist(),
-            "repeated_triangles": self.repeated.tolist(),
-            "degenerate_triangles": self.degenerate.tolist(),
-        }
-
-    def summary(self) -> str:
-        """Return one line for each kind."""
-        from quasiharmonic.util.arrays import names_of
-
-        kinds = (
-            (self.reversed, "verified with the winding of the neighbours, which is the opposite one"),
-            (self.repeated, "left out, because an earlier triangle has the same vertices"),
-            (self.degenerate, "left out, because there is no area on the model"),
-        )
-        return "\n".join(f"{names_of('triangle', 'triangles', found)}: {what}" for found, what in kinds if found.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +104,10 @@ def certify_map(mesh: MeshData, *, precision: str = "float64") -> WrittenMap:
     found = WrittenMap(V, F, uv, certify(F, uv), verdict, mesh.faces, find_bent(mesh, F, uv))
     if found.certificate.injective or mesh.vt is None:
         return found
-    return _certify_charts(mesh, found) or found
+    from quasiharmonic.apps.unwrapping.defective_charts import certify_defective
+
+    charts = certify_defective(mesh.V, mesh.F, uv[F])
+    return found if charts is None else replace(found, verdict=charts[0], set_apart=charts[1])
 
 
 def find_bent(mesh: MeshData, F: NDArray[np.int64], uv: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -157,36 +130,14 @@ def describe_bent(bent: NDArray[np.int64]) -> str:
     )
 
 
-def _certify_charts(mesh: MeshData, found: WrittenMap) -> WrittenMap | None:
-    """Certify the charts of a model with defects, with the triangles that `clean` keeps; None if it changes nothing."""
-    import numpy as np
-
-    from quasiharmonic.apps.atlas.atlas_verdict import certify as certify_islands
-    from quasiharmonic.apps.unwrapping.cleaning import clean
-    from quasiharmonic.io.seamed_mesh import SeamedMesh
-
-    try:
-        cleaned = clean(mesh.V, mesh.F)
-    except ValueError:
-        return None
-    corner_uv = found.uv[found.F]
-    uv = corner_uv[cleaned.triangles]
-    uv[cleaned.flipped] = uv[cleaned.flipped][:, (0, 2, 1)]
-    changed = cleaned.flipped.any() or cleaned.excluded.size > 0
-    if not changed or not np.array_equal(cleaned.restore_corners(uv), corner_uv):
-        return None
-    corners = np.arange(uv[..., 0].size).reshape(-1, 3)
-    verdict = certify_islands(SeamedMesh(cleaned.V, cleaned.F, corners, uv.reshape(-1, 2)))
-    apart = SetApart(
-        cleaned.triangles[cleaned.flipped],
-        cleaned.excluded[cleaned.repeated],
-        cleaned.excluded[~cleaned.repeated],
-    )
-    islands = tuple(
-        replace(one, triangles=cleaned.triangles[one.triangles], inverted=cleaned.triangles[one.inverted])
-        for one in verdict.islands
-    )
-    return replace(found, verdict=replace(verdict, islands=islands), set_apart=apart)
+def add_bent(facts: dict[str, Any], lines: list[str], mesh: MeshData) -> None:
+    """Add the faces of `find_bent` of a mesh with texture coordinates to a report."""
+    assert mesh.FT is not None
+    assert mesh.vt is not None
+    bent = find_bent(mesh, mesh.FT, mesh.vt)
+    facts["bent_faces"] = bent.tolist()
+    if bent.size:
+        lines.append(describe_bent(bent))
 
 
 def add_old_textures(facts: dict[str, Any], lines: list[str], before: MeshData, after: MeshData) -> None:

@@ -76,17 +76,18 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.problem.inspection import inspect_mesh
     from quasiharmonic.ui.cli import boundary_report, finite_elements, report
 
+    if options.boundary and (options.precision or options.any_triangulation or options.fixed):
+        raise ValueError("--boundary verifies no map: omit --as, --any-triangulation and --fixed")
     options.input, options.fixed = io.problem_files(options.input, options.fixed)
     report.check_json(options.json, inputs=(options.input, options.fixed))
     if options.boundary:
-        if options.precision is not None or options.any_triangulation:
-            raise ValueError("--boundary verifies no map: omit --as and --any-triangulation")
         return boundary_report.run(options)
     if options.plot is not None:
         raise ValueError("--plot needs --boundary: add it, or use qhm plot")
     if finite_elements.has_elements(options.input):
         return finite_elements.check(options)
     mesh = io.read_mesh(options.input)
+    fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input):
         found = inspect_mesh(mesh.V, mesh.F)
     facts: dict[str, Any] = {"input": str(options.input), "mesh": found.to_dict()}
@@ -100,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
         lines.append("The file has no map: no texture coordinates, and the mesh is not planar.")
         report.emit_verdict({**facts, "injective": None}, options.json, "\n".join(lines))
         return 0 if found.clean else 1
-    good, more, text = _verify(mesh, options)
+    good, more, text = _verify(mesh, options, fixed)
     report.emit_verdict({**facts, **more}, options.json, "\n".join([*lines, *text]))
     return 0 if good else 1
 
@@ -117,9 +118,10 @@ def _clean(mesh: MeshData) -> tuple[dict[str, Any], str]:
     return changes, f"qhm unwrap uses this mesh with these changes:\n{cleaned.tabulate_changes()}"
 
 
-def _verify(mesh: MeshData, options: argparse.Namespace) -> tuple[bool, dict[str, Any], list[str]]:
+def _verify(
+    mesh: MeshData, options: argparse.Namespace, fixed: NDArray[np.int64] | None
+) -> tuple[bool, dict[str, Any], list[str]]:
     """Certify the map of a mesh; return whether it passes, the entries of the report, and its text."""
-    from quasiharmonic import io
     from quasiharmonic.ui.cli import written_map
 
     precision = options.precision or "float64"
@@ -140,7 +142,6 @@ def _verify(mesh: MeshData, options: argparse.Namespace) -> tuple[bool, dict[str
         facts["not_convex"] = bent.tolist()
         good = good and not bent.size
         lines.append(text)
-    fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     diagnosis = None if good else _diagnose(mesh, fixed)
     facts["diagnosis"] = None if diagnosis is None else diagnosis.to_dict()
     return good, facts, lines if diagnosis is None else [*lines, diagnosis.summary()]

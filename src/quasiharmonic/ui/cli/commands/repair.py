@@ -101,5 +101,6 @@ def run(options: argparse.Namespace) -> int:
         }
         lines = [f"wrote {options.output}: {result.summary()}"]
         written_map.add_old_textures(facts, lines, mesh, repaired)
+        written_map.add_bent(facts, lines, repaired)
         report.emit(facts, options.json, "\n".join(lines))
     return 0 if verdict.injective else 1

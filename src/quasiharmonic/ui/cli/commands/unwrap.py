@@ -149,12 +149,7 @@ def run(options: argparse.Namespace) -> int:
         if divided:
             lines.append(f"{count_of('polygon', 'polygons', divided)} written as triangles, because seams cross them")
         written_map.add_old_textures(facts, lines, mesh, unwrapped)
-        assert unwrapped.FT is not None
-        assert unwrapped.vt is not None
-        bent = written_map.find_bent(unwrapped, unwrapped.FT, unwrapped.vt)
-        facts["bent_faces"] = bent.tolist()
-        if bent.size:
-            lines.append(written_map.describe_bent(bent))
+        written_map.add_bent(facts, lines, unwrapped)
         if not same:
             lines.append(f"{options.output} has other coordinates than were certified")
         report.emit(facts, options.json, "\n".join(lines))
