@@ -97,7 +97,7 @@ class TestTroubles:
         source, out = tmp_path / "set", tmp_path / "out"
         write_problem(source / "small", *star_of(4))
         assert batch.run(source, out, jobs=1).outcomes == {"injective": 1}
-        write_problem(source / "large", *star_of(50))
+        write_problem(source / "large", *star_of(150))
         limited = batch.run(source, out, jobs=1, time_limit=0.1)
         assert (limited.outcomes, limited.resumed) == ({"timeout": 1, "injective": 1}, 1)
         # With the same limit or a lower one the problem is not solved again.

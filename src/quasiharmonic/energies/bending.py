@@ -19,9 +19,8 @@ References
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array, dia_array, kron, triu
@@ -31,11 +30,11 @@ from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, in_un
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.energies.polishing import find_energy, scale_energy
-from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.problem import Domain
-from quasiharmonic.problem.result import MapResult, Stage, Status, Step
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each
 
 _MAX_STEPS = 200
@@ -161,12 +160,10 @@ def bend_map(
     The domain is planar, and ``length`` is ℓ in its unit. The status is one of `quasiharmonic.polish`, as are the
     options.
     """
-    began = time.perf_counter()
+    run = Run(callback)
     inside = np.ones(domain.n, dtype=bool)
     inside[np.concatenate(domain.loops)] = False
     plate = Plate(domain.V, domain.F, np.flatnonzero(inside), length, pull)
-    history = [*result.history]
-    status = Status.STILL_FALLING
     # As in `polish`, steps to inf or NaN are never accepted.
     with np.errstate(all="ignore"):
         deformation, exponent = scale_energy(domain, result.uv, find_energy(energy))
@@ -176,34 +173,13 @@ def bend_map(
         coordinates = Coordinates.of(result.uv, domain.fixed, exponent)
         model = MapModel(deformation, coordinates, system, [PlateTerm(plate, unit)])
         descent = NewtonDescent(model, model.evaluate(in_units(result.uv, exponent)))
-    try:
-        for number, outcome in enumerate(descent.descend(_MAX_STEPS, _TOLERANCE), start=1):
-            history.append(Step(number, 0, descent.value))
-            if callback is not None:
-                callback(history[-1])
-            status = outcome or status
-    except KeyboardInterrupt:
-        status = Status.INTERRUPTED
+    status = Status.INTERRUPTED
+    with run.until_interrupted():
+        status = run.descend("bending", descent.descend(_MAX_STEPS, _TOLERANCE), lambda: descent.value)
+    run.judge_last_stage(kept=descent.value < descent.first)
     uv = model.positions(descent.w)
-    seconds = time.perf_counter() - began
-    stage = Stage(
-        name="bending",
-        n_iterations=len(history) - len(result.history),
-        seconds=seconds,
-        inverted=(0, 0),
-        energy=(descent.first, descent.value),
-        kept=descent.value < descent.first,
-    )
-    return replace(
-        result,
-        uv=uv,
-        status=status,
-        certificate=certify(domain.F, uv, loops=domain.loops),
-        stages=[*result.stages, stage],
-        history=history,
-        linear_solver=system.solver.name,
-        seconds=result.seconds + seconds,
-    )
+    solver = system.solver.name
+    return run.result(uv, domain.F, status, loops=domain.loops, linear_solver=solver, V=domain.V).after(result)
 
 
 def _entry_indices(part: csr_array, whole: csr_array) -> IntArray:

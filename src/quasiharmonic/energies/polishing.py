@@ -24,11 +24,12 @@ from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.newton.progressive_reference import descend
 from quasiharmonic.energies.newton.sliding_boundary import SlidingModel, move_boundary
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
-from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
-from quasiharmonic.problem.result import MapResult, Stage, Status, Step
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -184,11 +185,11 @@ def polish_map(
     are measured in place of the domain's triangles. They must be positive in ``uv`` and stay so. They may overlap, but
     must cover the surface evenly.
     """
-    began = time.perf_counter()
     chosen, linear_solver, callback = find_energy(options.energy), options.linear_solver, options.callback
     check_integer("max_iterations", options.max_iterations, minimum=0)
     check_non_negative("tol", options.tol)
     check_callback(callback)
+    run = Run(callback)
     start = check_injective(domain, uv, "polish needs an injective map")
     track = None if options.slide is False else move_boundary(options.slide, domain, start)
     if track is not None:
@@ -207,60 +208,22 @@ def polish_map(
             model = SlidingModel(deformation, track, domain.fixed, domain.loops, exponent, linear_solver)
             descent = NewtonDescent(model, model.start())
             outcomes = descent.descend(options.max_iterations, options.tol)
-        first = model.mean_energy(descent.state)
-    history: list[Step] = []
-
-    def report() -> None:
-        history.append(Step(len(history), 0, model.mean_energy(descent.state)))
-        if callback is not None:
-            callback(history[-1])
-
-    status = Status.STILL_FALLING
-    try:
-        report()
-        for outcome in outcomes:
-            report()
-            status = outcome or status
-    except KeyboardInterrupt:
-        status = Status.INTERRUPTED
-    uv = model.positions(descent.w)
-    certificate = certify(domain.F, uv, loops=domain.loops)
-    seconds = time.perf_counter() - began
     name = options.energy if isinstance(options.energy, str) else type(chosen).__name__
-    stage = Stage(
-        name=f"polish, {name}",
-        n_iterations=max(len(history) - 1, 0),
-        seconds=seconds,
-        inverted=(0, 0),
-        energy=(first, model.mean_energy(descent.state)),
-        kept=descent.value < descent.first,
-    )
-    return MapResult(
-        uv=uv,
-        status=status,
-        certificate=certificate,
-        stages=[stage],
-        history=history,
-        linear_solver=model.system.solver.name,
-        seconds=seconds,
-        V=domain.V,
-    )
+    status = Status.INTERRUPTED
+    with run.until_interrupted():
+        status = run.descend(f"polish, {name}", outcomes, lambda: model.mean_energy(descent.state))
+    run.judge_last_stage(kept=descent.value < descent.first)
+    uv = model.positions(descent.w)
+    solver = model.system.solver.name
+    return run.result(uv, domain.F, status, loops=domain.loops, linear_solver=solver, V=domain.V)
 
 
 def polish_result(
     problem: Problem, result: MapResult, options: PolishOptions, *, triangles: IntArray | None = None
 ) -> MapResult:
     """Polish the injective map of a result with `polish_map`, appending to its stages and history."""
-    further = polish_map(problem.domain, result.uv, options, triangles=triangles)
-    return replace(
-        further,
-        stages=result.stages + further.stages,
-        history=result.history + further.history,
-        path=result.path,
-        refined=result.refined,
-        refinement_attempts=result.refinement_attempts,
-        seconds=result.seconds + further.seconds,
-    )
+    further = polish_map(problem.domain, result.uv, options, triangles=triangles).after(result)
+    return replace(further, refined=result.refined, refinement_attempts=result.refinement_attempts)
 
 
 def find_energy(energy: str | Energy) -> Energy:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -96,6 +97,33 @@ class Status(Enum):
     def converged(self) -> bool:
         """Whether no small change of the map lowers the minimised energy noticeably."""
         return self in (Status.INJECTIVE, Status.POLISHED, Status.NEARBY)
+
+    @classmethod
+    def most_severe(cls, statuses: Iterable[Status]) -> Status:
+        """Return the status of several maps together: that of the map that made the least progress."""
+        return min(statuses, key=_MOST_SEVERE_FIRST.index)
+
+
+_MOST_SEVERE_FIRST = (
+    Status.INTERRUPTED,
+    # Search and refinement without an injective map.
+    Status.IMPOSSIBLE,
+    Status.TOO_MANY_SPLITS,
+    Status.PRECISION_LIMIT,
+    Status.ROUNDED,
+    Status.UNSOLVABLE,
+    Status.STALLED,
+    Status.OUT_OF_ITERATIONS,
+    # An injective map that overlaps itself where a bijective one was requested; otherwise the success of a search.
+    Status.INJECTIVE,
+    # Polish and animation.
+    Status.COLLAPSED,
+    Status.UNIMPROVED,
+    Status.STILL_FALLING,
+    Status.EXHAUSTED,
+    Status.NEARBY,
+    Status.POLISHED,
+)
 
 
 @dataclass(frozen=True)
@@ -315,6 +343,31 @@ class MapResult(ReadOnly, Displayable, Outcome):
     def n_iterations(self) -> int:
         """Iterations over all stages."""
         return sum(stage.n_iterations for stage in self.stages)
+
+    def after(self, earlier: MapResult) -> MapResult:
+        """Return this result with the stages, history, path and time of an earlier call before its own."""
+        return replace(
+            self,
+            stages=earlier.stages + self.stages,
+            history=earlier.history + self.history,
+            path=earlier.path + self.path,
+            seconds=earlier.seconds + self.seconds,
+        )
+
+    @classmethod
+    def combine(cls, results: Sequence[MapResult], uv: NDArray[np.float64], certificate: Certificate) -> MapResult:
+        """Combine the results of several surfaces into one for all of them, with positions ``uv`` (n, 2)."""
+        return cls(
+            uv=uv,
+            status=Status.most_severe(result.status for result in results),
+            certificate=certificate,
+            stages=[stage for result in results for stage in result.stages],
+            history=[step for result in results for step in result.history],
+            path=results[0].path if len(results) == 1 else [],
+            diagnosis=results[0].diagnosis,
+            linear_solver=results[0].linear_solver,
+            seconds=sum(result.seconds for result in results),
+        )
 
     def short_repr(self) -> str:
         steps = f"{self.n_iterations} iteration{'' if self.n_iterations == 1 else 's'}"

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.animation.frames import FrameStep, find_longest
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.search.stages import Stages
@@ -33,7 +34,7 @@ _HALVINGS = 3
 class FrameSearch:
     """Search for the frames in order, each from the last injective map.
 
-    ``frames`` are the results so far. ``interrupted`` says whether Ctrl-C ended the work early.
+    ``frames`` are the results so far. ``work`` says whether Ctrl-C ended the work early.
     """
 
     def __init__(
@@ -47,14 +48,14 @@ class FrameSearch:
         self._problem, self._targets = problem, targets
         self._max_iterations, self._linear_solver, self._callback = max_iterations, linear_solver, callback
         self.frames: list[MapResult] = []
-        self.interrupted = False
+        self.work = Run()
 
     def run(self, start: ArrayLike | None) -> list[MapResult]:
         """Search for the map of every frame and return the results."""
         last = start
         move = 0.0
         before: int | None = None
-        try:
+        with self.work.until_interrupted():
             for t, target in enumerate(self._targets):
                 if before is not None and np.array_equal(target, self._targets[before]):
                     self.frames.append(self.frames[before])
@@ -68,8 +69,6 @@ class FrameSearch:
                     before, last = t, frame.uv
                 if self._callback is not None:
                     self._callback(FrameStep(t, len(self._targets), 0, move))
-        except KeyboardInterrupt:
-            self.interrupted = True
         return self.frames
 
     def search(self, target: FloatArray, start: ArrayLike | None, last: FloatArray | None = None) -> MapResult:
@@ -125,7 +124,7 @@ class FrameSearch:
         found = np.array([frame.injective for frame in self.frames])
         bridged = np.zeros(len(found), dtype=bool)
         have = np.flatnonzero(found)
-        try:
+        with self.work.until_interrupted():
             for t in np.flatnonzero(~found).tolist():
                 after = int(np.searchsorted(have, t))
                 if not 0 < after < have.size:
@@ -137,6 +136,4 @@ class FrameSearch:
                 frame = self.search(between, self.frames[near].uv, targets[near])
                 if frame.injective:
                     self.frames[t], targets[t], bridged[t] = frame, between, True
-        except KeyboardInterrupt:
-            self.interrupted = True
         return targets, bridged

@@ -5,7 +5,6 @@ targets ──▶ each frame from the previous map ──▶ no map: report why,
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from numbers import Real
@@ -21,6 +20,7 @@ from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import Status
+from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.search.options import MAX_ITERATIONS
 from quasiharmonic.util.arrays import FloatArray, check_bool, check_callback, check_integer
 from quasiharmonic.util.progress import reports_progress
@@ -113,17 +113,15 @@ def animate(
     following = FrameSearch(problem, positions, max_iterations, linear_solver, callback)
     frames = following.run(start)
     asked, bridged = positions[: len(frames)], np.zeros(len(frames), dtype=bool)
-    if fill_gaps and not following.interrupted:
+    if fill_gaps and not following.work.interrupted:
         asked, bridged = following.fill_gaps()
-    interrupted = following.interrupted
-    if energy is None:
-        return Animation(frames, asked, bridged, np.full(len(frames), np.nan), interrupted=interrupted)
-    max_motion_ratio = _LIMIT if max_motion_ratio is None else float(max_motion_ratio)
     energies = np.full(len(frames), np.nan)
-    if not interrupted:
-        smoothing = MotionSmoothing(problem.domain, energy, max_motion_ratio, linear_solver)
-        energies, interrupted = _smooth_frames(smoothing, following, asked, callback)
-    return Animation(frames, asked, bridged, energies, max_motion_ratio, interrupted)
+    if energy is not None:
+        max_motion_ratio = _LIMIT if max_motion_ratio is None else float(max_motion_ratio)
+        if not following.work.interrupted:
+            smoothing = MotionSmoothing(problem.domain, energy, max_motion_ratio, linear_solver)
+            energies = _smooth_frames(smoothing, following, asked, callback)
+    return Animation(frames, asked, bridged, energies, max_motion_ratio, following.work.interrupted)
 
 
 def _smooth_frames(
@@ -131,12 +129,9 @@ def _smooth_frames(
     following: FrameSearch,
     targets: FloatArray,
     callback: Callable[[FrameStep], object] | None,
-) -> tuple[FloatArray, bool]:
-    """Lower the distortion of the frames that have a map, in place.
-
-    Return their mean energies (t,), NaN for other frames, and whether Ctrl-C ended the work.
-    """
-    began = time.perf_counter()
+) -> FloatArray:
+    """Lower the distortion of the frames that have a map, in place; return mean energies (t,), NaN for other frames."""
+    run = Run()
     frames = following.frames
     # Consecutive frames with the same target share one map.
     of = np.full(len(frames), -1)
@@ -146,8 +141,7 @@ def _smooth_frames(
         if callback is not None:
             callback(FrameStep(which[t], len(frames), sweep, smoothing.largest_move()))
 
-    status = Status.NEARBY
-    try:
+    with following.work.until_interrupted():
         for t in range(len(frames)):
             if not frames[t].injective:
                 continue
@@ -163,11 +157,10 @@ def _smooth_frames(
                 report(0, len(which) - 1)
             of[t] = len(which) - 1
         smoothing.sweep(report)
-    except KeyboardInterrupt:
-        status = Status.INTERRUPTED
+    status = Status.INTERRUPTED if following.work.interrupted else Status.NEARBY
     energies = np.full(len(frames), np.nan)
-    seconds = (time.perf_counter() - began) / max(len(which), 1)
-    try:
+    seconds = run.seconds / max(len(which), 1)
+    with following.work.until_interrupted():
         for t in np.flatnonzero(of >= 0).tolist():
             uv = smoothing.maps[of[t]]
             certificate = certify(smoothing.domain.F, uv, loops=smoothing.domain.loops)
@@ -175,6 +168,4 @@ def _smooth_frames(
                 frames[t], uv=uv, status=status, certificate=certificate, seconds=frames[t].seconds + seconds, mu=None
             )
             energies[t] = smoothing.energies[of[t]]
-    except KeyboardInterrupt:
-        status = Status.INTERRUPTED
-    return energies, status is Status.INTERRUPTED
+    return energies

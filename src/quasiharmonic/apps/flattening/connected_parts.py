@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.geometry.mesh.topology import components
-from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range
-
-# The status of several pieces is the first of these that one of them has. Other statuses, of pieces without a bijective
-# map, come first of all.
-_FURTHEST_LAST = (
-    Status.INTERRUPTED,
-    Status.COLLAPSED,
-    Status.STILL_FALLING,
-    Status.EXHAUSTED,
-    Status.POLISHED,
-)
 
 
 class Part(NamedTuple):
@@ -78,8 +67,3 @@ def unite_parts(parts: Sequence[Part]) -> Part:
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.triangles for part in parts]),
     )
-
-
-def combine_statuses(statuses: Iterable[Status]) -> Status:
-    """The status of several parts: that of the part that made the least progress."""
-    return min(statuses, key=lambda status: _FURTHEST_LAST.index(status) if status in _FURTHEST_LAST else -1)

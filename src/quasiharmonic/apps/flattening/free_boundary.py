@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.flattening.connected_parts import Part, combine_statuses, split_parts
+from quasiharmonic.apps.flattening.connected_parts import Part, split_parts
 from quasiharmonic.apps.flattening.distances.distance_descent import lower_distance_error
 from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.layout import (
@@ -34,6 +34,7 @@ from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -233,20 +234,11 @@ def _combine(
 ) -> MapResult:
     """Certify the map of all pieces, and combine the reports of the descents."""
     loops = [loop for part in [*held, *free] for loop in part.loops]
-    status, certificate = combine_statuses(result.status for result in results), certify(F, uv, loops=loops)
-    if held and not certificate.bijective and status in _DESCENDED:
+    found = MapResult.combine(results, uv, certify(F, uv, loops=loops))
+    if held and not found.certificate.bijective and found.status in _DESCENDED:
         # If fixed vertices are far away or at a very different scale, doubles cannot resolve the other pieces there.
-        status = Status.ROUNDED
-    return MapResult(
-        uv=uv,
-        status=status,
-        certificate=certificate,
-        stages=[stage for result in results for stage in result.stages],
-        history=[step for result in results for step in result.history],
-        path=results[0].path if len(results) == 1 else [],
-        diagnosis=results[0].diagnosis,
-        linear_solver=results[0].linear_solver,
-    )
+        return replace(found, status=Status.ROUNDED)
+    return found
 
 
 def check_flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
@@ -269,17 +261,10 @@ def _flatten_with_distances(piece: Piece, start: FloatArray | None, rings: int, 
     found = Flattening(piece, settings, None).run(start)
     if found.status is Status.INTERRUPTED or piece.thin_planar_map() is not None:
         return found
-    try:
-        then = lower_distance_error(piece, found.uv, rings, sampled, first=len(found.history))
-    except KeyboardInterrupt:
-        return replace(found, status=Status.INTERRUPTED)
-    return replace(
-        then,
-        status=Status.COLLAPSED if found.status is Status.COLLAPSED else then.status,
-        stages=found.stages + then.stages,
-        history=found.history + then.history,
-        path=found.path + then.path,
-    )
+    with Run().until_interrupted():
+        then = lower_distance_error(piece, found.uv, rings, sampled, first=len(found.history)).after(found)
+        return replace(then, status=Status.COLLAPSED) if found.status is Status.COLLAPSED else then
+    return replace(found, status=Status.INTERRUPTED)
 
 
 def _check_start(start: ArrayLike, V: FloatArray, F: IntArray) -> FloatArray:

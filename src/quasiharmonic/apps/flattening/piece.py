@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +25,8 @@ from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, is_injective
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
-from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import FloatArray, check_callback, check_integer, check_non_negative, count_of
 
 #: Surfaces with at least this number of triangles are flattened with coarse meshes.
@@ -177,44 +177,28 @@ class Flattening:
         self._starts = self._default_starts()
         # Solver and initial energy of the initial maps already used.
         self._begun: set[tuple[str, float]] = set()
-        # Number of steps of the last descent.
-        self._steps = 0
         self._solver = ""
-        self._stages: list[Stage] = []
-        self._history: list[Step] = []
-        self._path: list[Snapshot] = []
+        self._run = Run(settings.callback, settings.record_every)
 
     def run(self, start: FloatArray | None) -> MapResult:
         """Flatten the piece from an injective map (n, 2) in the piece's unit, or from a default initial map.
 
         Ctrl-C before there is a bijective map raises KeyboardInterrupt.
         """
-        began = time.perf_counter()
-        try:
+        status = Status.INTERRUPTED
+        with self._run.until_interrupted():
             if (flat := self._piece.thin_planar_map()) is not None:
                 status = self._keep(flat)
             else:
                 status = self._descend(start)
                 if self._has_collapsed(status):
                     status = self._restart(status)
-        except KeyboardInterrupt:
-            if self._bijective is None:
-                raise
-            status = Status.INTERRUPTED
-        assert self._bijective is not None
+        if self._bijective is None:
+            raise KeyboardInterrupt
         uv = self._bijective
         if self._is_scale_free(uv):
             uv = self._fit_scale(uv)
-        return MapResult(
-            uv=uv,
-            status=status,
-            certificate=certify(self._piece.F, uv, loops=self._piece.loops),
-            stages=self._stages,
-            history=self._history,
-            path=self._path,
-            linear_solver=self._solver,
-            seconds=time.perf_counter() - began,
-        )
+        return self._run.result(uv, self._piece.F, status, loops=self._piece.loops, linear_solver=self._solver)
 
     def _keep(self, uv: FloatArray) -> Status:
         """Use a bijective map without descending."""
@@ -252,7 +236,7 @@ class Flattening:
         # A converged map is a minimum. Only the barriers of a cramped boundary can imitate convergence, and then there
         # is an overlapping map to compare with.
         converged = status is Status.POLISHED and self._overlapping is None
-        falling = status is Status.STILL_FALLING and self._steps < _MANY
+        falling = status is Status.STILL_FALLING and self._run.stages[-1].n_iterations < _MANY
         if converged or falling or status is Status.INTERRUPTED:
             return False
         assert self._bijective is not None
@@ -264,8 +248,8 @@ class Flattening:
 
     def _restart(self, status: Status) -> Status:
         """Descend from other initial maps until one result has not collapsed; otherwise use the best result."""
-        attempts, first = [self._record_attempt(status, 0)], len(self._stages)
-        try:
+        attempts, first = [self._record_attempt(status, 0)], len(self._run.stages)
+        with self._run.until_interrupted():
             while (own := self._next_default_start()) is not None:
                 found = self._run_descent(own[0], guarded=False, near=own[1]) if not self._overlaps else None
                 status = found or self._descend_guarded()
@@ -274,12 +258,11 @@ class Flattening:
                     return self._choose(attempts, attempts[-1])
                 if self._agree(attempts):
                     return self._choose(attempts)
-                first = len(self._stages)
-        except KeyboardInterrupt:
-            self._choose([*attempts, self._record_attempt(Status.INTERRUPTED, first)])
-            raise
-        self._choose(attempts)
-        return Status.COLLAPSED
+                first = len(self._run.stages)
+            self._choose(attempts)
+            return Status.COLLAPSED
+        self._choose([*attempts, self._record_attempt(Status.INTERRUPTED, first)])
+        return Status.INTERRUPTED
 
     def _agree(self, attempts: Sequence[_Attempt]) -> bool:
         """Whether another initial map led to the same energy, so that the surface requires the stretch."""
@@ -287,7 +270,7 @@ class Flattening:
         least = min(attempt.energy for attempt in attempts)
 
         def begun(attempt: _Attempt) -> float:
-            return self._stages[attempt.stages.start].energy[0]
+            return self._run.stages[attempt.stages.start].energy[0]
 
         return last.energy <= (1 + _AGREE) * least and any(
             other.energy <= (1 + _AGREE) * least and abs(begun(other) - begun(last)) > _AGREE * begun(last)
@@ -298,14 +281,14 @@ class Flattening:
         """Record the current map, the result of the stages from ``first`` on."""
         assert self._bijective is not None
         energy = self._measure.value(in_units(self._bijective, 0))
-        return _Attempt(energy, self._bijective, status, self._solver, range(first, len(self._stages)))
+        return _Attempt(energy, self._bijective, status, self._solver, range(first, len(self._run.stages)))
 
     def _choose(self, attempts: Sequence[_Attempt], best: _Attempt | None = None) -> Status:
         """Use the result of one attempt, by default the one with the least energy, and mark the others as discarded."""
         best = best or min(attempts, key=lambda attempt: attempt.energy)
         for attempt in attempts:
             for k in attempt.stages if attempt is not best else ():
-                self._stages[k] = replace(self._stages[k], kept=False)
+                self._run.stages[k] = replace(self._run.stages[k], kept=False)
         self._bijective, self._solver = best.uv, best.solver
         return best.status
 
@@ -321,7 +304,6 @@ class Flattening:
 
     def _next_default_start(self) -> tuple[FloatArray, bool] | None:
         """The next default initial map that exists, and whether it is near the minimum already; None at the end."""
-        began = time.perf_counter()
         for name, start in self._starts:
             uv = start()
             if uv is None:
@@ -333,8 +315,7 @@ class Flattening:
                 continue
             self._begun.add((self._settings.linear_solver, energy))
             self._bijective = uv
-            what = f"start again, {name}" if self._stages else "start"
-            self._stages.append(Stage(what, 0, time.perf_counter() - began, (0, 0), (energy, energy)))
+            self._run.add_stage(f"start again, {name}" if self._run.stages else "start", energy=(energy, energy))
             return uv, energy < _DIRECT_ENERGY
         return None
 
@@ -372,37 +353,38 @@ class Flattening:
 
     def _run_descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
         """Descend from a map, which must be bijective if ``guarded``; return None if the result overlaps itself."""
-        began = time.perf_counter()
         settings, solver = self._settings, self._settings.linear_solver
         energy = self._piece.energy(settings.density if near else ReweightedDirichlet(), self._weights)
         descent = SurfaceDescent(energy, uv, solver, rim=self._rim if guarded else None)
         self._solver = descent.linear_solver
-        first = self._measure.value(descent.w)
-        apart, status, steps = guarded, Status.STILL_FALLING, 0
+        apart, status = guarded, Status.STILL_FALLING
         recent: deque[tuple[float, FloatArray]] = deque(maxlen=_RECENT)
-        try:
-            self._report(descent)
+
+        def measure() -> float:
+            return self._measure.value(descent.w)
+
+        def take_steps() -> Iterator[Status | None]:
             course = descend(descent, settings.density, settings.tol)
-            for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):
-                status = outcome or status
-                recent.append((self._measure.value(descent.w), descent.uv))
-                self._report(descent)
-                if not guarded and steps % _CHECK_EVERY == 0 and self._rim.tangled_fraction(descent.uv) > _TANGLED:
-                    break
+            for number, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):
+                recent.append((measure(), descent.uv))
+                yield outcome
+                if not guarded and number % _CHECK_EVERY == 0 and self._rim.tangled_fraction(descent.uv) > _TANGLED:
+                    return
+
+        name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
+        exponent = self._piece.exponent
+        try:
+            status = self._run.descend(name, take_steps(), measure, lambda: to_given_unit(descent.uv, exponent))
         finally:
             # After Ctrl-C too, the current map may be better than the previous one.
-            last = self._measure.value(descent.w)
             apart = guarded or not self._rim.meets_itself(descent.uv)
             if apart:
                 self._bijective = descent.uv
             else:
                 self._overlaps = True
                 self._overlapping = descent.uv if status is not Status.STILL_FALLING else None
-                self._bijective = self._latest_bijective(recent, _MAX_ENERGY_RATIO * last)
-            self._steps = steps
-            seconds = time.perf_counter() - began
-            name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
-            self._stages.append(Stage(name, steps, seconds, (0, 0), (first, last), kept=apart))
+                self._bijective = self._latest_bijective(recent, _MAX_ENERGY_RATIO * measure())
+            self._run.judge_last_stage(kept=apart)
         return status if apart else None
 
     def _latest_bijective(self, recent: Iterable[tuple[float, FloatArray]], most: float) -> FloatArray | None:
@@ -411,11 +393,3 @@ class Flattening:
             if energy <= most and not self._rim.meets_itself(uv):
                 return uv
         return self._bijective
-
-    def _report(self, descent: SurfaceDescent) -> None:
-        settings, number = self._settings, len(self._history)
-        self._history.append(Step(number, 0, self._measure.value(descent.w)))
-        if settings.record_every and number % settings.record_every == 0:
-            self._path.append(Snapshot(number, to_given_unit(descent.uv, self._piece.exponent)))
-        if settings.callback is not None:
-            settings.callback(self._history[-1])

@@ -24,6 +24,7 @@ from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding, project
 from quasiharmonic.apps.tetrahedra.topology import FaceReport, inspect_faces
 from quasiharmonic.problem.result import Step
+from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
 
 # Maximum number of crossing pairs of boundary triangles that are listed.
@@ -248,31 +249,24 @@ def _search(descent: Descent, settings: Settings) -> tuple[FloatArray, Tetrahedr
     """
     energy, X = descent.energy, descent.X
     best = [(len(energy.T) + 1, X)]
-    try:
-        with np.errstate(all="ignore"):
-            count = int(np.count_nonzero(~(energy.determinants(X) > 0)))
-            best[:] = [(count, X)]
-            _report(settings, descent, np.inf, count)
-            if count and descent.free.size:
-                count = _untangle(descent, settings, best)
-            if count:
-                ended = descent.iterations >= settings.max_iterations
-                status = TetrahedraStatus.OUT_OF_ITERATIONS if ended else TetrahedraStatus.STALLED
-                return best[-1][1], status, descent.iterations
-            status = _polish(descent, settings)
-            return descent.X, status, descent.iterations
-    except KeyboardInterrupt:
-        positive = bool(energy.determinants(descent.X).min() > 0)
-        return descent.X if positive else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
+    run = Run(settings.callback)
+    with run.until_interrupted(), np.errstate(all="ignore"):
+        count = int(np.count_nonzero(~(energy.determinants(X) > 0)))
+        best[:] = [(count, X)]
+        run.record(count, np.inf)
+        if count and descent.free.size:
+            count = _untangle(descent, settings, run, best)
+        if count:
+            ended = descent.iterations >= settings.max_iterations
+            status = TetrahedraStatus.OUT_OF_ITERATIONS if ended else TetrahedraStatus.STALLED
+            return best[-1][1], status, descent.iterations
+        status = _polish(descent, settings, run)
+        return descent.X, status, descent.iterations
+    positive = bool(energy.determinants(descent.X).min() > 0)
+    return descent.X if positive else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
 
 
-def _report(settings: Settings, descent: Descent, value: float, inverted: int) -> None:
-    """Call the callback."""
-    if settings.callback is not None:
-        settings.callback(Step(descent.iterations, inverted, value))
-
-
-def _untangle(descent: Descent, settings: Settings, best: list[tuple[int, FloatArray]]) -> int:
+def _untangle(descent: Descent, settings: Settings, run: Run, best: list[tuple[int, FloatArray]]) -> int:
     """Untangle until nothing is inverted or progress ends, and keep the best mesh; return how many stay inverted."""
     energy = descent.energy
     since, least = 0, float(energy.determinants(descent.X).min())
@@ -283,17 +277,17 @@ def _untangle(descent: Descent, settings: Settings, best: list[tuple[int, FloatA
             since, least = 0, max(now, least)
         if count < best[-1][0]:
             best[:] = [(count, descent.X)]
-        _report(settings, descent, np.inf, count)
+        run.record(count, np.inf)
         if since >= _PATIENCE:
             break
     return int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
 
 
-def _polish(descent: Descent, settings: Settings) -> TetrahedraStatus:
+def _polish(descent: Descent, settings: Settings, run: Run) -> TetrahedraStatus:
     """Lower the energy of a valid mesh; return why this ended."""
     if not settings.polish or not descent.free.size:
         return TetrahedraStatus.FIRST_VALID
     for value in descent.polish(settings.max_iterations - descent.iterations, settings.tol):
-        _report(settings, descent, value, 0)
+        run.record(0, value)
     converged = descent.converged and np.isfinite(descent.energy.value(descent.X, 0.0))
     return TetrahedraStatus.POLISHED if converged else TetrahedraStatus.STILL_FALLING

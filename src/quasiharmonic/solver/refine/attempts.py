@@ -25,6 +25,7 @@ from quasiharmonic.geometry.mesh.refinement import Refined, compose, split_edges
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, Status
+from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.construction.constructing import Construction, constructions, refined_problem
 from quasiharmonic.solver.construction.opening import thin_refinement
 from quasiharmonic.solver.construction.simplicity import is_simple
@@ -108,14 +109,13 @@ class _Refinement:
 
     def run(self, start: FloatArray | None, budget: int) -> MapResult:
         """Return the map that adds the fewest vertices; if no attempt finds one, the result of the last attempt."""
-        try:
+        with Run().until_interrupted():
             return replace(self._run_attempts(start, budget), refinement_attempts=self._attempts)
-        except KeyboardInterrupt:
-            if self._last is None or self._best is None:
-                raise
-            best = self._use_construction(self._best) if self._best.stages[-1].name == CONSTRUCTED else self._best
-            best = replace(best, stages=self._last.stages, history=self._last.history)
-            return replace(best, status=Status.INTERRUPTED, refinement_attempts=self._attempts)
+        if self._last is None or self._best is None:
+            raise KeyboardInterrupt
+        best = self._use_construction(self._best) if self._best.stages[-1].name == CONSTRUCTED else self._best
+        best = replace(best, stages=self._last.stages, history=self._last.history)
+        return replace(best, status=Status.INTERRUPTED, refinement_attempts=self._attempts)
 
     def _run_attempts(self, start: FloatArray | None, budget: int) -> MapResult:
         problem = self._problem
@@ -177,10 +177,11 @@ class _Refinement:
         result = self._search(on_refinement(problem, refined), start, budget, self._select)
         if refined is not None:
             uv = result.uv
-            try:
+            thinning = Run()
+            with thinning.until_interrupted():
                 if result.certificate.bijective:
                     refined, uv = thin_refinement(problem, refined, uv)
-            except KeyboardInterrupt:
+            if thinning.interrupted:
                 result = replace(result, status=Status.INTERRUPTED)
             certificate = certify(refined.F, uv, loops=problem.domain.loops)
             result = replace(

@@ -13,7 +13,6 @@ minimum of E among the injective maps and not to a compromise with V₃.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.problem.result import Stage, Step
+from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods import LBFGS, LocalRepair, Newton, VectorAdam
 from quasiharmonic.solver.methods.base import Steps
@@ -51,8 +50,8 @@ class HarmonicDescent:
         Function from η to the functional of a round.
     uv : (n, 2) float64
         Initial map.
-    callback : callable or None
-        Called with a `Step` at every map.
+    run : Run
+        Records every map and every round.
 
     Attributes
     ----------
@@ -67,20 +66,18 @@ class HarmonicDescent:
         objective: Objective,
         energy: Callable[[float], Harmonised],
         uv: FloatArray,
-        callback: Callable[[Step], object] | None,
+        run: Run,
     ) -> None:
         self.uv = uv
         self._objective, self._energy = objective, energy
-        self._problem, self._callback = objective.problem, callback
+        self._problem, self._run = objective.problem, run
         self._measure = energy(1.0)
-        self.history: list[Step] = []
-        self.stages: list[Stage] = []
         self._squares = np.zeros(len(self._problem.F))
         self.return_to_best()
         inverted = inverted_triangles(self._problem.F, uv).size
         distortion = self._measure.distortion if inverted else self._measure.distortion_of_map
         self.best = inverted, distortion(self._last)
-        self._report(self.best)
+        run.record(*self.best)
 
     def return_to_best(self) -> None:
         """Return to the best map."""
@@ -113,36 +110,33 @@ class HarmonicDescent:
 
     def untangle(self) -> bool:
         """Untangle the last inverted triangles by descending V₃ alone; return whether none is left."""
-        if self.history[-1].inverted == 0:
+        if self._run.history[-1].inverted == 0:
             return True
         for method in (Newton(iterations=UNTANGLING_STEPS), LocalRepair(tries=UNTANGLING_STEPS)):
             with self._stage(f"{method.label}, tanh"):
                 self._last = self._objective.evaluate(self._last.xi)
                 for at in method.iterates(self._objective, self._last):
                     self._visit(at)
-                    if self.history[-1].inverted == 0:
+                    if self._run.history[-1].inverted == 0:
                         return True
         return False
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
         """Record a stage; end it if the Laplacian is not positive definite."""
-        began, done, best = time.perf_counter(), len(self.history), self.best
+        run, done, best = self._run, len(self._run.history), self.best
         try:
             yield
         except NotPositiveDefinite:
             pass
         finally:
-            first, last = self.history[done - 1], self.history[-1]
-            self.stages.append(
-                Stage(
-                    name=name,
-                    n_iterations=len(self.history) - done,
-                    seconds=time.perf_counter() - began,
-                    inverted=(first.inverted, last.inverted),
-                    energy=(first.energy, last.energy),
-                    kept=self.best < best,
-                )
+            first, last = run.history[done - 1], run.history[-1]
+            run.add_stage(
+                name,
+                n_iterations=len(run.history) - done,
+                inverted=(first.inverted, last.inverted),
+                energy=(first.energy, last.energy),
+                kept=self.best < best,
             )
 
     def _restart(self, objective: Objective) -> Iterate:
@@ -186,13 +180,8 @@ class HarmonicDescent:
             self._compare((inverted, self._measure.distortion_of_map(at)), uv)
         elif inverted <= self.best[0]:
             self._compare((inverted, distortion), self._problem.positions(at.w))
-        self._report((inverted, distortion))
+        self._run.record(inverted, distortion)
 
     def _compare(self, state: tuple[int, float], uv: FloatArray) -> None:
         if state < self.best:
             self.best, self.uv = state, uv
-
-    def _report(self, state: tuple[int, float]) -> None:
-        self.history.append(Step(len(self.history), *state))
-        if self._callback is not None:
-            self._callback(self.history[-1])

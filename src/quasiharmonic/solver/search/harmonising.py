@@ -17,12 +17,13 @@ from quasiharmonic.energies import polishing
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import ARAP, AreaPreserving, Energy, UnsignedARAP
 from quasiharmonic.energies.springs import MassSpring
-from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.regularisers import Conformal
 from quasiharmonic.solver.search.harmonic_descent import HarmonicDescent
@@ -200,7 +201,7 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
 
     The domain's ``fixed`` vertices keep their positions in ``uv``.
     """
-    began = time.perf_counter()
+    run = Run(options.callback)
     chosen = _find_energy(options.energy, domain)
     barrier = chosen is not None and chosen.barrier
     schedule = _eta_schedule(options.eta, barrier)
@@ -239,9 +240,9 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
         def descend(eta: float) -> Harmonised:
             return Harmonised(own, objective.mesh, area, deformation, regulariser, eta=eta, conformal=options.conformal)
 
-        descent = HarmonicDescent(objective, descend, start, options.callback)
+        descent = HarmonicDescent(objective, descend, start, run)
         first, status = descent.best, Status.STILL_FALLING
-        try:
+        with run.until_interrupted():
             for values in (schedule, len(schedule) * schedule[-1:]):
                 for value in values:
                     stage = f"harmonise, {name}, η = {value:g}"
@@ -253,31 +254,16 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
                 # The schedule's long steps left inverted triangles that could not be untangled, or the result is worse
                 # than the initial map. Restart from the best map with the last η alone.
                 descent.return_to_best()
-        except KeyboardInterrupt:
-            status = Status.INTERRUPTED
-    certificate = certify(domain.F, descent.uv)
-    diagnosis = None
-    if status is not Status.INTERRUPTED:
-        converged = status is Status.POLISHED and descent.history[-1].inverted == 0
-        if not certificate.injective:
-            try:
-                diagnosis = diagnose(problem)
-                status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.STALLED
-            except KeyboardInterrupt:
-                status = Status.INTERRUPTED
+    result = run.result(descent.uv, domain.F, status, linear_solver=objective.laplacian.solver.name, V=domain.V)
+    with run.until_interrupted():
+        converged = status is Status.POLISHED and run.history[-1].inverted == 0
+        if not result.injective and not run.interrupted:
+            diagnosis = diagnose(problem)
+            status = Status.IMPOSSIBLE if diagnosis.forbids_injective else Status.STALLED
+            result = replace(result, diagnosis=diagnosis)
         elif not (descent.best < first or converged):
             status = Status.UNIMPROVED
-    return MapResult(
-        uv=descent.uv,
-        status=status,
-        certificate=certificate,
-        stages=descent.stages,
-        history=descent.history,
-        diagnosis=diagnosis,
-        linear_solver=objective.laplacian.solver.name,
-        seconds=time.perf_counter() - began,
-        V=domain.V,
-    )
+    return replace(result, status=Status.INTERRUPTED if run.interrupted else status, seconds=run.seconds)
 
 
 def _find_energy(energy: str | Energy | None, domain: Domain) -> Energy | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,13 +21,14 @@ from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy, PairForm
 from quasiharmonic.apps.flattening.layout import to_given_unit
 from quasiharmonic.apps.flattening.piece import Piece, Settings
-from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.distances import Sampling, SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_integer, map_array
 from quasiharmonic.util.progress import reports_progress
 
@@ -138,7 +140,7 @@ def lower_distance_error(piece: Piece, uv: FloatArray, rings: int, settings: Set
     The energy of ``settings`` is ignored, and ``first`` is the number of the first step. The result's ``uv`` is in the
     piece's unit, and its ``path`` in the surface's.
     """
-    began = time.perf_counter()
+    run = Run(settings.callback, settings.record_every, first=first)
     distances = sample_distances(piece.V, piece.F, choose_sampling(rings))
     start = fit_scale(uv, distances, piece.F, piece.loops)
     with np.errstate(all="ignore"):
@@ -146,29 +148,16 @@ def lower_distance_error(piece: Piece, uv: FloatArray, rings: int, settings: Set
         descent = SurfaceDescent(
             energy, start, settings.linear_solver, rim=Rim(piece.loops), pairs=DistancePairs(energy)
         )
-    history: list[Step] = []
-    path: list[Snapshot] = []
-
-    def report(value: float) -> None:
-        history.append(Step(first + len(history), 0, value))
-        if settings.record_every and history[-1].iteration % settings.record_every == 0:
-            path.append(Snapshot(history[-1].iteration, to_given_unit(descent.uv, piece.exponent)))
-        if settings.callback is not None:
-            settings.callback(history[-1])
-
-    status = run_descent(descent, settings, report)
-    seconds = time.perf_counter() - began
-    energies = history[0].energy, descent.distortion
-    return MapResult(
-        uv=descent.uv,
-        status=status,
-        certificate=certify(piece.F, descent.uv, loops=piece.loops),
-        stages=[Stage("guarded descent, distances", len(history) - 1, seconds, (0, 0), energies)],
-        history=history,
-        path=path,
-        linear_solver=descent.linear_solver,
-        seconds=seconds,
-    )
+    status = Status.INTERRUPTED
+    with run.until_interrupted():
+        steps = islice(descend(descent, settings.density, settings.tol), settings.max_iterations)
+        status = run.descend(
+            "guarded descent, distances",
+            steps,
+            lambda: descent.distortion,
+            lambda: to_given_unit(descent.uv, piece.exponent),
+        )
+    return run.result(descent.uv, piece.F, status, loops=piece.loops, linear_solver=descent.linear_solver)
 
 
 def choose_sampling(rings: int) -> Sampling:
@@ -187,24 +176,6 @@ def fit_scale(uv: FloatArray, distances: SurfaceDistances, F: IntArray, loops: l
         return scaled
     # Rounding inverts very thin triangles; scaling by a power of two does not change their signs.
     return np.ldexp(uv, int(np.rint(np.log2(scale))))
-
-
-def run_descent(descent: SurfaceDescent, settings: Settings, report: Callable[[float], None]) -> Status:
-    """Take steps until converged, stalled or interrupted by Ctrl-C; return the status.
-
-    ``report`` is called with the energy at the start and after every step.
-    """
-    try:
-        report(descent.distortion)
-        for _ in range(settings.max_iterations):
-            with np.errstate(all="ignore"):
-                outcome = descent.step(settings.tol)
-            report(descent.distortion)
-            if outcome is not None and not descent.relax_barrier():
-                return outcome
-    except KeyboardInterrupt:
-        return Status.INTERRUPTED
-    return Status.STILL_FALLING
 
 
 class DistancePairs:

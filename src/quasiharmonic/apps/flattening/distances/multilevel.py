@@ -12,7 +12,7 @@ meshes have errors of 1 to 2 %. If a map can nearly keep distances, a descent on
 
 from __future__ import annotations
 
-import time
+from itertools import islice
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from quasiharmonic.apps.flattening.distances.distance_descent import (
     DistancePairs,
     choose_sampling,
     fit_scale,
-    run_descent,
 )
 from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy
 from quasiharmonic.apps.flattening.layout import to_given_unit
@@ -36,12 +35,12 @@ from quasiharmonic.apps.flattening.multilevel.coarse_flattening import (
 from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
 from quasiharmonic.apps.flattening.multilevel.local_smoothing import smooth_map, thick_energy
 from quasiharmonic.apps.flattening.piece import Piece, Settings
-from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.distances import SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Step
+from quasiharmonic.problem.result import MapResult, Snapshot, Status
+from quasiharmonic.problem.run import Run
 
 # Minimum length of the requested rings, in rings of the coarse mesh.
 _RINGS = 3.0
@@ -58,7 +57,7 @@ def lower_coarse_distance_error(piece: Piece, rings: int, settings: Settings, *,
     no coarser mesh, or rounding prevents a map. Ctrl-C outside the distance descent raises KeyboardInterrupt; there it
     only ends the descent.
     """
-    began = time.perf_counter()
+    run = Run(settings.callback)
     n, solver = len(piece.V), settings.linear_solver
     hierarchy = Hierarchy(piece.V, piece.F, piece.loops, COARSEST)
     stop = hierarchy.coarsest(max(least, n * (_RINGS / rings) ** 2))
@@ -72,39 +71,25 @@ def lower_coarse_distance_error(piece: Piece, rings: int, settings: Settings, *,
     barrier = thick_energy(V, level.F)
     barrier.energy = SymmetricDirichlet()
     value = barrier.value(in_units(uv, 0))
-    middle = time.perf_counter()
-    stages = [Stage("start, coarse", 0, middle - began, (0, 0), (value, value))]
+    run.add_stage("start, coarse", energy=(value, value))
 
     distances = _measure_distances(hierarchy, level, rings)
     with np.errstate(all="ignore"):
         energy = DistanceEnergy(distances, barrier, len(V))
         start = fit_scale(uv, distances, level.F, level.loops)
         descent = SurfaceDescent(energy, start, solver, rim=Rim(level.loops), pairs=DistancePairs(energy))
-    history: list[Step] = []
-
-    def report(value: float) -> None:
-        history.append(Step(len(history), 0, value))
-        if settings.callback is not None:
-            settings.callback(history[-1])
-
-    status = run_descent(descent, settings, report)
+    status = Status.INTERRUPTED
+    with run.until_interrupted():
+        steps = islice(descend(descent, settings.density, settings.tol), settings.max_iterations)
+        status = run.descend("guarded descent, distances, coarse", steps, lambda: descent.distortion)
     found = prolong_map(hierarchy, level, hierarchy.level(0), descent.uv, solver)
     if found is None:
         return None
     # Smooth once more than other maps; on a cortex this lowers the mean error by 1 %.
     found = smooth_map(piece.V, piece.F, piece.loops, found, solver)
-    seconds, energies = time.perf_counter() - middle, (history[0].energy, descent.distortion)
-    stages.append(Stage("guarded descent, distances, coarse", len(history) - 1, seconds, (0, 0), energies))
-    return MapResult(
-        uv=found,
-        status=status,
-        certificate=certify(piece.F, found, loops=piece.loops),
-        stages=stages,
-        history=history,
-        path=[Snapshot(history[-1].iteration, to_given_unit(found, piece.exponent))] if settings.record_every else [],
-        linear_solver=descent.linear_solver,
-        seconds=seconds,
-    )
+    if settings.record_every:
+        run.path.append(Snapshot(run.history[-1].iteration, to_given_unit(found, piece.exponent)))
+    return run.result(found, piece.F, status, loops=piece.loops, linear_solver=descent.linear_solver)
 
 
 def _measure_distances(hierarchy: Hierarchy, level: Level, rings: int) -> SurfaceDistances:

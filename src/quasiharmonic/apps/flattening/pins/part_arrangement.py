@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.connected_parts import Part, combine_statuses, name_part, unite_parts
+from quasiharmonic.apps.flattening.connected_parts import Part, name_part, unite_parts
 from quasiharmonic.apps.flattening.piece import Settings
 from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
 from quasiharmonic.apps.flattening.pins.pin_search import PinSearch
@@ -94,14 +94,8 @@ def flatten_pinned_parts(
 def _combine(union: Part, results: Sequence[MapResult]) -> MapResult:
     """Combine the maps of all parts, which may overlap."""
     uv = np.concatenate([result.uv for result in results])
-    return MapResult(
-        uv=uv,
-        status=combine_statuses(result.status for result in results),
-        certificate=certify(union.piece.F, uv, loops=union.piece.loops),
-        stages=[stage for result in results for stage in result.stages],
-        history=[step for result in results for step in result.history],
-        linear_solver=results[0].linear_solver,
-    )
+    certificate = certify(union.piece.F, uv, loops=union.piece.loops)
+    return replace(MapResult.combine(results, uv, certificate), path=[], diagnosis=None)
 
 
 def _separate(run: PinSearch, union: Part, results: Sequence[MapResult], found: MapResult) -> MapResult:
@@ -121,7 +115,7 @@ def _separate(run: PinSearch, union: Part, results: Sequence[MapResult], found: 
     last = run.result()
     if not last.certificate.bijective and last.status is not Status.INTERRUPTED:
         last = replace(last, status=Status.INJECTIVE if last.certificate.injective else last.status, diagnosis=None)
-    return replace(last, stages=found.stages + last.stages, history=found.history + last.history)
+    return last.after(found)
 
 
 def _order_by_pins(maps: Sequence[FloatArray], fixed: IntArray) -> list[int]:

@@ -15,7 +15,6 @@ harmless.
 from __future__ import annotations
 
 import itertools
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +31,8 @@ from quasiharmonic.geometry.mesh.refinement import split_edges
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis, Kind
-from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.methods import RandomRestarts, Untangling, VectorAdam
 from quasiharmonic.solver.search.stages import CoarseToFine, Stages
@@ -76,12 +76,11 @@ def flatten_pinned(
     KeyboardInterrupt before there is any bijective map, with or without pins. ValueError if a rest triangle has no
     area.
     """
-    began = time.perf_counter()
-    run = PinSearch(piece, fixed, target, settings, weights)
+    search = PinSearch(piece, fixed, target, settings, weights)
     # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never accepted.
     with np.errstate(all="ignore"):
-        run.run(start)
-    return replace(run.result(), seconds=time.perf_counter() - began)
+        search.run(start)
+    return search.result()
 
 
 def move_onto_pins(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
@@ -163,9 +162,7 @@ class PinSearch:
         self._solver = ""
         self.status = Status.STALLED
         self._diagnosis: Diagnosis | None = None
-        self._stages: list[Stage] = []
-        self._history: list[Step] = []
-        self._path: list[Snapshot] = []
+        self._run = Run(settings.callback, settings.record_every)
 
     @property
     def pins(self) -> tuple[IntArray, FloatArray]:
@@ -186,7 +183,7 @@ class PinSearch:
         solver = self._settings.linear_solver
         rough = Settings("symmetric-dirichlet", _TOLERANCE, _MAX_STEPS, solver, callback=None, record_every=0)
         flat = Flattening(piece, rough, None).run(None if start is None else np.ldexp(start, -piece.exponent))
-        self._stages += flat.stages
+        self._run.stages += flat.stages
         self._solver = flat.linear_solver
         if flat.status is Status.INTERRUPTED:
             self.status = Status.INTERRUPTED
@@ -237,8 +234,8 @@ class PinSearch:
                 linear_solver=settings.linear_solver,
                 callback=settings.callback,
             )
-            self._stages += found.stages
-            self._history += found.history
+            self._run.stages += found.stages
+            self._run.history += found.history
             before = self.certificate
             uv = found.uv[:n]
             here = certify(piece.F, uv, loops=piece.loops)
@@ -285,32 +282,20 @@ class PinSearch:
 
     def lower_distortion(self) -> None:
         """Lower the distortion of a bijective map with only the pins fixed."""
-        began, settings = time.perf_counter(), self._settings
+        settings = self._settings
         descent = SurfaceDescent(
             self._energy, self._uv, settings.linear_solver, self._fixed, rim=Rim(self._piece.loops)
         )
         self._solver = descent.linear_solver
-        first, steps, status = descent.distortion, 0, Status.STILL_FALLING
-        try:
-            self._report(descent)
-            course = descend(descent, settings.density, settings.tol)
-            for steps, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):  # noqa: B007
-                status = outcome or status
-                self._report(descent)
-        except KeyboardInterrupt:
-            status = Status.INTERRUPTED
+        self.status = Status.INTERRUPTED
+        with self._run.until_interrupted():
+            self.status = self._run.descend(
+                f"guarded descent, {settings.name}",
+                itertools.islice(descend(descent, settings.density, settings.tol), settings.max_iterations),
+                lambda: descent.distortion,
+                lambda: self._to_target_unit(descent.uv),
+            )
         self.keep(descent.uv)
-        self.status = status
-        seconds, energies = time.perf_counter() - began, (first, descent.distortion)
-        self._stages.append(Stage(f"guarded descent, {settings.name}", steps, seconds, (0, 0), energies))
-
-    def _report(self, descent: SurfaceDescent) -> None:
-        settings, number = self._settings, len(self._history)
-        self._history.append(Step(number, 0, descent.distortion))
-        if settings.record_every and number % settings.record_every == 0:
-            self._path.append(Snapshot(number, self._to_target_unit(descent.uv)))
-        if settings.callback is not None:
-            settings.callback(self._history[-1])
 
     def keep(self, uv: FloatArray) -> None:
         """Store a map in units of ``2 ** exponent``, with the fixed vertices set to their target positions."""
@@ -327,17 +312,13 @@ class PinSearch:
     def result(self) -> MapResult:
         """Return the result for the current map."""
         uv = self._to_target_unit(self._uv)
-        certificate = certify(self._piece.F, uv, loops=self._piece.loops)
-        status = self.status
-        if certificate.injective and not certificate.bijective and status in _UNDECIDED:
-            status = Status.INJECTIVE
-        return MapResult(
-            uv=uv,
-            status=status,
-            certificate=certificate,
-            stages=self._stages,
-            history=self._history,
-            path=self._path,
+        result = self._run.result(
+            uv,
+            self._piece.F,
+            self.status,
+            loops=self._piece.loops,
             diagnosis=self._diagnosis,
             linear_solver=self._solver,
         )
+        undecided = result.injective and not result.certificate.bijective and self.status in _UNDECIDED
+        return replace(result, status=Status.INJECTIVE) if undecided else result

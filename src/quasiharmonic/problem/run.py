@@ -1,0 +1,138 @@
+"""The record of a call while it runs: history, stages, recorded maps, clock, and how it ends.
+
+A descent is an iterator: it changes its map and yields a status, or None, after every step. `Run.descend` takes the
+steps and records each. Ctrl-C is caught here and nowhere else in the library: code that keeps the work so far runs in
+`Run.until_interrupted`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+
+class Run:
+    """Record of the steps and stages of a call.
+
+    Parameters
+    ----------
+    callback : callable, optional
+        Called with every `Step`. It may raise `KeyboardInterrupt`, which ends the run as Ctrl-C does.
+    record_every : int
+        Keep the map of every ``record_every``-th step; none if 0.
+    first : int
+        Number of the first step.
+    time_limit : float, optional
+        Seconds after which the next step ends the run as Ctrl-C does.
+
+    Attributes
+    ----------
+    history : list of Step
+    path : list of Snapshot
+    stages : list of Stage
+    interrupted : bool
+        Whether Ctrl-C, the callback or the time limit ended a block of `until_interrupted`.
+    """
+
+    def __init__(
+        self,
+        callback: Callable[[Step], object] | None = None,
+        record_every: int = 0,
+        *,
+        first: int = 0,
+        time_limit: float | None = None,
+    ) -> None:
+        self._callback, self._record_every, self._first, self._time_limit = callback, record_every, first, time_limit
+        self._began = self._stage_began = time.perf_counter()
+        self.history: list[Step] = []
+        self.path: list[Snapshot] = []
+        self.stages: list[Stage] = []
+        self.interrupted = False
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since the run began."""
+        return time.perf_counter() - self._began
+
+    @contextmanager
+    def until_interrupted(self) -> Iterator[None]:
+        """Run a block until it ends or is interrupted; the caller continues after it in both cases."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.interrupted = True
+
+    def record(self, inverted: int, energy: float, uv: Callable[[], FloatArray] | None = None) -> None:
+        """Record a step; ``uv`` returns its map (n, 2), for ``path``. Raise KeyboardInterrupt after the time limit."""
+        step = Step(self._first + len(self.history), inverted, energy)
+        self.history.append(step)
+        if uv is not None and self._record_every and step.iteration % self._record_every == 0:
+            self.path.append(Snapshot(step.iteration, uv()))
+        if self._callback is not None:
+            self._callback(step)
+        if self._time_limit is not None and self.seconds > self._time_limit:
+            raise KeyboardInterrupt
+
+    def add_stage(
+        self,
+        name: str,
+        *,
+        n_iterations: int = 0,
+        inverted: tuple[int, int] = (0, 0),
+        energy: tuple[float, float],
+        kept: bool = True,
+    ) -> None:
+        """Add a stage that has just ended; it began when the stage before it ended."""
+        now = time.perf_counter()
+        self.stages.append(Stage(name, n_iterations, now - self._stage_began, inverted, energy, kept))
+        self._stage_began = now
+
+    def descend(
+        self,
+        name: str,
+        steps: Iterable[Status | None],
+        energy: Callable[[], float],
+        uv: Callable[[], FloatArray] | None = None,
+    ) -> Status:
+        """Take the steps of a descent among injective maps as one stage, and record the start and every step.
+
+        ``energy`` and ``uv`` return those of the current map. Return the status of the last step, ``STILL_FALLING`` if
+        it had none. The stage is added even if the steps raise an exception.
+        """
+        done, first, status = len(self.history), energy(), Status.STILL_FALLING
+        try:
+            self.record(0, first, uv)
+            for outcome in steps:
+                status = outcome or status
+                self.record(0, energy(), uv)
+        finally:
+            taken = max(len(self.history) - done - 1, 0)
+            self.add_stage(name, n_iterations=taken, energy=(first, energy()))
+        return status
+
+    def judge_last_stage(self, kept: bool) -> None:
+        """Replace whether the result of the last stage was kept."""
+        self.stages[-1] = replace(self.stages[-1], kept=kept)
+
+    def result(
+        self, uv: FloatArray, F: IntArray, status: Status, *, loops: list[IntArray] | None = None, **further: Any
+    ) -> MapResult:
+        """Certify a map and return it as the result; ``further`` are other fields of `MapResult`."""
+        certificate = certify(F, uv, loops=loops)
+        return MapResult(
+            uv=uv,
+            status=status,
+            certificate=certificate,
+            stages=self.stages,
+            history=self.history,
+            path=self.path,
+            seconds=self.seconds,
+            **further,
+        )
