@@ -39,7 +39,7 @@ import numpy as np
 from problems import ADVERSARIAL, FAMILIES, make, parse
 from quasiharmonic import Problem, Status, solve
 from quasiharmonic.solver.construction.simplicity import is_simple
-from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.solver.search.stages import STRATEGIES
 from speed import machine
 
 Record = dict[str, Any]

@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 
 from quasiharmonic import Descent, MapResult, Problem, distortion, harmonise, io, polish, solve
 from quasiharmonic.solver.methods import LBFGS, Alternating, Newton, Untangling, VectorAdam
-from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.solver.search.stages import STRATEGIES
 from speed import machine
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))

@@ -14,7 +14,7 @@ from quasiharmonic.linsolve import base, laplacian
 from quasiharmonic.problem import domain
 from quasiharmonic.solver import mapping
 from quasiharmonic.solver.field.objective import Iterate, Objective
-from quasiharmonic.solver.search import coarse, search, solving, stage_run
+from quasiharmonic.solver.search import coarse, record, search
 
 # The available clocks: wall time or CPU time.
 clock = time.perf_counter
@@ -51,8 +51,8 @@ _CLOCKED: tuple[tuple[Any, str, str], ...] = (
     (base.LinearSolver, "solve", "solve"),
     (Iterate, "_sweep", "gradient"),
     (search.Search, "run", "optimiser"),
-    (solving, "certify", "certificate"),
-    (stage_run, "triangle_signs", "certificate"),
+    (search, "certify", "certificate"),
+    (record, "triangle_signs", "certificate"),
 )
 
 

@@ -42,7 +42,7 @@ from quasiharmonic import Descent, Problem, boundary_loops, io, is_injective, so
 from quasiharmonic.linsolve import available
 from quasiharmonic.solver import mapping
 from quasiharmonic.solver.methods import VectorAdam
-from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.solver.search.stages import STRATEGIES
 from quasiharmonic.targets import arc_length, letter, rectangle
 from quasiharmonic.util.arrays import FloatArray, IntArray
 

@@ -21,7 +21,7 @@ import problems
 from evaluation import FEASIBLE
 from quasiharmonic import MapResult, Problem, distortion, solve
 from quasiharmonic.problem.result import Stage
-from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.solver.search.stages import STRATEGIES
 from speed import machine
 
 

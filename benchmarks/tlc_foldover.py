@@ -24,7 +24,7 @@ import numpy as np
 import problems
 from quasiharmonic import Problem, distortion, polish, solve
 from quasiharmonic.solver.methods import Untangling
-from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.solver.search.stages import STRATEGIES
 from quasiharmonic.util.arrays import FloatArray
 
 RECORDS = Path(__file__).parent / "records"

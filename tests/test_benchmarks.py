@@ -17,7 +17,7 @@ import small_problems
 import speed
 import tetrahedral_problems
 from quasiharmonic import Problem, boundary_loops, certify, certify_tetrahedra, injective_tetrahedra, solve
-from quasiharmonic.solver.search.strategy import stages_of
+from quasiharmonic.solver.search.stages import stages_of
 from quasiharmonic.util import kernels
 
 pytestmark = pytest.mark.long

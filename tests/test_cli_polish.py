@@ -70,10 +70,10 @@ class TestPolish:
     def test_energy_names_are_those_of_the_library(self):
         from quasiharmonic import linsolve
         from quasiharmonic.energies.polishing import ENERGIES
-        from quasiharmonic.solver.search import harmonising, strategy
+        from quasiharmonic.solver.search import harmonising, stages
         from quasiharmonic.ui.cli import arguments
 
-        assert tuple(strategy.STRATEGIES) == arguments.STRATEGIES
+        assert tuple(stages.STRATEGIES) == arguments.STRATEGIES
         assert set(arguments.ENERGIES) == set(ENERGIES)
         assert set(arguments.HARMONISED) == set(harmonising.ENERGIES)
         assert set(arguments.LINEAR_SOLVERS) - {"auto"} == set(linsolve.BACKENDS)

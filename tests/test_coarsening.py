@@ -19,8 +19,7 @@ from quasiharmonic.problem import Domain
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.search import search
 from quasiharmonic.solver.search.coarse import CoarseMesh, coarse_mesh
-from quasiharmonic.solver.search.stages import CoarseToFine
-from quasiharmonic.solver.search.strategy import speed
+from quasiharmonic.solver.search.stages import CoarseToFine, speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter
 from shared.distinct_steps import DistinctSteps

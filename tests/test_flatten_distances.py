@@ -17,7 +17,7 @@ from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.distances.distance_descent import DistancePairs, lower_distance_error
 from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy
 from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
-from quasiharmonic.apps.flattening.piece import Piece, Settings
+from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
 from quasiharmonic.energies.distances import surface_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
@@ -254,6 +254,10 @@ def test_record_stores_intermediate_maps(dome):
 # --- by way of a coarse mesh
 
 
+# Rings of the pairs, and vertices of the coarse mesh.
+RINGS, LEAST = 13, 800
+
+
 @pytest.fixture(scope="module")
 def folded():
     """A square with hills and valleys, of 4,600 triangles."""
@@ -263,7 +267,7 @@ def folded():
 
 @pytest.fixture(scope="module")
 def asked():
-    return Settings("symmetric-dirichlet", 1e-3, 100, "auto", None, 0)
+    return DistanceOptions(rings=RINGS)
 
 
 @pytest.fixture(scope="module")
@@ -271,18 +275,14 @@ def coarse(folded, asked):
     """The result by way of a coarse mesh, with its record, and the steps passed to the callback."""
     steps = []
     settings = replace(asked, callback=steps.append, record_every=1)
-    return lower_coarse_distance_error(folded, RINGS, settings, least=LEAST), steps
-
-
-# Rings of the pairs, and vertices of the coarse mesh.
-RINGS, LEAST = 13, 800
+    return lower_coarse_distance_error(folded, settings, least=LEAST), steps
 
 
 @pytest.mark.long
 def test_a_coarse_mesh_helps_the_fine_one(folded, asked, coarse):
     found, _ = coarse
     plain = flatten(folded.V, folded.F)
-    whole = lower_distance_error(folded, plain.uv, RINGS, asked)
+    whole = lower_distance_error(folded, plain.uv, asked)
     sample = surface_distances(folded.V, folded.F, rings=RINGS, sources=60)
     errors = [sample.error(uv) for uv in (plain.uv, whole.uv, found.uv)]
     assert found.status is Status.POLISHED
@@ -293,12 +293,12 @@ def test_a_coarse_mesh_helps_the_fine_one(folded, asked, coarse):
     assert errors[2].rms < errors[0].rms
     assert errors[2].scale == pytest.approx(1, abs=0.03)
     assert [stage.name for stage in found.stages] == ["start, coarse", "guarded descent, distances, coarse"]
-    assert np.array_equal(lower_coarse_distance_error(folded, RINGS, asked, least=LEAST).uv, found.uv)
+    assert np.array_equal(lower_coarse_distance_error(folded, asked, least=LEAST).uv, found.uv)
 
 
 def test_too_few_rings_for_a_coarser_mesh(folded, asked):
-    assert lower_coarse_distance_error(folded, 3, asked, least=LEAST) is None
-    assert lower_coarse_distance_error(folded, 20, asked, least=len(folded.V)) is None
+    assert lower_coarse_distance_error(folded, replace(asked, rings=3), least=LEAST) is None
+    assert lower_coarse_distance_error(folded, replace(asked, rings=20), least=len(folded.V)) is None
 
 
 @pytest.mark.long
@@ -318,7 +318,7 @@ def test_ctrl_c_on_the_coarse_mesh_returns_a_map_of_the_surface(folded, asked):
         if step.iteration == 1:
             raise KeyboardInterrupt
 
-    found = lower_coarse_distance_error(folded, RINGS, replace(asked, callback=stop), least=LEAST)
+    found = lower_coarse_distance_error(folded, replace(asked, callback=stop), least=LEAST)
     assert found.status is Status.INTERRUPTED
     assert len(found.uv) == len(folded.V)
     assert certify(folded.F, found.uv).bijective

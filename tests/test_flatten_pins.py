@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Status, certify, flatten
-from quasiharmonic.apps.flattening.piece import Piece, Settings
+from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
 from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, move_onto_pins
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
@@ -250,7 +250,7 @@ def test_a_map_that_overlaps_itself_has_the_more_specific_status(ended, told):
     V, F = grid(40, 2)
     z = (1 + V[:, 1]) * np.exp(-2.4j * np.pi * V[:, 0])
     uv = np.stack([z.real, z.imag], axis=1)
-    settings = Settings("symmetric-dirichlet", 1e-4, 10, "auto", None, 0)
+    settings = FlattenOptions(max_iterations=10)
     piece = Piece(V, F)
     run = PinSearch(piece, np.array([5]), np.ldexp(uv[5:6], piece.exponent), settings, None)
     run.keep(uv)

@@ -16,8 +16,8 @@ from quasiharmonic.solver.field.objective_batch import Patterns
 from quasiharmonic.solver.methods import Newton, VectorAdam
 from quasiharmonic.solver.search import first_stage, many
 from quasiharmonic.solver.search.first_stage import run_first_stage
-from quasiharmonic.solver.search.options import SearchOptions
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from quasiharmonic.util.options import MapOptions
 from shared.exact import inverted
 from shared.infeasible_problems import OBSTRUCTED
 from shared.meshes import boundary_of, random_annulus
@@ -117,7 +117,7 @@ class TestAgreement:
         for problems in (ellipses(2) + stars, [Problem(V, F, fixed, target).with_target(one[3]) for one in turned]):
             posed = [given if isinstance(given, Problem) else Problem(*given) for given in problems]
             descent = VectorAdam(iterations=30, relocation=True)
-            found = run_first_stage(posed, descent, Patterns("auto"), SearchOptions(max_iterations=1000))
+            found = run_first_stage(posed, descent, Patterns("auto"), MapOptions(max_iterations=1000))
             assert max(len(one.history) for one in found) > 4
             for problem, one in zip(posed, found, strict=True):
                 alone = solve(problem, strategy=[descent])
@@ -201,7 +201,7 @@ class TestAgreement:
 
     def test_rounding_errors_of_one_problem_do_not_affect_others(self, monkeypatch):
         problems = [Problem(*arrays) for arrays in ellipses(5)]
-        patterns, options = Patterns("auto"), SearchOptions(max_iterations=100)
+        patterns, options = Patterns("auto"), MapOptions(max_iterations=100)
 
         def defeated(pattern, stiffness):
             raise NotPositiveDefinite("for once")

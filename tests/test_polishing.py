@@ -10,11 +10,12 @@ from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.energies import ARAP, MIPS, AreaPreserving, conformal_area_blend
 from quasiharmonic.energies.newton import map_model
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
-from quasiharmonic.energies.polishing import ENERGIES, PolishOptions, polish_map
+from quasiharmonic.energies.polishing import ENERGIES, polish_map
 from quasiharmonic.energies.springs import MassSpring
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Domain
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
+from quasiharmonic.util.options import PolishOptions
 from shared.distinct_steps import DistinctSteps
 from shared.meshes import bend, boundary_of, lift
 from shared.polygons import circle

@@ -12,7 +12,7 @@ from quasiharmonic import Problem, Status, boundary_loops, certify, injective_ma
 from quasiharmonic.solver.construction import constructing, cutting
 from quasiharmonic.solver.methods import Newton, RandomRestarts, VectorAdam
 from quasiharmonic.solver.refine import attempts as climbing
-from quasiharmonic.solver.search.strategy import quick_stages, speed, without_restarts
+from quasiharmonic.solver.search.stages import quick_stages, speed, without_restarts
 from quasiharmonic.surfaces import disk
 from shared.commands import run
 from shared.simple_targets import onto_polygon, with_holes
@@ -169,7 +169,7 @@ def test_no_restarts_after_a_constructed_map(monkeypatch):
     """Quick stages, then the construction, then the whole search with a time limit and without random restarts."""
     problem, searches = onto_polygon(9, "grid"), []
 
-    def search(on, options):
+    def search(on, options, repairs):
         searches.append((len(on.F), options.strategy, options.max_iterations))
         return search_map(on, replace(options, strategy=[VectorAdam(iterations=1)], max_iterations=1))
 
@@ -290,10 +290,10 @@ def test_attempts_share_one_budget(monkeypatch):
     (loop,) = boundary_loops(F, len(V))
     search_map, budgets = climbing.search_map, []
 
-    def search(on, options):
-        budgets.append((options.max_iterations, options.failed_repairs.left))
-        options.failed_repairs.left = 0
-        return search_map(on, replace(options, strategy=[VectorAdam(iterations=5)], failed_repairs=None))
+    def search(on, options, repairs):
+        budgets.append((options.max_iterations, repairs.left))
+        repairs.left = 0
+        return search_map(on, replace(options, strategy=[VectorAdam(iterations=5)]))
 
     monkeypatch.setattr(climbing, "search_map", search)
     result = solve(Problem(V, F, loop, V[loop]), refine=True, max_iterations=12)

@@ -11,7 +11,7 @@ from quasiharmonic import Problem, boundary_loops, injective_maps, quasi_harmoni
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.methods.relocation import RetrySchedule, highest_positions, relocate, relocate_each
-from quasiharmonic.solver.search.strategy import paper, speed
+from quasiharmonic.solver.search.stages import paper, speed
 from quasiharmonic.surfaces import random_delaunay
 
 

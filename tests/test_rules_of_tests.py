@@ -99,7 +99,7 @@ def test_rules(path):
         "from quasiharmonic.solver.mapping import _hidden",
         "import quasiharmonic._hidden",
         "result._hidden()",
-        "monkeypatch.setattr('quasiharmonic.solver.search.solving._hidden', 1)",
+        "monkeypatch.setattr('quasiharmonic.solver.search.search._hidden', 1)",
         "patch.setattr(solving, '_hidden', 1)",
     ],
 )

@@ -18,9 +18,8 @@ from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.solver.methods import LBFGS, Alternating, LocalRepair, Newton, RandomRestarts, Untangling, VectorAdam
 from quasiharmonic.solver.methods.untangling import untangle
-from quasiharmonic.solver.search import search
-from quasiharmonic.solver.search.stages import CoarseToFine, IfManyInverted
-from quasiharmonic.solver.search.strategy import quick_stages, speed
+from quasiharmonic.solver.search import stages
+from quasiharmonic.solver.search.stages import CoarseToFine, IfManyInverted, quick_stages, speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from shared.infeasible_problems import OBSTRUCTED
 from shared.meshes import boundary_of, signed_areas
@@ -204,7 +203,7 @@ class TestNoMap:
     def test_a_stage_for_many_inverted_triangles_is_skipped_if_few_are_inverted(self, many, monkeypatch):
         problem = Problem(*turned_ring(180))
         if not many:
-            monkeypatch.setattr(search, "MANY_INVERTED", 1.0)
+            monkeypatch.setattr(stages, "MANY_INVERTED", 1.0)
         strategy = [VectorAdam(iterations=1), IfManyInverted(Newton(iterations=2, resume=True))]
         result = solve(problem, strategy=strategy)
         assert result.stages[0].inverted[1] > 0.02 * len(problem.F)

@@ -28,8 +28,7 @@ from quasiharmonic.solver.methods.local_repair import Patch, untangle_fully
 from quasiharmonic.solver.methods.random_restarts import left_of, nearest
 from quasiharmonic.solver.methods.reweighting import reweight
 from quasiharmonic.solver.methods.untangling import GRADINGS, Regularised, untangle
-from quasiharmonic.solver.search.stages import TentativeStage
-from quasiharmonic.solver.search.strategy import STRATEGIES, stages_of
+from quasiharmonic.solver.search.stages import STRATEGIES, TentativeStage, stages_of
 from quasiharmonic.surfaces import grid
 from shared.descent import path
 from shared.meshes import bend, boundary_of, lift

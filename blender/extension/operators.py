@@ -13,7 +13,7 @@ from quasiharmonic.apps.atlas import seam_cuts
 from quasiharmonic.apps.atlas.mapped_atlas import each_island
 from quasiharmonic.apps.repair.fitting import fit_boundary
 from quasiharmonic.atlas import AtlasVerdict, Island, SeamedMesh
-from quasiharmonic.energies.polishing import PolishOptions, polish_result
+from quasiharmonic.energies.polishing import polish_result
 from quasiharmonic.geometry.exact.convexity import find_concave
 from quasiharmonic.geometry.exact.triangles import find_overlapping
 from quasiharmonic.geometry.mesh.topology import boundary_edges
@@ -22,6 +22,7 @@ from quasiharmonic.results import Step
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 from quasiharmonic.util.arrays import IntArray, count_of
+from quasiharmonic.util.options import PolishOptions
 
 from . import outline, pins, surface
 from .job import Work, Working, find_objects

@@ -11,12 +11,13 @@ import numpy as np
 from quasiharmonic.apps.atlas.mapped_atlas import each_island, fit_in_place
 from quasiharmonic.apps.flattening.free_boundary import flatten
 from quasiharmonic.apps.flattening.layout import place_in_row
-from quasiharmonic.energies.polishing import PolishOptions, polish_map
+from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.options import PolishOptions
 
 from .surface import Refused, Surface
 

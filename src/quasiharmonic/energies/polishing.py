@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,13 +34,11 @@ from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    check_callback,
-    check_integer,
-    check_non_negative,
     describe,
     map_array,
     names_of,
 )
+from quasiharmonic.util.options import MapOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
 #: Polishing steps of `smooth`. On about 10,000 triangles they take a few times as long as the first map and go nearly
@@ -57,34 +56,23 @@ ENERGIES: dict[str, Energy] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class PolishOptions:
-    """Options of `polish`, as the functions inside the library pass them on."""
+class PolishKeywords(TypedDict, total=False):
+    """Types of the options of `polish`."""
 
-    energy: str | Energy = "symmetric-dirichlet"
-    weights: ArrayLike | None = None
-    max_iterations: int = 200
-    tol: float = 1e-4
-    linear_solver: str = "auto"
-    callback: Callable[[Step], object] | None = None
-    slide: bool | BoundaryCurves = False
+    energy: str | Energy
+    weights: ArrayLike | None
+    max_iterations: int
+    tol: float
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+    slide: bool | BoundaryCurves
 
 
 @accepts_mesh
 @reports_progress
+@takes(PolishOptions, PolishKeywords)
 def polish(
-    V: ArrayLike,
-    F: ArrayLike,
-    uv: ArrayLike,
-    *,
-    fixed: ArrayLike | None = None,
-    energy: str | Energy = "symmetric-dirichlet",
-    weights: ArrayLike | None = None,
-    max_iterations: int = 200,
-    tol: float = 1e-4,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
-    slide: bool | BoundaryCurves = False,
+    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, fixed: ArrayLike | None = None, **options: Unpack[PolishKeywords]
 ) -> MapResult:
     """Lower the distortion of an injective map; every step is injective, certified exactly.
 
@@ -164,16 +152,7 @@ def polish(
     began = time.perf_counter()
     domain = Domain(V, F, fixed)
     domain.check_boundary_fixed()
-    options = PolishOptions(
-        energy=energy,
-        weights=weights,
-        max_iterations=max_iterations,
-        tol=tol,
-        linear_solver=linear_solver,
-        callback=callback,
-        slide=slide,
-    )
-    return replace(polish_map(domain, uv, options), seconds=time.perf_counter() - began)
+    return replace(polish_map(domain, uv, PolishOptions(**options)), seconds=time.perf_counter() - began)
 
 
 def polish_map(
@@ -185,11 +164,8 @@ def polish_map(
     are measured in place of the domain's triangles. They must be positive in ``uv`` and stay so. They may overlap, but
     must cover the surface evenly.
     """
-    chosen, linear_solver, callback = find_energy(options.energy), options.linear_solver, options.callback
-    check_integer("max_iterations", options.max_iterations, minimum=0)
-    check_non_negative("tol", options.tol)
-    check_callback(callback)
-    run = Run(callback)
+    chosen, linear_solver = find_energy(options.energy), options.linear_solver
+    run = Run(options.callback)
     start = check_injective(domain, uv, "polish needs an injective map")
     track = None if options.slide is False else move_boundary(options.slide, domain, start)
     if track is not None:
@@ -224,6 +200,16 @@ def polish_result(
     """Polish the injective map of a result with `polish_map`, appending to its stages and history."""
     further = polish_map(problem.domain, result.uv, options, triangles=triangles).after(result)
     return replace(further, refined=result.refined, refinement_attempts=result.refinement_attempts)
+
+
+def polish_options(options: MapOptions) -> PolishOptions:
+    """Return the options of the polish that follows a search, with the energy that they name."""
+    return PolishOptions(
+        energy=find_energy(options.polish),
+        linear_solver=options.linear_solver,
+        callback=options.callback,
+        slide=options.slide,
+    )
 
 
 def find_energy(energy: str | Energy) -> Energy:

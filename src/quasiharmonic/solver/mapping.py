@@ -8,13 +8,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import get_args
+from typing import TypedDict, Unpack, get_args
 
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
-from quasiharmonic.energies.polishing import PolishOptions, find_energy, polish_result
+from quasiharmonic.energies.polishing import polish_options, polish_result
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
@@ -22,23 +22,34 @@ from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH, beltrami_coefficients
-from quasiharmonic.solver.search.options import MAX_ITERATIONS, SearchOptions
-from quasiharmonic.solver.search.solving import search_map
+from quasiharmonic.solver.search.search import search_map
 from quasiharmonic.solver.search.stages import Stages
 from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,
-    check_bool,
-    check_callback,
     check_choice,
-    check_integer,
-    map_array,
 )
+from quasiharmonic.util.options import MapOptions, takes
 from quasiharmonic.util.progress import reports_progress
+
+
+class MapKeywords(TypedDict, total=False):
+    """Types of the options of `injective_map` and `solve`."""
+
+    strategy: str | Stages
+    polish: str | Energy | None
+    start: ArrayLike | None
+    max_iterations: int
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+    record_every: int
+    slide: bool | BoundaryCurves
+    refine: bool
 
 
 @accepts_mesh
 @reports_progress
+@takes(MapOptions, MapKeywords)
 def injective_map(
     V: ArrayLike,
     F: ArrayLike,
@@ -46,15 +57,7 @@ def injective_map(
     target: ArrayLike,
     *,
     reference: Reference | None = None,
-    strategy: str | Stages = "speed",
-    polish: str | Energy | None = None,
-    start: ArrayLike | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
-    record_every: int = 0,
-    slide: bool | BoundaryCurves = False,
-    refine: bool = False,
+    **options: Unpack[MapKeywords],
 ) -> MapResult:
     """Map a triangle mesh into the plane without inverted triangles.
 
@@ -129,35 +132,13 @@ def injective_map(
     (True, True)
     """
     began = time.perf_counter()
-    result = solve(
-        Problem(V, F, fixed, target, reference=reference),
-        strategy=strategy,
-        polish=polish,
-        start=start,
-        max_iterations=max_iterations,
-        linear_solver=linear_solver,
-        callback=callback,
-        record_every=record_every,
-        slide=slide,
-        refine=refine,
-    )
+    result = solve(Problem(V, F, fixed, target, reference=reference), **options)
     return replace(result, seconds=time.perf_counter() - began)
 
 
 @reports_progress
-def solve(
-    problem: Problem,
-    *,
-    strategy: str | Stages = "speed",
-    polish: str | Energy | None = None,
-    start: ArrayLike | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
-    record_every: int = 0,
-    slide: bool | BoundaryCurves = False,
-    refine: bool = False,
-) -> MapResult:
+@takes(MapOptions, MapKeywords)
+def solve(problem: Problem, **options: Unpack[MapKeywords]) -> MapResult:
     """Search for an injective map of a `Problem`.
 
     Parameters
@@ -179,30 +160,19 @@ def solve(
     ImportError
         If the named linear solver is not installed.
     """
-    began = time.perf_counter()
     check_problem("solve", problem, ": use injective_map for the arrays V, F, fixed and target")
-    check_bool("refine", refine)
-    check_integer("max_iterations", max_iterations, minimum=1)
-    check_integer("record_every", record_every, minimum=0)
-    check_callback(callback)
-    options = SearchOptions(
-        strategy=strategy,
-        start=None if start is None else map_array("start", start, problem.n),
-        max_iterations=max_iterations,
-        linear_solver=linear_solver,
-        callback=callback,
-        record_every=record_every,
-    )
-    polishing = None
-    if polish is not None:
-        polishing = PolishOptions(
-            energy=find_energy(polish), linear_solver=linear_solver, callback=callback, slide=slide
-        )
-    if slide is not False:
+    return solve_problem(problem, MapOptions(**options))
+
+
+def solve_problem(problem: Problem, options: MapOptions) -> MapResult:
+    """Search for an injective map and polish it; see `injective_map`."""
+    began = time.perf_counter()
+    polishing = None if options.polish is None else polish_options(options)
+    if options.slide is not False:
         if polishing is None:
             raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
-        problem = move_onto(slide, problem)
-    if refine:
+        problem = move_onto(options.slide, problem)
+    if options.refine:
         # Import on demand: refinement also imports the construction and the diagnosis, which most maps do not need.
         from quasiharmonic.solver.refine.attempts import on_refinement, search_refining
 

@@ -21,8 +21,8 @@ from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.solver.search.options import MAX_ITERATIONS
 from quasiharmonic.util.arrays import FloatArray, check_bool, check_callback, check_integer
+from quasiharmonic.util.options import MAX_ITERATIONS
 from quasiharmonic.util.progress import reports_progress
 
 # Default maximum vertex displacement, relative to the maximum boundary displacement.

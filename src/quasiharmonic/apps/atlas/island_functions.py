@@ -21,7 +21,7 @@ from quasiharmonic.apps.atlas.mapped_atlas import (
 from quasiharmonic.apps.flattening import free_boundary
 from quasiharmonic.apps.flattening.layout import fit_unit_square, place_in_row
 from quasiharmonic.energies.deformation import positive_weights
-from quasiharmonic.energies.polishing import PolishOptions, polish_map
+from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.curves.boundary_curves import sliding_curves
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.topology import boundary_edges
@@ -30,7 +30,7 @@ from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve
-from quasiharmonic.solver.search.harmonising import HarmoniseOptions, harmonise_map
+from quasiharmonic.solver.search.harmonising import harmonise_map
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -40,6 +40,7 @@ from quasiharmonic.util.arrays import (
     map_array,
     names_of,
 )
+from quasiharmonic.util.options import HarmoniseOptions, PolishOptions
 
 
 def polish(

@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,9 +28,10 @@ from quasiharmonic.apps.flattening.layout import (
     place_in_row,
     to_given_unit,
 )
-from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
+from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
 from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
+from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve import check_name
@@ -38,14 +40,12 @@ from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    check_bool,
-    check_integer,
-    check_non_negative,
     map_array,
     names_of,
     triangle_rows,
     vertex_array,
 )
+from quasiharmonic.util.options import FlattenOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
 # Distances are sampled, so their descent converges at a tolerance larger by this factor.
@@ -54,26 +54,28 @@ _SAMPLED = 10.0
 _DESCENDED = Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING, Status.COLLAPSED
 
 
+class FlattenKeywords(TypedDict, total=False):
+    """Types of the options of `flatten`."""
+
+    fixed: ArrayLike | None
+    target: ArrayLike | None
+    energy: str | Energy
+    weights: ArrayLike | None
+    start: ArrayLike | None
+    unit_square: bool
+    rings: int
+    gap: float
+    max_iterations: int
+    tol: float
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+    record_every: int
+
+
 @accepts_mesh
 @reports_progress
-def flatten(
-    V: ArrayLike,
-    F: ArrayLike,
-    *,
-    fixed: ArrayLike | None = None,
-    target: ArrayLike | None = None,
-    energy: str | Energy = "symmetric-dirichlet",
-    weights: ArrayLike | None = None,
-    start: ArrayLike | None = None,
-    unit_square: bool = False,
-    rings: int = 20,
-    gap: float = 0.0,
-    max_iterations: int = 500,
-    tol: float = 1e-4,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
-    record_every: int = 0,
-) -> MapResult:
+@takes(FlattenOptions, FlattenKeywords)
+def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> MapResult:
     """Map a surface into the plane bijectively with a free boundary.
 
     Parameters
@@ -160,57 +162,64 @@ def flatten(
     (True, True)
     """
     began = time.perf_counter()
-    if (fixed is None) != (target is None):
-        raise ValueError("give fixed and target together: fixed vertices and their target positions")
-    if fixed is not None and unit_square:
-        raise ValueError("fixed vertices determine the size of the map: omit unit_square")
-    check_bool("unit_square", unit_square)
-    check_integer("rings", rings, minimum=1)
-    check_non_negative("gap", gap)
-    check_name(linear_solver)
-    of_distances = isinstance(energy, str) and energy == "distances"
-    if of_distances and not (fixed is None and weights is None):
-        raise ValueError(
-            "the energy 'distances' supports neither fixed vertices nor weights: omit fixed and weights, or choose "
-            "another energy"
-        )
-    chosen = "symmetric-dirichlet" if of_distances else energy
-    settings = Settings(chosen, tol, max_iterations, linear_solver, callback, record_every)
+    checked = FlattenOptions(**options)
+    _check_combination(checked)
     V, F = vertex_array(V), triangle_rows(F)
-    weights = None if weights is None else positive_weights(weights, len(F))
-    given = None if start is None else _check_start(start, V, F)
+    weights = None if checked.weights is None else positive_weights(checked.weights, len(F))
+    given = None if checked.start is None else _check_start(checked.start, V, F)
     held, free, results = list[Part](), split_parts(V, F), list[MapResult]()
-    if fixed is not None and target is not None:
+    if checked.fixed is not None:
         from quasiharmonic.apps.flattening.pins.part_arrangement import flatten_pinned_parts
         from quasiharmonic.apps.flattening.pins.pin_search import check_pins, flatten_pinned
 
-        pins = check_pins(fixed, target, len(V))
+        pins = check_pins(checked.fixed, checked.target, len(V))
         if len(free) == 1:
-            result = flatten_pinned(free[0].piece, *pins, settings, weights, given)
+            result = flatten_pinned(free[0].piece, *pins, checked, weights, given)
             return replace(result, seconds=time.perf_counter() - began, V=V)
         has_pins = [bool(np.isin(pins[0], part.vertices).any()) for part in free]
         held = [part for part, has in zip(free, has_pins, strict=True) if has]
         free = [part for part, has in zip(free, has_pins, strict=True) if not has]
-        results.append(flatten_pinned_parts(F, held, *pins, settings, weights, given))
+        results.append(flatten_pinned_parts(F, held, *pins, checked, weights, given))
     for part in free:
         if results and results[-1].status is Status.INTERRUPTED:
             # The other pieces still need a position, so they get their initial maps.
-            settings = replace(settings, max_iterations=0, callback=None)
-        results.append(_flatten_part(part, given, weights, settings, rings if of_distances else None))
-    uv = _place(len(V), held, free, results, gap)
-    result = _combine(F, fit_unit_square(uv) if unit_square else uv, held, free, results)
+            checked = replace(checked, max_iterations=0, callback=None)
+        results.append(_flatten_part(part, given, weights, checked))
+    uv = _place(len(V), held, free, results, checked.gap)
+    result = _combine(F, fit_unit_square(uv) if checked.unit_square else uv, held, free, results)
     return replace(result, seconds=time.perf_counter() - began, V=V)
 
 
+def _check_combination(options: FlattenOptions) -> None:
+    """Raise ValueError if options exclude each other or name what does not exist."""
+    if (options.fixed is None) != (options.target is None):
+        raise ValueError("give fixed and target together: fixed vertices and their target positions")
+    if options.fixed is not None and options.unit_square:
+        raise ValueError("fixed vertices determine the size of the map: omit unit_square")
+    check_name(options.linear_solver)
+    if not _keeps_distances(options):
+        find_energy(options.energy)
+    elif options.fixed is not None or options.weights is not None:
+        raise ValueError(
+            "the energy 'distances' supports neither fixed vertices nor weights: omit fixed and weights, or choose "
+            "another energy"
+        )
+
+
+def _keeps_distances(options: FlattenOptions) -> bool:
+    """Whether the energy is that of distances."""
+    return isinstance(options.energy, str) and options.energy == "distances"
+
+
 def _flatten_part(
-    part: Part, start: FloatArray | None, weights: FloatArray | None, settings: Settings, rings: int | None
+    part: Part, start: FloatArray | None, weights: FloatArray | None, options: FlattenOptions
 ) -> MapResult:
-    """Flatten one connected surface without fixed vertices; with ``rings``, keep distances."""
+    """Flatten one connected surface without fixed vertices."""
     piece = part.piece
     uv = None if start is None else np.ldexp(start[part.vertices], -piece.exponent)
-    if rings is not None:
-        return _flatten_with_distances(piece, uv, rings, settings)
-    return Flattening(piece, settings, None if weights is None else weights[part.triangles]).run(uv)
+    if _keeps_distances(options):
+        return _flatten_with_distances(piece, uv, replace(options, energy="symmetric-dirichlet"))
+    return Flattening(piece, options, None if weights is None else weights[part.triangles]).run(uv)
 
 
 def _place(n: int, held: Sequence[Part], free: Sequence[Part], results: Sequence[MapResult], gap: float) -> FloatArray:
@@ -251,18 +260,18 @@ def check_flattenable(V: ArrayLike, F: ArrayLike) -> list[Piece]:
     return pieces
 
 
-def _flatten_with_distances(piece: Piece, start: FloatArray | None, rings: int, settings: Settings) -> MapResult:
+def _flatten_with_distances(piece: Piece, start: FloatArray | None, options: FlattenOptions) -> MapResult:
     """Map a piece with ``"distances"``; if interrupted before that map exists, return the map without distances."""
-    sampled = replace(settings, tol=_SAMPLED * settings.tol)
-    if start is None and settings.max_iterations and len(piece.F) >= COARSE_FROM:
-        by_coarse = lower_coarse_distance_error(piece, rings, sampled)
+    sampled = replace(options, tol=_SAMPLED * options.tol)
+    if start is None and options.max_iterations and len(piece.F) >= COARSE_FROM:
+        by_coarse = lower_coarse_distance_error(piece, sampled)
         if by_coarse is not None:
             return by_coarse
-    found = Flattening(piece, settings, None).run(start)
+    found = Flattening(piece, options, None).run(start)
     if found.status is Status.INTERRUPTED or piece.thin_planar_map() is not None:
         return found
     with Run().until_interrupted():
-        then = lower_distance_error(piece, found.uv, rings, sampled, first=len(found.history)).after(found)
+        then = lower_distance_error(piece, found.uv, sampled, first=len(found.history)).after(found)
         return replace(then, status=Status.COLLAPSED) if found.status is Status.COLLAPSED else then
     return replace(found, status=Status.INTERRUPTED)
 

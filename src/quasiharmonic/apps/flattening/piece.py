@@ -25,9 +25,10 @@ from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, is_injective
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
-from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import FloatArray, check_callback, check_integer, check_non_negative, count_of
+from quasiharmonic.util.arrays import FloatArray, count_of
+from quasiharmonic.util.options import FlattenOptions
 
 #: Surfaces with at least this number of triangles are flattened with coarse meshes.
 COARSE_FROM = 50_000
@@ -52,33 +53,9 @@ _AGREE = 0.1
 _MANY = 100
 
 
-@dataclass(frozen=True)
-class Settings:
-    """The options of a call of `flatten`; ValueError or TypeError if one is invalid."""
-
-    energy: str | Energy
-    tol: float
-    max_iterations: int
-    linear_solver: str
-    callback: Callable[[Step], object] | None
-    record_every: int
-
-    def __post_init__(self) -> None:
-        check_integer("max_iterations", self.max_iterations, minimum=0)
-        check_integer("record_every", self.record_every, minimum=0)
-        check_non_negative("tol", self.tol)
-        check_callback(self.callback)
-        find_energy(self.energy)
-
-    @property
-    def density(self) -> Energy:
-        """The energy to minimise."""
-        return find_energy(self.energy)
-
-    @property
-    def name(self) -> str:
-        """The energy's name."""
-        return self.energy if isinstance(self.energy, str) else type(self.energy).__name__
+def energy_name(options: FlattenOptions) -> str:
+    """Return the name of the energy of a flattening, for reports."""
+    return options.energy if isinstance(options.energy, str) else type(options.energy).__name__
 
 
 class Piece:
@@ -166,10 +143,11 @@ class _Attempt:
 class Flattening:
     """The flattening of one surface, with its record for the result; ``weights`` is (f,) or None."""
 
-    def __init__(self, piece: Piece, settings: Settings, weights: FloatArray | None) -> None:
-        self._piece, self._settings, self._weights = piece, settings, weights
+    def __init__(self, piece: Piece, options: FlattenOptions, weights: FloatArray | None) -> None:
+        self._piece, self._options, self._weights = piece, options, weights
+        self._density = find_energy(options.energy)
         self._rim = Rim(piece.loops)
-        self._measure = piece.energy(settings.density, weights)
+        self._measure = piece.energy(self._density, weights)
         self._bijective: FloatArray | None = None
         # Whether a free descent ended with an overlap, and the map, if it had converged.
         self._overlaps = False
@@ -178,7 +156,7 @@ class Flattening:
         # Solver and initial energy of the initial maps already used.
         self._begun: set[tuple[str, float]] = set()
         self._solver = ""
-        self._run = Run(settings.callback, settings.record_every)
+        self._run = Run(options.callback, options.record_every)
 
     def run(self, start: FloatArray | None) -> MapResult:
         """Flatten the piece from an injective map (n, 2) in the piece's unit, or from a default initial map.
@@ -202,7 +180,7 @@ class Flattening:
 
     def _keep(self, uv: FloatArray) -> Status:
         """Use a bijective map without descending."""
-        self._settings = replace(self._settings, max_iterations=0)
+        self._options = replace(self._options, max_iterations=0)
         self._run_descent(self._fit_scale(uv), guarded=False, near=True)
         return Status.EXHAUSTED
 
@@ -310,10 +288,10 @@ class Flattening:
                 continue
             uv = self._fit_scale(uv)
             energy = self._measure.value(in_units(uv, 0))
-            if (self._settings.linear_solver, energy) in self._begun:
+            if (self._options.linear_solver, energy) in self._begun:
                 # The coarse mesh of a small surface is the surface itself.
                 continue
-            self._begun.add((self._settings.linear_solver, energy))
+            self._begun.add((self._options.linear_solver, energy))
             self._bijective = uv
             self._run.add_stage(f"start again, {name}" if self._run.stages else "start", energy=(energy, energy))
             return uv, energy < _DIRECT_ENERGY
@@ -321,7 +299,7 @@ class Flattening:
 
     def _default_starts(self) -> Iterator[tuple[str, Callable[[], FloatArray | None]]]:
         """Initial bijective maps, the most promising first; each is computed on demand and may not exist."""
-        piece, solver = self._piece, self._settings.linear_solver
+        piece, solver = self._piece, self._options.linear_solver
         surface = piece.V, piece.F, piece.loops
         disk = "disk", partial(map_to_disk, *surface, solver)
         large = len(piece.F) >= COARSE_FROM
@@ -333,7 +311,7 @@ class Flattening:
         if large:
             yield disk
         for other in [name for name in available() if name != self._solver][:1]:
-            self._settings = replace(self._settings, linear_solver=other)
+            self._options = replace(self._options, linear_solver=other)
             yield f"coarse mesh, {other}", partial(flatten_coarse, *surface, other)
 
     def _is_scale_free(self, uv: FloatArray) -> bool:
@@ -353,8 +331,8 @@ class Flattening:
 
     def _run_descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
         """Descend from a map, which must be bijective if ``guarded``; return None if the result overlaps itself."""
-        settings, solver = self._settings, self._settings.linear_solver
-        energy = self._piece.energy(settings.density if near else ReweightedDirichlet(), self._weights)
+        options, solver = self._options, self._options.linear_solver
+        energy = self._piece.energy(self._density if near else ReweightedDirichlet(), self._weights)
         descent = SurfaceDescent(energy, uv, solver, rim=self._rim if guarded else None)
         self._solver = descent.linear_solver
         apart, status = guarded, Status.STILL_FALLING
@@ -364,14 +342,14 @@ class Flattening:
             return self._measure.value(descent.w)
 
         def take_steps() -> Iterator[Status | None]:
-            course = descend(descent, settings.density, settings.tol)
-            for number, outcome in enumerate(itertools.islice(course, settings.max_iterations), 1):
+            course = descend(descent, self._density, options.tol)
+            for number, outcome in enumerate(itertools.islice(course, options.max_iterations), 1):
                 recent.append((measure(), descent.uv))
                 yield outcome
                 if not guarded and number % _CHECK_EVERY == 0 and self._rim.tangled_fraction(descent.uv) > _TANGLED:
                     return
 
-        name = f"{'guarded' if guarded else 'free'} descent, {settings.name}"
+        name = f"{'guarded' if guarded else 'free'} descent, {energy_name(options)}"
         exponent = self._piece.exponent
         try:
             status = self._run.descend(name, take_steps(), measure, lambda: to_given_unit(descent.uv, exponent))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,12 +19,11 @@ from quasiharmonic.apps.mesh_motion.midsides import (
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult, find_forbidden
 from quasiharmonic.apps.mesh_motion.quadrilaterals import make_convex
 from quasiharmonic.apps.mesh_motion.quality import element_quality
-from quasiharmonic.apps.tetrahedra.placement import Settings
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.apps.tetrahedra.tetrahedral_maps import morph_tetrahedra
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
-from quasiharmonic.energies.polishing import PolishOptions, find_energy, polish_result
+from quasiharmonic.energies.polishing import find_energy, polish_result
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
@@ -46,37 +45,36 @@ from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
-from quasiharmonic.solver.search.options import MAX_ITERATIONS
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    check_callback,
     check_finite,
-    check_integer,
-    check_positive,
     map_array,
     names_of,
     vertex_indices,
 )
+from quasiharmonic.util.options import MorphOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
+
+
+class MorphKeywords(TypedDict, total=False):
+    """Types of the options of `morph`."""
+
+    energy: str | Energy | None
+    max_iterations: int
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+    slide: bool | BoundaryCurves | ArrayLike
+    rest: ArrayLike | None
+    start: ArrayLike | None
+    tol: float
 
 
 @accepts_planar_mesh
 @reports_progress
+@takes(MorphOptions, MorphKeywords)
 def morph(
-    points: ArrayLike,
-    F: ArrayLike,
-    moved_vertices: ArrayLike,
-    target: ArrayLike,
-    *,
-    energy: str | Energy | None = "symmetric-dirichlet",
-    max_iterations: int = MAX_ITERATIONS,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
-    slide: bool | BoundaryCurves | ArrayLike = False,
-    rest: ArrayLike | None = None,
-    start: ArrayLike | None = None,
-    tol: float = 1e-8,
+    points: ArrayLike, F: ArrayLike, moved_vertices: ArrayLike, target: ArrayLike, **options: Unpack[MorphKeywords]
 ) -> MorphResult | TetrahedraResult:
     """Move some nodes of a mesh, planar or of tetrahedra, and place the others so that no element is inverted.
 
@@ -159,19 +157,15 @@ def morph(
     >>> morphed.valid, bool(morphed.quality_after.min() > 0.25)
     (True, True)
     """
+    checked = MorphOptions(**options)
+    slide, rest, start = checked.slide, checked.rest, checked.start
     if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
         if isinstance(slide, BoundaryCurves):
             raise ValueError("slide must be a bool or an array of planes for tetrahedra, not BoundaryCurves")
-        if energy is not None:
-            find_energy(energy)
-        check_name(linear_solver)
-        check_integer("max_iterations", max_iterations, minimum=0)
-        check_positive(tol=tol)
-        check_callback(callback)
-        options = Settings(energy is not None, max_iterations, tol, callback)
-        return morph_tetrahedra(
-            points, F, moved_vertices, target, rest=rest, start=start, settings=options, slide=slide
-        )
+        if checked.energy is not None:
+            find_energy(checked.energy)
+        check_name(checked.linear_solver)
+        return morph_tetrahedra(points, F, moved_vertices, target, checked)
     if not isinstance(slide, bool | np.bool_ | BoundaryCurves):
         raise ValueError(f"slide must be a bool or BoundaryCurves for planar meshes, not {slide!r}")
     curves = slide if isinstance(slide, BoundaryCurves) else bool(slide)
@@ -185,12 +179,11 @@ def morph(
     check_spread(F, len(points))
     fixed, goal = _find_fixed(points, F, moved_vertices, target)
     given = _MorphProblem(F, first, fixed, nets_of(F))
-    settings = _Settings(energy, max_iterations, linear_solver, callback, tol)
-    after, result = _place_nodes(given, points, goal, begin, (curves, np.asarray(moved_vertices)), settings)
+    after, result = _place_nodes(given, points, goal, begin, (curves, np.asarray(moved_vertices)), checked)
 
     def one_step() -> FloatArray:
         # Fix the boundary at the positions to which it has slid.
-        alone = settings._replace(callback=None)
+        alone = replace(checked, callback=None)
         whole, _ = _place_nodes(given, first, after[fixed], None, (False, fixed), alone)
         return np.full_like(whole, np.nan) if inverted_elements(F, whole).size else whole
 
@@ -209,23 +202,13 @@ class _MorphProblem(NamedTuple):
     nets: list[IntArray]
 
 
-class _Settings(NamedTuple):
-    """Search options; see `morph`."""
-
-    energy: str | Energy | None
-    max_iterations: int
-    linear_solver: str
-    callback: Callable[[Step], object] | None
-    tol: float
-
-
 def _place_nodes(
     given: _MorphProblem,
     points: FloatArray,
     target: FloatArray,
     begin: FloatArray | None,
     slide: tuple[bool | BoundaryCurves, IntArray],
-    settings: _Settings,
+    options: MorphOptions,
 ) -> tuple[FloatArray, MapResult]:
     """Place all nodes by the first set of triangles that leaves no element inverted, or by the best one.
 
@@ -236,21 +219,16 @@ def _place_nodes(
     F, rest, fixed, nets = given
     if F.shape[1] == 6 and slide[0] is not False:
         # Mid-side nodes slide as other nodes do. They are then moved to the middle of their sides and fixed there.
-        there, slid = _search(given, nets[-1], points, target, begin, slide, settings)
+        there, slid = _search(given, nets[-1], points, target, begin, slide, options)
         has_slid = fixed[(there[fixed] != target).any(axis=1)]
         before = points.copy()
         before[fixed] = target
         there = centre_midsides(F, there, has_slid, _list_curves(slide[0], nets[-1], before))
-        after, result = _place_nodes(given, points, there[fixed], there, (False, fixed), settings)
-        return after, replace(
-            result,
-            stages=slid.stages + result.stages,
-            history=slid.history + result.history,
-            seconds=slid.seconds + result.seconds,
-        )
+        after, result = _place_nodes(given, points, there[fixed], there, (False, fixed), options)
+        return after, result.after(slid)
     best, least = None, np.inf
     for triangles in nets:
-        after, result = _search(given, triangles, points, target, begin, slide, settings)
+        after, result = _search(given, triangles, points, target, begin, slide, options)
         if F.shape[1] == 6:
             # Mid-side nodes outside these triangles have not moved yet.
             inside = ~np.isin(F[:, MIDDLES], triangles).any()
@@ -272,11 +250,11 @@ def _search(
     target: FloatArray,
     begin: FloatArray | None,
     slide: tuple[bool | BoundaryCurves, IntArray],
-    settings: _Settings,
+    options: MorphOptions,
 ) -> tuple[FloatArray, MapResult]:
     """Search a map of some triangles, untangle those at quadrilaterals' corners, and return the moved mesh."""
     F, rest, fixed, _ = given
-    energy, max_iterations, linear_solver, callback, tol = settings
+    energy, linear_solver, callback = options.energy, options.linear_solver, options.callback
     used = np.unique(triangles)
     known = np.isin(fixed, used)
     own, own_fixed = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
@@ -293,14 +271,16 @@ def _search(
     result = solve(
         problem,
         start=None if begin is None else begin[used],
-        max_iterations=max_iterations,
+        max_iterations=options.max_iterations,
         linear_solver=linear_solver,
         callback=callback,
     )
     if corners is not None and result.status is not Status.INTERRUPTED:
         result = make_convex(problem, result, corners, linear_solver=linear_solver)
     if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
-        polishing = PolishOptions(energy=energy, tol=tol, linear_solver=linear_solver, callback=callback, slide=curves)
+        polishing = PolishOptions(
+            energy=energy, tol=options.tol, linear_solver=linear_solver, callback=callback, slide=curves
+        )
         result = polish_result(problem, result, polishing, triangles=corners)
     after = points.copy()
     after[fixed] = target

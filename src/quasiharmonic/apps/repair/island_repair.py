@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from quasiharmonic.energies.polishing import PolishOptions, polish_map
+from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.fans import fans, renumber
@@ -29,6 +29,7 @@ from quasiharmonic.problem.diagnosis.obstruction import Obstruction
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, edge_names, names_of
+from quasiharmonic.util.options import PolishOptions
 
 # Numbers of rings of free vertices around inverted triangles, tried in turn.
 _RINGS = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32

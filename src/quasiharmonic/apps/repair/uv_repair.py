@@ -19,7 +19,6 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import Step
-from quasiharmonic.solver.search.options import MAX_ITERATIONS
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -30,6 +29,7 @@ from quasiharmonic.util.arrays import (
     names_of,
     vertex_indices,
 )
+from quasiharmonic.util.options import MAX_ITERATIONS
 from quasiharmonic.util.outcome import Outcome
 from quasiharmonic.util.progress import reports_progress
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,9 +22,9 @@ from quasiharmonic.apps.tetrahedra.result import (
 from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding, project
 from quasiharmonic.apps.tetrahedra.topology import FaceReport, inspect_faces
-from quasiharmonic.problem.result import Step
 from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
+from quasiharmonic.util.options import TetrahedraOptions
 
 # Maximum number of crossing pairs of boundary triangles that are listed.
 _MAX_LISTED = 20
@@ -45,16 +44,6 @@ class RestMesh:
     def boundary_vertices(self) -> IntArray:
         """Ascending vertices of the boundary."""
         return np.unique(self.faces.boundary)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Options of a search."""
-
-    polish: bool = True
-    max_iterations: int = 2000
-    tol: float = 1e-8
-    callback: Callable[[Step], object] | None = None
 
 
 def check_rest(T: ArrayLike, X: FloatArray) -> RestMesh:
@@ -91,7 +80,7 @@ def place_vertices(
     fixed: IntArray,
     target: FloatArray,
     start: FloatArray | None,
-    settings: Settings,
+    options: TetrahedraOptions,
     sliding: Sliding = NO_SLIDING,
 ) -> TetrahedraResult:
     """Find positions of the free vertices such that every tetrahedron is positive, then lower the distortion.
@@ -116,7 +105,7 @@ def place_vertices(
             X[sliding.vertices] = here + project(sliding.projections, X[sliding.vertices] - here)
         else:
             X = extend_harmonically(energy, np.ldexp(points, -exponent), fixed, X[fixed], projections)
-        X, status, iterations = _search(Descent(energy, free, X, projections=projections), settings)
+        X, status, iterations = _search(Descent(energy, free, X, projections=projections), options)
         after = np.ldexp(X, exponent)
         begin[free] = after[free]
     certificate = certify_arrays(T, begin, faces=mesh.faces)
@@ -242,35 +231,35 @@ def extend_harmonically(
     return there if np.isfinite(there).all() else X
 
 
-def _search(descent: Descent, settings: Settings) -> tuple[FloatArray, TetrahedraStatus, int]:
+def _search(descent: Descent, options: TetrahedraOptions) -> tuple[FloatArray, TetrahedraStatus, int]:
     """Untangle and polish; return the best positions, why the search ended, and the number of steps.
 
     Ctrl-C ends the search, and a callback may raise KeyboardInterrupt.
     """
     energy, X = descent.energy, descent.X
     best = [(len(energy.T) + 1, X)]
-    run = Run(settings.callback)
+    run = Run(options.callback)
     with run.until_interrupted(), np.errstate(all="ignore"):
         count = int(np.count_nonzero(~(energy.determinants(X) > 0)))
         best[:] = [(count, X)]
         run.record(count, np.inf)
         if count and descent.free.size:
-            count = _untangle(descent, settings, run, best)
+            count = _untangle(descent, options, run, best)
         if count:
-            ended = descent.iterations >= settings.max_iterations
+            ended = descent.iterations >= options.max_iterations
             status = TetrahedraStatus.OUT_OF_ITERATIONS if ended else TetrahedraStatus.STALLED
             return best[-1][1], status, descent.iterations
-        status = _polish(descent, settings, run)
+        status = _polish(descent, options, run)
         return descent.X, status, descent.iterations
     positive = bool(energy.determinants(descent.X).min() > 0)
     return descent.X if positive else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
 
 
-def _untangle(descent: Descent, settings: Settings, run: Run, best: list[tuple[int, FloatArray]]) -> int:
+def _untangle(descent: Descent, options: TetrahedraOptions, run: Run, best: list[tuple[int, FloatArray]]) -> int:
     """Untangle until nothing is inverted or progress ends, and keep the best mesh; return how many stay inverted."""
     energy = descent.energy
     since, least = 0, float(energy.determinants(descent.X).min())
-    for now in descent.untangle(settings.max_iterations):
+    for now in descent.untangle(options.max_iterations):
         count = int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
         since += 1
         if count < best[-1][0] or now > least + 0.05 * abs(least):
@@ -283,11 +272,11 @@ def _untangle(descent: Descent, settings: Settings, run: Run, best: list[tuple[i
     return int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
 
 
-def _polish(descent: Descent, settings: Settings, run: Run) -> TetrahedraStatus:
+def _polish(descent: Descent, options: TetrahedraOptions, run: Run) -> TetrahedraStatus:
     """Lower the energy of a valid mesh; return why this ended."""
-    if not settings.polish or not descent.free.size:
+    if not options.polish or not descent.free.size:
         return TetrahedraStatus.FIRST_VALID
-    for value in descent.polish(settings.max_iterations - descent.iterations, settings.tol):
+    for value in descent.polish(options.max_iterations - descent.iterations, options.tol):
         run.record(0, value)
     converged = descent.converged and np.isfinite(descent.energy.value(descent.X, 0.0))
     return TetrahedraStatus.POLISHED if converged else TetrahedraStatus.STILL_FALLING

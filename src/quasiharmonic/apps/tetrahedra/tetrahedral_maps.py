@@ -3,40 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.certificate import space_array
-from quasiharmonic.apps.tetrahedra.placement import RestMesh, Settings, check_rest, place_vertices
+from quasiharmonic.apps.tetrahedra.placement import RestMesh, check_rest, place_vertices
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.apps.tetrahedra.sliding import Sliding, find_sliding
 from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import (
     IntArray,
-    check_bool,
-    check_callback,
-    check_integer,
-    check_positive,
     fixed_vertices,
     names_of,
     vertex_indices,
 )
+from quasiharmonic.util.options import MorphOptions, TetrahedraOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
 
+class TetrahedraKeywords(TypedDict, total=False):
+    """Types of the options of `injective_tetrahedra`."""
+
+    start: ArrayLike | None
+    polish: bool
+    max_iterations: int
+    tol: float
+    callback: Callable[[Step], object] | None
+
+
 @reports_progress
+@takes(TetrahedraOptions, TetrahedraKeywords)
 def injective_tetrahedra(
-    X: ArrayLike,
-    T: ArrayLike,
-    fixed: ArrayLike,
-    target: ArrayLike,
-    *,
-    start: ArrayLike | None = None,
-    polish: bool = True,
-    max_iterations: int = 1000,
-    tol: float = 1e-6,
-    callback: Callable[[Step], object] | None = None,
+    X: ArrayLike, T: ArrayLike, fixed: ArrayLike, target: ArrayLike, **options: Unpack[TetrahedraKeywords]
 ) -> TetrahedraResult:
     """Map a tetrahedral mesh such that fixed vertices have target positions and every tetrahedron is positive.
 
@@ -88,13 +88,9 @@ def injective_tetrahedra(
     mesh = check_rest(T, X)
     held = fixed_vertices(fixed, len(X))
     goal = space_array("target", target, held.size)
-    check_bool("polish", polish)
-    check_integer("max_iterations", max_iterations, minimum=0)
-    check_positive(tol=tol)
-    check_callback(callback)
-    begin = None if start is None else space_array("start", start, len(X))
-    settings = Settings(polish, max_iterations, tol, callback)
-    return place_vertices(mesh, X, held, goal, begin, settings)
+    checked = TetrahedraOptions(**options)
+    begin = None if checked.start is None else space_array("start", checked.start, len(X))
+    return place_vertices(mesh, X, held, goal, begin, checked)
 
 
 def morph_tetrahedra(
@@ -102,26 +98,29 @@ def morph_tetrahedra(
     T: ArrayLike,
     moved_vertices: ArrayLike,
     target: ArrayLike,
-    *,
-    rest: ArrayLike | None = None,
-    start: ArrayLike | None = None,
-    settings: Settings | None = None,
-    slide: bool | ArrayLike = False,
+    options: MorphOptions,
 ) -> TetrahedraResult:
     """`quasiharmonic.morph` for points (n, 3) and tetrahedra (t, 4).
 
     Boundary vertices that are neither moved nor slide are fixed; ``slide`` as in `find_sliding`.
     """
+    checked = TetrahedraOptions(
+        polish=options.energy is not None,
+        max_iterations=options.max_iterations,
+        tol=options.tol,
+        callback=options.callback,
+    )
+    rest, start = options.rest, options.start
     points = space_array("points", points, finite=False)
     first = points if rest is None else space_array("rest", rest, len(points), finite=False)
     mesh = check_rest(T, first)
     moved = find_moved(mesh, len(points), moved_vertices)
     goal = space_array("target", target, moved.size)
-    sliding = find_sliding(mesh.faces.boundary, points, moved, slide)
+    sliding = find_sliding(mesh.faces.boundary, points, moved, options.slide)
     still = find_still(mesh, moved, sliding)
     begin = (None if rest is None else points) if start is None else space_array("start", start, len(points))
     fixed, goal = np.concatenate([moved, still]), np.concatenate([goal, points[still]])
-    return place_vertices(mesh, points, fixed, goal, begin, settings or Settings(), sliding)
+    return place_vertices(mesh, points, fixed, goal, begin, checked, sliding)
 
 
 def find_moved(mesh: RestMesh, n: int, moved_vertices: ArrayLike) -> IntArray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
 from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
-from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece, Settings
+from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Deformation, Energy, Isotropic, SymmetricDirichlet
@@ -25,6 +25,7 @@ from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.options import FlattenOptions
 
 #: No triangle may be stretched more than this, except triangles with a smaller angle than `THIN_ANGLE`.
 WORST_STRETCH = 3.0
@@ -194,7 +195,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
 
 def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None:
     """Flatten a chart that must not overlap itself; slower than `flatten_chart` and with more stretch."""
-    settings = Settings("symmetric-dirichlet", _TOLERANCE, _MAX_STEPS, "auto", lambda _: check_wanted(), 0)
+    settings = FlattenOptions(tol=_TOLERANCE, max_iterations=_MAX_STEPS, callback=lambda _: check_wanted())
     result = Flattening(chart.piece, settings, None).run(None)
     chart.use(result.uv)
 

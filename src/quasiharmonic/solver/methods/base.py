@@ -9,12 +9,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias, get_args
+from typing import ClassVar, Protocol, TypeAlias, get_args
 
 import numpy as np
 
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import Status
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
@@ -42,8 +43,22 @@ class SearchState:
     lowest_energy: Iterate | None
 
 
+class StageRunner(Protocol):
+    """What a stage of a strategy needs of a search; see `quasiharmonic.solver.search.search.Search`."""
+
+    problem: Problem
+    best: tuple[int, float]
+    lowest_energy: Iterate | None
+
+    def attempt(self, descent: Descent) -> Status:
+        """Run a descent on the mesh itself and return the status of the search after it."""
+
+    def search_on_coarse(self, name: str, first: Descent) -> None:
+        """Search on a coarse mesh, beginning with a descent, and transfer the map to the mesh itself."""
+
+
 class SearchStage(ABC):
-    """One stage of a strategy; `quasiharmonic.solver.search.search.Search` runs it."""
+    """One stage of a strategy."""
 
     #: Whether the stage searches on a coarse mesh instead of the mesh itself.
     coarse: ClassVar[bool] = False
@@ -59,6 +74,10 @@ class SearchStage(ABC):
     @abstractmethod
     def begins_with(self) -> Descent:
         """The first descent of the stage, on the coarse mesh or the mesh itself."""
+
+    @abstractmethod
+    def run(self, search: StageRunner) -> None:
+        """Run the stage as a part of a search."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +111,10 @@ class Descent(SearchStage):
     def begins_with(self) -> Descent:
         """The stage itself."""
         return self
+
+    def run(self, search: StageRunner) -> None:
+        """See `SearchStage`."""
+        search.attempt(self)
 
     @property
     def patience(self) -> tuple[int, float] | None:

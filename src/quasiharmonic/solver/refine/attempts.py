@@ -30,13 +30,12 @@ from quasiharmonic.solver.construction.constructing import Construction, constru
 from quasiharmonic.solver.construction.opening import thin_refinement
 from quasiharmonic.solver.construction.simplicity import is_simple
 from quasiharmonic.solver.refine.refining import refine_problem
-from quasiharmonic.solver.search.options import FailedRepairs, SearchOptions
-from quasiharmonic.solver.search.search import allowed_repairs
-from quasiharmonic.solver.search.solving import search_map
-from quasiharmonic.solver.search.stages import Stages
-from quasiharmonic.solver.search.strategy import quick_stages, stages_of, without_restarts
+from quasiharmonic.solver.search.record import RepairBudget
+from quasiharmonic.solver.search.search import allowed_repairs, search_map
+from quasiharmonic.solver.search.stages import Stages, quick_stages, stages_of, without_restarts
 from quasiharmonic.targets.boundary.chords import flattened_edges
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.options import MapOptions
 
 # Names of the attempts.
 AS_GIVEN = "as given"
@@ -57,29 +56,26 @@ _SHARE = 4
 _MAX_ADDED_AT_ONCE = 1
 
 
-def search_refining(problem: Problem, options: SearchOptions) -> MapResult:
+def search_refining(problem: Problem, options: MapOptions) -> MapResult:
     """Search for a map, with refinement if needed; see `quasiharmonic.injective_map` with ``refine`` for the result.
 
     ``start`` and ``record_every`` apply to the given mesh.
     """
     left = options.max_iterations
-    repairs = allowed_repairs(problem, options)
+    repairs = allowed_repairs(problem, options.max_iterations)
 
     def search(on: Problem, first: FloatArray | None, budget: int, select: _Selection) -> MapResult:
         nonlocal left, repairs
         share = repairs // _SHARE
-        allowed = FailedRepairs(share)
-        result = search_map(
-            on,
-            replace(
-                options,
-                strategy=select(stages_of(options.strategy, on)),
-                start=first,
-                max_iterations=max(min(budget, left), 1),
-                record_every=options.record_every if on is problem else 0,
-                failed_repairs=allowed,
-            ),
+        own = replace(
+            options,
+            strategy=select(stages_of(options.strategy, on)),
+            start=first,
+            max_iterations=max(min(budget, left), 1),
+            record_every=options.record_every if on is problem else 0,
         )
+        allowed = RepairBudget(share)
+        result = search_map(on, own, allowed)
         left -= result.n_iterations
         repairs -= share - allowed.left
         return result

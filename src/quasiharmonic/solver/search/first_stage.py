@@ -24,13 +24,11 @@ from quasiharmonic.solver.field.tensor import Parameterisation, TensorField
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.methods.relocation import RetrySchedule, relocate_each
 from quasiharmonic.solver.methods.vector_adam import AdamState
-from quasiharmonic.solver.search.options import SearchOptions
-from quasiharmonic.solver.search.search import Search
-from quasiharmonic.solver.search.solving import result_of
-from quasiharmonic.solver.search.stage_run import Round, StageRun, visit_rounds
-from quasiharmonic.solver.search.stages import Stages
-from quasiharmonic.solver.search.strategy import stages_of
+from quasiharmonic.solver.search.record import Round, StageRun, visit_rounds
+from quasiharmonic.solver.search.search import Search, result_of
+from quasiharmonic.solver.search.stages import Stages, stages_of
 from quasiharmonic.util.arrays import ComplexArray, repeat_each
+from quasiharmonic.util.options import MapOptions
 
 # Meshes with more triangles are solved separately: the overhead per NumPy call is then negligible.
 SMALL = 4_000
@@ -71,7 +69,7 @@ def _is_plain(stage: object) -> TypeGuard[VectorAdam]:
 
 
 def run_first_stage(
-    problems: Sequence[Problem], descent: VectorAdam, patterns: Patterns, options: SearchOptions
+    problems: Sequence[Problem], descent: VectorAdam, patterns: Patterns, options: MapOptions
 ) -> list[MapResult | Search | None]:
     """Run the first stage of many searches in batches.
 
@@ -83,7 +81,7 @@ def run_first_stage(
         Descent of V₃ with equilateral reference triangles.
     patterns : Patterns
         Cache of the calling thread.
-    options : SearchOptions
+    options : MapOptions
         Without ``start`` and ``record_every``.
 
     Returns
@@ -93,8 +91,9 @@ def run_first_stage(
         batch; a new search must then begin.
     """
     members = []
-    for problem in problems:
-        run = Search(problem, options).begin_in_batch(descent)
+    searches = [Search(problem, options) for problem in problems]
+    for problem, search in zip(problems, searches, strict=True):
+        run = search.begin_in_batch(descent)
         members.append(_Member(run, descent.objective(problem, options.linear_solver), RetrySchedule()))
     end, batches = descent.iterations + 1, []
     for first, last in _divide([len(problem.F) for problem in problems]):
@@ -109,11 +108,11 @@ def run_first_stage(
         run.end(Status.OUT_OF_ITERATIONS)
     results = iter(_certify([run for run in runs if run.status is Status.INJECTIVE]))
     found: list[MapResult | Search | None] = []
-    for run in runs:
+    for run, search in zip(runs, searches, strict=True):
         if run.status is Status.INJECTIVE:
             found.append(next(results))
         else:
-            found.append(None if run.status is Status.UNSOLVABLE else run.search)
+            found.append(None if run.status is Status.UNSOLVABLE else search)
     return found
 
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import get_args
+from dataclasses import replace
+from typing import TypedDict, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,16 +31,12 @@ from quasiharmonic.solver.search.harmonised import Harmonised
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    check_bool,
-    check_callback,
-    check_choice,
-    check_integer,
-    check_non_negative,
     describe,
     map_array,
     names_of,
     real_array,
 )
+from quasiharmonic.util.options import HarmoniseOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
 
@@ -62,40 +58,26 @@ BARRIER_ETA = (0.1, 1.0, 1.0, 1.0)
 ETA = (0.1, 0.1, 0.01, 0.001)
 
 
-@dataclass(frozen=True, kw_only=True)
-class HarmoniseOptions:
-    """Options of `harmonise`, as the functions inside the library pass them on."""
+class HarmoniseKeywords(TypedDict, total=False):
+    """Types of the options of `harmonise`."""
 
-    energy: str | Energy | None = "arap"
-    eta: float | Sequence[float] | None = None
-    conformal: float = 1e-3
-    weights: ArrayLike | None = None
-    scaled: bool = True
-    max_iterations: int = 40
-    tol: float = 1e-3
-    reference: Reference = "rest"
-    linear_solver: str = "auto"
-    callback: Callable[[Step], object] | None = None
+    energy: str | Energy | None
+    eta: float | Sequence[float] | None
+    conformal: float
+    weights: ArrayLike | None
+    scaled: bool
+    max_iterations: int
+    tol: float
+    reference: Reference
+    linear_solver: str
+    callback: Callable[[Step], object] | None
 
 
 @accepts_mesh
 @reports_progress
+@takes(HarmoniseOptions, HarmoniseKeywords)
 def harmonise(
-    V: ArrayLike,
-    F: ArrayLike,
-    uv: ArrayLike,
-    *,
-    fixed: ArrayLike | None = None,
-    energy: str | Energy | None = "arap",
-    eta: float | Sequence[float] | None = None,
-    conformal: float = 1e-3,
-    weights: ArrayLike | None = None,
-    scaled: bool = True,
-    max_iterations: int = 40,
-    tol: float = 1e-3,
-    reference: Reference = "rest",
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
+    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, fixed: ArrayLike | None = None, **options: Unpack[HarmoniseKeywords]
 ) -> MapResult:
     """Lower any distortion energy within the injective maps, by quasi-harmonisation (§11).
 
@@ -179,21 +161,10 @@ def harmonise(
     began = time.perf_counter()
     domain = Domain(V, F, fixed)
     domain.check_boundary_fixed()
-    if energy is None and reference == "rest":
+    checked = HarmoniseOptions(**options)
+    if checked.energy is None and checked.reference == "rest":
         domain.check_areas()
-    options = HarmoniseOptions(
-        energy=energy,
-        eta=eta,
-        conformal=conformal,
-        weights=weights,
-        scaled=scaled,
-        max_iterations=max_iterations,
-        tol=tol,
-        reference=reference,
-        linear_solver=linear_solver,
-        callback=callback,
-    )
-    return replace(harmonise_map(domain, uv, options), seconds=time.perf_counter() - began)
+    return replace(harmonise_map(domain, uv, checked), seconds=time.perf_counter() - began)
 
 
 def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> MapResult:
@@ -204,17 +175,12 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
     run = Run(options.callback)
     chosen = _find_energy(options.energy, domain)
     barrier = chosen is not None and chosen.barrier
+    reference = cast("Reference", options.reference)
     schedule = _eta_schedule(options.eta, barrier)
-    check_non_negative("conformal", options.conformal)
     if chosen is None and options.conformal == 0:
         raise ValueError("conformal must be positive if energy is None, not 0")
     if options.weights is not None and chosen is None:
         raise ValueError("weights belong to the energy, but energy is None")
-    check_choice("reference", options.reference, get_args(Reference))
-    check_integer("max_iterations", options.max_iterations, minimum=1)
-    check_non_negative("tol", options.tol)
-    check_bool("scaled", options.scaled)
-    check_callback(options.callback)
     start = map_array("uv", uv, domain.n)
     inverted = inverted_triangles(domain.F, start)
     if barrier and inverted.size:
@@ -234,7 +200,7 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
             # units.
             V, scaled_to = (own.V, area) if options.scaled else (own.frame.lengths(own.V), None)
             deformation = DeformationEnergy(V, own.F, chosen, area=scaled_to, weights=options.weights)
-        objective = Objective(own, "dirichlet", "tanh", options.reference, options.linear_solver)
+        objective = Objective(own, "dirichlet", "tanh", reference, options.linear_solver)
         regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
 
         def descend(eta: float) -> Harmonised:

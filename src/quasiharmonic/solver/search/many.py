@@ -7,14 +7,15 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
-from dataclasses import dataclass, replace
-from typing import Any, get_args
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypedDict, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.energies import Energy
-from quasiharmonic.energies.polishing import PolishOptions, find_energy, polish_result
+from quasiharmonic.energies.polishing import find_energy, polish_options, polish_result
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
@@ -22,12 +23,10 @@ from quasiharmonic.problem.problem_batch import set_up_batch
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.field.objective_batch import Patterns
 from quasiharmonic.solver.search.first_stage import GROUP, SMALL, group_by_first_stage, run_first_stage
-from quasiharmonic.solver.search.options import MAX_ITERATIONS, SearchOptions
-from quasiharmonic.solver.search.search import Search
-from quasiharmonic.solver.search.solving import finish_search, search_map
-from quasiharmonic.solver.search.stages import Stages
-from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.solver.search.search import Search, finish_search, search_map
+from quasiharmonic.solver.search.stages import STRATEGIES, Stages
 from quasiharmonic.util.arrays import check_callback, check_choice, check_integer, check_sequence
+from quasiharmonic.util.options import MapOptions, takes
 from quasiharmonic.util.threads import count_cores, make_executor
 
 #: A problem as arrays: ``V, F, fixed, target`` as `quasiharmonic.Problem` takes them.
@@ -42,17 +41,24 @@ _PART = 8
 _TICK = 0.2
 
 
+class ManyKeywords(TypedDict, total=False):
+    """Types of the options of `injective_maps` that it shares with `injective_map`."""
+
+    strategy: str | Stages
+    polish: str | Energy | None
+    max_iterations: int
+    linear_solver: str
+
+
+@takes(MapOptions, ManyKeywords)
 def injective_maps(
     problems: Iterable[Problem | Arrays],
     *,
     reference: Reference | None = None,
-    strategy: str | Stages = "speed",
-    polish: str | Energy | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    linear_solver: str = "auto",
     jobs: int | None = None,
     errors: str = "raise",
     callback: Callable[[int], object] | None = None,
+    **options: Unpack[ManyKeywords],
 ) -> Iterator[MapResult | ValueError]:
     """Solve many problems as `injective_map` does, several times as many per second if they are small.
 
@@ -109,32 +115,28 @@ def injective_maps(
     >>> sum(result.injective for result in results)
     20
     """
-    check_integer("max_iterations", max_iterations, minimum=1)
+    search = MapOptions(**options)
     if jobs is not None:
         check_integer("jobs", jobs, minimum=1)
     check_choice("errors", errors, ("raise", "yield"))
     check_callback(callback)
     if reference is not None:
         check_choice("reference", reference, get_args(Reference))
-    if isinstance(strategy, str):
-        check_choice("strategy", strategy, STRATEGIES)
-    search = SearchOptions(strategy=strategy, max_iterations=max_iterations, linear_solver=linear_solver)
-    settings = _Settings(reference, search, None if polish is None else find_energy(polish))
+    if isinstance(search.strategy, str):
+        check_choice("strategy", search.strategy, STRATEGIES)
+    if search.polish is not None:
+        find_energy(search.polish)
     check_sequence("problems", problems, "problems")
-    return _solve_groups(iter(problems), settings, jobs or count_cores(), errors == "raise", callback)
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """Options that apply to all problems."""
-
-    reference: Reference | None
-    search: SearchOptions
-    polish: Energy | None
+    worker = partial(_Worker, reference, search)
+    return _solve_groups(iter(problems), worker, jobs or count_cores(), errors == "raise", callback)
 
 
 def _solve_groups(
-    problems: Iterator[Any], settings: _Settings, jobs: int, raising: bool, callback: Callable[[int], object] | None
+    problems: Iterator[Any],
+    make_worker: Callable[[threading.Event], _Worker],
+    jobs: int,
+    raising: bool,
+    callback: Callable[[int], object] | None,
 ) -> Iterator[MapResult | ValueError]:
     """Solve groups in threads and yield their results in order; submit a few more groups than there are threads."""
     stop = threading.Event()
@@ -142,7 +144,7 @@ def _solve_groups(
 
     def work(first: int, group: list[Any]) -> list[MapResult | Exception]:
         if not hasattr(workers, "own"):
-            workers.own = _Worker(settings, stop)
+            workers.own = make_worker(stop)
         own: _Worker = workers.own
         return own.solve(first, group)
 
@@ -205,11 +207,11 @@ def _count_triangles(given: Any) -> int:
 class _Worker:
     """Solver of groups of problems for one thread, with the caches that the thread reuses."""
 
-    def __init__(self, settings: _Settings, stop: threading.Event) -> None:
-        self._settings = settings
-        self._search = replace(settings.search, callback=self._check_wanted)
+    def __init__(self, reference: Reference | None, options: MapOptions, stop: threading.Event) -> None:
+        self._reference = reference
+        self._options = replace(options, callback=self._check_wanted)
         self._stop = stop
-        self._patterns = Patterns(settings.search.linear_solver)
+        self._patterns = Patterns(options.linear_solver)
         self._last: Problem | None = None
 
     def solve(self, first: int, group: Sequence[Any]) -> list[MapResult | Exception]:
@@ -218,8 +220,8 @@ class _Worker:
         posed = [self._set_up(first + k, given, ready.get(k)) for k, given in enumerate(group)]
         begun: dict[int, MapResult | Search] = {}
         problems = {k: one for k, one in enumerate(posed) if not isinstance(one, Exception)}
-        for descent, keys in group_by_first_stage(problems, self._search.strategy):
-            outcomes = run_first_stage([problems[k] for k in keys], descent, self._patterns, self._search)
+        for descent, keys in group_by_first_stage(problems, self._options.strategy):
+            outcomes = run_first_stage([problems[k] for k in keys], descent, self._patterns, self._options)
             begun |= {k: one for k, one in zip(keys, outcomes, strict=True) if one is not None}
         return [
             problem if isinstance(problem, Exception) else self._finish(first + k, problem, begun.get(k))
@@ -228,7 +230,7 @@ class _Worker:
 
     def _set_up_batch(self, group: Sequence[Any]) -> dict[int, Problem]:
         """Set up problems with small meshes given as arrays in one batch; return {} if one of them is invalid."""
-        if self._settings.reference is not None:
+        if self._reference is not None:
             return {}
         new = dict[int, Any]()
         before: Sequence[Any] | None = None
@@ -258,7 +260,7 @@ class _Worker:
             if not isinstance(given, Sequence) or len(given) != 4:
                 raise ValueError("give each as a Problem, as V, F, fixed, target or as mesh, fixed, target")
             V, F, fixed, target = given
-            last, reference = self._last, self._settings.reference
+            last, reference = self._last, self._reference
             if last is not None and _is_same(last.V, V) and _is_same(last.F, F) and _is_same(last.fixed, fixed):
                 return last.with_target(target)
             self._last = Problem(V, F, fixed, target, reference=reference) if ready is None else ready
@@ -268,19 +270,15 @@ class _Worker:
 
     def _finish(self, number: int, problem: Problem, begun: MapResult | Search | None) -> MapResult | Exception:
         """Complete the search for one problem, from its result or its search after the first stage."""
-        energy = self._settings.polish
         try:
             if isinstance(begun, MapResult):
                 result = begun
             elif begun is None:
-                result = search_map(problem, self._search)
+                result = search_map(problem, self._options)
             else:
-                result = finish_search(begun, self._search.strategy, begun.stages[0].seconds)
-            if energy is not None and result.status is Status.INJECTIVE:
-                polishing = PolishOptions(
-                    energy=energy, linear_solver=self._search.linear_solver, callback=self._check_wanted
-                )
-                result = polish_result(problem, result, polishing)
+                result = finish_search(begun, self._options.strategy, begun.work.stages[0].seconds)
+            if self._options.polish is not None and result.status is Status.INJECTIVE:
+                result = polish_result(problem, result, polish_options(self._options))
             if result.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
         except Exception as error:

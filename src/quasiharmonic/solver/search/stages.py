@@ -1,42 +1,54 @@
-"""Stages of a strategy other than a plain `Descent`: on a coarse mesh, tentative, or conditional."""
+"""Strategies: lists of stages. The default strategy is fast and reliable; the other is the pipeline of the paper.
+
+Most stages are a plain `Descent`. The others run on a coarse mesh, tentatively, or under a condition.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from itertools import takewhile
 from typing import ClassVar, TypeAlias
 
-from quasiharmonic.solver.methods.base import Descent, SearchStage
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import Status
+from quasiharmonic.solver.methods import (
+    Alternating,
+    Composite,
+    Descent,
+    LineShift,
+    LocalRepair,
+    Newton,
+    RandomRestarts,
+    Untangling,
+    VectorAdam,
+    WideRepair,
+)
+from quasiharmonic.solver.methods.base import SearchStage, StageRunner
+from quasiharmonic.util.arrays import describe
 
 #: Stages of a strategy.
 Stages: TypeAlias = Sequence[SearchStage]
 
-
-@dataclass(frozen=True)
-class CoarseToFine(SearchStage):
-    """Stage that searches on a coarse mesh and transfers the map to the fine mesh; skipped if the mesh is small.
-
-    ``first`` is the first stage on the coarse mesh; local repair and untangling follow.
-    """
-
-    first: Descent
-
-    coarse: ClassVar[bool] = True
-
-    @property
-    def name(self) -> str:
-        """Name of this stage in reports."""
-        return f"coarse-to-fine, {self.first.name}"
-
-    @property
-    def begins_with(self) -> Descent:
-        """``first``."""
-        return self.first
+# Fraction of inverted triangles above which a stage `IfManyInverted` runs.
+MANY_INVERTED = 0.02
+# Number of vertices from which a coarse-to-fine start pays. Making, solving and refining the coarse mesh is then faster
+# than ten iterations on the fine mesh.
+_COARSE_FROM = 6000
+# Number of triangles from which wide patches are tried before the whole mesh is untangled.
+_WIDE_FROM = 4000
+# Up to this number of triangles the composite costs more time than it saves,
+_COMPOSITE_FROM = 1000
+# and up to this number of triangles per boundary edge.
+_COMPOSITE_FROM_PER_EDGE = 4
+# Repetitions of alternation and Newton's method in the paper's pipeline.
+_REPETITIONS = 10
 
 
 @dataclass(frozen=True)
 class _DescentStage(SearchStage):
-    """Stage that runs one descent under conditions of its own."""
+    """Stage that runs one descent in its own way."""
 
     descent: Descent
 
@@ -51,9 +63,148 @@ class _DescentStage(SearchStage):
         return self.descent
 
 
+class CoarseToFine(_DescentStage):
+    """Stage that searches on a coarse mesh and transfers the map to the fine mesh; skipped if the mesh is small.
+
+    ``descent`` is the first stage on the coarse mesh; local repair and untangling follow.
+    """
+
+    coarse: ClassVar[bool] = True
+
+    @property
+    def name(self) -> str:
+        """Name of this stage in reports."""
+        return f"coarse-to-fine, {self.descent.name}"
+
+    def run(self, search: StageRunner) -> None:
+        """See `SearchStage`."""
+        search.search_on_coarse(self.name, self.descent)
+
+
 class TentativeStage(_DescentStage):
     """Stage whose iterations are discarded if it finds no map (§9.2). Later stages continue from the earlier state."""
+
+    def run(self, search: StageRunner) -> None:
+        """See `SearchStage`."""
+        lowest_energy = search.lowest_energy
+        if search.attempt(self.descent) is not Status.INJECTIVE:
+            search.lowest_energy = lowest_energy
 
 
 class IfManyInverted(_DescentStage):
     """Stage that runs only if so many triangles are inverted that local repair would be slower."""
+
+    def run(self, search: StageRunner) -> None:
+        """See `SearchStage`."""
+        if search.best[0] > MANY_INVERTED * len(search.problem.F):
+            search.attempt(self.descent)
+
+
+def speed(problem: Problem) -> Stages:
+    """Return the stages of the default strategy, which finds a map fastest; the first stage usually suffices.
+
+    The order of stages follows from these observations:
+
+    - Without pins tanh is best. With pins si-log is best: the spike at a pinned vertex needs distortion that grows
+      slowly towards it, which tanh does not reach.
+    - With one boundary loop and no pins, the composite through a disk starts close to a solution.
+    - After the first stage a few triangles in narrow regions may be inverted; moving vertices untangles them faster
+      than changing tensors. Otherwise parts of the map are far from a solution, and Newton's method is used.
+    - On a large mesh a coarse mesh is searched first; on a small mesh it is searched after the first repairs.
+    - On a large mesh, wide patches are untangled before the whole mesh.
+    """
+    domain = problem.domain
+    pinned, triangles = bool(domain.pins.size), len(problem.F)
+    is_disk = len(domain.loops) == 1 and not pinned
+    composed = is_disk and triangles > max(_COMPOSITE_FROM, _COMPOSITE_FROM_PER_EDGE * domain.loops[0].size)
+    return list(_speed(pinned, is_disk, composed, problem.n >= _COARSE_FROM, triangles >= _WIDE_FROM))
+
+
+@cache
+def _speed(pinned: bool, is_disk: bool, composed: bool, large: bool, wide: bool) -> Stages:
+    """Return the stages of `speed` for these properties of a mesh.
+
+    It has pins, is a disk without pins, is mapped by the composite first, or is large; ``wide`` adds wide patches
+    before the whole mesh is untangled.
+    """
+    other: Stages = ()
+    if pinned:
+        first: Descent = VectorAdam(parameterisation="si-log", iterations=400, relocation=True)
+        newton = Newton(parameterisation="si-log", iterations=60, resume=True)
+    else:
+        first, newton = VectorAdam(iterations=100, relocation=True), Newton(iterations=300, resume=True)
+    # Most successful local repairs succeed within the first tries, and a failed try costs as much as many Newton steps.
+    repair: Stages = (LineShift(resume=True), LocalRepair(tries=15, resume=True))
+    if is_disk:
+        # Two different starts: if one fails, the other may succeed.
+        composite = Composite(iterations=100, relocation=True)
+        first, second = (composite, first) if composed else (first, composite)
+        other = (second, *repair)
+    coarse = CoarseToFine(first)
+    first_stages: Stages = (first, *repair, coarse)
+    if large:
+        # Newton steps untangle thousands of triangles at once, local repair only one patch at a time.
+        first_stages = (coarse, first, *((IfManyInverted(newton),) if is_disk else ()), *repair)
+    return (
+        *first_stages,
+        *((WideRepair(resume=True),) if wide else ()),
+        Untangling(iterations=400, resume=True),
+        LineShift(max_failures=10, resume=True),
+        *other,
+        newton,
+        Untangling(iterations=600, resume=True),
+        LineShift(max_failures=10, resume=True),
+        RandomRestarts(max_failures=30, resume=True),
+        RandomRestarts(max_failures=30),
+        RandomRestarts(max_failures=60, resume=True),
+    )
+
+
+def paper(_: Problem) -> Stages:
+    """Return the stages of the paper's evaluation (§9.2, §10.1).
+
+    The stages are si-log for at most 1000 iterations, then tanh from ξ = 0. Alternation and Newton's method then take
+    turns for the last few triangles, and failed alternations are discarded. All stages run on the mesh itself, with the
+    surface's triangles as reference and angles below π/6 corrected (§F.1). The paper does not give the iterations of
+    tanh and of each turn; those used here add up to 2000. The steps are the defaults of `VectorAdam`.
+    """
+    turn: list[SearchStage] = [
+        TentativeStage(Alternating(reference="corrected", iterations=20, resume=True)),
+        Newton(reference="corrected", iterations=20, resume=True),
+    ]
+    return [
+        VectorAdam(parameterisation="si-log", reference="corrected", iterations=1000),
+        VectorAdam(reference="corrected", iterations=600),
+        *_REPETITIONS * turn,
+    ]
+
+
+STRATEGIES: dict[str, Callable[[Problem], Stages]] = {"speed": speed, "paper": paper}
+
+
+def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
+    """Return the stages of a named strategy, or the given list of stages; raise a ValueError if neither is valid."""
+    if isinstance(strategy, str):
+        if strategy not in STRATEGIES:
+            raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
+        return STRATEGIES[strategy](problem)
+    given = list(strategy) if isinstance(strategy, Sequence) else []
+    stages = [stage for stage in given if isinstance(stage, SearchStage)]
+    if not stages or len(stages) < len(given):
+        raise ValueError(
+            f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {describe(strategy)}"
+        )
+    return stages
+
+
+def quick_stages(stages: Stages) -> Stages:
+    """Return the first stages of a strategy: up to the first on the mesh itself, and the quick ones after it."""
+    before = list(takewhile(lambda stage: stage.coarse, stages))
+    first = stages[len(before) : len(before) + 1]
+    rest = [stage for stage in stages[len(before) + 1 :] if not isinstance(stage, IfManyInverted)]
+    return [*before, *first, *takewhile(lambda stage: stage.quick, rest)]
+
+
+def without_restarts(stages: Stages) -> Stages:
+    """Return a strategy without random restarts, whose failed tries cost many iterations each."""
+    return [stage for stage in stages if not isinstance(stage, RandomRestarts)] or stages

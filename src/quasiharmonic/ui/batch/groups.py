@@ -28,10 +28,10 @@ from quasiharmonic.problem.problem_batch import Given, set_up_batch
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.field.objective_batch import Patterns
 from quasiharmonic.solver.search.first_stage import SMALL, group_by_first_stage, run_first_stage
-from quasiharmonic.solver.search.options import SearchOptions
 from quasiharmonic.ui.batch import island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.options import MapOptions
 
 Job = dict[str, Any]
 
@@ -175,7 +175,7 @@ def _solve_first_stage(problems: dict[int, Problem], settings: dict[str, Any]) -
     """Yield the problems that the first stage of their search solves, with their results."""
     for descent, some in group_by_first_stage(problems, settings["strategy"]):
         patterns = Patterns(solver_for(problems[some[0]], settings["linear_solver"]))
-        options = SearchOptions(max_iterations=settings["max_iterations"], linear_solver=settings["linear_solver"])
+        options = MapOptions(max_iterations=settings["max_iterations"], linear_solver=settings["linear_solver"])
         found = run_first_stage([problems[k] for k in some], descent, patterns, options)
         for k, result in zip(some, found, strict=True):
             if isinstance(result, MapResult) and result.injective:

@@ -16,10 +16,10 @@ from quasiharmonic.energies.polishing import ENERGIES
 from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.linsolve import available
-from quasiharmonic.solver.search.options import MAX_ITERATIONS
-from quasiharmonic.solver.search.strategy import STRATEGIES
+from quasiharmonic.solver.search.stages import STRATEGIES
 from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.util.arrays import check_bool, check_choice, check_integer, describe
+from quasiharmonic.util.options import MAX_ITERATIONS
 
 _CHOICES: dict[str, tuple[str | None, ...]] = {
     "strategy": tuple(STRATEGIES),

@@ -29,7 +29,7 @@ from quasiharmonic.apps.atlas.atlas_verdict import certify
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, each_island, merge_refined, orient_islands
 from quasiharmonic.apps.flattening.free_boundary import check_flattenable
 from quasiharmonic.apps.repair.fitting import FittedProblem
-from quasiharmonic.energies.polishing import PolishOptions, polish_result
+from quasiharmonic.energies.polishing import polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.refinement import Refined
 from quasiharmonic.io.errors import FileInUseError
@@ -39,6 +39,7 @@ from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refine.attempts import on_refinement
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.util.options import PolishOptions
 from quasiharmonic.util.standard_input import detach_input
 from quasiharmonic.util.untrusted import bounded
 

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-# Copies of names in energies.polishing, solver.search.harmonising, energies.measures, solver.search.strategy and
+# Copies of names in energies.polishing, solver.search.harmonising, energies.measures, solver.search.stages and
 # linsolve, so that the parser does not import these modules.
 ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
 FLATTENED = *ENERGIES, "distances"

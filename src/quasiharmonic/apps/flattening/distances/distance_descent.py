@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy, PairForm
 from quasiharmonic.apps.flattening.layout import to_given_unit
-from quasiharmonic.apps.flattening.piece import Piece, Settings
+from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.distances import Sampling, SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
@@ -29,7 +30,8 @@ from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_integer, map_array
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, map_array
+from quasiharmonic.util.options import DistanceOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
 # Number of pairs. On a cortex of 9,465 vertices, twice as many lower the error by 1 %, and half as many raise it by 1
@@ -49,20 +51,21 @@ _RESIDUAL = 0.1
 _MAX_GRADIENTS = 20
 
 
+class DistanceKeywords(TypedDict, total=False):
+    """Types of the options of `keep_distances`."""
+
+    rings: int
+    max_iterations: int
+    tol: float
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+    record_every: int
+
+
 @accepts_mesh
 @reports_progress
-def keep_distances(
-    V: ArrayLike,
-    F: ArrayLike,
-    uv: ArrayLike,
-    *,
-    rings: int = 20,
-    max_iterations: int = 100,
-    tol: float = 1e-3,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
-    record_every: int = 0,
-) -> MapResult:
+@takes(DistanceOptions, DistanceKeywords)
+def keep_distances(V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[DistanceKeywords]) -> MapResult:
     """Lower the error of distances in a bijective map; all maps on the way are bijective.
 
     The objective is a mean over a sample of vertex pairs at most ``rings`` edges apart. It is the distance error of
@@ -119,38 +122,37 @@ def keep_distances(
     True
     """
     began = time.perf_counter()
-    check_integer("rings", rings, minimum=1)
-    settings = Settings("symmetric-dirichlet", tol, max_iterations, linear_solver, callback, record_every)
+    checked = DistanceOptions(**options)
     piece = Piece(V, F)
     n = len(piece.V)
     positions = map_array("uv", uv, n)
     certificate = certify(piece.F, positions, loops=piece.loops)
     if not certificate.bijective:
         raise ValueError(f"uv is not bijective: the descent needs a bijective map. {certificate.summary()}")
-    result = lower_distance_error(piece, positions, rings, settings)
+    result = lower_distance_error(piece, positions, checked)
     uv = to_given_unit(result.uv, piece.exponent)
     certificate = certify(piece.F, uv, loops=piece.loops)
     rest = np.ldexp(piece.V, piece.exponent)
     return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began, V=rest)
 
 
-def lower_distance_error(piece: Piece, uv: FloatArray, rings: int, settings: Settings, *, first: int = 0) -> MapResult:
+def lower_distance_error(piece: Piece, uv: FloatArray, options: DistanceOptions, *, first: int = 0) -> MapResult:
     """Lower the error of distances in a bijective map (n, 2), of any size, of a piece; see `keep_distances`.
 
-    The energy of ``settings`` is ignored, and ``first`` is the number of the first step. The result's ``uv`` is in the
-    piece's unit, and its ``path`` in the surface's.
+    ``first`` is the number of the first step. The result's ``uv`` is in the piece's unit, and its ``path`` in the
+    surface's.
     """
-    run = Run(settings.callback, settings.record_every, first=first)
-    distances = sample_distances(piece.V, piece.F, choose_sampling(rings))
+    run = Run(options.callback, options.record_every, first=first)
+    distances = sample_distances(piece.V, piece.F, choose_sampling(options.rings))
     start = fit_scale(uv, distances, piece.F, piece.loops)
     with np.errstate(all="ignore"):
         energy = DistanceEnergy(distances, piece.energy(SymmetricDirichlet(), None), len(piece.V))
         descent = SurfaceDescent(
-            energy, start, settings.linear_solver, rim=Rim(piece.loops), pairs=DistancePairs(energy)
+            energy, start, options.linear_solver, rim=Rim(piece.loops), pairs=DistancePairs(energy)
         )
     status = Status.INTERRUPTED
     with run.until_interrupted():
-        steps = islice(descend(descent, settings.density, settings.tol), settings.max_iterations)
+        steps = islice(descend(descent, SymmetricDirichlet(), options.tol), options.max_iterations)
         status = run.descend(
             "guarded descent, distances",
             steps,

@@ -34,13 +34,14 @@ from quasiharmonic.apps.flattening.multilevel.coarse_flattening import (
 )
 from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
 from quasiharmonic.apps.flattening.multilevel.local_smoothing import smooth_map, thick_energy
-from quasiharmonic.apps.flattening.piece import Piece, Settings
+from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.distances import SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.problem.result import MapResult, Snapshot, Status
 from quasiharmonic.problem.run import Run
+from quasiharmonic.util.options import DistanceOptions
 
 # Minimum length of the requested rings, in rings of the coarse mesh.
 _RINGS = 3.0
@@ -49,16 +50,16 @@ _RINGS = 3.0
 _MAX_RINGS = 20
 
 
-def lower_coarse_distance_error(piece: Piece, rings: int, settings: Settings, *, least: int = 9000) -> MapResult | None:
+def lower_coarse_distance_error(piece: Piece, options: DistanceOptions, *, least: int = 9000) -> MapResult | None:
     """Keep distances on a coarse mesh of at least ``least`` vertices, and prolong its map to the surface.
 
-    The arguments are those of `lower_distance_error`. ``rings`` counts the surface's edges, and steps are counted on
+    The options are those of `lower_distance_error`. ``rings`` counts the surface's edges, and steps are counted on
     the coarse mesh; ``path`` gets the final map only. Return a bijective map in the piece's unit, or None if there is
     no coarser mesh, or rounding prevents a map. Ctrl-C outside the distance descent raises KeyboardInterrupt; there it
     only ends the descent.
     """
-    run = Run(settings.callback)
-    n, solver = len(piece.V), settings.linear_solver
+    run, rings = Run(options.callback), options.rings
+    n, solver = len(piece.V), options.linear_solver
     hierarchy = Hierarchy(piece.V, piece.F, piece.loops, COARSEST)
     stop = hierarchy.coarsest(max(least, n * (_RINGS / rings) ** 2))
     stops = [*(coarser for coarser in hierarchy.select_stops(RATIO) if coarser > stop), stop]
@@ -80,14 +81,14 @@ def lower_coarse_distance_error(piece: Piece, rings: int, settings: Settings, *,
         descent = SurfaceDescent(energy, start, solver, rim=Rim(level.loops), pairs=DistancePairs(energy))
     status = Status.INTERRUPTED
     with run.until_interrupted():
-        steps = islice(descend(descent, settings.density, settings.tol), settings.max_iterations)
+        steps = islice(descend(descent, SymmetricDirichlet(), options.tol), options.max_iterations)
         status = run.descend("guarded descent, distances, coarse", steps, lambda: descent.distortion)
     found = prolong_map(hierarchy, level, hierarchy.level(0), descent.uv, solver)
     if found is None:
         return None
     # Smooth once more than other maps; on a cortex this lowers the mean error by 1 %.
     found = smooth_map(piece.V, piece.F, piece.loops, found, solver)
-    if settings.record_every:
+    if options.record_every:
         run.path.append(Snapshot(run.history[-1].iteration, to_given_unit(found, piece.exponent)))
     return run.result(found, piece.F, status, loops=piece.loops, linear_solver=descent.linear_solver)
 

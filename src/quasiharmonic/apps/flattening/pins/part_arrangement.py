@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 
 from quasiharmonic.apps.flattening.connected_parts import Part, name_part, unite_parts
-from quasiharmonic.apps.flattening.piece import Settings
 from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
 from quasiharmonic.apps.flattening.pins.pin_search import PinSearch
 from quasiharmonic.geometry.exact.certificate import certify
@@ -27,6 +26,7 @@ from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.options import FlattenOptions
 
 # A surface placed at a pin fills this fraction of the free space around it.
 _FILLED = 0.5
@@ -41,7 +41,7 @@ def flatten_pinned_parts(
     parts: Sequence[Part],
     fixed: IntArray,
     target: FloatArray,
-    settings: Settings,
+    options: FlattenOptions,
     weights: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> MapResult:
@@ -60,7 +60,7 @@ def flatten_pinned_parts(
         number[part.vertices] = np.arange(part.vertices.size)
         here = number[fixed] >= 0
         own = None if weights is None else weights[part.triangles]
-        return PinSearch(part.piece, number[fixed[here]], target[here], settings, own)
+        return PinSearch(part.piece, number[fixed[here]], target[here], options, own)
 
     results: list[MapResult] = []
     for part in parts:

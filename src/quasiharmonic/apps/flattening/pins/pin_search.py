@@ -22,10 +22,11 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.layout import to_given_unit
-from quasiharmonic.apps.flattening.piece import Flattening, Piece, Settings
+from quasiharmonic.apps.flattening.piece import Flattening, Piece, energy_name
 from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
 from quasiharmonic.apps.flattening.scaffold.air_triangulation import triangulate_air
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.refinement import split_edges
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
@@ -35,9 +36,9 @@ from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.methods import RandomRestarts, Untangling, VectorAdam
-from quasiharmonic.solver.search.stages import CoarseToFine, Stages
-from quasiharmonic.solver.search.strategy import speed
+from quasiharmonic.solver.search.stages import CoarseToFine, Stages, speed
 from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, target_positions
+from quasiharmonic.util.options import FlattenOptions
 
 # Tolerance for the map that is then moved onto the pins.
 _TOLERANCE = 1e-2
@@ -62,21 +63,21 @@ def flatten_pinned(
     piece: Piece,
     fixed: IntArray,
     target: FloatArray,
-    settings: Settings,
+    options: FlattenOptions,
     weights: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> MapResult:
     """Map a surface into the plane bijectively, with some fixed vertices and an otherwise free boundary.
 
     ``target`` (k, 2) are the positions of ``fixed`` (k,), at least one; they may be contradictory. ``start`` (n, 2) is
-    an injective map at any scale and position. ``settings`` are those of the descent that follows once the map is
+    an injective map at any scale and position. ``options`` are those of the descent that follows once the map is
     bijective. If the result's certificate is bijective, its status reports the convergence of the distortion, as for
     `flatten`. Otherwise the status is ``IMPOSSIBLE`` if the diagnosis proves that there is no bijective map,
     ``INJECTIVE`` if no triangle is inverted but the surface overlaps itself, or else that of the search. Ctrl-C raises
     KeyboardInterrupt before there is any bijective map, with or without pins. ValueError if a rest triangle has no
     area.
     """
-    search = PinSearch(piece, fixed, target, settings, weights)
+    search = PinSearch(piece, fixed, target, options, weights)
     # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never accepted.
     with np.errstate(all="ignore"):
         search.run(start)
@@ -146,9 +147,9 @@ class PinSearch:
     """
 
     def __init__(
-        self, piece: Piece, fixed: IntArray, target: FloatArray, settings: Settings, weights: FloatArray | None
+        self, piece: Piece, fixed: IntArray, target: FloatArray, options: FlattenOptions, weights: FloatArray | None
     ) -> None:
-        self._piece, self._settings = piece, settings
+        self._piece, self._options = piece, options
         self._fixed, self._given = fixed, target
         # Computed from quarters, because the difference of the largest doubles overflows.
         extent, quarter = np.frexp(np.ptp(np.ldexp(target, -2), axis=0).max())
@@ -158,11 +159,11 @@ class PinSearch:
         self._larger = max(int(np.frexp(np.abs(target).max())[1]) - _LARGEST - unit, 0)
         self.exponent = unit + self._larger
         self._target = np.ldexp(target, -self.exponent)
-        self._energy = piece.energy(settings.density, weights)
+        self._energy = piece.energy(find_energy(options.energy), weights)
         self._solver = ""
         self.status = Status.STALLED
         self._diagnosis: Diagnosis | None = None
-        self._run = Run(settings.callback, settings.record_every)
+        self._run = Run(options.callback, options.record_every)
 
     @property
     def pins(self) -> tuple[IntArray, FloatArray]:
@@ -180,8 +181,8 @@ class PinSearch:
     def flatten_freely(self, start: FloatArray | None) -> FloatArray:
         """Flatten freely, optionally from a start in the surface's unit, and move the map onto the pins; (n, 2)."""
         piece = self._piece
-        solver = self._settings.linear_solver
-        rough = Settings("symmetric-dirichlet", _TOLERANCE, _MAX_STEPS, solver, callback=None, record_every=0)
+        solver = self._options.linear_solver
+        rough = FlattenOptions(tol=_TOLERANCE, max_iterations=_MAX_STEPS, linear_solver=solver)
         flat = Flattening(piece, rough, None).run(None if start is None else np.ldexp(start, -piece.exponent))
         self._run.stages += flat.stages
         self._solver = flat.linear_solver
@@ -226,13 +227,13 @@ class PinSearch:
             refined = split_edges(points, F, split)
             F, points = refined.F, refined.V
             problem = Problem(points, F, fixed, target, reference="equilateral")
-            settings = self._settings
+            options = self._options
             found = solve(
                 problem,
                 strategy=_choose_stages(problem, last=last),
-                max_iterations=max(_MIN_ITERATIONS, settings.max_iterations),
-                linear_solver=settings.linear_solver,
-                callback=settings.callback,
+                max_iterations=max(_MIN_ITERATIONS, options.max_iterations),
+                linear_solver=options.linear_solver,
+                callback=options.callback,
             )
             self._run.stages += found.stages
             self._run.history += found.history
@@ -282,16 +283,14 @@ class PinSearch:
 
     def lower_distortion(self) -> None:
         """Lower the distortion of a bijective map with only the pins fixed."""
-        settings = self._settings
-        descent = SurfaceDescent(
-            self._energy, self._uv, settings.linear_solver, self._fixed, rim=Rim(self._piece.loops)
-        )
+        options = self._options
+        descent = SurfaceDescent(self._energy, self._uv, options.linear_solver, self._fixed, rim=Rim(self._piece.loops))
         self._solver = descent.linear_solver
         self.status = Status.INTERRUPTED
         with self._run.until_interrupted():
             self.status = self._run.descend(
-                f"guarded descent, {settings.name}",
-                itertools.islice(descend(descent, settings.density, settings.tol), settings.max_iterations),
+                f"guarded descent, {energy_name(options)}",
+                itertools.islice(descend(descent, find_energy(options.energy), options.tol), options.max_iterations),
                 lambda: descent.distortion,
                 lambda: self._to_target_unit(descent.uv),
             )

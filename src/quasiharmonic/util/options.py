@@ -1,0 +1,234 @@
+"""Options of the operations: names, defaults, checks, and texts of the command line, each declared once.
+
+An operation has one frozen class. The keyword functions and the command line derive their options from its fields, and
+the library passes its instances on. This module imports nothing heavy, so that the parser of the command line starts
+fast.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, field, fields
+from functools import wraps
+from typing import Any, TypeVar
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# Names of the values that some options accept; the dictionaries with the values themselves are tested to have these.
+ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
+FLATTENED = *ENERGIES, "distances"
+HARMONISED = "arap", "arap-unsigned", "area", "springs", *ENERGIES
+STRATEGIES = "speed", "paper"
+#: Default maximum number of iterations of a search.
+MAX_ITERATIONS = 2000
+REFERENCES = "equilateral", "rest", "corrected"
+LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
+
+
+def option(
+    default: Any = MISSING,
+    help: str = "",
+    *,
+    check: Callable[[str, Any], None] | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Declare an option.
+
+    ``check`` raises an error for the name and a wrong value. ``help`` and ``choices`` are for the command line; the
+    operation itself rejects unknown names.
+    """
+    return field(default=default, metadata={"help": help, "check": check, "choices": choices})
+
+
+def positive(name: str, value: Any) -> None:
+    """Check a positive integer."""
+    from quasiharmonic.util.arrays import check_integer
+
+    check_integer(name, value, minimum=1)
+
+
+def count(name: str, value: Any) -> None:
+    """Check an integer that is not negative."""
+    from quasiharmonic.util.arrays import check_integer
+
+    check_integer(name, value, minimum=0)
+
+
+def tolerance(name: str, value: Any) -> None:
+    """Check a number that is not negative."""
+    from quasiharmonic.util.arrays import check_non_negative
+
+    check_non_negative(name, value)
+
+
+def positive_number(name: str, value: Any) -> None:
+    """Check a positive number."""
+    from quasiharmonic.util.arrays import check_positive
+
+    check_positive(**{name: value})
+
+
+def switch(name: str, value: Any) -> None:
+    """Check a boolean."""
+    from quasiharmonic.util.arrays import check_bool
+
+    check_bool(name, value)
+
+
+def function(name: str, value: Any) -> None:
+    """Check a callback or None."""
+    from quasiharmonic.util.arrays import check_callback
+
+    check_callback(value)
+
+
+def reference_name(name: str, value: Any) -> None:
+    """Check the name of reference triangles."""
+    from quasiharmonic.util.arrays import check_choice
+
+    check_choice(name, value, REFERENCES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Base of the options of an operation; an instance has checked its values.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If a value is invalid.
+    """
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            check = one.metadata.get("check")
+            if check is not None:
+                check(one.name, getattr(self, one.name))
+
+
+def takes(options: type[Options], keywords: type) -> Callable[[F], F]:
+    """Decorate a function of ``**options: Unpack[keywords]``, so that its signature shows names, types and defaults.
+
+    ``keywords`` is a TypedDict with the types of the fields of ``options`` that the function has.
+    """
+    defaults = {one.name: one.default for one in fields(options)}
+    shown = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=of.__forward_arg__)
+        for name, of in keywords.__annotations__.items()
+    ]
+
+    def decorate(function: F) -> F:
+        signature = inspect.signature(function)
+        own = [one for one in signature.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
+        known = {one.name for one in [*own, *shown]}
+
+        @wraps(function)
+        def call(*args: Any, **given: Any) -> Any:
+            for name in given:
+                if name not in known:
+                    raise TypeError(f"{function.__name__}() got an unexpected keyword argument {name!r}")
+            return function(*args, **given)
+
+        call.__signature__ = signature.replace(parameters=[*own, *shown])  # type: ignore[attr-defined]
+        return call  # type: ignore[return-value]
+
+    return decorate
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions(Options):
+    """Options of every operation that solves linear systems step by step."""
+
+    linear_solver: str = option("auto", "(default: the fastest one installed)", choices=LINEAR_SOLVERS)
+    callback: Callable[[Any], object] | None = option(None, check=function)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOptions(SolverOptions):
+    """Options of `quasiharmonic.injective_map` and `quasiharmonic.solve`."""
+
+    strategy: Any = option(
+        "speed",
+        "the fastest method, or the paper's pipeline, which starts with si-log (default: speed)",
+        choices=STRATEGIES,
+    )
+    polish: Any = option(None, choices=ENERGIES)
+    start: Any = option(None)
+    max_iterations: int = option(MAX_ITERATIONS, "(default: 2000)", check=positive)
+    record_every: int = option(0, check=count)
+    slide: Any = option(False)
+    refine: bool = option(False, check=switch)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolishOptions(SolverOptions):
+    """Options of `quasiharmonic.polish`."""
+
+    energy: Any = option("symmetric-dirichlet", "(default: symmetric-dirichlet)", choices=ENERGIES)
+    weights: Any = option(None)
+    max_iterations: int = option(200, "(default: 200)", check=count)
+    tol: float = option(1e-4, check=tolerance)
+    slide: Any = option(False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HarmoniseOptions(SolverOptions):
+    """Options of `quasiharmonic.harmonise`."""
+
+    energy: Any = option("arap", "(default: arap)", choices=HARMONISED)
+    eta: Any = option(None)
+    conformal: float = option(1e-3, check=tolerance)
+    weights: Any = option(None)
+    scaled: bool = option(True, check=switch)
+    max_iterations: int = option(40, check=positive)
+    tol: float = option(1e-3, check=tolerance)
+    reference: str = option("rest", check=reference_name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistanceOptions(SolverOptions):
+    """Options of `quasiharmonic.keep_distances`."""
+
+    rings: int = option(20, check=positive)
+    max_iterations: int = option(100, check=count)
+    tol: float = option(1e-3, check=tolerance)
+    record_every: int = option(0, check=count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlattenOptions(DistanceOptions):
+    """Options of `quasiharmonic.flatten`."""
+
+    energy: Any = option("symmetric-dirichlet", "(default: symmetric-dirichlet)", choices=FLATTENED)
+    max_iterations: int = option(500, check=count)
+    tol: float = option(1e-4, check=tolerance)
+    fixed: Any = option(None)
+    target: Any = option(None)
+    weights: Any = option(None)
+    start: Any = option(None)
+    unit_square: bool = option(False, check=switch)
+    gap: float = option(0.0, check=tolerance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TetrahedraOptions(Options):
+    """Options of `quasiharmonic.injective_tetrahedra`."""
+
+    start: Any = option(None)
+    polish: bool = option(True, check=switch)
+    max_iterations: int = option(1000, check=count)
+    tol: float = option(1e-6, check=positive_number)
+    callback: Callable[[Any], object] | None = option(None, check=function)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MorphOptions(SolverOptions):
+    """Options of `quasiharmonic.morph`; its two kinds of mesh check ``max_iterations`` and ``tol``."""
+
+    energy: Any = option("symmetric-dirichlet", choices=ENERGIES)
+    max_iterations: int = option(MAX_ITERATIONS)
+    slide: Any = option(False)
+    rest: Any = option(None)
+    start: Any = option(None)
+    tol: float = option(1e-8)
