@@ -21,6 +21,7 @@ from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
 from quasiharmonic.energies.distances import surface_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.util.options import DistanceOptions
 from shared.distances import rolled, spherical, turned
 from shared.distinct_steps import DistinctSteps
 

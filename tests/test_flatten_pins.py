@@ -14,6 +14,7 @@ from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, move_onto_p
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.results import Forbids, Kind
 from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay
+from quasiharmonic.util.options import FlattenOptions
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 DONE = {Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING}
