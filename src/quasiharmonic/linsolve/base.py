@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from functools import cache
+from importlib.util import find_spec
 from types import TracebackType
 from typing import ClassVar, Self
 
@@ -53,6 +55,8 @@ class LinearSolver(ABC):
 
     name: ClassVar[str]
     requirement: ClassVar[str]
+    #: Python package that contains the library; None if `present` does not depend on a package.
+    package: ClassVar[str | None] = None
     #: Whether the backend can use a given numbering instead of computing an order.
     takes_order: ClassVar[bool] = True
 
@@ -73,9 +77,10 @@ class LinearSolver(ABC):
             self._analyse()
 
     @classmethod
+    @cache  # Searching for a missing package takes as long as solving for 100 unknowns.
     def present(cls) -> bool:
         """Whether the library of this backend is installed; does not load it."""
-        return True
+        return cls.package is None or find_spec(cls.package) is not None
 
     def factor(self, values: ArrayLike) -> None:
         """Factor the matrix with these values.

@@ -129,6 +129,49 @@ def enumerate_each(counts: ArrayLike) -> tuple[IntArray, IntArray]:
     )
 
 
+def mark(n: int, *chosen: IntArray) -> BoolArray:
+    """Mask (n,) that is True at the given indices, arrays of any shape."""
+    marked = np.zeros(n, dtype=bool)
+    for indices in chosen:
+        marked[indices] = True
+    return marked
+
+
+def list_others(n: int, chosen: IntArray) -> IntArray:
+    """Ascending numbers below ``n`` that are not among the given ones."""
+    return np.flatnonzero(~mark(n, chosen))
+
+
+def invert_indices(chosen: IntArray, n: int) -> IntArray:
+    """Position in ``chosen`` (k,) of each number below ``n``, -1 for the others; (n,) int64."""
+    position = np.full(n, -1, dtype=np.int64)
+    position[chosen] = np.arange(len(chosen))
+    return position
+
+
+def to_complex(points: FloatArray) -> ComplexArray:
+    """Points (k, 2) as complex numbers x + iy, (k,)."""
+    return np.ascontiguousarray(points, dtype=np.float64).view(np.complex128).ravel()
+
+
+def to_points(w: ComplexArray) -> FloatArray:
+    """Complex numbers x + iy, (k,), as points (k, 2)."""
+    return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
+
+
+def find_exponent(values: NDArray[np.floating]) -> int:
+    """Binary exponent e of the largest absolute value: ``2**-e`` scales it to between 1/2 and 1; 0 if all are zero.
+
+    Scaling by a power of two rounds nothing, and afterwards squares neither overflow nor underflow.
+    """
+    return int(np.frexp(np.abs(values).max(initial=0.0))[1])
+
+
+def scale_to_unit(values: FloatArray) -> FloatArray:
+    """Values scaled by a power of two so that the largest absolute value is between 1/2 and 1; see `find_exponent`."""
+    return np.ldexp(values, -find_exponent(values))
+
+
 def own_triangles(F: ArrayLike) -> IntArray:
     """Triangles as from `triangle_rows`, contiguous and unchangeable, as kernels require."""
     return unchangeable(triangle_rows(F, copy=False))
