@@ -77,10 +77,9 @@ class LinearSolver(ABC):
             self._analyse()
 
     @classmethod
-    @cache  # Searching for a missing package takes as long as solving for 100 unknowns.
     def present(cls) -> bool:
         """Whether the library of this backend is installed; does not load it."""
-        return cls.package is None or find_spec(cls.package) is not None
+        return cls.package is None or _is_installed(cls.package)
 
     def factor(self, values: ArrayLike) -> None:
         """Factor the matrix with these values.
@@ -203,6 +202,11 @@ class LinearSolver(ABC):
     @abstractmethod
     def _release(self) -> None:
         """Release the factor and the memory of the library."""
+
+
+@cache  # Searching for a missing package takes as long as solving for 100 unknowns.
+def _is_installed(package: str) -> bool:
+    return find_spec(package) is not None
 
 
 def _check_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pattern]:

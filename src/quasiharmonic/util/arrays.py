@@ -142,7 +142,7 @@ def list_others(n: int, chosen: IntArray) -> IntArray:
     return np.flatnonzero(~mark(n, chosen))
 
 
-def invert_indices(chosen: IntArray, n: int) -> IntArray:
+def invert_indices(n: int, chosen: IntArray) -> IntArray:
     """Position in ``chosen`` (k,) of each number below ``n``, -1 for the others; (n,) int64."""
     position = np.full(n, -1, dtype=np.int64)
     position[chosen] = np.arange(len(chosen))
@@ -157,6 +157,23 @@ def to_complex(points: FloatArray) -> ComplexArray:
 def to_points(w: ComplexArray) -> FloatArray:
     """Complex numbers x + iy, (k,), as points (k, 2)."""
     return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
+
+
+def to_space(points: FloatArray) -> FloatArray:
+    """Points (n, 2) or (n, 3) as points in space (n, 3), with zeros for a missing coordinate."""
+    return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+
+
+def sum_at(indices: IntArray, values: ComplexArray, n: int) -> ComplexArray:
+    """Sum complex values (k,) at each of ``n`` indices; (n,) complex128."""
+    return np.bincount(indices, values.real, minlength=n) + 1j * np.bincount(indices, values.imag, minlength=n)
+
+
+def to_integers(values: FloatArray) -> list[int]:
+    """Finite doubles, multiplied by a common power of two that makes all of them integers."""
+    ratios = [value.as_integer_ratio() for value in values.ravel().tolist()]
+    unit = max(denominator for _, denominator in ratios)  # all are powers of two
+    return [numerator * (unit // denominator) for numerator, denominator in ratios]
 
 
 def find_exponent(values: NDArray[np.floating]) -> int:
@@ -396,6 +413,25 @@ def check_callback(callback: Any) -> None:
     """Raise a ValueError unless the callback is callable or None. Called before any work that reports to it."""
     if callback is not None and not callable(callback):
         raise ValueError(f"callback must be callable, or None, not {describe(callback)}")
+
+
+# Cells of the curve of `morton_order`: 2 to this power along the longest side of the points' bounding box.
+_CURVE_BITS = 10
+
+
+def morton_order(points: FloatArray) -> IntArray:
+    """Order of points (n, d) along Morton's curve, so that consecutive points are close to each other."""
+    if not len(points):
+        return np.empty(0, dtype=np.int64)
+    # Halve first, so that the extent of numbers near the largest double does not overflow.
+    offset = points / 2 - points.min(axis=0) / 2
+    size = float(offset.max())
+    cell = (offset / (size if size > 0 else 1.0) * ((1 << _CURVE_BITS) - 1)).astype(np.int64)
+    code = np.zeros(len(points), dtype=np.int64)
+    for bit in range(_CURVE_BITS):
+        for axis, along in enumerate(cell.T):
+            code |= (along >> bit & 1) << (len(cell.T) * bit + axis)
+    return np.argsort(code, kind="stable")
 
 
 def work(force: ComplexArray, displacement: ComplexArray) -> float:
