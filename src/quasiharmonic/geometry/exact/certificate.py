@@ -157,8 +157,7 @@ class Certificate(ReadOnly, Displayable):
 
     def plot(self) -> Figure:
         """Draw the certified map, with non-positive triangles in red and marks on boundary edges that meet."""
-        figure: Figure = self._draw("certificate")
-        return figure
+        return self._draw("certificate")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the certificate in plain Python types, fit for JSON; each loop as its first vertex and its length."""

@@ -100,6 +100,17 @@ def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
     return triangulation.triangles()
 
 
+def triangulate_inside(points: FloatArray, rim: IntArray, low: FloatArray, high: FloatArray) -> IntArray:
+    """Return the constrained Delaunay triangles (t, 3) to the left of directed edges ``rim`` (m, 2) that form loops.
+
+    ``low`` and ``high`` (2,) are corners of a box around all points. Raises as `constrained_delaunay`.
+    """
+    k = len(points)
+    box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    F = constrained_delaunay(np.concatenate([points, box]), rim, k + np.arange(4))
+    return F[select_inside(F, rim, k + 4)]
+
+
 def select_inside(F: IntArray, rim: IntArray, n: int) -> BoolArray:
     """Select the triangles (t, 3) to the left of directed edges that form loops, and those joined to them inside.
 

@@ -141,6 +141,14 @@ class TargetCurves:
             ranges.append((left.min() - 1, left.max()))
         return np.array(ranges, dtype=np.int64)
 
+    @property
+    def proper(self) -> bool:
+        """Whether the loops are simple, disjoint, and nested as holes in one outer loop."""
+        if not self.simple or self.turning is None or self.winding_range is None:
+            return False
+        low, high = self.winding_range.T
+        return self.turning.count(1) == 1 and bool((low >= 0).all() and (high <= 1).all())
+
     def _crossing_position(self, edge: int, other: int) -> Fraction:
         """Return the position along an edge where another crosses it, from 0 at its tail to 1 at its head."""
         heartbeat()

@@ -197,8 +197,7 @@ class Diagnosis(Displayable):
         ValueError
             If ``problem`` is None.
         """
-        figure: Figure = self._draw("diagnosis")
-        return figure
+        return self._draw("diagnosis")
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON: the forbidden classes, every obstruction, the edges to split."""

@@ -16,7 +16,7 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay, select_inside
+from quasiharmonic.geometry.exact.constrained_delaunay import triangulate_inside
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.solver.construction.halfedges import Edge, HalfEdges
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -50,7 +50,8 @@ class Regions:
         self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
         self._tolerance = _ROUNDINGS * float(np.spacing(np.abs(points).max()))
         rim = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
-        self.apex = HalfEdges(_triangles_within(points, rim)).apex
+        low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
+        self.apex = HalfEdges(triangulate_inside(points, rim, low, high)).apex
         self.cuts = {(a, b) for a, b in self.apex if (b, a) in self.apex}
         self._join()
         self._loop = np.full(len(points), -1)
@@ -149,15 +150,6 @@ class Regions:
                 if (b, a) in self.apex and (a, b) not in self.cuts:
                     waiting.append((b, a))
         return region
-
-
-def _triangles_within(points: FloatArray, rim: IntArray) -> IntArray:
-    """Return the constrained Delaunay triangles to the left of directed edges that form loops."""
-    low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
-    frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-    k = len(points)
-    T = constrained_delaunay(np.concatenate([points, frame]), rim, k + np.arange(4))
-    return T[select_inside(T, rim, k + 4)]
 
 
 def _order_by_halves(weight: dict[int, int], beside: dict[int, list[tuple[int, Edge]]]) -> list[Edge]:

@@ -19,12 +19,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.constrained_delaunay import (
-    BlockedError,
-    constrained_delaunay,
-    delaunay_of_polygon,
-    select_inside,
-)
+from quasiharmonic.geometry.exact.constrained_delaunay import delaunay_of_polygon, triangulate_inside
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.solver.field.objective import Iterate, Objective
@@ -131,15 +126,13 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
     if k <= _DIRECT_UP_TO:
         return delaunay_of_polygon(points)
     low, high = points.min(axis=0), points.max(axis=0)
-    low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-    box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    margin = _MARGIN * (high - low)
     sides = np.stack([ring, np.roll(ring, -1)], axis=1)
     try:
-        F = constrained_delaunay(np.concatenate([points, box]), sides, k + np.arange(4))
-    except (BlockedError, ValueError):
+        F = triangulate_inside(points, sides, low - margin, high + margin)
+    except ValueError:
         return None
     # If the polygon runs clockwise, the rest of the box is to its left, and the number of triangles differs.
-    F = F[select_inside(F, sides, k + 4)]
     return F if len(F) == k - 2 else None
 
 
