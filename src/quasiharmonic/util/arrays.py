@@ -148,6 +148,11 @@ def list_others(n: int, chosen: IntArray) -> IntArray:
     return np.flatnonzero(~mark(n, chosen))
 
 
+def cyclic_pairs(loop: IntArray) -> IntArray:
+    """Pairs (k, 2) of each element of a closed loop (k,) and the next, such as the edges of a boundary loop."""
+    return np.stack([loop, np.roll(loop, -1)], axis=1)
+
+
 def invert_indices(n: int, chosen: IntArray) -> IntArray:
     """Position in ``chosen`` (k,) of each number below ``n``, -1 for the others; (n,) int64."""
     position = np.full(n, -1, dtype=np.int64)

@@ -19,7 +19,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.loops import Contacts, contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, repeat_each
 from quasiharmonic.util.progress import heartbeat
 
 # Limit on the pairs of meeting edges to collect; a longer list would not help the user.
@@ -62,7 +62,7 @@ class TargetCurves:
     def __init__(self, positions: FloatArray, loops: list[IntArray]) -> None:
         self.positions = positions
         self.loops = [_from_lowest(positions, loop) for loop in loops]
-        self.ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops])
+        self.ends = np.concatenate([cyclic_pairs(loop) for loop in self.loops])
         self.loop_of = repeat_each(np.arange(len(loops)), [len(loop) for loop in self.loops])
 
     @cached_property

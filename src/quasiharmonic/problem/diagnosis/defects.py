@@ -17,7 +17,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.curves import TargetCurves
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, smallest_conflict, vertex_names
-from quasiharmonic.util.arrays import edge_names, names_of
+from quasiharmonic.util.arrays import cyclic_pairs, edge_names, names_of
 
 
 def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
@@ -36,7 +36,7 @@ def inverted_fixed_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obs
     sign = orientation(*(fixture.positions[corners[:, k]] for k in range(3)))
     boundary = pair_keys(problem.domain.edges.boundary, problem.n)
     for t, abc, s in zip(triangles[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
-        sides = np.stack([abc, np.roll(abc, -1)], axis=1)
+        sides = cyclic_pairs(abc)
         message = (
             f"All vertices of {names_of('triangle', 'triangles', t[None])} are fixed, "
             f"and the target {'inverts' if s < 0 else 'flattens'} it."

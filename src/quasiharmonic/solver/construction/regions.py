@@ -19,7 +19,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.constrained_delaunay import triangulate_inside
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.solver.construction.halfedges import Edge, HalfEdges
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, cyclic_pairs
 
 # A turn counts as straight if the point is off the line by at most this many roundings of the largest coordinate.
 _ROUNDINGS = 4.0
@@ -49,7 +49,7 @@ class Regions:
         self.points = points
         self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
         self._tolerance = _ROUNDINGS * float(np.spacing(np.abs(points).max()))
-        rim = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
+        rim = np.concatenate([cyclic_pairs(loop) for loop in loops])
         low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
         self.apex = HalfEdges(triangulate_inside(points, rim, low, high)).apex
         self.cuts = {(a, b) for a, b in self.apex if (b, a) in self.apex}

@@ -25,7 +25,7 @@ from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates
 from quasiharmonic.solver.methods.vector_adam import VectorAdam
-from quasiharmonic.util.arrays import ComplexArray, IntArray, check_integer, to_points
+from quasiharmonic.util.arrays import ComplexArray, IntArray, check_integer, cyclic_pairs, to_points
 
 # Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
 _EVEN_SHARE = 0.5
@@ -51,15 +51,12 @@ class Composite(VectorAdam):
     direct: int = 6
 
     label: ClassVar[str] = "composite"
+    #: Short: close to a solution it is found soon; the rest is for local repair.
+    patience: ClassVar[tuple[int, float] | None] = (10, 0.5)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_integer("direct", self.direct, minimum=0)
-
-    @property
-    def patience(self) -> tuple[int, float]:
-        """A short patience: close to a solution it is found soon; the rest is for local repair."""
-        return 10, 0.5
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; without a composite all steps are those of `VectorAdam`."""
@@ -127,7 +124,7 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
         return delaunay_of_polygon(points)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = _MARGIN * (high - low)
-    sides = np.stack([ring, np.roll(ring, -1)], axis=1)
+    sides = cyclic_pairs(ring)
     try:
         F = triangulate_inside(points, sides, low - margin, high + margin)
     except ValueError:
