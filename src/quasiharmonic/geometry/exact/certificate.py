@@ -35,7 +35,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.loops import Obstacle, Reason, check_loops, join_items, simple_loops
 from quasiharmonic.geometry.exact.triangles import find_multiply_wound, triangle_signs
@@ -113,18 +112,6 @@ class Certificate(ReadOnly, Displayable):
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, name, unchangeable(value))
         object.__setattr__(self, "loops", tuple(unchangeable(loop) for loop in self.loops))
-
-    def _read_only(self) -> tuple[NDArray[Any], ...]:
-        return (
-            self.F,
-            self.uv,
-            self.inverted,
-            self.degenerate,
-            self.nonfinite,
-            self.crossings,
-            self.multiply_wound,
-            *self.loops,
-        )
 
     @property
     def triangles(self) -> int:
