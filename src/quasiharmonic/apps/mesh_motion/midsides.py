@@ -10,7 +10,7 @@ from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.geometry.mesh.elements import MIDDLES, SIDES
 from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, invert_indices, to_complex, to_points
 
 # Required least control value of an inverted element, relative to that of the triangle of its corners.
 _MARGIN = 0.1
@@ -37,12 +37,12 @@ def follow_sides(before: FloatArray, after: FloatArray, middle: IntArray, ends: 
 
     Nodes of straight sides keep their relative position. If both ends are unchanged, the node is exactly unchanged.
     """
-    z, w = (np.ascontiguousarray(points).view(np.complex128).ravel() for points in (before, after))
+    z, w = (to_complex(points) for points in (before, after))
     (a, b), (p, q) = z[ends].T, w[ends].T
     ratio = np.divide(q - p, b - a, out=np.zeros_like(a), where=a != b)
     place = 0.5 * (p + q) + ratio * (z[middle] - 0.5 * (a + b))
     place = np.where((a == p) & (b == q), z[middle], place)
-    return place.view(np.float64).reshape(-1, 2)
+    return to_points(place)
 
 
 def restore_midsides(F: IntArray, rest: FloatArray, points: FloatArray, fixed: IntArray) -> FloatArray:
@@ -118,8 +118,7 @@ def _move_nodes(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
     near = F[np.isin(F, free).any(axis=1)]
     unit = np.abs(jacobian_coefficients(*_chords(near, points))[:, 0])
     size = np.sqrt(unit.mean())
-    number = np.full(len(points), -1)
-    number[free] = np.arange(free.size)
+    number = invert_indices(len(points), free)
     now = points.copy()
     weight = _DISPLACEMENT_WEIGHT
     for _ in range(_MAX_TRIES):
