@@ -113,13 +113,13 @@ class PlateSystem(NewtonSystem):
     def assemble(self, form: QuadraticForm) -> None:
         """Add up the triangles' quadratic forms and the constant matrix."""
         super().assemble(form)
-        self._diagonal = self._diagonal + self._constant[self._starts]
+        self.diagonal = self.diagonal + self._constant[self._starts]
 
     def factor(self, shift: float = 0.0) -> None:
         """Factor the assembled matrix; see `NewtonSystem.factor`."""
         values = self._constant.copy()
         values[self._own_slots] += self._values
-        diagonal = self._diagonal * (1 + shift)
+        diagonal = self.diagonal * (1 + shift)
         values[self._starts] = np.where(diagonal > 0, diagonal, 1)
         self.solver.factor(values)
 
