@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -43,9 +44,3 @@ def map_to_disk(
     )
     result = solve(problem, linear_solver=linear_solver, max_iterations=200)
     return result.uv[: len(V)] if result.injective else None
-
-
-def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:
-    """Fill loops, with the surface on their left, by triangles (k, 3) around new vertices numbered from ``n``."""
-    triangles = [np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)]
-    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles])

@@ -107,9 +107,7 @@ class Piece:
     @staticmethod
     def _count_missing(domain: Domain) -> int:
         """How much the Euler characteristic is below that of a disk with as many loops: two for each handle."""
-        found = domain.edges
-        euler = domain.n - len(found.interior) - len(found.boundary) + len(domain.F)
-        return 2 - len(domain.loops) - euler
+        return 2 - len(domain.loops) - domain.euler
 
     def planar_map(self) -> FloatArray | None:
         """Return the surface itself if it is planar and does not overlap itself, as no map is better."""

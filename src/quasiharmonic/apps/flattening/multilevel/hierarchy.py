@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.disk_start import make_fans
 from quasiharmonic.geometry.coarsening.levels import coarsen
 from quasiharmonic.geometry.coarsening.prolongation import reinsertion_positions
+from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices, mark
 
