@@ -12,9 +12,12 @@ from os import PathLike
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
+from quasiharmonic.io.mesh_files import read_mesh, write_mapped
+from quasiharmonic.io.models.cut_seams import seamed
+from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -177,8 +180,6 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
         If the file cannot be read.
     """
     if isinstance(mesh, str | PathLike):
-        from quasiharmonic.io import read_mesh
-
         read = read_mesh(mesh)
         return read.V, read.F
     what = describe(mesh)
@@ -214,19 +215,63 @@ def planar_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     return (V[:, :2] if V.shape[1] == 3 and len(V) and not np.ptp(V[:, 2]) else V), F
 
 
-def seamed_mesh(mesh: MeshLike) -> SeamedMesh:
-    """Return a `SeamedMesh` of a mesh; seams and map come from a `SeamedMesh`, `MeshData` or file only."""
-    from quasiharmonic import io
+def as_seamed_mesh(mesh: MeshLike) -> SeamedMesh:
+    """Return a mesh as a `SeamedMesh`, with its seams and its map.
 
+    Parameters
+    ----------
+    mesh : SeamedMesh, MeshData, path or mesh object
+        A path is read. Of a mesh object of another library, positions and triangles are used, without seams and map.
+
+    Returns
+    -------
+    SeamedMesh
+        A `SeamedMesh` is returned unchanged.
+
+    Raises
+    ------
+    TypeError
+        If the argument is not a mesh.
+    ValueError
+        If positions or faces are missing.
+    quasiharmonic.io.MeshFileError
+        If the file cannot be read.
+    """
     if isinstance(mesh, SeamedMesh):
         return mesh
     if isinstance(mesh, str | PathLike):
-        return io.seamed(io.read_mesh(mesh))
-    if isinstance(mesh, io.MeshData):
-        return io.seamed(mesh)
+        mesh = read_mesh(mesh)
+    if isinstance(mesh, MeshData):
+        return seamed(mesh)
     if not stands_for_mesh(mesh):
         raise TypeError(f"{describe(mesh)} is not a mesh: pass a SeamedMesh, or the path of a file")
     return SeamedMesh(*mesh_arrays(mesh))
+
+
+def write_map(path: str | PathLike[str], mesh: MeshLike, uv: ArrayLike) -> None:
+    """Write a mesh with one position per vertex as its map; see `write_mapped`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file to write.
+    mesh : MeshData, path or mesh object
+        A path is read. Of a mesh object of another library, positions and triangles are written.
+    uv : (n, 2) float
+        Position of every vertex in the plane.
+
+    Raises
+    ------
+    MeshFileError, OutputError
+        As `write_mapped`.
+    ValueError
+        If ``uv`` has another shape or is not finite.
+    """
+    if isinstance(mesh, str | PathLike):
+        mesh = read_mesh(mesh)
+    elif not isinstance(mesh, MeshData):
+        mesh = MeshData(*mesh_arrays(mesh))
+    write_mapped(path, mesh.with_map(getattr(uv, "uv", uv)))
 
 
 def mesh_triangles(F: Any) -> Any:

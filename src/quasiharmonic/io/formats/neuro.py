@@ -11,6 +11,9 @@ import gzip
 import os
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -219,25 +222,28 @@ def single_precision(path: str | os.PathLike[str], V: FloatArray) -> NDArray[np.
 _KINDS = "inflated", "smoothwm", "white", "pial", "midthickness", "fiducial", "orig", "sphere", "surf"
 _ENDINGS = "", ".surf.gii", ".gii", ".gii.gz"
 _ROWS = np.dtype([("vertex", ">i4"), ("place", ">f4", 3)])
-# The surface of all patches that are read, where it is not found beside the patch.
-_parent: Path | None = None
+_given_surface: ContextVar[Path | None] = ContextVar("given_surface", default=None)
 
 
-def set_parent_surface(path: str | os.PathLike[str] | None) -> None:
-    """Set the surface that `read_patch` uses by default; None for the one beside the patch."""
-    global _parent
-    _parent = None if path is None else Path(path)
+@contextmanager
+def use_parent_surface(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Read patches in the block with the triangles of a surface in place of the one beside the patch."""
+    token = _given_surface.set(Path(path))
+    try:
+        yield
+    finally:
+        _given_surface.reset(token)
 
 
 def find_parent_surface(path: str | os.PathLike[str]) -> Path | None:
-    """Return the surface of a patch: the one that was set, or one beside the patch with the same hemisphere.
+    """Return the surface of a patch: that of `use_parent_surface`, or one beside the patch with the same hemisphere.
 
     For ``lh.cortex.patch.3d`` this is the first that exists of ``lh.inflated``, ``lh.smoothwm``, ``lh.white``,
     ``lh.pial``, ``lh.midthickness``, ``lh.fiducial``, ``lh.orig``, ``lh.sphere`` and ``lh.surf``, or one of these names
     followed by ``.surf.gii``, ``.gii`` or ``.gii.gz``. None if there is none.
     """
-    if _parent is not None:
-        return _parent
+    if (given := _given_surface.get()) is not None:
+        return given
     folder, side = Path(path).parent, Path(path).name.split(".")[0]
     candidates = (folder / f"{side}.{kind}{ending}" for ending in _ENDINGS for kind in _KINDS)
     return next((candidate for candidate in candidates if candidate.is_file()), None)

@@ -120,7 +120,7 @@ def run_first_stage(
 class _Member(NamedTuple):
     """One search of a batch, its objective, and its schedule of relocation."""
 
-    run: StageRun
+    run: StageRun[Search]
     objective: Objective
     retries: RetrySchedule
 
@@ -255,7 +255,7 @@ def _divide(sizes: Sequence[int]) -> list[tuple[int, int]]:
     return [*portions, (first, len(sizes))] if sizes else []
 
 
-def _certify(runs: Sequence[StageRun]) -> list[MapResult]:
+def _certify(runs: Sequence[StageRun[Search]]) -> list[MapResult]:
     """Certify the maps of solved searches together and return the results."""
     searches = [run.search for run in runs]
     problems = [search.problem for search in searches]

@@ -191,7 +191,7 @@ class Search:
         assert run.status is not None
         return run.status
 
-    def begin_in_batch(self, stage: Descent) -> StageRun:
+    def begin_in_batch(self, stage: Descent) -> StageRun[Search]:
         """Return the run of the first stage, which a batch then performs."""
         self._has_tried = True
         return StageRun(self, stage)

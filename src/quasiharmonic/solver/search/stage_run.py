@@ -8,28 +8,46 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING, TypeAlias
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.result import Stage, Status
+from quasiharmonic.problem.result import Stage, Status, Step
 from quasiharmonic.solver.field.objective import Iterate, Objective
+from quasiharmonic.solver.field.tensor import TensorField
 from quasiharmonic.solver.methods.base import Descent, Patience, Steps
+from quasiharmonic.solver.search.options import FailedRepairs
 from quasiharmonic.util.arrays import ComplexArray, as_offsets
 
-if TYPE_CHECKING:
-    from quasiharmonic.solver.search.search import Search
+
+class SearchRecord(Protocol):
+    """What a stage uses of its search; `quasiharmonic.solver.search.search.Search` documents the attributes."""
+
+    problem: Problem
+    status: Status
+    history: list[Step]
+    stages: list[Stage]
+    best: tuple[int, float]
+    best_field: TensorField | None
+    failed_repairs: FailedRepairs
+
+    @property
+    def left(self) -> int: ...
+    def visit(self, here: Iterate, inverted: int, *, tensors: bool) -> None: ...
 
 
-class StageRun:
+AnySearch = TypeVar("AnySearch", bound=SearchRecord)
+
+
+class StageRun(Generic[AnySearch]):
     """One stage of one search while it runs: it visits maps and decides when the stage ends.
 
     ``status`` is the reason why the stage ended, None while it runs. ``seconds`` is the time spent, for the report.
     """
 
-    def __init__(self, search: Search, stage: Descent) -> None:
+    def __init__(self, search: AnySearch, stage: Descent) -> None:
         self.search, self.stage = search, stage
         self.status: Status | None = None
         self.seconds = 0.0
@@ -84,7 +102,7 @@ class StageRun:
 
 
 #: The next maps of some stages.
-Round: TypeAlias = Sequence[tuple[StageRun, Iterate]]
+Round: TypeAlias = Sequence[tuple[StageRun[Any], Iterate]]
 
 
 def visit_rounds(rounds: Iterable[Round]) -> None:
@@ -102,7 +120,7 @@ def visit_rounds(rounds: Iterable[Round]) -> None:
             run.visit(here, here.inverted or next(exact))
 
 
-def single_rounds(run: StageRun, objective: Objective, start: Iterate) -> Iterator[Round]:
+def single_rounds(run: StageRun[Any], objective: Objective, start: Iterate) -> Iterator[Round]:
     """Yield the maps of a single descent as rounds of one map until it ends."""
     steps = Steps(run.stage.iterates(objective, start))
     for here in chain([start], steps):

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
+    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.apps.unwrapping.defective_charts import SetApart
     from quasiharmonic.geometry.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
@@ -179,3 +180,21 @@ def write(output: Path, mesh: MeshData) -> WrittenMap:
     io.write_mapped(output, mesh)
     with report.after_writing(output):
         return certify_map(io.read_written(output, mesh))
+
+
+def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str:
+    """Return the text report of a map that was computed and written."""
+    from quasiharmonic.problem.result import Status
+    from quasiharmonic.util.arrays import count_of
+
+    lines = [f"wrote {output}: {written.summary()}"]
+    results = [island.result for island in mapped.islands]
+    if not written.injective:
+        lines.append(mapped.status.value)
+    # Each surface may be injective although pins make an overlap between surfaces unavoidable.
+    if not written.injective or mapped.status is Status.IMPOSSIBLE:
+        lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
+    iterations = sum(result.n_iterations for result in results)
+    seconds = sum(result.seconds for result in results)
+    lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
+    return "\n".join(lines)
