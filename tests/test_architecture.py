@@ -127,7 +127,7 @@ def test_no_cycle_between_subpackages():
 
 
 def in_circles(graph):
-    """Members of circles of a graph, and members between circles, sorted; ``graph`` has the set of what each imports."""
+    """Members of circles of a graph, and members between circles; ``graph`` has the set of what each imports."""
     while True:
         among = {one: others & set(graph) for one, others in graph.items()}
         imported_by_one = set().union(*among.values())
@@ -153,7 +153,7 @@ def lazy_names(stub):
 def graph_of_files(trees, lazy):
     """The set of modules that each module imports at any position: at the top, in functions, and for type checkers.
 
-    ``trees`` has the syntax tree of each module. ``lazy`` has the names that a package imports when they are first used,
+    ``trees`` has the syntax tree of each module. ``lazy`` has the names that a package imports on first use,
     with their modules: a file that uses such a name imports its module.
     """
 
