@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # Longest description of a fault, in characters. A file may have very long text in place of a number.
 _MAX_LENGTH = 300
@@ -51,6 +53,25 @@ class MeshFileError(ValueError):
         text = f"{self.what}{at}{then}"
         # Escape invalid Unicode, so that the message stays printable.
         return f"{printable(self.path)}: {text.encode('utf-8', 'backslashreplace').decode()}"
+
+
+@contextmanager
+def reading(
+    path: str | os.PathLike[str],
+    fault: str = "",
+    damage: type[Exception] | tuple[type[Exception], ...] = ValueError,
+    remedy: str = "",
+) -> Iterator[None]:
+    """Raise errors about the contents of a file, of the types ``damage``, as `MeshFileError`; ``fault`` precedes them.
+
+    A `MeshFileError` already names its file and is not changed.
+    """
+    try:
+        yield
+    except MeshFileError:
+        raise
+    except damage as error:
+        raise MeshFileError(path, f"{fault}{error}", remedy=remedy) from error
 
 
 class OutputError(OSError):

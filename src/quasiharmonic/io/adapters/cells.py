@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.elements import join_elements
+from quasiharmonic.geometry.mesh.elements import join_elements, split_solids
 from quasiharmonic.io.adapters.objects import MeshLike, planar_arrays
 from quasiharmonic.io.registry import suffixes
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe, index_array, vertex_array
@@ -41,10 +41,11 @@ def simulation_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
             from quasiharmonic.io.fem.files import read_volume
 
             read = read_volume(mesh)
-            if len(read.H):
+            T, H = split_solids(read.F)
+            if len(H):
                 raise ValueError(f"{what} has hexahedra: only tetrahedra are supported")
-            if len(read.T):
-                return read.points, read.T
+            if len(T):
+                return read.points, T
         return planar_cells(mesh)
     if hasattr(given, "doflocs"):
         X, T = np.asarray(given.doflocs).T, np.asarray(given.dofs.element_dofs).T

@@ -16,14 +16,13 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
@@ -50,10 +49,8 @@ def read_gifti(path: str | os.PathLike[str]) -> MeshData:
         If nibabel is not installed.
     """
     image = _read_gifti(path)
-    try:
+    with reading(path, damage=(TypeError, ValueError)):
         return MeshData(*gifti_arrays(image), source=os.fspath(path))
-    except (TypeError, ValueError) as error:
-        raise MeshFileError(path, str(error)) from error
 
 
 def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray:
@@ -77,18 +74,13 @@ def _read_gifti(path: str | os.PathLike[str]) -> Any:
     """Return the ``GiftiImage`` of a file; MeshFileError if it is not valid."""
     nibabel, data = _nibabel(), read_bytes(path)
     if os.fspath(path).lower().endswith(".gz"):
-        try:
+        with reading(path, "is not a complete gzip file: "):
             data = unpack_gzip(data)
-        except ValueError as error:
-            raise MeshFileError(path, f"is not a complete gzip file: {error}") from error
-    with warnings.catch_warnings():
+    # The parser raises errors of many types for damaged files.
+    with reading(path, "is not valid GIFTI: ", Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        try:
-            check_gifti(data)
-            # The parser raises errors of many types for damaged files.
-            return nibabel.gifti.GiftiImage.from_bytes(data)
-        except Exception as error:
-            raise MeshFileError(path, f"is not valid GIFTI: {error}") from error
+        check_gifti(data)
+        return nibabel.gifti.GiftiImage.from_bytes(data)
 
 
 def gifti_arrays(image: Any) -> tuple[Any, Any]:
@@ -146,26 +138,21 @@ def read_freesurfer(path: str | os.PathLike[str]) -> MeshData:
     nibabel, data = _nibabel(), read_bytes(path)
     if data.startswith(b"#!ascii"):
         raise MeshFileError(path, "is a text file of FreeSurfer", remedy="convert it: mris_convert IN OUT.gii")
-    with warnings.catch_warnings():
+    # A damaged file also gives MemoryError, and errors of other types.
+    with reading(path, "is not a binary surface of FreeSurfer: ", Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        try:
-            # A damaged file also gives MemoryError, and errors of other types.
-            V, F = nibabel.freesurfer.read_geometry(os.fspath(path))
-            return MeshData(V, F, source=os.fspath(path))
-        except Exception as error:
-            raise MeshFileError(path, f"is not a binary surface of FreeSurfer: {error}") from error
+        V, F = nibabel.freesurfer.read_geometry(os.fspath(path))
+        return MeshData(V, F, source=os.fspath(path))
 
 
 def write_freesurfer(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """Write the map of a mesh as a flat binary surface of FreeSurfer; see `write_gifti`."""
     write_geometry = _nibabel().freesurfer.write_geometry
     flat = flat_surface(path, mesh)
-    with TemporaryDirectory() as folder:
-        part = Path(folder, "surface")
-        # The default stamp contains the user's name and the time.
-        write_geometry(str(part), single_precision(path, flat.V), flat.F, create_stamp="created by quasiharmonic")
-        data = part.read_bytes()
-    write_whole(path, data)
+    places = single_precision(path, flat.V)
+    # The default stamp contains the user's name and the time.
+    stamp = "created by quasiharmonic"
+    write_whole(path, encode_by("surface", lambda part: write_geometry(part, places, flat.F, create_stamp=stamp)))
 
 
 def flat_surface(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
@@ -294,17 +281,20 @@ def read_patch(path: str | os.PathLike[str], surface: str | os.PathLike[str] | N
         n, F = len(whole.V), whole.F
         if number.size and number.max() >= n:
             raise MeshFileError(path, f"has vertex {number.max()}, but {parent} has {n} vertices")
+    V, F = _patch_of(number, places, n, F)
+    if not len(F):
+        raise MeshFileError(path, "has no triangle whose corners all belong to the patch")
+    with reading(path):
+        return MeshData(V, F, source=os.fspath(path))
+
+
+def _patch_of(number: IntArray, places: FloatArray, n: int, F: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return positions of all ``n`` vertices of a surface, zero outside a patch, and the triangles inside it."""
     inside = np.zeros(n, dtype=np.bool_)
     inside[number] = True
     V = np.zeros((n, 3))
     V[number] = places
-    F = F[inside[F].all(axis=1)]
-    if not len(F):
-        raise MeshFileError(path, "has no triangle whose corners all belong to the patch")
-    try:
-        return MeshData(V, F, source=os.fspath(path))
-    except ValueError as error:
-        raise MeshFileError(path, str(error)) from error
+    return V, F[inside[F].all(axis=1)]
 
 
 def read_written_patch(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
@@ -312,12 +302,8 @@ def read_written_patch(path: str | os.PathLike[str], mesh: MeshData) -> MeshData
     parent = find_parent_surface(path)
     if parent is not None:
         return read_patch(path, parent)
-    number, places = _binary_patch(path, read_bytes(path))
-    inside = np.zeros(len(mesh.V), dtype=np.bool_)
-    inside[number] = True
-    V = np.zeros((len(mesh.V), 3))
-    V[number] = places
-    return replace(mesh, V=V, F=mesh.F[inside[mesh.F].all(axis=1)], vt=None, FT=None, polygons=None)
+    V, F = _patch_of(*_binary_patch(path, read_bytes(path)), len(mesh.V), mesh.F)
+    return replace(mesh, V=V, F=F, vt=None, FT=None, polygons=None)
 
 
 def write_patch(path: str | os.PathLike[str], mesh: MeshData) -> None:
@@ -360,7 +346,7 @@ def _binary_patch(path: str | os.PathLike[str], data: bytes) -> tuple[IntArray, 
 
 def _text_patch(path: str | os.PathLike[str], data: bytes) -> tuple[IntArray, FloatArray, IntArray]:
     """Return numbers and positions of the vertices of a text patch, and its triangles."""
-    try:
+    with reading(path, "is not a text patch of FreeSurfer: ", (ValueError, IndexError, OverflowError)):
         _, text = data.split(b"\n", 1)
         # The number from zero follows as "vno=…".
         words = re.sub(rb"vno=\S*", b"", text).split()
@@ -375,8 +361,6 @@ def _text_patch(path: str | os.PathLike[str], data: bytes) -> tuple[IntArray, Fl
         F = np.array(words[2 + 4 * n :]).reshape(-1, 4)[:, 1:].astype(np.int64)
         if F.min() < 0 or not np.isin(F, number).all():
             raise ValueError("a triangle has a corner outside the patch")
-    except (ValueError, IndexError, OverflowError) as error:
-        raise MeshFileError(path, f"is not a text patch of FreeSurfer: {error}") from error
     _check_patch(path, number, places)
     return number, places, F
 

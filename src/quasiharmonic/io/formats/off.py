@@ -81,11 +81,9 @@ def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """
     head = f"OFF\n{len(mesh.V)} {mesh.faces} 0\n"
     points = "%r %r %r\n" * len(mesh.V) % tuple(mesh.V.ravel().tolist())
-    if mesh.polygons is None:
-        faces = "3 %d %d %d\n" * len(mesh.F) % tuple(mesh.F.ravel().tolist())
-    else:
-        forms = [f"{size}" + " %d" * size + "\n" for size in mesh.polygons.sizes.tolist()]
-        faces = "".join(forms) % tuple(mesh.F.ravel()[mesh.polygons.corners].tolist())
+    forms = {size: f"{size}" + " %d" * size + "\n" for size in np.unique(mesh.rings.sizes).tolist()}
+    faces = "".join(map(forms.__getitem__, mesh.rings.sizes.tolist()))
+    faces %= tuple(mesh.F.ravel()[mesh.rings.corners].tolist())
     write_whole(path, (head + points + faces).encode())
 
 

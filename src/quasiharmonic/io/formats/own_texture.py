@@ -14,6 +14,7 @@ from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.formats.gltf import document as gltf
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf
 from quasiharmonic.io.lowlevel.textual import read_bytes
+from quasiharmonic.io.models.materials import library_names
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.models.textures import Texture, read_texture, texture_of
 from quasiharmonic.util.untrusted import beside
@@ -70,12 +71,8 @@ def _images_of_libraries(mesh: MeshData) -> Iterator[tuple[bytes, Path, str]]:
     """
     folder = Path(mesh.source).parent
     for line in mesh.statements.split(b"\n"):
-        keyword, _, rest = line.partition(b" ")
-        if keyword != b"mtllib":
-            continue
-        name = os.fsdecode(rest.strip())
-        names = [name] if (folder / name).is_file() else name.split()
-        for library in (folder / name for name in names if _is_beside(folder, name) and (folder / name).is_file()):
+        names = [name for name in library_names(line, folder) if _is_beside(folder, name)]
+        for library in (folder / name for name in names if (folder / name).is_file()):
             within = library.parent.relative_to(folder)
             for entry in read_bytes(library).splitlines():
                 words = entry.split()

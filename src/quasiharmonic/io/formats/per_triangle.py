@@ -9,6 +9,7 @@ from io import BytesIO
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.registry import find_format
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_instance, map_array, triangle_rows, vertex_array
@@ -92,19 +93,9 @@ def encode_ply(V: FloatArray, F: IntArray, uv: FloatArray, columns: Mapping[str,
         V = np.column_stack([V, np.zeros(len(V))])
     # MeshLab colours by "quality": write the first value under this name.
     properties = {"quality": next(iter(columns.values())), **columns} if columns else {}
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(V)}",
-        *(f"property double {name}" for name in ("x", "y", "z", "s", "t")),
-        f"element face {len(F)}",
-        "property list uchar int vertex_indices",
-        *(f"property double {name}" for name in properties),
-        "end_header\n",
-    ]
-    faces = np.empty(len(F), dtype=[("n", "u1"), ("corners", "<i4", 3), *((name, "<f8") for name in properties)])
-    faces["n"], faces["corners"] = 3, F
-    for name, column in properties.items():
-        faces[name] = column
-    vertices = np.column_stack([V, uv]).astype("<f8")
-    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    places = np.column_stack([V, uv]).T
+    vertices = [Column(name, values) for name, values in zip(("x", "y", "z", "s", "t"), places, strict=True)]
+    corners = Column("vertex_indices", F.ravel().astype(np.int32), np.full(len(F), 3))
+    faces = [corners, *(Column(name, values) for name, values in properties.items())]
+    elements = Element("vertex", len(V), tuple(vertices)), Element("face", len(F), tuple(faces))
+    return encode_tables(PlyTables(elements))

@@ -137,6 +137,13 @@ class MeshData:
         """Number of faces in the file."""
         return len(self.F) if self.polygons is None else len(self.polygons)
 
+    @property
+    def rings(self) -> Polygons:
+        """The file's faces as rings of corners of the triangles, also if all are triangles."""
+        if self.polygons is not None:
+            return self.polygons
+        return Polygons(np.arange(self.F.size), 3 * np.arange(len(self.F) + 1))
+
     def with_map(self, uv: ArrayLike) -> MeshData:
         """Return the same mesh with one texture coordinate for each vertex.
 

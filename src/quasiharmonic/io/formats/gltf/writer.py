@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
-from quasiharmonic.io.formats.normals import normal_rows
+from quasiharmonic.io.formats.vertex_data import colours_of, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.models.materials import materials_lost
 from quasiharmonic.io.models.meshdata import MeshData
@@ -68,9 +68,9 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
         lost.append(f"{same} at positions that coincide with others in single precision")
     if mesh.polygons is not None:
         lost.append("polygons, which are written as triangles")
-    if mesh.extra is not None and _colours(mesh) is None:
+    if mesh.extra is not None and colours_of(mesh) is None:
         lost.append("data after the coordinates of some vertices, unless they are colours")
-    if mesh.FN is not None and _normals(mesh) is None:
+    if mesh.FN is not None and normals_of(mesh) is None:
         lost.append("normals, because some faces have none")
     words = {line.split(None, 1)[0] for line in mesh.statements.splitlines() if line.split()}
     if words & {b"o", b"g", b"s"}:
@@ -266,7 +266,7 @@ def _new(mesh: MeshData) -> Document:
     if mesh.FT is not None and mesh.vt is not None:
         bare = np.asarray((mesh.FT < 0).any(axis=1))
         places[~bare] = _convert_places(mesh.vt)[mesh.FT[~bare]]
-    normals, colours = _normals(mesh), _colours(mesh)
+    normals, colours = normals_of(mesh), colours_of(mesh)
     line = np.zeros_like(mesh.F) if normals is None or mesh.FN is None else mesh.FN
     keys = np.concatenate([_bits(places), line[:, :, None]], axis=2)
     rows, origin, corner = _split(mesh.F, keys, len(mesh.V))
@@ -306,7 +306,7 @@ def _runs(mesh: MeshData, bare: BoolArray) -> Iterator[tuple[int, int, str | Non
     """
     lines = mesh.statements.split(b"\n")[:-1]
     uses = [(line, int(at)) for line, at in zip(lines, mesh.statement_faces, strict=True) if line.startswith(b"usemtl")]
-    first = np.arange(len(mesh.F) + 1) if mesh.polygons is None else mesh.polygons.first_triangle
+    first = mesh.rings.first_triangle
     label = np.zeros(len(mesh.F), dtype=np.int64)
     names: list[str | None] = [None]
     for line, at in uses:
@@ -316,16 +316,3 @@ def _runs(mesh: MeshData, bare: BoolArray) -> Iterator[tuple[int, int, str | Non
     edges = [0, *change.tolist(), len(mesh.F)]
     for begin, end in pairwise(edges):
         yield begin, end, names[label[begin]], bool(bare[begin])
-
-
-def _colours(mesh: MeshData) -> FloatArray | None:
-    """Return colours of vertices, with or without opacity; None unless all vertices have one."""
-    extra = mesh.extra
-    if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
-        return None
-    return extra
-
-
-def _normals(mesh: MeshData) -> FloatArray | None:
-    """Return all normals; None if a corner has none."""
-    return None if mesh.FN is None or (mesh.FN < 0).any() else normal_rows(mesh.normals)
