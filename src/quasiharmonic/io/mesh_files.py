@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 from quasiharmonic.io.lowlevel.atomic import check_writable
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.io.registry import find_format
+from quasiharmonic.io.registry import find_format, find_function
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshData:
@@ -22,9 +22,7 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshData:
     MeshFileError
         If the format is not supported, or the file is not valid in its format.
     """
-    read = find_format(path, "read").read
-    assert read is not None
-    return read(path)
+    return find_function(path, "read")(path)
 
 
 def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
@@ -49,9 +47,7 @@ def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
     OutputError
         If the file cannot be written. An existing file is then unchanged.
     """
-    write = find_format(path, "write_map").write_map
-    assert write is not None
-    write(path, mesh)
+    find_function(path, "write_map")(path, mesh)
 
 
 def check_output(path: str | os.PathLike[str]) -> None:

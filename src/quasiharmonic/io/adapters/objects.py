@@ -31,70 +31,57 @@ from quasiharmonic.util.arrays import (
 )
 
 
-class _VerticesFaces(Protocol):
+class _HasVertices(Protocol):
     @property
     def vertices(self) -> Any: ...
-    @property
-    def faces(self) -> Any: ...
 
 
-class _VerticesTriangles(Protocol):
-    @property
-    def vertices(self) -> Any: ...
-    @property
-    def triangles(self) -> Any: ...
-
-
-class _PointsFaces(Protocol):
+class _HasPoints(Protocol):
     @property
     def points(self) -> Any: ...
-    @property
-    def faces(self) -> Any: ...
 
 
-class _PointsCells(Protocol):
-    @property
-    def points(self) -> Any: ...
-    @property
-    def cells(self) -> Any: ...
-
-
-class _VF(Protocol):
+class _HasV(Protocol):
     @property
     def V(self) -> Any: ...
+
+
+class _HasCoordinates(Protocol):
     @property
-    def F(self) -> Any: ...
+    def coordinates(self) -> Any: ...
 
 
-class _DoflocsT(Protocol):
+class _HasVerts(Protocol):
+    @property
+    def verts(self) -> Any: ...
+
+
+class _HasDoflocs(Protocol):
     @property
     def doflocs(self) -> Any: ...
-    @property
-    def t(self) -> Any: ...
 
 
-class _Geometry(Protocol):
+class _HasGeometry(Protocol):
     @property
     def geometry(self) -> Any: ...
 
 
-class _Gifti(Protocol):
+class _HasDarrays(Protocol):
     @property
     def darrays(self) -> Any: ...
-    def agg_data(self) -> Any: ...
 
 
 #: A mesh: an object with vertices and faces, a mapping with these keys, a surface of nibabel (a ``GiftiImage``, or a
 #: tuple of an array of points and an array of triangles), or the path of a file.
 MeshLike = (
-    _VerticesFaces
-    | _VerticesTriangles
-    | _PointsFaces
-    | _PointsCells
-    | _VF
-    | _DoflocsT
-    | _Geometry
-    | _Gifti
+    _HasVertices
+    | _HasPoints
+    | _HasV
+    | _HasCoordinates
+    | _HasVerts
+    | _HasDoflocs
+    | _HasGeometry
+    | _HasDarrays
     | tuple[NDArray[Any], NDArray[Any]]
     | tuple[NDArray[Any], NDArray[Any], Any]
     | tuple[NDArray[Any], NDArray[Any], Any, Any]
@@ -212,7 +199,12 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
 def planar_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     """Return the arrays of `mesh_arrays`, with positions (n, 2) if the third coordinate is constant."""
     V, F = mesh_arrays(mesh)
-    return (V[:, :2] if V.shape[1] == 3 and len(V) and not np.ptp(V[:, 2]) else V), F
+    return without_constant_z(V), F
+
+
+def without_constant_z(V: FloatArray) -> FloatArray:
+    """Return positions (n, 2) if the third coordinate is constant; otherwise ``V``."""
+    return V[:, :2].copy() if V.shape[1] == 3 and len(V) and not np.ptp(V[:, 2]) else V
 
 
 def as_seamed_mesh(mesh: MeshLike) -> SeamedMesh:

@@ -18,7 +18,7 @@ from quasiharmonic.io.fem.meshparts import MeshParts
 from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import is_planar
-from quasiharmonic.io.registry import find_format, suffixes
+from quasiharmonic.io.registry import find_function, suffixes
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of, vertex_array
 
 # Errors that readers may raise on damaged files.
@@ -151,11 +151,11 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
 
 def _parse(source: str | os.PathLike[str], data: bytes, *, solid: bool) -> MeshParts:
     """Parse a file, with its tetrahedra and hexahedra if ``solid``."""
-    parse = find_format(source, "read_elements").read_elements
-    assert parse is not None
+    parse = find_function(source, "read_elements")
     try:
         with np.errstate(invalid="ignore"):
-            return parse(data, solid)
+            parts: MeshParts = parse(data, solid)
+            return parts
     except _DAMAGE as error:
         what = str(error) if isinstance(error, ValueError) else f"an entry is missing ({error})"
         raise MeshFileError(source, f"cannot be read: {what}") from error

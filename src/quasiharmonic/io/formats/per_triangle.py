@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables
 from quasiharmonic.io.lowlevel.atomic import write_whole
-from quasiharmonic.io.registry import find_format
+from quasiharmonic.io.registry import find_function
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_instance, map_array, triangle_rows, vertex_array
 
 # Names that a format or its writer reserves.
@@ -58,8 +58,7 @@ def write_per_triangle(
         If the file cannot be written.
     """
     check_instance("values", values, Mapping)
-    encode = find_format(path, "encode_values").encode_values
-    assert encode is not None
+    encode = find_function(path, "encode_values")
     V, F = vertex_array(V, finite=False), triangle_rows(F)
     uv = map_array("uv", uv, len(V), finite=False)
     columns = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
