@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
+from quasiharmonic.io.fem.vtk_cells import find_counts
 from quasiharmonic.io.mesh_files import read_mesh, write_mapped
 from quasiharmonic.io.models.cut_seams import seamed
 from quasiharmonic.io.models.meshdata import MeshData
@@ -317,11 +318,9 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
 
     ``kinds`` are the kinds of the cells; None if all cells are faces.
     """
-    step = int(numbers[0]) + 1
-    if step > 1 and len(numbers) % step == 0 and (numbers[::step] == step - 1).all():
-        heads = np.arange(0, len(numbers), step)
-    else:
-        heads = np.array(_heads(name, numbers.tolist()))
+    heads = find_counts(numbers)
+    if heads is None or not numbers[heads].all():
+        raise ValueError(f"{name} must have one row of corners per face, or the flat form (count, corners, count, …)")
     sizes = numbers[heads]
     faces = np.ones(len(heads), dtype=np.bool_)
     if kinds is not None:
@@ -332,19 +331,6 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
     corner = repeat_each(faces, sizes + 1)
     corner[heads] = False
     return numbers[corner], sizes[faces]
-
-
-def _heads(name: str, numbers: list[int]) -> list[int]:
-    """Return the indices of the counts in VTK's list."""
-    heads, at = [], 0
-    while at < len(numbers):
-        if numbers[at] < 1 or at + numbers[at] >= len(numbers):
-            raise ValueError(
-                f"{name} must have one row of corners per face, or the flat form (count, corners, count, …)"
-            )
-        heads.append(at)
-        at += 1 + numbers[at]
-    return heads
 
 
 def _cut(V: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:

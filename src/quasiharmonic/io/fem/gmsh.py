@@ -13,6 +13,7 @@ from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers
 from quasiharmonic.io.fem.meshparts import MeshParts
 from quasiharmonic.io.fem.vtk_cells import SUPPORTED
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.untrusted import check_end
 
 # Number of nodes of each kind of element that is read, and of the kinds that are skipped: lines and points.
 _ELEMENTS = {2: 3, 3: 4, 9: 6}
@@ -180,14 +181,12 @@ def _element_lines(numbers: list[int], count: int, solid: bool) -> list[IntArray
     found: list[list[int]] = []
     at = 0
     for _ in range(count):
-        if at + 3 > len(numbers):
-            raise ValueError("it ends too early")
+        check_end(at + 3, len(numbers))
         kind, stop = numbers[at + 1], at + 3 + numbers[at + 2] + _nodes_of(numbers[at + 1], solid)
         if kind in (_SOLIDS if solid else _ELEMENTS):
             found.append(numbers[stop - _nodes_of(kind, solid) : stop])
         at = stop
-    if at > len(numbers):
-        raise ValueError("it ends too early")
+    check_end(at, len(numbers))
     return [np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)]
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.lowlevel.textual import shown
 from quasiharmonic.util.arrays import IntArray, repeat_each
+from quasiharmonic.util.untrusted import check_end
 
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -188,9 +189,7 @@ class _BinaryReader(_Reader):
             fields.append((f"v{i}", self._order + of.kind, () if of.count is None else (size,)))
         dtype = np.dtype(fields)
         if rows * dtype.itemsize > len(self._data) - self._at:
-            if any(of.count is not None for of in properties):
-                return None
-            raise ValueError("it ends too early")
+            return None
         table = np.frombuffer(self._data, dtype, count=rows, offset=self._at)
         columns = []
         for i, (of, size) in enumerate(zip(properties, sizes, strict=True)):
@@ -221,8 +220,7 @@ class _BinaryReader(_Reader):
 
     def _take(self, kind: str, count: int) -> bytes:
         begin, self._at = self._at, self._at + count * np.dtype(kind).itemsize
-        if self._at > len(self._data):
-            raise ValueError("it ends too early")
+        check_end(self._at, len(self._data))
         return self._data[begin : self._at]
 
     def _join(self, parts: list[bytes], kind: str) -> NDArray[Any]:
@@ -260,8 +258,7 @@ class _TextReader(_Reader):
         return size
 
     def _take(self, kind: str, count: int) -> NDArray[np.float64]:
-        if self._at + count > len(self._numbers):
-            raise ValueError("it ends too early")
+        check_end(self._at + count, len(self._numbers))
         self._at += count
         return self._numbers[self._at - count : self._at]
 

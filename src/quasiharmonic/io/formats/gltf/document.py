@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError, printable
 from quasiharmonic.io.lowlevel.textual import read_bytes
-from quasiharmonic.util.untrusted import beside
+from quasiharmonic.util.untrusted import beside, check_end
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}
@@ -260,8 +260,7 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     at = 12
     while at + 8 <= len(data):
         size, name = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
-        if at + 8 + size > len(data):
-            raise ValueError("it ends too early")
+        check_end(at + 8 + size, len(data))
         found.setdefault(name, data[at + 8 : at + 8 + size])
         at += 8 + size
     return found[b"JSON"], found.get(b"BIN\0")

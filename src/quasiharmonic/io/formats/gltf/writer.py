@@ -106,7 +106,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
             for primitive, own in zip(primitives, np.split(rows, bounds), strict=True):
                 primitive["mode"] = 4
                 primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
-        _set_attribute(document, pool, primitives, PLACES, table, users)
+        _set_numbers(document, [primitive["attributes"] for primitive in primitives], PLACES, table, users)
         if old_places is None or not np.array_equal(old_places, places):
             _drop_tangents(primitives)
     return document
@@ -193,41 +193,36 @@ def _extend(
     document: Document, pool: VertexPool, primitives: list[dict[str, Any]], origin: IntArray, users: dict[int, int]
 ) -> None:
     """Copy the attributes of a pool's vertices to their copies."""
-    for name in pool.attributes:
-        if name != PLACES:
-            table = document.numbers(pool.attributes[name])[origin]
-            _set_attribute(document, pool, primitives, name, table, users, repeated=True)
+    attributes = [(name, accessor) for name, accessor in pool.attributes.items() if name != PLACES]
+    shared = [([primitive["attributes"] for primitive in primitives], attributes)]
     for t, target in enumerate(pool.targets):
-        for name, accessor in target.items():
-            new = _other(document, accessor, document.numbers(accessor)[origin], users, repeated=True)
-            for primitive in primitives:
-                primitive["targets"][t][name] = new
+        shared.append(([primitive["targets"][t] for primitive in primitives], list(target.items())))
+    for holders, entries in shared:
+        for name, accessor in entries:
+            _set_numbers(document, holders, name, document.numbers(accessor)[origin], users, repeated=True)
 
 
-def _set_attribute(
+def _set_numbers(
     document: Document,
-    pool: VertexPool,
-    primitives: list[dict[str, Any]],
+    holders: list[dict[str, int]],
     name: str,
     table: NDArray[Any],
     users: dict[int, int],
     *,
     repeated: bool = False,
 ) -> None:
-    old = pool.attributes.get(name)
-    new = document.add(table) if old is None else _other(document, old, table, users, repeated=repeated)
-    for primitive in primitives:
-        primitive["attributes"][name] = new
-
-
-def _other(document: Document, accessor: int, table: NDArray[Any], users: dict[int, int], *, repeated: bool) -> int:
-    """Replace the numbers of an accessor, or of a copy of it if something else refers to it; return the index."""
-    if users[accessor] > 1:
-        document.tree["accessors"].append(dict(document.tree["accessors"][accessor]))
-        accessor = len(document.tree["accessors"]) - 1
-        users[accessor] = 1
-    document.put(accessor, table, repeated=repeated)
-    return accessor
+    """Replace the numbers of an attribute that several primitives share; a copy, if something else refers to them."""
+    accessor = holders[0].get(name)
+    if accessor is None:
+        accessor = document.add(table)
+    else:
+        if users[accessor] > 1:
+            document.tree["accessors"].append(dict(document.tree["accessors"][accessor]))
+            accessor = len(document.tree["accessors"]) - 1
+            users[accessor] = 1
+        document.put(accessor, table, repeated=repeated)
+    for holder in holders:
+        holder[name] = accessor
 
 
 def _convert_places(vt: FloatArray) -> NDArray[np.float32]:

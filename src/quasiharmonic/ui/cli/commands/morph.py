@@ -116,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
     if options.slide_plane is not None:
         raise ValueError("--slide-plane is for tetrahedra: use --slide for planar meshes")
     mesh = read_fem(options.input)
-    rest = None if options.rest is None else _rest(options.rest, mesh)
+    rest = None if options.rest is None else _rest(options.rest, read_fem(options.rest), mesh)
     if options.field is not None:
         moved = rim(mesh.F)
         positions = mesh.points[moved] + mesh.point_field(options.field, moved)
@@ -180,12 +180,7 @@ def _run_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     slide = options.slide_plane or options.slide
     rest = None
     if options.rest is not None:
-        first = read_volume(options.rest)
-        if first.points.shape != mesh.points.shape or not np.array_equal(first.F, mesh.F):
-            raise MeshFileError(
-                options.rest, f"must have the same nodes and elements, in the same order, as {mesh.source}"
-            )
-        rest = first.points
+        rest = _rest(options.rest, read_volume(options.rest), mesh)
     if options.field is not None:
         moved = np.unique(inspect_faces(T, len(mesh.points)).boundary)
         positions = mesh.points[moved] + mesh.point_field(options.field, moved)
@@ -245,14 +240,12 @@ def _drop_idle(points: FloatArray, moved: IntArray, positions: FloatArray) -> tu
     return moved[goes], positions[goes]
 
 
-def _rest(path: Path, mesh: FemMesh) -> FloatArray:
+def _rest(path: Path, first: FemMesh, mesh: FemMesh) -> FloatArray:
     """Return the positions of the same nodes in another file."""
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.fem.files import read_fem
 
-    first = read_fem(path)
     if first.points.shape != mesh.points.shape or not np.array_equal(first.F, mesh.F):
         raise MeshFileError(path, f"must have the same nodes and elements, in the same order, as {mesh.source}")
     return first.points
