@@ -26,6 +26,7 @@ from quasiharmonic.util.arrays import (
     check_range,
     describe,
     index_array,
+    pad_to_space,
     repeat_each,
     triangle_rows,
     vertex_array,
@@ -336,6 +337,5 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
 def _cut(V: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
     """Cut faces of any number of corners into triangles (f, 3)."""
     check_range("the faces", corners, len(V))
-    space = V if V.shape[1] == 3 else np.column_stack([V, np.zeros(len(V))])
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    return corners[triangulate_polygons(space, corners, starts)[0]]
+    return corners[triangulate_polygons(pad_to_space(V), corners, starts)[0]]

@@ -12,7 +12,15 @@ from numpy.typing import ArrayLike
 from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.registry import find_function
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_instance, map_array, triangle_rows, vertex_array
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_instance,
+    map_array,
+    pad_to_space,
+    triangle_rows,
+    vertex_array,
+)
 
 # Names that a format or its writer reserves.
 _RESERVED = {"triangle", "F", "uv", "file", "args", "kwds", "allow_pickle", "vertex_indices", "quality"}
@@ -88,11 +96,9 @@ def encode_npz(V: FloatArray, F: IntArray, uv: FloatArray, columns: Mapping[str,
 
 def encode_ply(V: FloatArray, F: IntArray, uv: FloatArray, columns: Mapping[str, FloatArray]) -> bytes:
     """Return a binary PLY file of the surface, the map and the columns."""
-    if V.shape[1] == 2:
-        V = np.column_stack([V, np.zeros(len(V))])
     # MeshLab colours by "quality": write the first value under this name.
     properties = {"quality": next(iter(columns.values())), **columns} if columns else {}
-    places = np.column_stack([V, uv]).T
+    places = np.column_stack([pad_to_space(V), uv]).T
     vertices = [Column(name, values) for name, values in zip(("x", "y", "z", "s", "t"), places, strict=True)]
     corners = Column("vertex_indices", F.ravel().astype(np.int32), np.full(len(F), 3))
     faces = [corners, *(Column(name, values) for name, values in properties.items())]

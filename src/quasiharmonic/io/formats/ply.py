@@ -199,15 +199,12 @@ def _with_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
 
 def _corner_places(mesh: MeshData) -> Column:
     """Return a pair for each corner of the faces that have texture coordinates."""
-    assert mesh.FT is not None
-    assert mesh.vt is not None
-    at, sizes = mesh.FT.ravel()[mesh.rings.corners], mesh.rings.sizes
+    pairs, sizes = mesh.corner_uv.reshape(-1, 2)[mesh.rings.corners], mesh.rings.sizes
     face = repeat_each(np.arange(len(sizes)), sizes)
-    bare = np.unique(face[at < 0])
-    given = ~np.isin(face, bare)
+    bare = np.unique(face[np.isnan(pairs[:, 0])])
     count = 2 * sizes
     count[bare] = 0
-    return Column(_CORNER_PLACES, mesh.vt[at[given]].ravel(), count)
+    return Column(_CORNER_PLACES, pairs[~np.isin(face, bare)].ravel(), count)
 
 
 def _vertices(mesh: MeshData) -> Element:

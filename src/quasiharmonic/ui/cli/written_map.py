@@ -150,13 +150,8 @@ def add_old_textures(facts: dict[str, Any], lines: list[str], before: MeshData, 
 
     if after.texture is not None or not (named := io.texture_names(before)):
         return
-    if before.FT is not None and after.FT is not None and before.FT.shape == after.FT.shape:
-        assert before.vt is not None
-        assert after.vt is not None
-        known = before.FT >= 0
-        same = np.array_equal(known, after.FT >= 0)
-        if same and np.array_equal(before.vt[before.FT[known]], after.vt[after.FT[known]]):
-            return
+    if np.array_equal(before.corner_uv, after.corner_uv, equal_nan=True):
+        return
     facts["old_textures"] = named
     names = ", ".join(map(printable, named))
     lines.append(f"the new coordinates do not fit the textures of the file: {names}")

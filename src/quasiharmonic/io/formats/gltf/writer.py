@@ -87,13 +87,12 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     for number, pool in enumerate(carried.pools):
         parts = [part for part in carried.parts if part.pool == number]
         faces = np.concatenate([np.arange(part.begin, part.end) for part in parts])
-        FT = None if mesh.FT is None else mesh.FT[faces]
         primitives = [document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in parts]
-        if FT is None or (FT < 0).all():
+        places = _convert_places(mesh.corner_uv[faces])
+        if np.isnan(places).all():
             continue
-        if (FT < 0).any() or mesh.vt is None:
+        if np.isnan(places).any():
             raise ValueError("some faces of a primitive have no texture coordinates, which glTF does not support")
-        places = _convert_places(mesh.vt)[FT]
         old_places = _places_of(document, pool, carried.rows[faces] - pool.first)
         rows, origin, corner = _split(carried.rows[faces] - pool.first, _bits(places), pool.count)
         table = places.reshape(-1, 2)[corner]
@@ -129,12 +128,13 @@ def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
 def _has_old_tangents(carried: CarriedGltf, mesh: MeshData) -> bool:
     """Whether the file has tangents, and the mesh has other texture coordinates."""
     numbers = [number for number, pool in enumerate(carried.pools) if "TANGENT" in pool.attributes]
-    if not numbers or mesh.FT is None or mesh.vt is None:
+    places = _convert_places(mesh.corner_uv)
+    if np.isnan(places).all():
         return False
     for part in (part for part in carried.parts if part.pool in numbers):
         pool, faces = carried.pools[part.pool], np.arange(part.begin, part.end)
         old = _places_of(carried.document, pool, carried.rows[faces] - pool.first)
-        if old is None or not np.array_equal(old, _convert_places(mesh.vt)[mesh.FT[faces]]):
+        if old is None or not np.array_equal(old, places[faces]):
             return True
     return False
 
@@ -225,18 +225,18 @@ def _set_numbers(
         holder[name] = accessor
 
 
-def _convert_places(vt: FloatArray) -> NDArray[np.float32]:
-    """Return texture coordinates (m, 2) in glTF's convention: v downwards, in single precision."""
-    v = 1 - vt[:, 1]
+def _convert_places(uv: FloatArray) -> NDArray[np.float32]:
+    """Return texture coordinates (..., 2) in glTF's convention: v downwards, in single precision."""
+    v = 1 - uv[..., 1]
     # Round v so that 1 - v is exact in double precision, and readers lose nothing.
     v = np.where(np.abs(v) < 2.0**-29, np.rint(v / _EXACT) * _EXACT, v)
-    return _single("a place", np.stack([vt[:, 0], v], axis=1))
+    return _single("a place", np.stack([uv[..., 0], v], axis=-1))
 
 
 def _single(what: str, numbers: FloatArray) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):
         single = numbers.astype(np.float32)
-    if not np.isfinite(single).all():
+    if np.isinf(single).any():
         raise ValueError(f"{what} exceeds single precision, the only one in glTF: write .ply or .obj")
     return single
 
@@ -256,11 +256,9 @@ def _new(mesh: MeshData) -> Document:
         "meshes": [{"primitives": []}],
     }
     document = Document(tree, [])
-    bare: BoolArray = np.full(len(mesh.F), mesh.FT is None)
-    places = np.zeros((*mesh.F.shape, 2), dtype=np.float32)
-    if mesh.FT is not None and mesh.vt is not None:
-        bare = np.asarray((mesh.FT < 0).any(axis=1))
-        places[~bare] = _convert_places(mesh.vt)[mesh.FT[~bare]]
+    places = _convert_places(mesh.corner_uv)
+    bare = np.asarray(np.isnan(places).any(axis=(1, 2)))
+    places[bare] = 0
     normals, colours = normals_of(mesh), colours_of(mesh)
     line = np.zeros_like(mesh.F) if normals is None or mesh.FN is None else mesh.FN
     keys = np.concatenate([_bits(places), line[:, :, None]], axis=2)
