@@ -24,6 +24,7 @@ from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.itk_headers import check_header
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import check_size, read_npy
 
 NIFTI = ".nii", ".nii.gz"
@@ -141,10 +142,8 @@ def _read_npy(path: str | os.PathLike[str]) -> DisplacementField:
 
 
 def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
-    try:
+    with explain_missing("NIfTI files need nibabel", "nibabel"):
         import nibabel
-    except ImportError as error:
-        raise ImportError(f"NIfTI files need nibabel ({error}): pip install nibabel") from error
     read_bytes(path)  # Raises an error that names what is wrong with the path.
     # Damaged files cause errors of many types.
     with reading(path, "is not valid NIfTI: ", Exception):
@@ -177,10 +176,8 @@ def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
 
 
 def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
-    try:
+    with explain_missing("ITK's files need SimpleITK", "SimpleITK"):
         import SimpleITK
-    except ImportError as error:
-        raise ImportError(f"ITK's files need SimpleITK ({error}): pip install SimpleITK") from error
     try:
         with reading(path):
             check_header(read_bytes(path), field_suffix(path))

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 
 from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole
+from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import parse_json
 
 Record = dict[str, Any]
@@ -239,10 +240,8 @@ def _suffix(path: str | os.PathLike[str]) -> str:
 
 def load_pyarrow() -> Any:
     """Return the module `pyarrow.parquet`; ImportError with the install command if it is missing."""
-    try:
+    with explain_missing("Parquet needs pyarrow", "'quasiharmonic[batch]', or choose .csv"):
         import pyarrow.parquet
-    except ImportError as error:
-        raise ImportError("Parquet needs pyarrow: pip install 'quasiharmonic[batch]', or choose .csv") from error
     return pyarrow.parquet
 
 

@@ -26,6 +26,7 @@ from quasiharmonic.ui.plot.canvas import (
 )
 from quasiharmonic.ui.plot.shading import drawable, lit, view
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, enumerate_each, map_array
+from quasiharmonic.util.optional import explain_missing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -192,10 +193,8 @@ def _checkerboard_color(coordinates: FloatArray) -> FloatArray:
 
 def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[FloatArray], FloatArray]:
     """Return a function from texture coordinates (k, 2) to colours (k, 3) of an image that repeats with period 1."""
-    try:
+    with explain_missing("pictures need Pillow", "pillow"):
         from PIL import Image
-    except ImportError as error:
-        raise ImportError(f"pictures need Pillow ({error}): pip install pillow") from error
     if not isinstance(texture, Texture):
         check_path("texture", texture)
     path, image_file = ("", texture) if isinstance(texture, Texture) else (texture, read_texture(texture))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from quasiharmonic.io.errors import OutputError
+from quasiharmonic.util.optional import explain_missing
 
 T = TypeVar("T")
 # Number of attempts, and seconds before the second one; each further pause is twice as long.
@@ -96,14 +97,10 @@ def read_start(location: str, size: int) -> bytes | None:
 
 def _open(location: str) -> tuple[Any, str]:
     """Return the file system of a URL and the path in it; ImportError if a package is missing."""
-    try:
+    with explain_missing("URLs need fsspec", "'quasiharmonic[remote]'"):
         from fsspec.core import url_to_fs
-    except ImportError as error:
-        raise ImportError("URLs need fsspec: pip install 'quasiharmonic[remote]'") from error
-    try:
+    with explain_missing(location, "'quasiharmonic[remote]' for S3"):
         return url_to_fs(location)
-    except ImportError as error:
-        raise ImportError(f"{location}: {error}: pip install 'quasiharmonic[remote]' for S3") from error
 
 
 def _retry(action: Callable[[], T], location: str) -> T:
