@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 # Longest description of a fault, in characters. A file may have very long text in place of a number.
@@ -60,18 +60,21 @@ def reading(
     path: str | os.PathLike[str],
     fault: str = "",
     damage: type[Exception] | tuple[type[Exception], ...] = ValueError,
+    *,
+    describe: Callable[[Exception], str] = str,
+    line: int | None = None,
     remedy: str = "",
 ) -> Iterator[None]:
-    """Raise errors about the contents of a file, of the types ``damage``, as `MeshFileError`; ``fault`` precedes them.
+    """Raise errors about the contents of a file, of the types ``damage``, as `MeshFileError`.
 
-    A `MeshFileError` already names its file and is not changed.
+    Its fault is ``fault`` and the description of the error. A `MeshFileError` is not changed: it names its own file.
     """
     try:
         yield
     except MeshFileError:
         raise
     except damage as error:
-        raise MeshFileError(path, f"{fault}{error}", remedy=remedy) from error
+        raise MeshFileError(path, f"{fault}{describe(error)}", line, remedy) from error
 
 
 class OutputError(OSError):

@@ -152,10 +152,10 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
 def _parse(source: str | os.PathLike[str], data: bytes, *, solid: bool) -> MeshParts:
     """Parse a file, with its tetrahedra and hexahedra if ``solid``."""
     parse = find_function(source, "read_elements")
-    try:
-        with np.errstate(invalid="ignore"):
-            parts: MeshParts = parse(data, solid)
-            return parts
-    except _DAMAGE as error:
-        what = str(error) if isinstance(error, ValueError) else f"an entry is missing ({error})"
-        raise MeshFileError(source, f"cannot be read: {what}") from error
+    with reading(source, "cannot be read: ", _DAMAGE, describe=_describe_damage), np.errstate(invalid="ignore"):
+        parts: MeshParts = parse(data, solid)
+    return parts
+
+
+def _describe_damage(error: Exception) -> str:
+    return str(error) if isinstance(error, ValueError) else f"an entry is missing ({error})"

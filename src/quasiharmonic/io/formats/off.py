@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.lowlevel.textual import integer, integer_table, number, number_table, read_text, shown
 from quasiharmonic.io.models.meshdata import MeshData, in_plane, polygon_mesh
@@ -51,10 +51,8 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
         counts = text.split(None, 2)
     if len(counts) < 2:
         raise MeshFileError(path, "no counts of vertices and faces", line)
-    try:
+    with reading(path, "no counts of vertices and faces: ", line=line):
         vertices, faces = integer(counts[0]), integer(counts[1])
-    except ValueError as error:
-        raise MeshFileError(path, f"no counts of vertices and faces: {error}", line) from None
     if vertices < 1 or faces < 1:
         what = f"has {vertices} vertices and {faces} faces"
         raise MeshFileError(path, what, line, "give a mesh with vertices and faces")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import os
 from collections.abc import Iterator
 from pathlib import Path, PureWindowsPath
@@ -52,7 +50,7 @@ def texture_names(mesh: MeshData) -> list[str]:
         tree = mesh.carried.document.tree if isinstance(mesh.carried, CarriedGltf) else {}
         try:
             return list(dict.fromkeys(_names_in_gltf(tree)))
-        except (*gltf.DAMAGE, RecursionError):
+        except gltf.DAMAGE:
             # A damaged description of a material does not prevent other work.
             return []
     textures = (name for keyword, _, name in _images_of_libraries(mesh) if _shows_image(keyword.lower()))
@@ -128,11 +126,8 @@ def _of_gltf(path: Path) -> Texture | None:
             image = tree["images"][tree["textures"][colour["index"]]["source"]]
             if "bufferView" in image:
                 return texture_of(bytes(document.views[image["bufferView"]]))
-            uri = image["uri"]
-            if uri.startswith("data:"):
-                return texture_of(base64.b64decode(uri.partition(",")[2], validate=True))
-            return texture_of(read_bytes(beside(path.parent, uri)))
-    except (*gltf.DAMAGE, binascii.Error):
+            return texture_of(gltf.read_uri(path.parent, image["uri"]))
+    except gltf.DAMAGE:
         # A damaged description of a material does not prevent drawing.
         return None
     return None

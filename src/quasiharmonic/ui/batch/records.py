@@ -14,7 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path
+from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path, reading
 from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole
 from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import parse_json
@@ -100,6 +100,7 @@ TABLES = "records.csv", "records.parquet"
 FILE = "record.json"
 _MAP = "map.obj"
 _ROWS = 1000
+_NO_TABLE = "cannot be read as a table: "
 
 
 def map_path(folder: Path) -> Path:
@@ -281,25 +282,20 @@ def _write_parquet(parquet: Any, file: BinaryIO, records: Iterable[Record]) -> N
 
 
 def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            for row in csv.DictReader(file):
-                row.pop(None, None)  # values after the last column
-                yield row
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MeshFileError(path, f"cannot be read as a table: {error}") from error
+    damage = OSError, UnicodeDecodeError, csv.Error
+    with reading(path, _NO_TABLE, damage), open(path, encoding="utf-8-sig", newline="") as file:
+        for row in csv.DictReader(file):
+            row.pop(None, None)  # values after the last column
+            yield row
 
 
 def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
     parquet = load_pyarrow()
     import pyarrow
 
-    try:
-        with parquet.ParquetFile(path) as file:
-            for batch in file.iter_batches(_ROWS):
-                yield from batch.to_pylist()
-    except (OSError, pyarrow.ArrowException) as error:
-        raise MeshFileError(path, f"cannot be read as a table: {error}") from error
+    with reading(path, _NO_TABLE, (OSError, pyarrow.ArrowException)), parquet.ParquetFile(path) as file:
+        for batch in file.iter_batches(_ROWS):
+            yield from batch.to_pylist()
 
 
 def _convert(path: str | os.PathLike[str], number: int, column: str, value: Any) -> Any:

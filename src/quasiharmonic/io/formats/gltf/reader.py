@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
 from quasiharmonic.io.formats.vertex_data import normal_lines
 from quasiharmonic.io.formats.welding import weld
@@ -108,12 +108,9 @@ def read_gltf(path: str | os.PathLike[str]) -> MeshData:
         If the file is not glTF 2.0, is damaged, is compressed by an extension, or has no triangles.
     """
     document = load(path)
-    try:
-        # Overflow is reported later, by the checks for finite numbers.
-        with np.errstate(over="ignore", invalid="ignore"):
-            mesh = _mesh(document, os.fspath(path))
-    except (*DAMAGE, RecursionError) as error:
-        raise MeshFileError(path, f"is damaged: {fault(error)}") from error
+    # Overflow is reported later, by the checks for finite numbers.
+    with reading(path, "is damaged: ", DAMAGE, describe=fault), np.errstate(over="ignore", invalid="ignore"):
+        mesh = _mesh(document, os.fspath(path))
     if mesh is None:
         raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
     return mesh
