@@ -111,6 +111,17 @@ def write_whole(
         raise
 
 
+@contextlib.contextmanager
+def writing(place: str | Path) -> Iterator[None]:
+    """Raise errors of the system as `OutputError`, which names the place: a file, or "to" and a folder."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"cannot write {place}: {_reason(error)}") from error
+
+
 def encode_by(name: str, write: Callable[[str], object]) -> bytes:
     """Return the bytes that ``write``, a function of another library, writes to a file of this name."""
     with TemporaryDirectory() as folder:

@@ -14,8 +14,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path, reading
-from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole
+from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole, writing
 from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import parse_json
 
@@ -145,13 +145,9 @@ def clear(folder: Path) -> None:
 
     OutputError if the folder cannot be created or emptied, FileInUseError if another program has one of its files open.
     """
-    try:
+    with writing(f"results to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         remove_results(folder)
-    except FileInUseError:
-        raise
-    except OSError as error:
-        raise OutputError(f"cannot write results to {folder}: {error.strerror or error}") from error
 
 
 def remove_results(folder: Path) -> None:

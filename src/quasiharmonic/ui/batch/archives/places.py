@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.lowlevel.atomic import writing
 from quasiharmonic.util.optional import explain_missing
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ def fetch(location: str, folder: Path) -> Path:
 
 def send(path: Path, location: str) -> None:
     """Copy a file to a location. OutputError if it cannot be written."""
-    try:
+    with writing(location):
         if not is_url(location):
             Path(location).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, location)
@@ -79,8 +79,6 @@ def send(path: Path, location: str) -> None:
         # A folder of an object store needs not exist.
         _retry(lambda: system.makedirs(target.rpartition("/")[0], exist_ok=True), location)
         _retry(lambda: system.put_file(str(path), target), location)
-    except OSError as error:
-        raise OutputError(f"cannot write {location}: {error}") from error
 
 
 def read_start(location: str, size: int) -> bytes | None:
