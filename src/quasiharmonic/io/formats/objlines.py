@@ -58,10 +58,8 @@ class _Reader:
                     take[keyword](line, text)
                 else:
                     self.statement(keyword, text)
-            except _FaultError as fault:
-                raise MeshFileError(self.path, fault.what, line, fault.remedy) from None
             except ValueError as error:
-                raise MeshFileError(self.path, str(error), line) from None
+                raise MeshFileError(self.path, str(error), line, getattr(error, "remedy", "")) from None
         return self.result()
 
     def vertex(self, line: int, text: bytes) -> None:
@@ -150,11 +148,11 @@ class _Reader:
         return np.ascontiguousarray(rows[:, :3]), extra
 
 
-class _FaultError(Exception):
+class _FaultError(ValueError):
     """A fault on the current line, with the remedy for the user."""
 
     def __init__(self, what: str, remedy: str) -> None:
-        self.what = what
+        super().__init__(what)
         self.remedy = remedy
 
 

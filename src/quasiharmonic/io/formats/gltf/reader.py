@@ -74,6 +74,14 @@ class CarriedGltf(Carried):
         super().__init__(mesh.V, mesh.F)
         self.document, self.folder, self.pools, self.parts, self.rows = document, folder, pools, parts, rows
 
+    def parts_of(self, pool: int) -> list[Primitive]:
+        """Return the primitives that use a pool, by its index."""
+        return [part for part in self.parts if part.pool == pool]
+
+    def faces_of(self, pool: int) -> IntArray:
+        """Return the triangles of a pool, in the order of its primitives."""
+        return np.concatenate([np.arange(part.begin, part.end) for part in self.parts_of(pool)])
+
     def further(self) -> list[str]:
         tree = self.document.tree
         found = [name for name in ("materials", "animations", "skins", "cameras") if tree.get(name)]

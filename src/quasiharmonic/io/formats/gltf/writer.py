@@ -83,17 +83,15 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
 def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     """Return the document that was read, with the texture coordinates of a mesh."""
     document = carried.document.copy()
-    users = _users(carried)
+    users, all_places = _users(carried), _convert_places(mesh.corner_uv)
     for number, pool in enumerate(carried.pools):
-        parts = [part for part in carried.parts if part.pool == number]
-        faces = np.concatenate([np.arange(part.begin, part.end) for part in parts])
+        parts, faces = carried.parts_of(number), carried.faces_of(number)
         primitives = [document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in parts]
-        places = _convert_places(mesh.corner_uv[faces])
+        places = all_places[faces]
         if np.isnan(places).all():
             continue
         if np.isnan(places).any():
             raise ValueError("some faces of a primitive have no texture coordinates, which glTF does not support")
-        old_places = _places_of(document, pool, carried.rows[faces] - pool.first)
         rows, origin, corner = _split(carried.rows[faces] - pool.first, _bits(places), pool.count)
         table = places.reshape(-1, 2)[corner]
         if PLACES in pool.attributes:
@@ -106,16 +104,9 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
                 primitive["mode"] = 4
                 primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
         _set_numbers(document, [primitive["attributes"] for primitive in primitives], PLACES, table, users)
-        if old_places is None or not np.array_equal(old_places, places):
+        if _has_moved(carried, number, all_places):
             _drop_tangents(primitives)
     return document
-
-
-def _places_of(document: Document, pool: VertexPool, rows: IntArray) -> NDArray[np.float32] | None:
-    """Return the texture coordinates (f, 3, 2) of a pool's triangles; None if there are none."""
-    if PLACES not in pool.attributes:
-        return None
-    return document.reals(pool.attributes[PLACES]).astype(np.float32)[rows]
 
 
 def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
@@ -127,16 +118,18 @@ def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
 
 def _has_old_tangents(carried: CarriedGltf, mesh: MeshData) -> bool:
     """Whether the file has tangents, and the mesh has other texture coordinates."""
-    numbers = [number for number, pool in enumerate(carried.pools) if "TANGENT" in pool.attributes]
     places = _convert_places(mesh.corner_uv)
-    if np.isnan(places).all():
-        return False
-    for part in (part for part in carried.parts if part.pool in numbers):
-        pool, faces = carried.pools[part.pool], np.arange(part.begin, part.end)
-        old = _places_of(carried.document, pool, carried.rows[faces] - pool.first)
-        if old is None or not np.array_equal(old, places[faces]):
-            return True
-    return False
+    tangents = [number for number, pool in enumerate(carried.pools) if "TANGENT" in pool.attributes]
+    return not np.isnan(places).all() and any(_has_moved(carried, number, places) for number in tangents)
+
+
+def _has_moved(carried: CarriedGltf, number: int, places: NDArray[np.float32]) -> bool:
+    """Whether a pool's triangles have other texture coordinates than ``places`` (f, 3, 2) in the file."""
+    pool, faces = carried.pools[number], carried.faces_of(number)
+    if PLACES not in pool.attributes:
+        return True
+    old = carried.document.reals(pool.attributes[PLACES]).astype(np.float32)
+    return not np.array_equal(old[carried.rows[faces] - pool.first], places[faces])
 
 
 def _paint(document: Document, texture: Texture) -> None:
