@@ -144,6 +144,11 @@ def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> Float
     return array
 
 
+def pad_to_space(V: FloatArray) -> FloatArray:
+    """Return positions (n, 3); those in the plane get a third coordinate of zero."""
+    return V if V.shape[1] == 3 else np.column_stack([V, np.zeros(len(V))])
+
+
 def triangle_array(F: ArrayLike, n: int) -> IntArray:
     """Convert triangles (f, 3) among ``n`` vertices, at least one, to int64; returns a copy."""
     array = triangle_rows(F)

@@ -11,7 +11,7 @@ import numpy as np
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
-from quasiharmonic.io.adapters.objects import MeshLike, seamed_mesh
+from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of
 from quasiharmonic.util.tables import make_dataframe
@@ -168,7 +168,7 @@ def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
     >>> print(certify(SeamedMesh(V, F, uv=V)).summary())
     1 island: 1 injective, 1 bijective.
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     judged = []
     for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         found = certificate.certify(island.F[:, ::-1] if mirrored else island.F, island.uv)

@@ -25,7 +25,7 @@ from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.curves.boundary_curves import sliding_curves
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.objects import MeshLike, seamed_mesh
+from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult
@@ -80,7 +80,7 @@ def polish(
     ValueError
         If an island is not injective or not a surface; the message names its first triangle.
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     check_bool("free", free)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     if free and fixed is not None:
@@ -118,7 +118,7 @@ def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **
     -------
     MappedAtlas
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     checked = _check_fixed(mesh, fixed)
     return each_island(
         mesh, lambda island: harmonise_map(_domain(island, checked), island.uv, HarmoniseOptions(**rest))
@@ -149,7 +149,7 @@ def injective_map(
     MappedAtlas
         If an island has no injective map, its result reports it.
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     checked = _check_fixed(mesh, fixed)
 
     def find(island: Island) -> MapResult:
@@ -195,7 +195,7 @@ def flatten(
         In the surface's unit of length, or in the unit square. After Ctrl-C the remaining islands keep their positions,
         and the others keep their centre, direction and area.
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     check_bool("start", start)
     check_bool("unit_square", unit_square)
     check_non_negative("gap", gap)
@@ -312,7 +312,7 @@ def pack(
     # Packing needs scipy.spatial, which takes longer to load than most maps take.
     from quasiharmonic.apps.atlas.packing.pack import pack_charts
 
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     islands = mesh.islands
     charts = _scale_to_surface(islands, _surface_areas(mesh))
     packing = pack_charts(charts, resolution=resolution, padding=padding, rotate=rotate, stack=stack)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.util.arrays import count_of
 
 # First bytes of common files that are not plain text.
 _FOREIGN = {
@@ -183,8 +184,7 @@ def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, lis
         if at == 1 and not any(is_number(word) for word in words):
             continue
         if len(words) != columns:
-            plural = "number" if columns == 1 else "numbers"
-            raise MeshFileError(path, f"not {columns} {plural}: {shown(text)}", at)
+            raise MeshFileError(path, f"not {count_of('number', 'numbers', columns)}: {shown(text)}", at)
         try:
             rows.append((at, [number(word) for word in words]))
         except ValueError as error:

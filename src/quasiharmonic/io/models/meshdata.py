@@ -19,6 +19,7 @@ from quasiharmonic.util.arrays import (
     check_range,
     map_array,
     names_of,
+    pad_to_space,
     triangle_rows,
     vertex_array,
 )
@@ -116,9 +117,7 @@ class MeshData:
 
     def __post_init__(self) -> None:
         """Convert the arrays to the types and shapes above; raise `ValueError` for invalid ones."""
-        V = vertex_array(self.V)
-        if V.shape[1] == 2:
-            V = np.column_stack([V, np.zeros(len(V))])
+        V = pad_to_space(vertex_array(self.V))
         object.__setattr__(self, "V", V)
         F = triangle_rows(self.F, copy=False)
         check_range("F", F, len(V))
@@ -136,6 +135,20 @@ class MeshData:
     def faces(self) -> int:
         """Number of faces in the file."""
         return len(self.F) if self.polygons is None else len(self.polygons)
+
+    @property
+    def rings(self) -> Polygons:
+        """The file's faces as rings of corners of the triangles, also if all are triangles."""
+        if self.polygons is not None:
+            return self.polygons
+        return Polygons(np.arange(self.F.size), 3 * np.arange(len(self.F) + 1))
+
+    @property
+    def corner_uv(self) -> FloatArray:
+        """Texture coordinates at every corner, (f, 3, 2) float64; NaN where there are none."""
+        if self.vt is None or self.FT is None:
+            return np.full((*self.F.shape, 2), np.nan)
+        return np.where(self.FT[:, :, None] >= 0, self.vt[self.FT], np.nan)
 
     def with_map(self, uv: ArrayLike) -> MeshData:
         """Return the same mesh with one texture coordinate for each vertex.
@@ -213,11 +226,11 @@ def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
     """
     uv = np.full((len(mesh.V), 2), np.nan)
     seam = np.zeros(len(mesh.V), dtype=np.bool_)
-    if mesh.vt is not None and mesh.FT is not None:
-        given = mesh.FT >= 0
-        vertex, place = mesh.F[given], mesh.vt[mesh.FT[given]]
-        uv[vertex] = place
-        seam[vertex[(uv[vertex] != place).any(axis=1)]] = True
+    places = mesh.corner_uv
+    given = ~np.isnan(places[:, :, 0])
+    vertex, place = mesh.F[given], places[given]
+    uv[vertex] = place
+    seam[vertex[(uv[vertex] != place).any(axis=1)]] = True
     return uv, seam
 
 

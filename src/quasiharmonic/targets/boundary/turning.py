@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, triangle_array, vertex_array
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, pad_to_space, triangle_array, vertex_array
 
 # Total turning in radians that is added, spread evenly, so that corners divide a straight side evenly.
 _ADDED_TURNING = 0.01
@@ -196,7 +196,7 @@ def outermost(loops: Sequence[IntArray], space: FloatArray) -> int:
 
 def in_space(V: FloatArray) -> FloatArray:
     """Return positions (n, 3), centred and scaled to about unit size to avoid overflow."""
-    V = np.column_stack([V, np.zeros(len(V))]) if V.shape[1] == 2 else V
+    V = pad_to_space(V)
     V = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
     return np.asarray(V - V.mean(axis=0))
 

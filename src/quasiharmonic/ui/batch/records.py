@@ -14,8 +14,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole
+from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole, writing
+from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import parse_json
 
 Record = dict[str, Any]
@@ -99,6 +100,7 @@ TABLES = "records.csv", "records.parquet"
 FILE = "record.json"
 _MAP = "map.obj"
 _ROWS = 1000
+_NO_TABLE = "cannot be read as a table: "
 
 
 def map_path(folder: Path) -> Path:
@@ -143,13 +145,9 @@ def clear(folder: Path) -> None:
 
     OutputError if the folder cannot be created or emptied, FileInUseError if another program has one of its files open.
     """
-    try:
+    with writing(f"results to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         remove_results(folder)
-    except FileInUseError:
-        raise
-    except OSError as error:
-        raise OutputError(f"cannot write results to {folder}: {error.strerror or error}") from error
 
 
 def remove_results(folder: Path) -> None:
@@ -239,10 +237,8 @@ def _suffix(path: str | os.PathLike[str]) -> str:
 
 def load_pyarrow() -> Any:
     """Return the module `pyarrow.parquet`; ImportError with the install command if it is missing."""
-    try:
+    with explain_missing("Parquet needs pyarrow", "'quasiharmonic[batch]', or choose .csv"):
         import pyarrow.parquet
-    except ImportError as error:
-        raise ImportError("Parquet needs pyarrow: pip install 'quasiharmonic[batch]', or choose .csv") from error
     return pyarrow.parquet
 
 
@@ -282,25 +278,20 @@ def _write_parquet(parquet: Any, file: BinaryIO, records: Iterable[Record]) -> N
 
 
 def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            for row in csv.DictReader(file):
-                row.pop(None, None)  # values after the last column
-                yield row
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MeshFileError(path, f"cannot be read as a table: {error}") from error
+    damage = OSError, UnicodeDecodeError, csv.Error
+    with reading(path, _NO_TABLE, damage), open(path, encoding="utf-8-sig", newline="") as file:
+        for row in csv.DictReader(file):
+            row.pop(None, None)  # values after the last column
+            yield row
 
 
 def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
     parquet = load_pyarrow()
     import pyarrow
 
-    try:
-        with parquet.ParquetFile(path) as file:
-            for batch in file.iter_batches(_ROWS):
-                yield from batch.to_pylist()
-    except (OSError, pyarrow.ArrowException) as error:
-        raise MeshFileError(path, f"cannot be read as a table: {error}") from error
+    with reading(path, _NO_TABLE, (OSError, pyarrow.ArrowException)), parquet.ParquetFile(path) as file:
+        for batch in file.iter_batches(_ROWS):
+            yield from batch.to_pylist()
 
 
 def _convert(path: str | os.PathLike[str], number: int, column: str, value: Any) -> Any:

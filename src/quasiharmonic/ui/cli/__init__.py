@@ -117,7 +117,7 @@ def _parent_surface(options: argparse.Namespace) -> Iterator[None]:
     if path is None:
         yield
         return
-    from quasiharmonic.io.formats.neuro import set_parent_surface
+    from quasiharmonic.io.formats.neuro import use_parent_surface
     from quasiharmonic.io.registry import format_of
 
     given = [value if isinstance(value, list) else [value] for value in vars(options).values() if value is not path]
@@ -126,12 +126,8 @@ def _parent_surface(options: argparse.Namespace) -> Iterator[None]:
         raise ValueError("--surface gives the triangles of FreeSurfer's patches, but no file is a patch: omit it")
     if not path.is_file():
         raise ValueError(f"--surface {path}: there is no such file")
-
-    set_parent_surface(path)
-    try:
+    with use_parent_surface(path):
         yield
-    finally:
-        set_parent_surface(None)
 
 
 def _fail(command: str, why: str | Exception, status: int) -> int:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.io.fem.files import FemMesh, VolumeMesh
+    from quasiharmonic.io.fem.files import FemMesh
 
 
 def has_elements(path: Path) -> bool:
@@ -30,7 +30,7 @@ def check(options: argparse.Namespace) -> int:
 
     _reject(options, ("precision", "--as"), ("any_triangulation", "--any-triangulation"), ("fixed", "--fixed"))
     volume = read_volume(options.input)
-    if len(volume.parts.F):
+    if len(volume.F):
         return _check_volume(options, volume)
     mesh = read_fem(options.input)
     triangles, _, inverted = _split(mesh)
@@ -50,26 +50,28 @@ def check(options: argparse.Namespace) -> int:
     return 1 if inverted.size else 0
 
 
-def _check_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
+def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     """Certify tetrahedra as they are in the file; report hexahedra with a corner that is not positive."""
     from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
     from quasiharmonic.apps.tetrahedra.hexahedra import find_bad_corners
+    from quasiharmonic.geometry.mesh.elements import split_solids
     from quasiharmonic.ui.cli import report
     from quasiharmonic.util.arrays import count_of, names_of
 
-    facts: dict[str, Any] = {"input": str(options.input), "elements": len(mesh.parts.F)}
+    T, H = split_solids(mesh.F)
+    facts: dict[str, Any] = {"input": str(options.input), "elements": len(mesh.F)}
     lines, good = [], True
-    if len(mesh.T):
+    if len(T):
         # Faces to hexahedra would count as boundary, so with hexahedra the boundary is not checked.
-        certificate = certify_arrays(mesh.T, mesh.points, boundary=not len(mesh.H))
-        good = certificate.positive if len(mesh.H) else bool(certificate.injective)
+        certificate = certify_arrays(T, mesh.points, boundary=not len(H))
+        good = certificate.positive if len(H) else bool(certificate.injective)
         facts |= certificate.to_dict()
         lines.append(certificate.summary())
-    if len(mesh.H):
-        bad = find_bad_corners(mesh.H, mesh.points)
+    if len(H):
+        bad = find_bad_corners(H, mesh.points)
         good = good and not bad.size
-        facts |= {"hexahedra": len(mesh.H), "corners_not_positive": bad.tolist(), "injective": None if good else False}
-        hexahedra = count_of("hexahedron", "hexahedra", len(mesh.H))
+        facts |= {"hexahedra": len(H), "corners_not_positive": bad.tolist(), "injective": None if good else False}
+        hexahedra = count_of("hexahedron", "hexahedra", len(H))
         lines.append(
             f"Of {hexahedra}, these have a corner that is not positive: {names_of('hexahedron', 'hexahedra', bad)}."
             if bad.size

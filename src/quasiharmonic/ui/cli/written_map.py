@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
+    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.apps.unwrapping.defective_charts import SetApart
     from quasiharmonic.geometry.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
@@ -149,13 +150,8 @@ def add_old_textures(facts: dict[str, Any], lines: list[str], before: MeshData, 
 
     if after.texture is not None or not (named := io.texture_names(before)):
         return
-    if before.FT is not None and after.FT is not None and before.FT.shape == after.FT.shape:
-        assert before.vt is not None
-        assert after.vt is not None
-        known = before.FT >= 0
-        same = np.array_equal(known, after.FT >= 0)
-        if same and np.array_equal(before.vt[before.FT[known]], after.vt[after.FT[known]]):
-            return
+    if np.array_equal(before.corner_uv, after.corner_uv, equal_nan=True):
+        return
     facts["old_textures"] = named
     names = ", ".join(map(printable, named))
     lines.append(f"the new coordinates do not fit the textures of the file: {names}")
@@ -179,3 +175,21 @@ def write(output: Path, mesh: MeshData) -> WrittenMap:
     io.write_mapped(output, mesh)
     with report.after_writing(output):
         return certify_map(io.read_written(output, mesh))
+
+
+def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str:
+    """Return the text report of a map that was computed and written."""
+    from quasiharmonic.problem.result import Status
+    from quasiharmonic.util.arrays import count_of
+
+    lines = [f"wrote {output}: {written.summary()}"]
+    results = [island.result for island in mapped.islands]
+    if not written.injective:
+        lines.append(mapped.status.value)
+    # Each surface may be injective although pins make an overlap between surfaces unavoidable.
+    if not written.injective or mapped.status is Status.IMPOSSIBLE:
+        lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
+    iterations = sum(result.n_iterations for result in results)
+    seconds = sum(result.seconds for result in results)
+    lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
+    return "\n".join(lines)

@@ -20,6 +20,7 @@ from quasiharmonic.io.errors import check_path
 from quasiharmonic.ui.plot.canvas import AS_DRAWN, as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.ui.plot.shading import view
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_sequence, map_array
+from quasiharmonic.util.optional import explain_missing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -188,12 +189,8 @@ def _ffmpeg() -> str:
     """Return the path of the program ffmpeg, from PATH or from the extra ``video``."""
     if (found := shutil.which("ffmpeg")) is not None:
         return found
-    try:
+    with explain_missing("an .mp4 needs the program ffmpeg", "'quasiharmonic[video]' brings it, or write a .gif"):
         from imageio_ffmpeg import get_ffmpeg_exe
-    except ImportError:
-        raise ImportError(
-            "an .mp4 needs the program ffmpeg: pip install 'quasiharmonic[video]' brings it, or write a .gif"
-        ) from None
     return str(get_ffmpeg_exe())
 
 

@@ -13,6 +13,7 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.ui.plot.shading import View, drawable, edge_style, min_heights
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, triangle_rows, vertex_array
+from quasiharmonic.util.optional import explain_missing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,12 +38,10 @@ _INSIDE = np.array((0.80, 0.82, 0.86))
 
 def new_figure(inches: tuple[float, float]) -> Figure:
     """Return a white figure of 100 pixels per inch that is not registered with pyplot; notebooks display it."""
-    try:
+    with explain_missing("pictures need matplotlib", "'matplotlib>=3.8'"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         from quasiharmonic.ui.plot.notebook_figures import NotebookFigure
-    except ImportError as error:
-        raise ImportError(f"pictures need matplotlib ({error}): pip install 'matplotlib>=3.8'") from error
 
     figure = NotebookFigure(figsize=inches, dpi=100, facecolor="white")
     FigureCanvasAgg(figure)

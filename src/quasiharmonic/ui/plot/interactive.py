@@ -14,6 +14,7 @@ from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.ui.plot.canvas import RED, as_mesh
 from quasiharmonic.util.arrays import FloatArray, map_array
+from quasiharmonic.util.optional import explain_missing
 
 #: Measures of distortion that the window offers as colours.
 SHOWN = ("isometric", "conformal", "area_ratio", "mips")
@@ -125,8 +126,6 @@ def view_of(points: FloatArray, aspect: float, angle: float) -> tuple[FloatArray
 
 
 def _polyscope() -> Any:
-    try:
+    with explain_missing("a window needs polyscope", "'quasiharmonic[view]'"):
         import polyscope
-    except ImportError as error:
-        raise ImportError("a window needs polyscope: pip install 'quasiharmonic[view]'") from error
     return polyscope

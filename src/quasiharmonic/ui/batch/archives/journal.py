@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.lowlevel.atomic import writing
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives import results
 from quasiharmonic.ui.batch.archives.tar_stream import Damage, pack_member, read_members
@@ -46,7 +46,7 @@ class Journal:
         self.path = path
         self.part = path.with_name(path.name + results.PART)
         self.entries: dict[str, _Entry] = {}
-        try:
+        with writing(self.part):
             path.parent.mkdir(parents=True, exist_ok=True)
             if not self.part.exists() and path.exists():
                 if not results.is_parquet(path):
@@ -55,8 +55,6 @@ class Journal:
                     for key, record, data in results.read_results(path):
                         self.add(key, record, data)
             self._repair()
-        except OSError as error:
-            raise _cannot_write(self.part, error) from error
 
     def record(self, key: str) -> Record | None:
         """Return the kept values of the newest record of a problem; None if there is none."""
@@ -67,19 +65,16 @@ class Journal:
         """Append a result; OutputError if it cannot be written."""
         packed = b"" if data is None else pack_member(key + results.MAP, data)
         packed += pack_member(key + results.RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
-        try:
-            with open(self.part, "ab") as file:
-                start = file.tell()
-                file.write(packed)
-        except OSError as error:
-            raise _cannot_write(self.part, error) from error
+        with writing(self.part), open(self.part, "ab") as file:
+            start = file.tell()
+            file.write(packed)
         self._note(key, start, start + len(packed), record)
 
     def finish(self, order: Sequence[str], stamp: str, settings: str) -> None:
         """Write the finished archive, in the given order of names, and delete the journal."""
         entries = [(key, self.entries[key]) for key in order]
         about = results.describe((entry.record for _, entry in entries), stamp, settings)
-        try:
+        with writing(self.path):
             # An archive without problems has no journal.
             with open(self.part, "a+b") as file:
                 if results.is_parquet(self.path):
@@ -87,10 +82,6 @@ class Journal:
                 else:
                     results.write_tar(self.path, about, _packed(file, entries))
             self.part.unlink()
-        except OutputError:
-            raise
-        except OSError as error:
-            raise _cannot_write(self.path, error) from error
 
     def _note(self, key: str, start: int, end: int, record: Record) -> None:
         self.entries[key] = _Entry(start, end, {name: record[name] for name in _KEPT if name in record})
@@ -132,7 +123,3 @@ def _unpacked(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator
             if not isinstance(member, Damage)
         }
         yield key, parse_json(data[results.RECORD]), data.get(results.MAP)
-
-
-def _cannot_write(path: Path, error: OSError) -> OutputError:
-    return OutputError(f"cannot write {path}: {error.strerror or error}")

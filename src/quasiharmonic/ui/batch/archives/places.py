@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.lowlevel.atomic import writing
+from quasiharmonic.util.optional import explain_missing
 
 T = TypeVar("T")
 # Number of attempts, and seconds before the second one; each further pause is twice as long.
@@ -69,7 +70,7 @@ def fetch(location: str, folder: Path) -> Path:
 
 def send(path: Path, location: str) -> None:
     """Copy a file to a location. OutputError if it cannot be written."""
-    try:
+    with writing(location):
         if not is_url(location):
             Path(location).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, location)
@@ -78,8 +79,6 @@ def send(path: Path, location: str) -> None:
         # A folder of an object store needs not exist.
         _retry(lambda: system.makedirs(target.rpartition("/")[0], exist_ok=True), location)
         _retry(lambda: system.put_file(str(path), target), location)
-    except OSError as error:
-        raise OutputError(f"cannot write {location}: {error}") from error
 
 
 def read_start(location: str, size: int) -> bytes | None:
@@ -96,14 +95,10 @@ def read_start(location: str, size: int) -> bytes | None:
 
 def _open(location: str) -> tuple[Any, str]:
     """Return the file system of a URL and the path in it; ImportError if a package is missing."""
-    try:
+    with explain_missing("URLs need fsspec", "'quasiharmonic[remote]'"):
         from fsspec.core import url_to_fs
-    except ImportError as error:
-        raise ImportError("URLs need fsspec: pip install 'quasiharmonic[remote]'") from error
-    try:
+    with explain_missing(location, "'quasiharmonic[remote]' for S3"):
         return url_to_fs(location)
-    except ImportError as error:
-        raise ImportError(f"{location}: {error}: pip install 'quasiharmonic[remote]' for S3") from error
 
 
 def _retry(action: Callable[[], T], location: str) -> T:

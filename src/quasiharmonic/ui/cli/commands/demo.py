@@ -51,6 +51,6 @@ def run(options: argparse.Namespace) -> int:
     with report.after_writing(folder / "demo.obj"):
         map.draw(folder / "demo.png", written, [problem], mapped)
         facts = {**mapped.to_dict(), **written.to_dict(), **report.sizes(problem.domain)}
-        report.emit(facts, str(folder / "demo.json"), report.describe_maps(mapped, written, folder / "demo.obj"))
+        report.emit(facts, str(folder / "demo.json"), written_map.describe_maps(mapped, written, folder / "demo.obj"))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
     return 0 if written.injective else 1

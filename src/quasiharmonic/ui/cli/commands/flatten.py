@@ -164,7 +164,11 @@ def run(options: argparse.Namespace) -> int:
             "seconds_in_all": time.perf_counter() - began,
         }
         worst = measured.statistics("isometric").maximum
-        lines = [report.describe_maps(mapped, certified, options.output), *found.notes, f"maximum stretch {worst:.3g}"]
+        lines = [
+            written_map.describe_maps(mapped, certified, options.output),
+            *found.notes,
+            f"maximum stretch {worst:.3g}",
+        ]
         if measured.distances is not None:
             lines.append(measured.distances.summary())
         if options.pattern is not None:

@@ -156,7 +156,9 @@ def run(options: argparse.Namespace) -> int:
             if one.result.crowded.size
         ]
         written_map.add_old_textures(facts, notes, mesh, written)
-        report.emit(facts, options.json, "\n".join([report.describe_maps(mapped, certified, options.output), *notes]))
+        report.emit(
+            facts, options.json, "\n".join([written_map.describe_maps(mapped, certified, options.output), *notes])
+        )
     return 0 if certified.injective else 1
 
 

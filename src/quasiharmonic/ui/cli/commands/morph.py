@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
-    from quasiharmonic.io.fem.files import FemMesh, VolumeMesh
+    from quasiharmonic.io.fem.files import FemMesh
     from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -111,12 +111,12 @@ def run(options: argparse.Namespace) -> int:
     report.check_moved(options.output, options.json, inputs=(options.input, options.positions, options.rest))
     check_fem_output(options.output, options.input)
     volume = read_volume(options.input)
-    if len(volume.parts.F):
+    if len(volume.F):
         return _run_volume(options, volume)
     if options.slide_plane is not None:
         raise ValueError("--slide-plane is for tetrahedra: use --slide for planar meshes")
     mesh = read_fem(options.input)
-    rest = None if options.rest is None else _rest(options.rest, mesh)
+    rest = None if options.rest is None else _rest(options.rest, read_fem(options.rest), mesh)
     if options.field is not None:
         moved = rim(mesh.F)
         positions = mesh.points[moved] + mesh.point_field(options.field, moved)
@@ -156,7 +156,7 @@ def run(options: argparse.Namespace) -> int:
     return 0 if not inverted.size else 1
 
 
-def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
+def _run_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     """`run` for a mesh of tetrahedra."""
     import numpy as np
 
@@ -164,12 +164,14 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
     from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
     from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
     from quasiharmonic.apps.tetrahedra.topology import inspect_faces
+    from quasiharmonic.geometry.mesh.elements import split_solids
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.fem.files import read_volume, write_volume
+    from quasiharmonic.io.fem.files import read_volume, write_fem
     from quasiharmonic.ui.cli import progress_line, report
     from quasiharmonic.util.arrays import count_of
 
-    if len(mesh.H):
+    T, H = split_solids(mesh.F)
+    if len(H):
         raise MeshFileError(options.input, "has hexahedra", remedy="split them into tetrahedra")
     if options.energy is not None:
         raise ValueError("--energy is for planar meshes: omit it for tetrahedra")
@@ -178,14 +180,9 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
     slide = options.slide_plane or options.slide
     rest = None
     if options.rest is not None:
-        first = read_volume(options.rest)
-        if first.points.shape != mesh.points.shape or not np.array_equal(first.T, mesh.T):
-            raise MeshFileError(
-                options.rest, f"must have the same nodes and elements, in the same order, as {mesh.source}"
-            )
-        rest = first.points
+        rest = _rest(options.rest, read_volume(options.rest), mesh)
     if options.field is not None:
-        moved = np.unique(inspect_faces(mesh.T, len(mesh.points)).boundary)
+        moved = np.unique(inspect_faces(T, len(mesh.points)).boundary)
         positions = mesh.points[moved] + mesh.point_field(options.field, moved)
         if slide:
             moved, positions = _drop_idle(mesh.points, moved, positions)
@@ -194,7 +191,7 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
     with report.about(options.input), progress_line.line() as show:
         morphed = morph(
             mesh.points,
-            mesh.T,
+            T,
             moved,
             positions,
             energy=None if options.no_polish else "symmetric-dirichlet",
@@ -204,10 +201,10 @@ def _run_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
             rest=rest,
         )
     assert isinstance(morphed, TetrahedraResult)
-    write_volume(options.output, mesh, morphed.points)
+    write_fem(options.output, mesh, morphed.points)
     with report.after_writing(options.output):
         certificate = certify_arrays(morphed.T, read_volume(options.output).points)
-        reversed_rows = int((morphed.T != mesh.T).any(axis=1).sum())
+        reversed_rows = int((morphed.T != T).any(axis=1).sum())
         facts = {
             **morphed.to_dict(),
             "certificate": certificate.to_dict(),
@@ -243,14 +240,12 @@ def _drop_idle(points: FloatArray, moved: IntArray, positions: FloatArray) -> tu
     return moved[goes], positions[goes]
 
 
-def _rest(path: Path, mesh: FemMesh) -> FloatArray:
+def _rest(path: Path, first: FemMesh, mesh: FemMesh) -> FloatArray:
     """Return the positions of the same nodes in another file."""
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.fem.files import read_fem
 
-    first = read_fem(path)
     if first.points.shape != mesh.points.shape or not np.array_equal(first.F, mesh.F):
         raise MeshFileError(path, f"must have the same nodes and elements, in the same order, as {mesh.source}")
     return first.points

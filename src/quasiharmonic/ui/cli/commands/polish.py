@@ -142,7 +142,7 @@ def lower_distortion(
             "distortion_before": measured[0].to_dict(),
             "distortion": measured[1].to_dict(),
         }
-        lines = [report.describe_maps(after, written, options.output)]
+        lines = [written_map.describe_maps(after, written, options.output)]
         if written.injective:
             lines += [*notes, _change(*measured), *([] if written.mirrored else [after.status.value])]
         written_map.add_old_textures(facts, lines, mesh, lowered)

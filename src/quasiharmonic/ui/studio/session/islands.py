@@ -77,11 +77,6 @@ class IslandState:
         """Return the island with other target positions, as after a drag; it then has no outline."""
         return replace(self.with_problem(self.problem.with_target(target)), outline=None, chosen=(), by_angle=False)
 
-    def with_result(self, result: MapResult) -> IslandState:
-        """Return the island with another map."""
-        other = replace(self, result=result)
-        return other._share(self.__dict__.get("problem"), self.__dict__.get("loops"))
-
     def _share(self, problem: Problem | None, loops: list[IntArray] | None) -> IslandState:
         """Store values that are known, so that they are not computed again."""
         if problem is not None:

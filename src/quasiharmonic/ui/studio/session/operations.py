@@ -56,7 +56,7 @@ def make_start(mesh: SeamedMesh) -> Source:
 def saved_start(mesh: SeamedMesh) -> Recipe:
     """Return the recipe of a map that no step makes: the file with it."""
     source = make_start(mesh)
-    python = recipes.write_script([f"mesh = atlas.SeamedMesh({source.name!r})"], names=["atlas"])
+    python = recipes.write_script([f"mesh = atlas.as_seamed_mesh({source.name!r})"], names=["atlas"])
     return Recipe(f"qhm check {source.name}", python, source.start)
 
 
@@ -373,12 +373,12 @@ def _cut_lines(source: Source, state: SessionState) -> list[str]:
     """Return the lines that cut a surface as ``--cut`` does."""
     if _polygons(state, source) is None:
         return [
-            f"mesh = atlas.SeamedMesh({source.name!r})",
+            f"mesh = atlas.as_seamed_mesh({source.name!r})",
             "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))",
         ]
     return [
         f"model = io.read_mesh({source.name!r})",
-        "mesh, inside = atlas.SeamedMesh(model), model.polygons.diagonals(model.F)",
+        "mesh, inside = atlas.as_seamed_mesh(model), model.polygons.diagonals(model.F)",
         "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams, forbidden_edges=inside))",
     ]
 
@@ -397,7 +397,7 @@ def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> 
     mapped = atlas.flatten(mesh, callback=callback)
     words = ["flatten", source.command, "--seams", SEAMS if len(drawn) else "none", *recipes.option_words(cut=cut)]
     lines = [
-        f"mesh = atlas.SeamedMesh({source.name!r})",
+        f"mesh = atlas.as_seamed_mesh({source.name!r})",
         "mesh = atlas.SeamedMesh(mesh.V, mesh.F)",
         *([f"mesh = mesh.cut(np.loadtxt({SEAMS!r}, dtype=np.int64).reshape(-1, 2))"] if len(drawn) else []),
         *(["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"] if cut else []),

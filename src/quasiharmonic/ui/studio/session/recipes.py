@@ -112,7 +112,7 @@ def outline_script(
     """
     contours = f"outline({to!r})"
     lines = [
-        f"mesh = atlas.SeamedMesh({source.name!r})",
+        f"mesh = atlas.as_seamed_mesh({source.name!r})",
         f"contours = {f'filled({contours})' if filled else contours}",
         "places = [island.uv for island in mesh.islands]",
     ]
