@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 _INTERVAL = 0.1
 
 
-def _of_search(step: Step) -> str:
+def describe_step(step: Step) -> str:
+    """Return a sentence about a step of a search."""
     return f"iteration {step.iteration}   inverted {step.inverted}   energy/area {step.energy:.3g}"
 
 
@@ -27,7 +28,7 @@ def overwrite(text: str) -> None:
 
 
 @contextmanager
-def line(words: Callable[[Any], str] = _of_search) -> Iterator[Callable[[Any], None] | None]:
+def line(words: Callable[[Any], str] = describe_step) -> Iterator[Callable[[Any], None] | None]:
     """Yield a callback that shows steps, or None if standard error is not a terminal."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield None

@@ -19,10 +19,7 @@ def add_parser(commands: Commands) -> None:
         description="Make the head of a cat, map it onto the letter R, and write demo.obj, demo.png and demo.json.",
         epilog="Exit status: 0 the written map is certified injective; 1 it is not; 2 nothing was written; 3 the map "
         "was written, but the report failed.",
-        examples=(
-            "qhm demo",
-            "qhm demo -o folder/",
-        ),
+        examples=("qhm demo", "qhm demo -o folder/"),
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("qhm-demo"), metavar="DIR", help="folder to write to (qhm-demo)"

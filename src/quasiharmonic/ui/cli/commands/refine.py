@@ -6,6 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from quasiharmonic.ui.cli import pipeline, report
+from quasiharmonic.ui.cli.arguments import add_files, add_options
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -18,8 +21,6 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.ui.cli import arguments
-
     parser = commands.add_parser(
         "refine",
         description="Split only the edges that qhm check lists, until it lists none. Three files are written: the "
@@ -30,17 +31,8 @@ def add_parser(commands: Commands) -> None:
         "report failed.",
         examples=("qhm refine problem/ -o finer.obj",),
     )
-    parser.add_argument(
-        "input", type=Path, metavar="INPUT", help="OBJ file, or a folder with input.obj and handles.txt"
-    )
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ file to write")
-    parser.add_argument(
-        "--fixed",
-        type=Path,
-        metavar="FILE",
-        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
-    )
-    arguments.add_report(parser)
+    add_files(parser, "OBJ file, or a folder with input.obj and handles.txt", "OBJ file to write")
+    add_options(parser, "fixed", "json")
     parser.set_defaults(run=run)
 
 
@@ -49,7 +41,6 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.problem import Problem
     from quasiharmonic.solver.refine.refining import refine_problem
-    from quasiharmonic.ui.cli import report
 
     output: Path = options.output
     if output.suffix.lower() != ".obj":
@@ -65,15 +56,15 @@ def run(options: argparse.Namespace) -> int:
         result = refine_problem(problem)
     with io.no_remains(output, handles, origin):
         write(output, handles, origin, mesh, problem, result)
-    with report.after_writing(output):
+
+    def describe() -> pipeline.Account:
         split = len(result.refined.parents)
         facts = {
             "split": split,
             "rounds": result.rounds,
             "diagnosis": result.diagnosis.to_dict(),
             **report.sizes(result.problem.domain),
-            "input": str(options.input),
-            "output": str(output),
+            **pipeline.name_files(options),
             "handles": str(handles),
             "origin": str(origin),
         }
@@ -81,8 +72,9 @@ def run(options: argparse.Namespace) -> int:
         lines.append(result.diagnosis.summary())
         if not result.diagnosis.forbids_injective:
             lines.append(f"Next: qhm map {output} --fixed {handles} -o …")
-        report.emit(facts, options.json, "\n".join(lines))
-    return 1 if result.diagnosis.forbids_injective else 0
+        return pipeline.Account(facts, lines, not result.diagnosis.forbids_injective)
+
+    return pipeline.finish(options, describe, output)
 
 
 def write(output: Path, handles: Path, origin: Path, mesh: MeshData, problem: Problem, result: RefinedProblem) -> None:

@@ -20,10 +20,7 @@ def add_parser(commands: Commands) -> None:
         "follows. Every map shown is certified. Needs the extra 'studio'. Only this machine can open the page, at the "
         "address that is printed. Ctrl-C stops the server.",
         epilog="Exit status: 0 ended by Ctrl-C; 2 wrong input or call.",
-        examples=(
-            "qhm studio",
-            "qhm studio model.obj",
-        ),
+        examples=("qhm studio", "qhm studio model.obj"),
     )
     parser.add_argument(
         "input",

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.ui.cli import pipeline, report, written_map
+from quasiharmonic.ui.cli.arguments import add_options, choice, file, set_default
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -31,7 +34,6 @@ class _MappedFile:
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments
 
     parser = commands.add_parser(
         "transfer",
@@ -53,40 +55,35 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "-o",
         "--output",
-        type=Path,
-        metavar="FILE",
-        help="write the target with its vertices moved to the corresponding points of the source: its triangles, and "
-        f"the source's shape; as {format_names('write_map', 'seams')}",
+        **file(
+            "write the target with its vertices moved to the corresponding points of the source: its triangles, and "
+            f"the source's shape; as {format_names('write_map', 'seams')}"
+        ),
     )
-    parser.add_argument(
-        "--values",
-        nargs=2,
-        type=Path,
-        metavar=("FILE", "OUT"),
-        help=f"transfer values of the source to the target's vertices: {', '.join(_TABLES)} (one row per vertex or "
-        "triangle), or GIFTI data to read",
+    pair = {"nargs": 2, "metavar": ("FILE", "OUT")}
+    add_options(
+        parser,
+        values=file(
+            f"transfer values of the source to the target's vertices: {', '.join(_TABLES)} (one row per vertex or "
+            "triangle), or GIFTI data to read",
+            **pair,
+        ),
+        per=choice(
+            ("vertex", "triangle"), "for --values: whether rows belong to vertices or to triangles (default: vertex)"
+        ),
+        landmarks=file(
+            "transfer vertices of the source, 0-based, one per line; writes .csv: vertex, triangle of the target, "
+            "three weights of its corners, its nearest corner, position",
+            **pair,
+        ),
+        outside=choice(
+            ("nearest", "nan"),
+            "for points without a corresponding point: the nearest point of the other map's boundary, or nan "
+            "(default: nearest)",
+            default="nearest",
+        ),
     )
-    parser.add_argument(
-        "--per",
-        choices=("vertex", "triangle"),
-        help="for --values: whether rows belong to vertices or to triangles (default: vertex)",
-    )
-    parser.add_argument(
-        "--landmarks",
-        nargs=2,
-        type=Path,
-        metavar=("FILE", "OUT"),
-        help="transfer vertices of the source, 0-based, one per line; writes .csv: vertex, triangle of the target, "
-        "three weights of its corners, its nearest corner, position",
-    )
-    parser.add_argument(
-        "--outside",
-        choices=("nearest", "nan"),
-        default="nearest",
-        help="for points without a corresponding point: the nearest point of the other map's boundary, or nan "
-        "(default: nearest)",
-    )
-    arguments.add_report(parser)
+    add_options(parser, "json")
     parser.set_defaults(run=run)
 
 
@@ -98,10 +95,9 @@ def run(options: argparse.Namespace) -> int:
 
     from quasiharmonic import io
     from quasiharmonic.apps.inverse.transfer import SurfaceMap
-    from quasiharmonic.ui.cli import arguments, report, written_map
     from quasiharmonic.util.arrays import count_of
 
-    arguments.set_default(options, "per", "vertex", asked=options.values is not None, belongs="--values")
+    set_default(options, "per", "vertex", asked=options.values is not None, belongs="--values")
     outputs = _outputs(options)
     inputs = (options.source, options.target, *(pair[0] for pair in (options.values, options.landmarks) if pair))
     report.check_new(outputs, options.json, inputs=inputs)
@@ -144,8 +140,8 @@ def run(options: argparse.Namespace) -> int:
     if marks is not None:
         io.write_whole(options.landmarks[1], marks)
         written.append(str(options.landmarks[1]))
-    with report.after_writing(Path(written[0])):
-        facts["written"] = written
+
+    def describe() -> pipeline.Account:
         instead = "the nearest point of its boundary" if options.outside == "nearest" else "nan"
         lines = [
             f"wrote {', '.join(written)}",
@@ -155,8 +151,9 @@ def run(options: argparse.Namespace) -> int:
         ]
         if outside:
             lines.append(f"{count_of('vertex', 'vertices', outside)} outside the source's map: {instead}")
-        report.emit(facts, options.json, "\n".join(lines))
-    return 0
+        return pipeline.Account({**facts, "written": written}, lines)
+
+    return pipeline.finish(options, describe, Path(written[0]))
 
 
 def _outputs(options: argparse.Namespace) -> dict[str, Path]:
@@ -185,7 +182,6 @@ def _read(path: Path) -> _MappedFile:
 
     from quasiharmonic import io
     from quasiharmonic.apps.inverse.inverse_map import InverseMap
-    from quasiharmonic.ui.cli import report
 
     mesh = io.read_mesh(path)
     V, F, uv = io.cut_at_seams(mesh)

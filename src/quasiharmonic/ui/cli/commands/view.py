@@ -6,6 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from quasiharmonic.ui.cli import report
+from quasiharmonic.ui.cli.arguments import add_options, file
+
 if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
 
@@ -19,25 +22,17 @@ def add_parser(commands: Commands) -> None:
         description="Show a surface and the map in its texture coordinates (vt) in a window, with a "
         "checkerboard, distortion and inverted triangles. Needs the extra 'view'.",
         epilog="Exit status: 0 shown; 2 wrong input or call, or no window can be opened.",
-        examples=(
-            "qhm view map.obj",
-            "qhm view map.obj --screenshot view.png",
-        ),
+        examples=("qhm view map.obj", "qhm view map.obj --screenshot view.png"),
     )
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
-    parser.add_argument(
-        "--screenshot",
-        type=Path,
-        metavar="PNG",
-        help="write the view to this file instead of opening a window; needs no display",
-    )
+    shot = file("write the view to this file instead of opening a window; needs no display", metavar="PNG")
+    add_options(parser, screenshot=shot)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Read and show."""
     from quasiharmonic import io
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.ui.plot.interactive import show
 
     if options.screenshot is not None:
