@@ -44,10 +44,7 @@ class DataSet(Protocol):
         """Yield the problems."""
 
     def collect(self, item: Finished | None) -> Iterable[Finished]:
-        """Keep the results of an item of the pool; return the problems that are finished."""
-
-    def finish(self) -> Iterable[Finished]:
-        """Complete the results; return the problems that this finishes."""
+        """Keep the results of an item of the pool, if there is one; return the problems that are finished."""
 
     def records(self) -> Iterator[records.Record]:
         """Yield the records of the finished problems."""
@@ -238,7 +235,7 @@ def _solve(
     with closing(finished):
         for item in finished:
             count(data.collect(item))
-        count(data.finish())
+        count(data.collect(None))
     return progress
 
 
@@ -290,10 +287,8 @@ def _check_folder(folder: Path) -> None:
     """Raise OutputError if the path exists but is not a run's folder."""
     if os.path.lexists(folder) and not folder.is_dir():
         raise OutputError(f"cannot write to {folder}: it is not a folder")
-    try:
+    with records.output_errors(f"to {folder}"):
         tables = [name for name in records.TABLES if (folder / name).exists()]
-    except OSError as error:
-        raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     if tables and not (folder / MARKER).exists():
         raise OutputError(f"{folder} has a {tables[0]} that belongs to no run: choose another folder for the results")
 
@@ -304,15 +299,13 @@ def _absolute(source: str | os.PathLike[str]) -> str:
 
 def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, part: Shard) -> None:
     """Write the marker file with source, settings and version into the run's folder, and delete old tables."""
-    try:
+    with records.output_errors(f"to {folder}"):
         for path in folder.glob("records*"):
             # The table of the last run must not be taken for that of this run, nor the tables of other shards.
             if path.name in records.TABLES or (
                 shard_of(path.name) is not None and part in (WHOLE, shard_of(path.name))
             ):
                 remove_file(path)
-    except OSError as error:
-        raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     about = {"source": _absolute(source), "settings": settings.to_dict(), "version": __version__}
     contents = json.dumps(about, indent=2).encode() + b"\n"
     marker = folder / MARKER

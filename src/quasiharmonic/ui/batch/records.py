@@ -10,11 +10,12 @@ import io
 import json
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path
+from quasiharmonic.io.errors import MeshFileError, OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole
 from quasiharmonic.util.untrusted import parse_json
 
@@ -101,6 +102,17 @@ _MAP = "map.obj"
 _ROWS = 1000
 
 
+@contextmanager
+def output_errors(what: str) -> Iterator[None]:
+    """Raise an OutputError, which says that this cannot be written, for every other OSError of the block."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"cannot write {what}: {error.strerror or error}") from error
+
+
 def map_path(folder: Path) -> Path:
     """Return the path of a problem's map in the folder of its results."""
     return folder / _MAP
@@ -143,13 +155,9 @@ def clear(folder: Path) -> None:
 
     OutputError if the folder cannot be created or emptied, FileInUseError if another program has one of its files open.
     """
-    try:
+    with output_errors(f"results to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         remove_results(folder)
-    except FileInUseError:
-        raise
-    except OSError as error:
-        raise OutputError(f"cannot write results to {folder}: {error.strerror or error}") from error
 
 
 def remove_results(folder: Path) -> None:
@@ -190,8 +198,8 @@ def write_table(path: str | os.PathLike[str], records: Iterable[Record]) -> None
     if _suffix(path) == ".csv":
         write_whole(path, lambda file: _write_csv(file, records))
     else:
-        parquet = load_pyarrow()
-        write_whole(path, lambda file: _write_parquet(parquet, file, records))
+        load_pyarrow()
+        write_whole(path, lambda file: write_parquet(file, table_schema(), map(table_row, records), _ROWS))
 
 
 def check_table(path: str | os.PathLike[str]) -> None:
@@ -272,13 +280,14 @@ def table_row(record: Record) -> Record:
     return {column: _plain(record.get(column)) for column in COLUMNS}
 
 
-def _write_parquet(parquet: Any, file: BinaryIO, records: Iterable[Record]) -> None:
+def write_parquet(file: BinaryIO, schema: Any, rows: Iterable[Record], together: int) -> None:
+    """Write rows with a pyarrow schema, some together, so that memory use is constant."""
     import pyarrow
 
-    schema, rest = table_schema(), iter(records)
-    with parquet.ParquetWriter(file, schema) as writer:
-        while rows := [table_row(record) for record in islice(rest, _ROWS)]:
-            writer.write_table(pyarrow.Table.from_pylist(rows, schema=schema))
+    rest = iter(rows)
+    with load_pyarrow().ParquetWriter(file, schema) as writer:
+        while some := list(islice(rest, together)):
+            writer.write_table(pyarrow.Table.from_pylist(some, schema=schema))
 
 
 def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:

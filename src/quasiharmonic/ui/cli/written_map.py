@@ -1,4 +1,4 @@
-"""Write a map, read it back, and certify the file as a reader gets it."""
+"""Certify a map as a reader gets it from a file, and report what the file loses."""
 
 from __future__ import annotations
 
@@ -168,14 +168,3 @@ def tell_losses(output: Path, mesh: MeshData) -> None:
 
     if lost := io.not_held(output, mesh):
         tell(f"{output} will not have: {'; '.join(lost)}")
-
-
-def write(output: Path, mesh: MeshData) -> WrittenMap:
-    """Write a mesh with its map, read the file back, and certify it."""
-    from quasiharmonic import io
-    from quasiharmonic.ui.cli import report
-
-    tell_losses(output, mesh)
-    io.write_mapped(output, mesh)
-    with report.after_writing(output):
-        return certify_map(io.read_written(output, mesh))

@@ -39,15 +39,17 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.ui.cli.commands import map
 
     folder: Path = options.output
+    output = folder / "demo.obj"
     with io.new_folder(folder):
         V, F = surfaces.cat()
         (loop,) = boundary_loops(F, len(V))
         problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
         mapped = each_island(SeamedMesh(V, F), lambda _: map.search(problem, "speed", None, 2000, "auto"))
-        written = written_map.write(folder / "demo.obj", io.MeshData(V, F).with_places(mapped.mesh))
-    with report.after_writing(folder / "demo.obj"):
+        io.write_mapped(output, io.MeshData(V, F).with_places(mapped.mesh))
+    with report.after_writing(output):
+        written = written_map.certify_map(io.read_mesh(output))
         map.draw(folder / "demo.png", written, [problem], mapped)
         facts = {**mapped.to_dict(), **written.to_dict(), **report.sizes(problem.domain)}
-        report.emit(facts, str(folder / "demo.json"), report.describe_maps(mapped, written, folder / "demo.obj"))
+        report.emit(facts, str(folder / "demo.json"), report.describe_maps(mapped, written, output))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
     return 0 if written.injective else 1
