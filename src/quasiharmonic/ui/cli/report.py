@@ -97,16 +97,10 @@ def _json_file(json_path: str | None) -> Path | None:
     return None if json_path in (None, "-") else Path(str(json_path))
 
 
-def check_json(json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for a command that writes only a report."""
-    if (path := _json_file(json_path)) is not None:
-        _check_replaces_nothing("--json", path, inputs)
-
-
 def check_moved(output: Path, json_path: str | None, inputs: Sequence[Path | None]) -> None:
     """Like `check_outputs`, for a mesh in a format whose suffix another library checks."""
     _check_replaces_nothing("-o", output, inputs)
-    check_json(json_path, (*inputs, output))
+    check_new({}, json_path, (*inputs, output))
 
 
 def check_new(outputs: Mapping[str, Path | None], json_path: str | None, inputs: Sequence[Path | None]) -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import time
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import report, targets
+from quasiharmonic.ui.cli import progress_line, report, targets
 from quasiharmonic.ui.cli.arguments import (
     ENERGIES,
     FLATTENED,
@@ -23,7 +21,6 @@ from quasiharmonic.ui.cli.arguments import (
     pick,
     text,
 )
-from quasiharmonic.ui.cli.progress_line import overwrite
 from quasiharmonic.ui.cli.streams import tell
 
 if TYPE_CHECKING:
@@ -154,22 +151,19 @@ def run(options: argparse.Namespace) -> int:
     options.strategy = options.strategy or "speed"
     options.pieces = None if options.pieces is None else str(options.pieces)
     settings = batch.Settings(**pick(options, *(one.name for one in fields(batch.Settings))))
-    show = _Display()
+    limits = pick(options, "jobs", "threads", "memory_limit")
+    rest = pick(options, "retry", "table", "shard", "scheduler")
+    time_limit = options.time_limit or None
     try:
-        limits = pick(options, "jobs", "threads", "memory_limit")
-        rest = pick(options, "retry", "table", "shard", "scheduler")
-        time_limit = options.time_limit or None
-        progress = batch.run(
-            options.source, options.output, settings, time_limit=time_limit, callback=show, **limits, **rest
-        )
+        with progress_line.line(_words, live=LIVE, log=LOG) as show:
+            progress = batch.run(
+                options.source, options.output, settings, time_limit=time_limit, callback=show, **limits, **rest
+            )
     except KeyboardInterrupt:
-        show.clear()
         tell(
             f"qhm batch: interrupted; finished results are kept in {options.output}; give the same command to continue"
         )
         return 2
-    finally:
-        show.clear()
     wanted = "bijective" if options.flatten else "injective"
     records = places.join(options.output, table_name(read_shard(options.shard), options.table))
     with report.after_writing(records):
@@ -237,30 +231,10 @@ def _account(progress: Progress, wanted: str, table: str) -> str:
     return "\n".join(lines)
 
 
-class _Display:
-    """Progress display: one overwritten line on a terminal, otherwise occasional lines."""
-
-    def __init__(self) -> None:
-        self._terminal = sys.stderr is not None and sys.stderr.isatty()
-        self._shown = time.monotonic() - LIVE if self._terminal else time.monotonic()
-
-    def __call__(self, progress: Progress) -> None:
-        now = time.monotonic()
-        if sys.stderr is None or now - self._shown < (LIVE if self._terminal else LOG):
-            return
-        self._shown = now
-        text = f"{progress.done}/{progress.total} done   {progress.failed} failed   {progress.rate:.3g}/s"
-        if progress.seconds_left is not None:
-            text += f"   {_duration(progress.seconds_left)} left"
-        if self._terminal:
-            overwrite(text)
-        else:
-            tell(text)
-
-    def clear(self) -> None:
-        """Erase the progress line."""
-        if self._terminal:
-            overwrite("")
+def _words(progress: Progress) -> str:
+    text = f"{progress.done}/{progress.total} done   {progress.failed} failed   {progress.rate:.3g}/s"
+    left = progress.seconds_left
+    return text if left is None else f"{text}   {_duration(left)} left"
 
 
 def _duration(seconds: float) -> str:

@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
     if options.boundary and (options.precision or options.any_triangulation or options.fixed):
         raise ValueError("--boundary verifies no map: omit --as, --any-triangulation and --fixed")
     options.input, options.fixed = io.problem_files(options.input, options.fixed)
-    report.check_json(options.json, inputs=(options.input, options.fixed))
+    report.check_new({}, options.json, inputs=(options.input, options.fixed))
     if options.boundary:
         return boundary_report.run(options)
     if options.plot is not None:

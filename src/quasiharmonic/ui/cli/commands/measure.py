@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.util.arrays import names_of
 
     set_default(options, "rings", 20, asked=options.distances, belongs="--distances")
-    report.check_json(options.json, inputs=(options.input, options.export))
+    report.check_new({}, options.json, inputs=(options.input, options.export))
     if options.export is not None:
         report.check_export(options.export, inputs=(options.input,))
     if finite_elements.has_elements(options.input):
