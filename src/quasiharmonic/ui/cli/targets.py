@@ -30,8 +30,6 @@ class IslandProblem:
     """Problem of an island as defined by the options."""
 
     fitted: FittedProblem  # If the boundary slides, its target positions lie on the curves
-    # Entries for the JSON report; those of several islands are added
-    facts: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # Sentences for the text report
     slide: bool | BoundaryCurves = False  # Whether the boundary slides, and along which curves
 
@@ -125,7 +123,7 @@ def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> I
         found = ",".join(map(str, island.vertices[fitted.corner_vertices].tolist()))
         posed.notes.append(f"corners by angle, in the outline's order: --corners {found}")
     if fitted.filled_holes:
-        posed.facts["filled_holes"] = holes = fitted.filled_holes
+        holes = fitted.filled_holes
         which = "the hole" if holes == 1 else f"the {holes} holes"
         posed.notes.append(
             f"the surface has no hole, so {which} of {options.to} {'is' if holes == 1 else 'are'} filled"
@@ -150,7 +148,6 @@ def _slide(options: argparse.Namespace, posed: IslandProblem) -> None:
             pieces=options.pieces,
         )
     posed.fitted = replace(posed.fitted, problem=move_onto(posed.slide, posed.fitted.problem))
-    posed.facts["slide"] = True
 
 
 def _check_room(problem: Problem, to: str) -> None:

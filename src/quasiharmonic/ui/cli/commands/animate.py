@@ -93,8 +93,8 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("-o: the same output is given twice")
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
-    with report.about(options.input):
-        if fixed is None:
+    if fixed is None:
+        with report.about(options.input):
             fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))
     positions = _targets(targets, mesh, fixed)
     with report.about(options.input):

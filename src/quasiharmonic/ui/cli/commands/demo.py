@@ -35,7 +35,8 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.geometry.mesh.topology import boundary_loops
     from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem import Problem
-    from quasiharmonic.ui.cli import report, written_map
+    from quasiharmonic.solver.mapping import solve
+    from quasiharmonic.ui.cli import progress_line, report, written_map
     from quasiharmonic.ui.cli.commands import map
 
     folder: Path = options.output
@@ -44,7 +45,8 @@ def run(options: argparse.Namespace) -> int:
         V, F = surfaces.cat()
         (loop,) = boundary_loops(F, len(V))
         problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
-        mapped = each_island(SeamedMesh(V, F), lambda _: map.search(problem, "speed", None, 2000, "auto"))
+        with progress_line.line() as show:
+            mapped = each_island(SeamedMesh(V, F), lambda _: solve(problem, callback=show))
         io.write_mapped(output, io.MeshData(V, F).with_places(mapped.mesh))
     with report.after_writing(output):
         written = written_map.certify_map(io.read_mesh(output))

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, progress_line, report, seam_options, slide_options, targets, written_map
-from quasiharmonic.ui.cli.arguments import ENERGIES, add_files, add_options, choice, file, flag, set_default
+from quasiharmonic.ui.cli.arguments import ENERGIES, add_files, add_options, choice, file, flag, pick, set_default
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
-    from quasiharmonic.geometry.curves import BoundaryCurves
-    from quasiharmonic.geometry.mesh.refinement import Refined
     from quasiharmonic.io import MeshData
     from quasiharmonic.io.seamed_mesh import Island
     from quasiharmonic.problem import Problem
@@ -100,7 +98,10 @@ def _map(
     """Map a mesh, island by island."""
     from quasiharmonic import io
     from quasiharmonic.apps.atlas.mapped_atlas import each_island, merge_refined
+    from quasiharmonic.energies.polishing import smooth
     from quasiharmonic.problem.result import Status
+    from quasiharmonic.solver.mapping import solve
+    from quasiharmonic.solver.refine.attempts import on_refinement
 
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     targets.check_options(options, mesh, fixed)
@@ -114,13 +115,17 @@ def _map(
         one = targets.make_problem(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
-        chosen = options.strategy or "speed", options.polish, options.max_iterations, options.linear_solver
-        result = search(problem, *chosen, slide=one.slide if options.polish else False, refine=options.refine)
+        given = pick(options, "polish", "max_iterations", "linear_solver", "refine")
+        slide = one.slide if options.polish else False
+        with progress_line.line() as show:
+            result = solve(problem, strategy=options.strategy or "speed", slide=slide, callback=show, **given)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-            fine = refined_by(problem, result.refined)
-            result = smooth_briefly(fine, result, options.linear_solver, one.slide)
+            # The short default polish lowers the worst distortion at little cost.
+            fine = on_refinement(problem, result.refined)
+            with progress_line.line() as show:
+                result = smooth(fine, result, linear_solver=options.linear_solver, callback=show, slide=one.slide)
         return result
 
     with report.about(source):
@@ -137,8 +142,9 @@ def _map(
         certified = written_map.certify_map(written)
         if options.plot is not None:
             problems = zip((one.fitted.problem for one in posed), refined, strict=False)
-            draw(options.plot, certified, [refined_by(*one) for one in problems], mapped, options.kind)
+            draw(options.plot, certified, [on_refinement(*one) for one in problems], mapped, options.kind)
         added = sum(one.result.added for one in mapped.islands)
+        filled = sum(one.fitted.filled_holes for one in posed)
         facts = {
             **mapped.to_dict(),
             **certified.to_dict(),
@@ -147,7 +153,8 @@ def _map(
             "fixed": sum(len(one.fitted.problem.fixed) for one in posed),
             **({} if options.to is None else {"to": options.to}),
             **found.facts,
-            **sum_facts([one.facts for one in posed]),
+            **({"filled_holes": filled} if filled else {}),
+            **({"slide": True} if options.slide else {}),
             **({"added_vertices": added} if options.refine else {}),
             "seconds_in_all": time.perf_counter() - began,
         }
@@ -165,64 +172,11 @@ def _map(
     return pipeline.Changed(new, describe)
 
 
-def search(
-    problem: Problem,
-    strategy: str,
-    polish: str | None,
-    max_iterations: int,
-    linear_solver: str,
-    slide: bool | BoundaryCurves = False,
-    refine: bool = False,
-) -> MapResult:
-    """Solve with progress on the terminal."""
-    from quasiharmonic.solver.mapping import solve
-
-    with progress_line.line() as show:
-        return solve(
-            problem,
-            strategy=strategy,
-            polish=polish,
-            max_iterations=max_iterations,
-            linear_solver=linear_solver,
-            callback=show,
-            slide=slide,
-            refine=refine,
-        )
-
-
-def refined_by(problem: Problem, refined: Refined | None) -> Problem:
-    """Return the problem on the refined mesh of a result."""
-    if refined is None:
-        return problem
-    from quasiharmonic.solver.refine.attempts import on_refinement
-
-    return on_refinement(problem, refined)
-
-
-def smooth_briefly(
-    problem: Problem, result: MapResult, linear_solver: str, slide: bool | BoundaryCurves = False
-) -> MapResult:
-    """Run the short default polish, which lowers the worst distortion at little cost."""
-    from quasiharmonic.energies.polishing import smooth
-
-    with progress_line.line() as show:
-        return smooth(problem, result, linear_solver=linear_solver, callback=show, slide=slide)
-
-
 def describe_crowded(vertices: NDArray[np.int64]) -> str:
     """Return a sentence about vertices where double precision is too coarse for a map."""
     from quasiharmonic.util.arrays import names_of
 
     return f"double precision is insufficient next to the fixed {names_of('vertex', 'vertices', vertices)}"
-
-
-def sum_facts(facts: list[dict[str, int]]) -> dict[str, int]:
-    """Return the sum of the report entries of all islands."""
-    total: dict[str, int] = {}
-    for one in facts:
-        for name, value in one.items():
-            total[name] = value if isinstance(value, bool) else total.get(name, 0) + value
-    return total
 
 
 def draw(path: Path, certified: WrittenMap, problems: list[Problem], mapped: MappedAtlas, kind: str = "map") -> None:
