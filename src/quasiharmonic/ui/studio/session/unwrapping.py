@@ -59,9 +59,8 @@ def unwrap_model(
         f"result = unwrap(model.V, model.F{more})",
         "mesh = atlas.SeamedMesh(model.V, model.F, result.indices, result.uvs)",
     ]
-    module = "from quasiharmonic.apps.unwrapping.model_files import polygon_costs"
-    python = recipes.write_script(lines, names=["atlas", "io", "unwrap"], modules=[] if costs is None else [module])
-    recipe = Recipe(recipes.write_command(words, "unwrapped.obj", source), python, source.start)
+    command = recipes.write_command(words, "unwrapped.obj", source)
+    recipe = Recipe(command, recipes.write_script(lines), source.start)
     mesh = SeamedMesh(sheet.surface.V, sheet.surface.F, FT, result.uvs)
     after = as_it_is(state, mesh, recipe)
     return replace(after, from_file=False, selected=tuple(range(len(after.islands))))
