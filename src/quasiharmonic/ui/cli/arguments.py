@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Option: TypeAlias = dict[str, Any]  # Keywords of `add_argument`
 
 # Copies of names in energies.polishing, solver.search.harmonising, energies.measures, solver.search.strategy and
 # linsolve, so that the parser does not import these modules.
@@ -32,7 +34,19 @@ LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 RESOLUTION, PADDING = 1024, 4
 
 
-Option: TypeAlias = dict[str, Any]  # Keywords of `add_argument`
+def add_command(
+    commands: Commands, name: str, text: str | None, run: Callable[[argparse.Namespace], int]
+) -> argparse.ArgumentParser:
+    """Declare a command, and return its parser.
+
+    ``text`` is the docstring of the command's module. It has four paragraphs: a title, which the help leaves out, what the command
+    does, the exit status, and examples.
+    """
+    _, description, epilog, examples = [*cleandoc(text or "").split("\n\n"), *[""] * 4][:4]
+    lines = tuple(line.strip() for line in examples.splitlines())
+    parser = commands.add_parser(name, description=description, epilog=epilog, examples=lines)
+    parser.set_defaults(run=run)
+    return parser
 
 
 def flag(words: str) -> Option:

@@ -1,4 +1,14 @@
-"""``qhm animate``: map a mesh to a sequence of targets, and write the frames or an animation."""
+"""``qhm animate``: map a mesh to a sequence of targets, and write the frames or an animation.
+
+Map a surface to a sequence of targets, each frame from the one before it. With --polish every frame has little
+distortion, and vertices do not jump between frames.
+
+Exit status: 0 every frame is written and certified injective as written; 1 one is not; 2 wrong input or call, nothing
+written; 3 written, but the report failed. Ctrl-C writes the frames so far.
+
+    qhm animate face.obj frames/*.obj -o film.gif
+    qhm animate face.obj frames/*.obj --polish symmetric-dirichlet -o frames_out/
+"""
 
 from __future__ import annotations
 
@@ -8,7 +18,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import ENERGIES, add_options, choice, count, flag, number, pick, set_default
+from quasiharmonic.ui.cli.arguments import (
+    ENERGIES,
+    add_command,
+    add_options,
+    choice,
+    count,
+    flag,
+    number,
+    pick,
+    set_default,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,17 +46,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "animate",
-        description="Map a surface to a sequence of targets, each frame from the one before it. With --polish every "
-        "frame has little distortion, and vertices do not jump between frames.",
-        epilog="Exit status: 0 every frame is written and certified injective as written; 1 one is not; 2 wrong input "
-        "or call, nothing written; 3 written, but the report failed. Ctrl-C writes the frames so far.",
-        examples=(
-            "qhm animate face.obj frames/*.obj -o film.gif",
-            "qhm animate face.obj frames/*.obj --polish symmetric-dirichlet -o frames_out/",
-        ),
-    )
+    parser = add_command(commands, "animate", __doc__, run)
     parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('read')} file: the surface")
     parser.add_argument(
         "targets",
@@ -67,7 +77,6 @@ def add_parser(commands: Commands) -> None:
         frames_per_second=number(count, "frame rate of a moving picture (default: 24)"),
     )
     add_options(parser, "max_iterations", "linear_solver", "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,18 @@
-"""``qhm batch``: map every problem of a data set, and write a record of each."""
+"""``qhm batch``: map every problem of a data set, and write a record of each.
+
+Map every problem of a data set, each in a separate process: a failure does not affect other problems. Maps and
+records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has all records. To
+continue an interrupted run, give the same command again.
+
+Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not (the records give
+the reason); 2 wrong call, or stopped: finished results are kept; 3 finished, but the report failed.
+
+    qhm batch problems/ -o results/ --report
+    qhm batch meshes/ -o flat/ --flatten --cut -j 4
+    qhm batch -o results/ --report --against other.csv
+    qhm batch problems/ -o results/ --shard $SLURM_ARRAY_TASK_ID/16
+    qhm batch -o results/ --merge --report
+"""
 
 from __future__ import annotations
 
@@ -11,6 +25,7 @@ from quasiharmonic.ui.cli import progress_line, report, targets
 from quasiharmonic.ui.cli.arguments import (
     ENERGIES,
     FLATTENED,
+    add_command,
     add_options,
     byte_count,
     choice,
@@ -35,23 +50,7 @@ LOG = 30.0
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    parser = commands.add_parser(
-        "batch",
-        description="Map every problem of a data set, each in a separate process: a failure does not affect "
-        "other problems. "
-        "Maps and records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has "
-        "all records. To continue an interrupted run, give the same command again.",
-        epilog="Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not "
-        "(the records give the reason); 2 wrong call, or stopped: finished results are kept; 3 "
-        "finished, but the report failed.",
-        examples=(
-            "qhm batch problems/ -o results/ --report",
-            "qhm batch meshes/ -o flat/ --flatten --cut -j 4",
-            "qhm batch -o results/ --report --against other.csv",
-            "qhm batch problems/ -o results/ --shard $SLURM_ARRAY_TASK_ID/16",
-            "qhm batch -o results/ --merge --report",
-        ),
-    )
+    parser = add_command(commands, "batch", __doc__, run)
     parser.add_argument(
         "source",
         metavar="DIR_OR_LIST",
@@ -127,7 +126,6 @@ def add_parser(commands: Commands) -> None:
         *("font", "corners", "corner_angle", "refine", "strategy", "pieces", "reference"),
         *("max_iterations", "linear_solver"),
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

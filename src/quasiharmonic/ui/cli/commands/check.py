@@ -1,4 +1,17 @@
-"""``qhm check``: say what a mesh is, certify its map exactly, and find what prevents a map."""
+"""``qhm check``: say what a mesh is, certify its map exactly, and find what prevents a map.
+
+Report the components, boundaries, genus and defects of a mesh. If the file has a map (vt of an OBJ; a planar mesh
+without vt is its own map), verify it exactly. A map with seams is verified in the plane. Tetrahedra are verified in
+space. If the map is not injective, look for obstructions: conditions that no map with these fixed vertices meets.
+
+Exit status: 0 every island of the map is injective (every triangle strictly positive; of several islands some may be
+mirrored), or there is no map and the mesh has no defect, or the boundary is listed; 1 otherwise; 2 the file cannot be
+read.
+
+    qhm check model.obj
+    qhm check problem/ --json report.json
+    qhm check model.obj --boundary --plot boundary.png
+"""
 
 from __future__ import annotations
 
@@ -7,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import boundary_report, finite_elements, pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import add_options, choice, file, flag
+from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, flag
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,21 +36,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "check",
-        description="Report the components, boundaries, genus and defects of a mesh. If the file has a map (vt of an "
-        "OBJ; a planar mesh without vt is its own map), verify it exactly. A map with seams is verified in the plane. "
-        "Tetrahedra are verified in space. "
-        "If the map is not injective, look for obstructions: conditions that no map with these fixed vertices meets.",
-        epilog="Exit status: 0 every island of the map is injective (every triangle strictly positive; of several "
-        "islands some may be mirrored), or there is no map and the mesh has no defect, or the boundary is listed; "
-        "1 otherwise; 2 the file cannot be read.",
-        examples=(
-            "qhm check model.obj",
-            "qhm check problem/ --json report.json",
-            "qhm check model.obj --boundary --plot boundary.png",
-        ),
-    )
+    parser = add_command(commands, "check", __doc__, run)
     parser.add_argument(
         "input",
         type=Path,
@@ -59,7 +58,6 @@ def add_parser(commands: Commands) -> None:
         plot=file("draw the boundary that --boundary lists", metavar="IMAGE"),
     )
     add_options(parser, "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

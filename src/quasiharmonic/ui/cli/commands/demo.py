@@ -1,10 +1,21 @@
-"""``qhm demo``: map a built-in surface onto a letter."""
+"""``qhm demo``: map a built-in surface onto a letter.
+
+Make the head of a cat, map it onto the letter R, and write demo.obj, demo.png and demo.json.
+
+Exit status: 0 the written map is certified injective; 1 it is not; 2 nothing was written; 3 the map was written, but
+the report failed.
+
+    qhm demo
+    qhm demo -o folder/
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli.arguments import add_command
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
@@ -14,17 +25,10 @@ LETTER = "R"
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    parser = commands.add_parser(
-        "demo",
-        description="Make the head of a cat, map it onto the letter R, and write demo.obj, demo.png and demo.json.",
-        epilog="Exit status: 0 the written map is certified injective; 1 it is not; 2 nothing was written; 3 the map "
-        "was written, but the report failed.",
-        examples=("qhm demo", "qhm demo -o folder/"),
-    )
+    parser = add_command(commands, "demo", __doc__, run)
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("qhm-demo"), metavar="DIR", help="folder to write to (qhm-demo)"
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,20 @@
-"""``qhm field``: compute the nearest displacement field of an image without folds, and its inverse."""
+"""``qhm field``: compute the nearest displacement field of an image without folds, and its inverse.
+
+Make a displacement field invertible with the least change. Away from folds the field is unchanged, bit for bit. A
+.npy array has shape (height, width, 2), with displacements along x (to the right) and y (down) in the unit of
+--spacing, or (depth, height, width, 3) on a volume. NIfTI files (.nii, .nii.gz) need nibabel, ITK's files (.mha,
+.nrrd) need SimpleITK; their vectors are along the axes of space, as ITK, ANTs and elastix write them. On volumes, six
+tetrahedra per cell are certified; ITK and ANTs interpolate trilinearly, for which --interpolation trilinear gives a
+certificate.
+
+Exit status: 0 the written field is certified without folds; 1 written, but the inverse that --inverse requests does
+not exist, because the border overlaps itself; 2 wrong input or call, or no such field was found, nothing written; 3
+written, but the report failed.
+
+    qhm field field.npy -o field_without_folds.npy
+    qhm field field.npy --inverse inverse.npy -o field_without_folds.npy
+    qhm field warp.nii.gz -o warp_without_folds.nii.gz
+"""
 
 from __future__ import annotations
 
@@ -6,7 +22,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_files, add_options, choice, file, flag, number
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, file, flag, number
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,23 +36,7 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    parser = commands.add_parser(
-        "field",
-        description="Make a displacement field invertible with the least change. Away from folds "
-        "the field is unchanged, bit for bit. A .npy array has shape (height, width, 2), with displacements "
-        "along x (to the right) and y (down) in the unit of --spacing, or (depth, height, width, 3) on a volume. NIfTI "
-        "files (.nii, .nii.gz) need nibabel, ITK's files (.mha, .nrrd) need SimpleITK; their vectors are along the "
-        "axes of space, as ITK, ANTs and elastix write them. On volumes, six tetrahedra per cell are certified; "
-        "ITK and ANTs interpolate trilinearly, for which --interpolation trilinear gives a certificate.",
-        epilog="Exit status: 0 the written field is certified without folds; 1 written, but the inverse that "
-        "--inverse requests does not exist, because the border overlaps itself; 2 wrong input or call, or no such "
-        "field was found, nothing written; 3 written, but the report failed.",
-        examples=(
-            "qhm field field.npy -o field_without_folds.npy",
-            "qhm field field.npy --inverse inverse.npy -o field_without_folds.npy",
-            "qhm field warp.nii.gz -o warp_without_folds.nii.gz",
-        ),
-    )
+    parser = add_command(commands, "field", __doc__, run)
     add_files(parser, ".npy, .nii, .nii.gz, .mha or .nrrd file", "file to write, of the same kind")
     add_options(
         parser,
@@ -65,7 +65,6 @@ def add_parser(commands: Commands) -> None:
         fix_border=flag("keep the displacements of the border's pixels"),
     )
     add_options(parser, "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

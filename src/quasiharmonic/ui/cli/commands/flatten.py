@@ -1,4 +1,15 @@
-"""``qhm flatten``: compute a bijective map of a mesh with free boundary and low distortion."""
+"""``qhm flatten``: compute a bijective map of a mesh with free boundary and low distortion.
+
+Map a surface with a boundary into the plane. The boundary is free and moves to lower distortion. No triangle is
+inverted, and nothing overlaps.
+
+Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing written; 3
+written, but the report failed. Ctrl-C writes the best map so far.
+
+    qhm flatten scan.obj -o flat.obj
+    qhm flatten model.glb --cut --pack --texture checkerboard -o model_uv.glb
+    qhm flatten shirt.obj --energy arap-barrier --pattern shirt.svg -o shirt_flat.obj
+"""
 
 from __future__ import annotations
 
@@ -11,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, written_map
 from quasiharmonic.ui.cli.arguments import (
     FLATTENED,
+    add_command,
     add_files,
     add_options,
     choice,
@@ -36,19 +48,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "flatten",
-        description="Map a surface with a boundary into the plane. The boundary is free and moves to lower "
-        "distortion. No "
-        "triangle is inverted, and nothing overlaps.",
-        epilog="Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing "
-        "written; 3 written, but the report failed. Ctrl-C writes the best map so far.",
-        examples=(
-            "qhm flatten scan.obj -o flat.obj",
-            "qhm flatten model.glb --cut --pack --texture checkerboard -o model_uv.glb",
-            "qhm flatten shirt.obj --energy arap-barrier --pattern shirt.svg -o shirt_flat.obj",
-        ),
-    )
+    parser = add_command(commands, "flatten", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map')} file to write")
     energy = choice(
         FLATTENED,
@@ -78,7 +78,6 @@ def add_parser(commands: Commands) -> None:
         ),
     )
     add_options(parser, "linear_solver", "texture", "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,11 +1,21 @@
-"""``qhm harmonise``: lower the distortion of a file's map by any energy, and make it injective."""
+"""``qhm harmonise``: lower the distortion of a file's map by any energy, and make it injective.
+
+Lower the distortion of the map in the input's texture coordinates (vt), by an energy that needs no barrier, and keep
+or make the map injective. If qhm polish has the energy, it is faster.
+
+Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (for mips and
+symmetric-dirichlet, a map that is not injective included), nothing written; 3 written, but the report failed.
+
+    qhm harmonise map.obj -o better.obj
+    qhm harmonise map.obj --energy area -o better.obj
+"""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli.arguments import HARMONISED, add_files, add_options, choice, count, flag, number
+from quasiharmonic.ui.cli.arguments import HARMONISED, add_command, add_files, add_options, choice, count, flag, number
 from quasiharmonic.ui.cli.commands import polish
 
 if TYPE_CHECKING:
@@ -18,15 +28,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "harmonise",
-        description="Lower the distortion of the map in the input's texture coordinates (vt), by an energy that "
-        "needs no barrier, and keep or make the map injective. If qhm polish has the energy, it is faster.",
-        epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (for mips "
-        "and symmetric-dirichlet, a map that is not injective included), nothing written; 3 written, but the "
-        "report failed.",
-        examples=("qhm harmonise map.obj -o better.obj", "qhm harmonise map.obj --energy area -o better.obj"),
-    )
+    parser = add_command(commands, "harmonise", __doc__, run)
     form = format_names("write_map")
     add_files(parser, f"{form} file with a map", f"{form} file to write")
     add_options(
@@ -44,7 +46,6 @@ def add_parser(commands: Commands) -> None:
         max_iterations=number(count, "linear solves per round (default: 40)", default=40),
     )
     add_options(parser, "pack", "resolution", "padding", "linear_solver", "texture", "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,15 @@
-"""``qhm map``: map a mesh onto a target boundary, and certify the written file."""
+"""``qhm map``: map a mesh onto a target boundary, and certify the written file.
+
+Place the free vertices of a mesh such that no triangle is inverted. The targets of the fixed vertices are the input's
+texture coordinates (vt), or an outline given by --to.
+
+Exit status: 0 the written file is certified injective; 1 a map was written that is not; 2 wrong input or call,
+nothing written; 3 a map was written, but the report failed.
+
+    qhm map model.obj --to letter:R -o map.obj
+    qhm map problem/ -o map.obj --refine
+    qhm map model.glb --to rect:2x1 --corners auto --slide -o map.glb
+"""
 
 from __future__ import annotations
 
@@ -8,7 +19,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, progress_line, report, seam_options, slide_options, targets, written_map
-from quasiharmonic.ui.cli.arguments import ENERGIES, add_files, add_options, choice, file, flag, pick, set_default
+from quasiharmonic.ui.cli.arguments import (
+    ENERGIES,
+    add_command,
+    add_files,
+    add_options,
+    choice,
+    file,
+    flag,
+    pick,
+    set_default,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,19 +49,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "map",
-        description="Place the free vertices of a mesh such that no triangle is inverted. The targets of the "
-        "fixed vertices "
-        "are the input's texture coordinates (vt), or an outline given by --to.",
-        epilog="Exit status: 0 the written file is certified injective; 1 a map was written that is not; "
-        "2 wrong input or call, nothing written; 3 a map was written, but the report failed.",
-        examples=(
-            "qhm map model.obj --to letter:R -o map.obj",
-            "qhm map problem/ -o map.obj --refine",
-            "qhm map model.glb --to rect:2x1 --corners auto --slide -o map.glb",
-        ),
-    )
+    parser = add_command(commands, "map", __doc__, run)
     add_files(
         parser,
         f"{format_names('read')} file, or a folder with input.obj and handles.txt",
@@ -67,7 +76,6 @@ def add_parser(commands: Commands) -> None:
     add_options(parser, "slide", "pieces")
     solver = parser.add_argument_group("solution")
     add_options(solver, "strategy", "reference", "max_iterations", "linear_solver")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,14 @@
-"""``qhm measure``: measure the distortion of a map, in summary and per triangle."""
+"""``qhm measure``: measure the distortion of a map, in summary and per triangle.
+
+Measure the distortion of every triangle by the map in the input's texture coordinates (vt). Means and quantiles are
+weighted by the surface's area. For measures of size the map is scaled to the surface's area first. Of a
+finite-element mesh, measure the quality of its elements.
+
+Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but the report failed.
+
+    qhm measure map.obj
+    qhm measure map.obj --export distortion.ply --json report.json
+"""
 
 from __future__ import annotations
 
@@ -7,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
-from quasiharmonic.ui.cli.arguments import add_options, file, flag, set_default
+from quasiharmonic.ui.cli.arguments import add_command, add_options, file, flag, set_default
 
 if TYPE_CHECKING:
     from quasiharmonic.energies.measures import Distortion
@@ -18,14 +28,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "measure",
-        description="Measure the distortion of every triangle by the map in the input's texture coordinates (vt). "
-        "Means and quantiles are weighted by the surface's area. For measures of size the map is scaled to the "
-        "surface's area first. Of a finite-element mesh, measure the quality of its elements.",
-        epilog="Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but the report failed.",
-        examples=("qhm measure map.obj", "qhm measure map.obj --export distortion.ply --json report.json"),
-    )
+    parser = add_command(commands, "measure", __doc__, run)
     parser.add_argument(
         "input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map, injective or not"
     )
@@ -35,7 +38,6 @@ def add_parser(commands: Commands) -> None:
         distances=flag("also compare distances between vertices some edges apart, along the surface and in the plane"),
     )
     add_options(parser, "rings", "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

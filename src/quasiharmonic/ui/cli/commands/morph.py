@@ -1,4 +1,15 @@
-"""``qhm morph``: move the boundary of a mesh, planar or of tetrahedra, and keep its interior valid."""
+"""``qhm morph``: move the boundary of a mesh, planar or of tetrahedra, and keep its interior valid.
+
+Move some nodes of a mesh and place the others such that no element is inverted: planar triangles of three or six
+nodes, quadrilaterals of four, or tetrahedra of four. Boundary nodes without a displacement stay fixed; mid-side nodes
+move with their sides. Only positions change in the file; data, time steps and physical groups stay unchanged.
+
+Exit status: 0 no element of the written mesh is inverted, verified exactly, and tetrahedra cover no point twice; 1
+otherwise; 2 wrong input or call, nothing written; 3 written, but the report failed.
+
+    qhm morph mesh.msh --positions boundary.csv -o moved.msh
+    qhm morph mesh.vtu --field displacement --slide -o moved.vtu
+"""
 
 from __future__ import annotations
 
@@ -10,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import ENERGIES, add_files, add_options, choice, file, flag, text
+from quasiharmonic.ui.cli.arguments import ENERGIES, add_command, add_files, add_options, choice, file, flag, text
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
@@ -34,19 +45,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "morph",
-        description="Move some nodes of a mesh and place the others such that no element is inverted: planar triangles "
-        "of three or six nodes, quadrilaterals of four, or tetrahedra of four. Boundary nodes without a displacement "
-        "stay fixed; mid-side nodes move with their sides. Only positions change in the file; data, time steps and "
-        "physical groups stay unchanged.",
-        epilog="Exit status: 0 no element of the written mesh is inverted, verified exactly, and tetrahedra cover no "
-        "point twice; 1 otherwise; 2 wrong input or call, nothing written; 3 written, but the report failed.",
-        examples=(
-            "qhm morph mesh.msh --positions boundary.csv -o moved.msh",
-            "qhm morph mesh.vtu --field displacement --slide -o moved.vtu",
-        ),
-    )
+    parser = add_command(commands, "morph", __doc__, run)
     add_files(
         parser,
         f"{format_names('read_elements')} file, text or binary",
@@ -89,7 +88,6 @@ def add_parser(commands: Commands) -> None:
         help="for tetrahedra: let boundary vertices without a displacement slide on the plane A x + B y + C z = D; "
         "repeat for several planes",
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,13 @@
-"""``qhm plot``: draw the map of a file."""
+"""``qhm plot``: draw the map of a file.
+
+Draw the map that the input's texture coordinates (vt) give, injective or not.
+
+Exit status: 0 the image is written; 2 wrong input or call, nothing written.
+
+    qhm plot map.obj -o map.png
+    qhm plot map.obj --kind distortion --measure area_ratio -o distortion.svg
+    qhm plot model.glb --kind texture -o model.png
+"""
 
 from __future__ import annotations
 
@@ -7,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import finite_elements, report, written_map
-from quasiharmonic.ui.cli.arguments import MEASURES, add_options, choice, set_default, text
+from quasiharmonic.ui.cli.arguments import MEASURES, add_command, add_options, choice, set_default, text
 from quasiharmonic.ui.cli.material import CHECKERBOARD
 
 if TYPE_CHECKING:
@@ -18,16 +27,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "plot",
-        description="Draw the map that the input's texture coordinates (vt) give, injective or not.",
-        epilog="Exit status: 0 the image is written; 2 wrong input or call, nothing written.",
-        examples=(
-            "qhm plot map.obj -o map.png",
-            "qhm plot map.obj --kind distortion --measure area_ratio -o distortion.svg",
-            "qhm plot model.glb --kind texture -o model.png",
-        ),
-    )
+    parser = add_command(commands, "plot", __doc__, run)
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="IMAGE", help="image to write: .png, .svg or .pdf"
@@ -47,7 +47,6 @@ def add_parser(commands: Commands) -> None:
             "(default: the model's own texture if it has one)",
         ),
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,13 @@
-"""``qhm polish``: lower the distortion of an injective map of a file."""
+"""``qhm polish``: lower the distortion of an injective map of a file.
+
+Lower the distortion of the injective map that the input's texture coordinates (vt) give.
+
+Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (a map that is not
+injective included), nothing written; 3 written, but the report failed.
+
+    qhm polish map.obj -o polished.obj
+    qhm polish map.obj --energy mips --free -o polished.obj
+"""
 
 from __future__ import annotations
 
@@ -8,6 +17,7 @@ from typing import TYPE_CHECKING
 from quasiharmonic.ui.cli import pipeline, report, seam_options, slide_options, written_map
 from quasiharmonic.ui.cli.arguments import (
     ENERGIES,
+    add_command,
     add_files,
     add_options,
     choice,
@@ -37,13 +47,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "polish",
-        description="Lower the distortion of the injective map that the input's texture coordinates (vt) give.",
-        epilog="Exit status: 0 the written file is certified injective; 1 it is not; 2 wrong input or call (a map "
-        "that is not injective included), nothing written; 3 written, but the report failed.",
-        examples=("qhm polish map.obj -o polished.obj", "qhm polish map.obj --energy mips --free -o polished.obj"),
-    )
+    parser = add_command(commands, "polish", __doc__, run)
     form = format_names("write_map")
     add_files(parser, f"{form} file with an injective map", f"{form} file to write")
     add_options(
@@ -62,7 +66,6 @@ def add_parser(commands: Commands) -> None:
         to=text("OUTLINE", "the outline of the boundary, as for qhm map (default: the polygon of the boundary)"),
     )
     add_options(parser, "islands", "pack", "resolution", "padding", "linear_solver", "texture", "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,14 @@
-"""``qhm refine``: split edges of a problem without a map until a map may exist."""
+"""``qhm refine``: split edges of a problem without a map until a map may exist.
+
+Split only the edges that qhm check lists, until it lists none. Three files are written: the mesh with an initial map
+(vt), the input of qhm map; its fixed vertices, OUTPUT.handles; and the origin of its vertices and triangles,
+OUTPUT.origin.json (OUTPUT without its suffix).
+
+Exit status: 0 written, and no known obstruction to an injective map remains; 1 written, but an obstruction remains
+that no refinement removes; 2 wrong input or call, nothing written; 3 written, but the report failed.
+
+    qhm refine problem/ -o finer.obj
+"""
 
 from __future__ import annotations
 
@@ -7,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_files, add_options
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,19 +31,9 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    parser = commands.add_parser(
-        "refine",
-        description="Split only the edges that qhm check lists, until it lists none. Three files are written: the "
-        "mesh with an initial map (vt), the input of qhm map; its fixed vertices, OUTPUT.handles; and the origin of "
-        "its vertices and triangles, OUTPUT.origin.json (OUTPUT without its suffix).",
-        epilog="Exit status: 0 written, and no known obstruction to an injective map remains; 1 written, but an "
-        "obstruction remains that no refinement removes; 2 wrong input or call, nothing written; 3 written, but the "
-        "report failed.",
-        examples=("qhm refine problem/ -o finer.obj",),
-    )
+    parser = add_command(commands, "refine", __doc__, run)
     add_files(parser, "OBJ file, or a folder with input.obj and handles.txt", "OBJ file to write")
     add_options(parser, "fixed", "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,14 @@
-"""``qhm repair``: repair the inverted triangles of a UV map, with unchanged boundary."""
+"""``qhm repair``: repair the inverted triangles of a UV map, with unchanged boundary.
+
+Untangle the inverted triangles of the map in the input's texture coordinates (vt). The map may have seams; each of
+its islands is repaired separately. Boundaries and all vertices that need not move stay fixed.
+
+Exit status: 0 every triangle in the written file is certified positive; 1 some are not; 2 wrong input or call,
+nothing written; 3 written, but the report failed.
+
+    qhm repair model.obj -o repaired.obj
+    qhm repair model.glb --whole -o repaired.glb
+"""
 
 from __future__ import annotations
 
@@ -6,7 +16,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, written_map
-from quasiharmonic.ui.cli.arguments import add_files, add_options, count, flag, number, pick
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, count, flag, number, pick
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
@@ -17,15 +27,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "repair",
-        description="Untangle the inverted triangles of the map in the input's texture coordinates (vt). The map "
-        "may have seams; each of its islands is repaired separately. Boundaries and all vertices that need not "
-        "move stay fixed.",
-        epilog="Exit status: 0 every triangle in the written file is certified positive; 1 some are not; 2 wrong input "
-        "or call, nothing written; 3 written, but the report failed.",
-        examples=("qhm repair model.obj -o repaired.obj", "qhm repair model.glb --whole -o repaired.glb"),
-    )
+    parser = add_command(commands, "repair", __doc__, run)
     add_files(
         parser,
         f"{format_names('read', 'seams')} file with texture coordinates",
@@ -38,7 +40,6 @@ def add_parser(commands: Commands) -> None:
         max_iterations=number(count, "maximum iterations on a whole island (default: 2000)", default=2000),
     )
     add_options(parser, "linear_solver", "texture", "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

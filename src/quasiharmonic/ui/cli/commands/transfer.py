@@ -1,4 +1,15 @@
-"""``qhm transfer``: transfer values, positions and landmarks from one surface to another."""
+"""``qhm transfer``: transfer values, positions and landmarks from one surface to another.
+
+Transfer positions, values and landmarks from one surface to another. Points that the maps of both surfaces send to
+the same position correspond. Both maps must be bijective, which is certified exactly, so the correspondence is one to
+one. For maps onto one outline, call qhm map --to with the same outline for both.
+
+Exit status: 0 both maps are certified bijective, and the files are written; 2 wrong input or call, or a map is not
+bijective, nothing written; 3 written, but the report failed.
+
+    qhm transfer a_map.obj b_map.obj --values depth.csv depth_on_b.csv
+    qhm transfer a_map.obj b_map.obj --landmarks points.txt points_on_b.csv -o b_in_the_shape_of_a.obj
+"""
 
 from __future__ import annotations
 
@@ -8,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import add_options, choice, file, set_default
+from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, set_default
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,19 +46,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "transfer",
-        description="Transfer positions, values and landmarks from one surface to another. Points that the maps of "
-        "both surfaces send to the same position correspond. Both maps must be bijective, which is certified exactly, "
-        "so the correspondence is one to one. For maps onto one outline, call qhm map --to with the same outline "
-        "for both.",
-        epilog="Exit status: 0 both maps are certified bijective, and the files are written; 2 wrong input or call, or "
-        "a map is not bijective, nothing written; 3 written, but the report failed.",
-        examples=(
-            "qhm transfer a_map.obj b_map.obj --values depth.csv depth_on_b.csv",
-            "qhm transfer a_map.obj b_map.obj --landmarks points.txt points_on_b.csv -o b_in_the_shape_of_a.obj",
-        ),
-    )
+    parser = add_command(commands, "transfer", __doc__, run)
     for name, text in (("source", "surface that the data belong to"), ("target", "surface that receives them")):
         parser.add_argument(
             name, type=Path, metavar=name.upper(), help=f"{text}: {format_names('write_map')} file with a map"
@@ -84,7 +83,6 @@ def add_parser(commands: Commands) -> None:
         ),
     )
     add_options(parser, "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,16 @@
-"""``qhm unwrap``: compute texture coordinates for any model, packed into a texture."""
+"""``qhm unwrap``: compute texture coordinates for any model, packed into a texture.
+
+Compute texture coordinates for any model: cut it into few charts with little stretch, and pack them into a texture.
+The vertices, faces, materials and other data of the file stay the same. Degenerate and repeated faces, mixed winding
+and edges of three or more faces are accepted and reported.
+
+Exit status: 0 every chart is certified bijective, and no two charts overlap; 1 this is not so; 2 wrong input or call,
+nothing written; 3 written, but the report failed. Ctrl-C writes nothing.
+
+    qhm unwrap model.obj -o out.glb
+    qhm unwrap scan.ply --max-stretch 1.2 --resolution 4096 --padding 8 -o out.ply
+    qhm unwrap model.glb --texture checkerboard -o out.glb
+"""
 
 from __future__ import annotations
 
@@ -10,7 +22,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import material, pipeline, written_map
-from quasiharmonic.ui.cli.arguments import add_files, add_options, byte_count, count, file, flag, number, pick, steps
+from quasiharmonic.ui.cli.arguments import (
+    add_command,
+    add_files,
+    add_options,
+    byte_count,
+    count,
+    file,
+    flag,
+    number,
+    pick,
+    steps,
+)
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStep
@@ -22,19 +45,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "unwrap",
-        description="Compute texture coordinates for any model: cut it into few charts with little stretch, and pack "
-        "them into a texture. The vertices, faces, materials and other data of the file stay the same. Degenerate and "
-        "repeated faces, mixed winding and edges of three or more faces are accepted and reported.",
-        epilog="Exit status: 0 every chart is certified bijective, and no two charts overlap; 1 this is not so; 2 "
-        "wrong input or call, nothing written; 3 written, but the report failed. Ctrl-C writes nothing.",
-        examples=(
-            "qhm unwrap model.obj -o out.glb",
-            "qhm unwrap scan.ply --max-stretch 1.2 --resolution 4096 --padding 8 -o out.ply",
-            "qhm unwrap model.glb --texture checkerboard -o out.glb",
-        ),
-    )
+    parser = add_command(commands, "unwrap", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map', 'seams')} file to write")
     add_options(
         parser,
@@ -63,7 +74,6 @@ def add_parser(commands: Commands) -> None:
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
     add_options(parser, "texture", "json")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
