@@ -39,8 +39,8 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """Declare a command, and return its parser.
 
-    ``text`` is the docstring of the command's module. It has four paragraphs: a title, which the help leaves out, what the command
-    does, the exit status, and examples.
+    ``text`` is the docstring of the command's module. It has four paragraphs: a title, which the help leaves out, what
+    the command does, the exit status, and examples.
     """
     _, description, epilog, examples = [*cleandoc(text or "").split("\n\n"), *[""] * 4][:4]
     lines = tuple(line.strip() for line in examples.splitlines())
@@ -199,5 +199,10 @@ SHARED: dict[str, Option] = {
     "rings": number(count, "for distances: largest number of edges between two vertices (default: 20)"),
     "max_iterations": number(count, "(default: 2000)", default=2000),
     "linear_solver": choice(LINEAR_SOLVERS, "(default: the fastest one installed)", default="auto"),
+    "surface": file(
+        "the surface with the triangles of a FreeSurfer patch (default: beside the patch, such as "
+        "lh.inflated for lh.cortex.patch.3d)",
+        dest="parent_surface",
+    ),
     "json": text("FILE", "write the report as JSON; - for standard output"),
 }

@@ -76,7 +76,7 @@ def add_parser(commands: Commands) -> None:
         fill_gaps=flag("replace frames without a map by the average of the frames around them"),
         frames_per_second=number(count, "frame rate of a moving picture (default: 24)"),
     )
-    add_options(parser, "max_iterations", "linear_solver", "json")
+    add_options(parser, "max_iterations", "linear_solver", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -57,7 +57,7 @@ def add_parser(commands: Commands) -> None:
         boundary=flag("only list the boundary of the surface: its loops, and corners for qhm map --corners"),
         plot=file("draw the boundary that --boundary lists", metavar="IMAGE"),
     )
-    add_options(parser, "json")
+    add_options(parser, "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -77,7 +77,7 @@ def add_parser(commands: Commands) -> None:
             steps, "maximum steps on each connected surface; 0 keeps the start (default: 500)", default=500
         ),
     )
-    add_options(parser, "linear_solver", "texture", "json")
+    add_options(parser, "linear_solver", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

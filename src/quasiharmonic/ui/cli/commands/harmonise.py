@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
         unscaled=flag("compare lengths and areas without first scaling the map to the surface's area"),
         max_iterations=number(count, "linear solves per round (default: 40)", default=40),
     )
-    add_options(parser, "pack", "resolution", "padding", "linear_solver", "texture", "json")
+    add_options(parser, "pack", "resolution", "padding", "linear_solver", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

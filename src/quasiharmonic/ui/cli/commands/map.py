@@ -62,7 +62,7 @@ def add_parser(commands: Commands) -> None:
         plot=file("draw the rest surface, the start and the map", metavar="IMAGE"),
         kind=choice(("map", "distortion"), kind),
     )
-    add_options(parser, "islands", "pack", "resolution", "padding", "texture", "json")
+    add_options(parser, "islands", "pack", "resolution", "padding", "texture", "json", "surface")
     add_options(
         parser.add_mutually_exclusive_group(),
         polish=choice(

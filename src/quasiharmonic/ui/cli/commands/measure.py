@@ -37,7 +37,7 @@ def add_parser(commands: Commands) -> None:
         export=file(f"write every measure of every triangle as {format_names('encode_values')}"),
         distances=flag("also compare distances between vertices some edges apart, along the surface and in the plane"),
     )
-    add_options(parser, "rings", "json")
+    add_options(parser, "rings", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

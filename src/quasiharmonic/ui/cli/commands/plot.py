@@ -47,6 +47,7 @@ def add_parser(commands: Commands) -> None:
             "(default: the model's own texture if it has one)",
         ),
     )
+    add_options(parser, "surface")
 
 
 def run(options: argparse.Namespace) -> int:

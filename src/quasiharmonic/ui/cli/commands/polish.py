@@ -65,7 +65,7 @@ def add_parser(commands: Commands) -> None:
         "pieces",
         to=text("OUTLINE", "the outline of the boundary, as for qhm map (default: the polygon of the boundary)"),
     )
-    add_options(parser, "islands", "pack", "resolution", "padding", "linear_solver", "texture", "json")
+    add_options(parser, "islands", "pack", "resolution", "padding", "linear_solver", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -39,7 +39,7 @@ def add_parser(commands: Commands) -> None:
         unmirror=flag("reflect mirrored islands in place (default: keep them, because some are intentional)"),
         max_iterations=number(count, "maximum iterations on a whole island (default: 2000)", default=2000),
     )
-    add_options(parser, "linear_solver", "texture", "json")
+    add_options(parser, "linear_solver", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -82,7 +82,7 @@ def add_parser(commands: Commands) -> None:
             default="nearest",
         ),
     )
-    add_options(parser, "json")
+    add_options(parser, "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

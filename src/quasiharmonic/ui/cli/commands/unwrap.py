@@ -73,7 +73,7 @@ def add_parser(commands: Commands) -> None:
         jobs=number(count, "number of threads (default: all cores)"),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
-    add_options(parser, "texture", "json")
+    add_options(parser, "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

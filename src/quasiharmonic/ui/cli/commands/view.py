@@ -29,7 +29,7 @@ def add_parser(commands: Commands) -> None:
     parser = add_command(commands, "view", __doc__, run)
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     shot = file("write the view to this file instead of opening a window; needs no display", metavar="PNG")
-    add_options(parser, screenshot=shot)
+    add_options(parser, "surface", screenshot=shot)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -182,7 +182,7 @@ class Session:
         self._keep(operations.map_to_outline(self.state, outline, corners, self._step), fit=True)
 
     def _do_corner(self, frame: Frame) -> None:
-        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+        k, vertex = self._find(frame)
         self._busy("finding the map")
         self._keep(with_corner(self.state, k, vertex, self._step))
 
@@ -238,7 +238,7 @@ class Session:
     # --- drags and pins ----------------------------------------------------------------------------------------------
 
     def _do_pin(self, frame: Frame) -> None:
-        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+        k, vertex = self._find(frame)
         one = self.state.islands[k]
         if any(vertex in loop for loop in one.loops):
             raise RequestError("that vertex is on the boundary, which is already fixed: drag it in the map")
@@ -247,14 +247,18 @@ class Session:
         if vertex not in one.pins:
             self._keep(pin_vertices(self.state, k, [*one.pins, vertex]))
 
+    def _find(self, frame: Frame) -> tuple[int, int]:
+        """Return island and own number of the vertex that a message names."""
+        numbering = self.state.numbering
+        return numbering.find(validation.vertex(frame, len(numbering.origin)))
+
     def _do_unpin(self, frame: Frame) -> None:
-        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+        k, vertex = self._find(frame)
         self._keep(pin_vertices(self.state, k, [v for v in self.state.islands[k].pins if v != vertex]))
 
     def _do_grab(self, frame: Frame) -> None:
-        vertex = validation.vertex(frame, len(self.state.numbering.origin))
+        k, vertex = self._find(frame)
         self._refuse_drawn()
-        k, vertex = self.state.numbering.find(vertex)
         one = self.state.islands[k]
         if one.result is None or one.fixed is None or one.target is None:
             raise RequestError("there is no map to drag yet: press Unwrap or Flatten first")
