@@ -44,10 +44,7 @@ class DataSet(Protocol):
         """Yield the problems."""
 
     def collect(self, item: Finished | None) -> Iterable[Finished]:
-        """Keep the results of an item of the pool; return the problems that are finished."""
-
-    def finish(self) -> Iterable[Finished]:
-        """Complete the results; return the problems that this finishes."""
+        """Keep the results of an item of the pool, if there is one; return the problems that are finished."""
 
     def records(self) -> Iterator[records.Record]:
         """Yield the records of the finished problems."""
@@ -238,7 +235,7 @@ def _solve(
     with closing(finished):
         for item in finished:
             count(data.collect(item))
-        count(data.finish())
+        count(data.collect(None))
     return progress
 
 

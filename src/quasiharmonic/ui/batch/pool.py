@@ -116,5 +116,5 @@ class _Workers:
                     files = self._starved.popleft()
                 except IndexError:
                     return
-                self._answers.put(supervisor.attend_again(files))
+                self._answers.put(supervisor.attend(files, again=True))
                 supervisor.rest()

@@ -188,8 +188,8 @@ def write_table(path: str | os.PathLike[str], records: Iterable[Record]) -> None
     if _suffix(path) == ".csv":
         write_whole(path, lambda file: _write_csv(file, records))
     else:
-        parquet = load_pyarrow()
-        write_whole(path, lambda file: _write_parquet(parquet, file, records))
+        load_pyarrow()
+        write_whole(path, lambda file: write_parquet(file, table_schema(), map(table_row, records), _ROWS))
 
 
 def check_table(path: str | os.PathLike[str]) -> None:
@@ -268,13 +268,14 @@ def table_row(record: Record) -> Record:
     return {column: _plain(record.get(column)) for column in COLUMNS}
 
 
-def _write_parquet(parquet: Any, file: BinaryIO, records: Iterable[Record]) -> None:
+def write_parquet(file: BinaryIO, schema: Any, rows: Iterable[Record], together: int) -> None:
+    """Write rows with a pyarrow schema, some together, so that memory use is constant."""
     import pyarrow
 
-    schema, rest = table_schema(), iter(records)
-    with parquet.ParquetWriter(file, schema) as writer:
-        while rows := [table_row(record) for record in islice(rest, _ROWS)]:
-            writer.write_table(pyarrow.Table.from_pylist(rows, schema=schema))
+    rest = iter(rows)
+    with load_pyarrow().ParquetWriter(file, schema) as writer:
+        while some := list(islice(rest, together)):
+            writer.write_table(pyarrow.Table.from_pylist(some, schema=schema))
 
 
 def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:

@@ -56,22 +56,6 @@ GROUPS = {
 }
 COMMANDS = tuple(name for group in GROUPS.values() for name in group)
 
-# The commands that read surfaces, and so patches of FreeSurfer.
-SURFACE_COMMANDS = (
-    "map",
-    "flatten",
-    "unwrap",
-    "polish",
-    "harmonise",
-    "repair",
-    "animate",
-    "transfer",
-    "check",
-    "measure",
-    "plot",
-    "view",
-)
-
 _INTERRUPTED = "interrupted, nothing was written"
 
 
@@ -188,13 +172,4 @@ def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
     )
     for name in names:
         import_module(f"{__name__}.commands.{name}").add_parser(commands)
-        if name in SURFACE_COMMANDS:
-            commands.choices[name].add_argument(
-                "--surface",
-                dest="parent_surface",
-                type=Path,
-                metavar="FILE",
-                help="the surface with the triangles of a FreeSurfer patch (default: beside the patch, such as "
-                "lh.inflated for lh.cortex.patch.3d)",
-            )
     return parser

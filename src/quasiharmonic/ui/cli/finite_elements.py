@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.ui.cli import pipeline, report
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -25,7 +27,6 @@ def check(options: argparse.Namespace) -> int:
     from quasiharmonic.geometry.mesh.elements import name_elements
     from quasiharmonic.io.fem.files import read_fem, read_volume
     from quasiharmonic.problem.inspection import inspect_mesh
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.util.arrays import count_of
 
     _reject(options, ("precision", "--as"), ("any_triangulation", "--any-triangulation"), ("fixed", "--fixed"))
@@ -45,9 +46,8 @@ def check(options: argparse.Namespace) -> int:
         "injective": not inverted.size,
         "inverted": inverted.tolist(),
     }
-    text = f"{options.input}: {elements}, split into triangles: {found.summary()}\n{verdict}"
-    report.emit_verdict(facts, options.json, text)
-    return 1 if inverted.size else 0
+    first = f"{options.input}: {elements}, split into triangles: {found.summary()}"
+    return pipeline.conclude(options, pipeline.Account(facts, [first, verdict], not inverted.size))
 
 
 def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
@@ -55,7 +55,6 @@ def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
     from quasiharmonic.apps.tetrahedra.hexahedra import find_bad_corners
     from quasiharmonic.geometry.mesh.elements import split_solids
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.util.arrays import count_of, names_of
 
     T, H = split_solids(mesh.F)
@@ -78,15 +77,13 @@ def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
             else f"All corners of {hexahedra} are positive. This does not certify them: a hexahedron with positive "
             "corners can be inverted inside."
         )
-    report.emit_verdict(facts, options.json, f"{options.input}: {' '.join(lines)}")
-    return 0 if good else 1
+    return pipeline.conclude(options, pipeline.Account(facts, [f"{options.input}: {' '.join(lines)}"], good))
 
 
 def measure(options: argparse.Namespace) -> int:
     """Report the quality of the elements; return the exit status of ``qhm measure``."""
     from quasiharmonic.apps.mesh_motion.quality import element_quality
     from quasiharmonic.io.fem.files import read_fem
-    from quasiharmonic.ui.cli import report
 
     _reject(options, ("export", "--export"), ("distances", "--distances"))
     mesh = read_fem(options.input)
@@ -100,8 +97,7 @@ def measure(options: argparse.Namespace) -> int:
         f"quality of {len(mesh.F)} elements (1: equilateral or square, 0: no area, negative: inverted): "
         f"mean {quality.mean():.4g}, minimum {quality.min():.4g} at element {quality.argmin()}"
     )
-    report.emit_verdict(facts, options.json, text)
-    return 0
+    return pipeline.conclude(options, pipeline.Account(facts, [text]))
 
 
 def plot(options: argparse.Namespace) -> int:
@@ -110,7 +106,6 @@ def plot(options: argparse.Namespace) -> int:
 
     from quasiharmonic import io
     from quasiharmonic.io.fem.files import read_fem
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.ui.plot import save_map_figure
 
     if options.kind not in (None, "map"):
@@ -120,9 +115,7 @@ def plot(options: argparse.Namespace) -> int:
     triangles, of, inverted = _split(mesh)
     V, F, uv = io.without_idle(mesh.points, triangles, mesh.points)
     save_map_figure(options.output, V, F, uv, inverted=np.flatnonzero(np.isin(of, inverted)))
-    with report.after_writing(options.output):
-        print(f"wrote {options.output}", flush=True)
-    return 0
+    return report.tell_written(options.output)
 
 
 def _split(mesh: FemMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -1,4 +1,4 @@
-"""Write a map, read it back, and certify the file as a reader gets it."""
+"""Certify a map as a reader gets it from a file, and report what the file loses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
-    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.apps.unwrapping.defective_charts import SetApart
     from quasiharmonic.geometry.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
@@ -164,32 +163,3 @@ def tell_losses(output: Path, mesh: MeshData) -> None:
 
     if lost := io.not_held(output, mesh):
         tell(f"{output} will not have: {'; '.join(lost)}")
-
-
-def write(output: Path, mesh: MeshData) -> WrittenMap:
-    """Write a mesh with its map, read the file back, and certify it."""
-    from quasiharmonic import io
-    from quasiharmonic.ui.cli import report
-
-    tell_losses(output, mesh)
-    io.write_mapped(output, mesh)
-    with report.after_writing(output):
-        return certify_map(io.read_written(output, mesh))
-
-
-def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str:
-    """Return the text report of a map that was computed and written."""
-    from quasiharmonic.problem.result import Status
-    from quasiharmonic.util.arrays import count_of
-
-    lines = [f"wrote {output}: {written.summary()}"]
-    results = [island.result for island in mapped.islands]
-    if not written.injective:
-        lines.append(mapped.status.value)
-    # Each surface may be injective although pins make an overlap between surfaces unavoidable.
-    if not written.injective or mapped.status is Status.IMPOSSIBLE:
-        lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
-    iterations = sum(result.n_iterations for result in results)
-    seconds = sum(result.seconds for result in results)
-    lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
-    return "\n".join(lines)

@@ -113,7 +113,10 @@ class ArchivedProblems:
                 self._in_read = self._known
 
     def collect(self, item: Finished | None) -> list[Finished]:
-        """Move a finished problem's results from the scratch folder into the journal; return the finished items."""
+        """Move a finished problem's results from the scratch folder into the journal, and finish archives.
+
+        Return the finished items.
+        """
         with self._lock:
             if item is not None:
                 self._journal(item)
@@ -122,10 +125,6 @@ class ArchivedProblems:
                 self._finish(opened)
             ready, self._ready = self._ready, []
             return ready
-
-    def finish(self) -> list[Finished]:
-        """Finish the remaining archives; return the finished items."""
-        return self.collect(None)
 
     def records(self) -> Iterator[records.Record]:
         """Yield the records of all finished problems, in the order of the archives."""

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from quasiharmonic.io.lowlevel.atomic import writing
-from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives import results
-from quasiharmonic.ui.batch.archives.tar_stream import Damage, pack_member, read_members
+from quasiharmonic.ui.batch.archives.tar_stream import Damage, pack_member
 from quasiharmonic.ui.batch.records import Record
-from quasiharmonic.util.untrusted import parse_json
 
 # Keys of a record that are kept, to decide whether it is still valid, and to count it in the archive's metadata.
 _KEPT = "key", "outcome", "time_limit", "memory_limit", "seconds"
@@ -91,19 +90,12 @@ class Journal:
         if not self.part.exists():
             return
         with open(self.part, "r+b") as file:
-            end, start, mapped = 0, None, ""
-            for member in read_members(file, lambda name: name.endswith(results.RECORD)):
-                if isinstance(member, Damage):
+            end = 0
+            for one in results.read_tar_results(file, maps=False):
+                if isinstance(one, Damage) or one.record is None:
                     break
-                key, extension = os.path.splitext(member.name)
-                if extension == results.MAP:
-                    start, mapped = member.start, key
-                    continue
-                record = records.parse_record(member.data or b"")
-                if extension != results.RECORD or record is None:
-                    break
-                self._note(key, start if start is not None and mapped == key else member.start, member.end, record)
-                start, end = None, member.end
+                self._note(one.key, one.start, one.end, one.record)
+                end = one.end
             file.truncate(end)
 
 
@@ -114,12 +106,7 @@ def _packed(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator[b
 
 
 def _unpacked(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator[tuple[str, Record, bytes | None]]:
-    import io
-
-    for (key, _), packed in zip(entries, _packed(file, entries), strict=True):
-        data: dict[str, Any] = {
-            os.path.splitext(member.name)[1]: member.data
-            for member in read_members(io.BytesIO(packed))
-            if not isinstance(member, Damage)
-        }
-        yield key, parse_json(data[results.RECORD]), data.get(results.MAP)
+    for packed in _packed(file, entries):
+        for one in results.read_tar_results(io.BytesIO(packed)):
+            if not isinstance(one, Damage) and one.record is not None:
+                yield one.key, one.record, one.data

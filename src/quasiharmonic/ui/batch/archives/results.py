@@ -10,9 +10,8 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.ui.batch import records
@@ -60,18 +59,18 @@ def read_about(path: Path) -> dict[str, Any] | None:
                 text = (parquet.schema_arrow.metadata or {})[_MARK].decode()
         else:
             with open(path, "rb") as file:
-                text = global_comment(file.read(MAX_ABOUT)) or ""
+                return parse_about(file.read(MAX_ABOUT))
     except (OSError, ValueError, KeyError):
         return None
-    return _parse(text)
+    return _parse_text(text)
 
 
 def parse_about(start: bytes) -> dict[str, Any] | None:
     """Return the metadata of a tar file of results with these first bytes; None if they are invalid."""
-    return _parse(global_comment(start) or "")
+    return _parse_text(global_comment(start) or "")
 
 
-def _parse(text: str) -> dict[str, Any] | None:
+def _parse_text(text: str) -> dict[str, Any] | None:
     try:
         about = parse_json(text)
     except ValueError:
@@ -109,21 +108,14 @@ def write_tar(path: Path, about: dict[str, Any], members: Iterable[bytes]) -> No
 
 def write_parquet(path: Path, about: dict[str, Any], results: Iterable[tuple[str, Record, bytes | None]]) -> None:
     """Write names, records and maps as an archive of results; it appears when it is complete and on the disk."""
-    parquet = load_pyarrow()
+    load_pyarrow()
     import pyarrow
 
     schema = records.table_schema()
     schema = schema.insert(0, pyarrow.field(KEYS[0], pyarrow.string())).append(pyarrow.field("obj", pyarrow.binary()))
     schema = schema.with_metadata({_MARK: json.dumps(about)})
-
     rows = ({KEYS[0]: key, **records.table_row(record), "obj": data} for key, record, data in results)
-
-    def write(file: BinaryIO) -> None:
-        with parquet.ParquetWriter(file, schema) as writer:
-            while some := list(islice(rows, _ROWS)):
-                writer.write_table(pyarrow.Table.from_pylist(some, schema=schema))
-
-    write_whole(path, write)
+    write_whole(path, lambda file: records.write_parquet(file, schema, rows, _ROWS))
 
 
 def find_map(folder: Path, problem: str) -> bytes | None:
@@ -165,17 +157,39 @@ def read_results(path: Path, *, maps: bool = True) -> Iterator[tuple[str, Record
     yield from _parquet_results(path, maps) if is_parquet(path) else _tar_results(path, maps)
 
 
+class TarResult(NamedTuple):
+    """Result in a tar file."""
+
+    key: str
+    record: Record | None  # None if it is damaged
+    data: bytes | None  # The map, if there is one and it was asked for
+    start: int  # Offset of its first header
+    end: int  # Offset after it
+
+
+def read_tar_results(file: BinaryIO, *, maps: bool = True) -> Iterator[TarResult | Damage]:
+    """Read the results of a tar file, which have the record after the map."""
+    mapped: Member | None = None
+    for member in read_members(file, lambda name: maps or name.endswith(RECORD)):
+        if isinstance(member, Damage):
+            yield member
+            continue
+        key, extension = os.path.splitext(member.name)
+        if extension == MAP:
+            mapped = member
+        elif extension == RECORD:
+            own = mapped if mapped is not None and mapped.name == key + MAP else None
+            record = records.parse_record(member.data or b"")
+            data, start = (None, member.start) if own is None else (own.data, own.start)
+            yield TarResult(key, record, data, start, member.end)
+            mapped = None
+
+
 def _tar_results(path: Path, maps: bool) -> Iterator[tuple[str, Record, bytes | None]]:
     with open_tar(os.fspath(path)) as file:
-        data: tuple[str, bytes | None] | None = None
-        for member in read_members(file, lambda name: maps or name.endswith(RECORD)):
-            if isinstance(member, Damage):
-                continue
-            key, extension = os.path.splitext(member.name)
-            if extension == MAP:
-                data = key, member.data
-            elif extension == RECORD and (record := records.parse_record(member.data or b"")) is not None:
-                yield key, record, data[1] if data is not None and data[0] == key else None
+        for one in read_tar_results(file, maps=maps):
+            if isinstance(one, TarResult) and one.record is not None:
+                yield one.key, one.record, one.data
 
 
 def _parquet_results(path: Path, maps: bool) -> Iterator[tuple[str, Record, bytes | None]]:

@@ -32,7 +32,7 @@ from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 from quasiharmonic.ui.studio.session import recipes
 from quasiharmonic.ui.studio.session.islands import IslandState
 from quasiharmonic.ui.studio.session.outlines import Outline
-from quasiharmonic.ui.studio.session.recipes import FIXED, POLISHING_STEPS, SEAMS, START, Recipe, Source
+from quasiharmonic.ui.studio.session.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Source
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -56,7 +56,7 @@ def make_start(mesh: SeamedMesh) -> Source:
 def saved_start(mesh: SeamedMesh) -> Recipe:
     """Return the recipe of a map that no step makes: the file with it."""
     source = make_start(mesh)
-    python = recipes.write_script([f"mesh = atlas.as_seamed_mesh({source.name!r})"], names=["atlas"])
+    python = recipes.write_script([f"mesh = atlas.as_seamed_mesh({source.name!r})"])
     return Recipe(f"qhm check {source.name}", python, source.start)
 
 
@@ -134,7 +134,7 @@ def map_in_place(
     """
     source = find_source(state, with_map=True) if start is state.mesh else make_start(start)
     fixed = _list_fixed(state, only)
-    numbers = None if fixed is None else np.array(fixed)
+    numbers = None if fixed is None else fixed.value
 
     def lower(island: Island) -> MapResult:
         return solve_smoothly(fix_in_place(island, numbers).problem, callback)
@@ -142,55 +142,38 @@ def map_in_place(
     mapped = each_island(start, lower, only=only)
     done = mapped.islands if only is None else [mapped.islands[k] for k in only]
     anew = all(one.result.injective for one in done)
-    options = [*recipes.option_words(fixed=None if fixed is None else FIXED), *recipes.island_words(only)]
-    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in fixed).encode()}
     if anew or not follows:
-        command = recipes.write_command(["map", source.command, *options], "again.obj", source)
-        name = None if fixed is None else FIXED
+        recipe = recipes.record_call("map", source, "again.obj", {"fixed": fixed}, only)
         chosen = list(range(len(mapped.islands))) if only is None else only
         small = max(len(one.triangles) for one in done) <= LARGEST_SMOOTHED
         smoothed = [k for k in chosen if small and mapped.islands[k].result.injective]
-        python = recipes.map_script(source, only, only if smoothed == chosen else smoothed, name)
+        python = recipes.map_script(source, only, only if smoothed == chosen else smoothed, fixed)
+        recipe = replace(recipe, python=python)
     else:
-        given: dict[str, Any] = {"energy": "blend", "max_iterations": SMOOTHING_STEPS}
-        mapped = atlas.polish(start, fixed=numbers, islands=only, callback=callback, **given)
-        words = ["polish", source.command, *recipes.option_words(**given), *options]
-        command = recipes.write_command(words, "again.obj", source)
-        read = recipes.read_indices(None if fixed is None else FIXED)
-        more = recipes.arguments(**given, fixed=read, islands=only)
-        python = recipes.write_script(
-            [f"result = atlas.polish({source.name!r}{more})", "mesh = result.mesh"], names=["atlas"]
-        )
-    recipe = Recipe(command, python, source.start, texts, anew=anew, dragged=start is not state.mesh)
+        options = {"energy": "blend", "max_iterations": SMOOTHING_STEPS, "fixed": fixed}
+        mapped = atlas.polish(start, islands=only, callback=callback, **recipes.values(options))
+        recipe = recipes.record_call("polish", source, "again.obj", options, only)
+    recipe = replace(recipe, anew=anew, dragged=start is not state.mesh)
     return rebuild(state, mapped, recipe, keep=True, corners=True)
 
 
 def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
     """Lower an energy of the selected islands until it converges."""
     only, source = choose(state), find_source(state, with_map=True)
-    fixed = _list_fixed(state, only, slide=slide)
     outline = state.active.outline if slide and len(state.islands) == 1 else None
-    curves: bool | BoundaryCurves = slide if outline is None else BoundaryCurves(outline.curves())
-    given: dict[str, Any] = {"energy": energy, "max_iterations": POLISHING_STEPS}
-    numbers = None if fixed is None else np.array(fixed)
-    mapped = atlas.polish(state.mesh, fixed=numbers, slide=curves, islands=only, callback=callback, **given)
-    to = None if outline is None else outline.to
-    options = recipes.option_words(energy=energy, slide=slide, to=to, fixed=None if fixed is None else FIXED)
-    words = ["polish", source.command, *options, *recipes.island_words(only)]
-    command = recipes.write_command(words, "again.obj", source)
-    track = recipes.Code(f"BoundaryCurves(outline_curves({to!r}))") if outline is not None else slide
-    read = recipes.read_indices(None if fixed is None else FIXED)
-    more = recipes.arguments(**given, fixed=read, slide=track, islands=only)
-    python = recipes.write_script(
-        [f"result = atlas.polish({source.name!r}{more})", "mesh = result.mesh"],
-        names=["atlas", *(["BoundaryCurves"] if outline is not None else [])],
-        modules=["from quasiharmonic.targets import outline_curves"] if outline is not None else [],
-    )
-    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in fixed).encode()}
-    if outline is not None and outline.content is not None:
-        texts[outline.to] = outline.content
-    recipe = Recipe(command, python, source.start, texts, to)
+    curves = slide if outline is None else _sliding_curves(outline)
+    options = {"energy": energy, "slide": curves, "fixed": _list_fixed(state, only, slide=slide)}
+    mapped = atlas.polish(state.mesh, islands=only, callback=callback, **recipes.values(options))
+    recipe = recipes.record_call("polish", source, "again.obj", options, only)
+    recipe = replace(recipe, outline=None if outline is None else outline.to)
     return rebuild(state, mapped, recipe, keep=True, outlines=True)
+
+
+def _sliding_curves(outline: Outline) -> Given:
+    """Return the curves of an outline, for a boundary that slides."""
+    code = Code(f"BoundaryCurves(outline_curves({outline.to!r}))")
+    texts = {} if outline.content is None else {outline.to: outline.content}
+    return Given(BoundaryCurves(outline.curves()), code, {"slide": True, "to": outline.to}, texts)
 
 
 def flatten_islands(state: SessionState, callback: Callback = None) -> SessionState:
@@ -203,22 +186,10 @@ def flatten_islands(state: SessionState, callback: Callback = None) -> SessionSt
     cut = only is None and not all(is_flattenable(one.island) for one in state.islands)
     if cut:
         mesh = cut_apart(mesh, polygons=_polygons(state, source), disks_too=True)
-    fixed = np.array(pins) if pins and not cut else None
-    mapped = atlas.flatten(mesh, fixed=fixed, islands=only, callback=callback)
-    options = recipes.option_words(cut=cut, fixed=None if fixed is None else FIXED)
-    command = recipes.write_command(
-        ["flatten", source.command, *options, *recipes.island_words(only)], "flat.obj", source
-    )
-    read = recipes.read_indices(None if fixed is None else FIXED)
-    more = recipes.arguments(fixed=read, islands=only)
-    lines, names = [f"result = atlas.flatten({source.name!r}{more})", "mesh = result.mesh"], ["atlas"]
-    if cut:
-        lines, names = _cut_lines(source, state), ["atlas", "find_cuts"]
-        lines += [f"result = atlas.flatten(mesh{more})", "mesh = result.mesh"]
-        if "io.read_mesh" in lines[0]:
-            names.append("io")
-    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in pins).encode()}
-    recipe = Recipe(command, recipes.write_script(lines, names=names), source.start, texts)
+    options = {"fixed": _saved_list(pins) if pins and not cut else None}
+    mapped = atlas.flatten(mesh, islands=only, callback=callback, **recipes.values(options))
+    words, before = (["--cut"], _cut_lines(source, state)) if cut else ([], [])
+    recipe = recipes.record_call("flatten", source, "flat.obj", options, only, words=words, before=before)
     after = rebuild(state, mapped, recipe, keep=not cut)
     return replace(after, from_file=state.from_file and not cut)
 
@@ -235,7 +206,7 @@ def pack_all(state: SessionState, resolution: int, padding: float) -> SessionSta
         f"flat = atlas.flatten({source.name!r}, start=True, max_iterations=0).mesh",
         f"mesh = atlas.pack(flat{recipes.arguments(**size)})",
     ]
-    recipe = Recipe(command, recipes.write_script(lines, names=["atlas"]), source.start)
+    recipe = Recipe(command, recipes.write_script(lines), source.start)
     return as_it_is(state, mesh, recipe, keep=True)
 
 
@@ -350,7 +321,7 @@ def _still(state: SessionState, islands: Sequence[IslandState]) -> tuple[int, ..
     return state.selected if len(islands) == len(state.islands) else tuple(range(len(islands)))
 
 
-def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> list[int] | None:
+def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> Given | None:
     """Return the fixed vertices of the selected islands, in the surface's numbering; None if these are the boundary.
 
     With ``slide``, only the pins are fixed.
@@ -362,7 +333,14 @@ def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool 
     for one in chosen:
         boundary = boundary_edges(one.island.F, len(one.island.vertices))[: 0 if slide else None]
         rows.append(one.island.vertices[np.union1d(boundary, np.array(one.pins, int))])
-    return np.unique(np.concatenate(rows)).tolist()
+    return _saved_list(np.unique(np.concatenate(rows)).tolist())
+
+
+def _saved_list(vertices: list[int]) -> Given:
+    """Return fixed vertices as an argument, from a file that the page saves."""
+    content = "".join(f"{vertex}\n" for vertex in vertices).encode()
+    code = Code(f"np.loadtxt({FIXED!r}, dtype=np.int64)")
+    return Given(np.array(vertices), code, {"fixed": FIXED}, {FIXED: content})
 
 
 def _polygons(state: SessionState, source: Source) -> Any:
@@ -395,19 +373,17 @@ def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> 
     if cut:
         mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
     mapped = atlas.flatten(mesh, callback=callback)
-    words = ["flatten", source.command, "--seams", SEAMS if len(drawn) else "none", *recipes.option_words(cut=cut)]
     lines = [
         f"mesh = atlas.as_seamed_mesh({source.name!r})",
         "mesh = atlas.SeamedMesh(mesh.V, mesh.F)",
         *([f"mesh = mesh.cut(np.loadtxt({SEAMS!r}, dtype=np.int64).reshape(-1, 2))"] if len(drawn) else []),
         *(["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"] if cut else []),
-        "result = atlas.flatten(mesh)",
-        "mesh = result.mesh",
     ]
+    words = ["--seams", SEAMS if len(drawn) else "none", *recipes.option_words(cut=cut)]
+    recipe = recipes.record_call("flatten", source, "flat.obj", {}, words=words, before=lines)
     texts = {SEAMS: "".join(f"{a} {b}\n" for a, b in drawn.tolist()).encode()} if len(drawn) else {}
-    python = recipes.write_script(lines, names=["atlas", *(["find_cuts"] if cut else [])])
-    recipe = Recipe(recipes.write_command(words, "flat.obj", source), python, source.start, texts)
-    return replace(rebuild(state, mapped, recipe), from_file=False, selected=tuple(range(len(mapped.islands))))
+    after = rebuild(state, mapped, replace(recipe, texts=texts))
+    return replace(after, from_file=False, selected=tuple(range(len(mapped.islands))))
 
 
 def require_map(state: SessionState) -> None:

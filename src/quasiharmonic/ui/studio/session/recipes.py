@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from quasiharmonic.energies.polishing import SMOOTHING_STEPS
 from quasiharmonic.io import MeshData
@@ -12,8 +14,12 @@ from quasiharmonic.io import MeshData
 #: Names of the files that the page saves: the map, the map from which the last step started, the fixed vertices, the
 #: seams that the user drew.
 MAP, START, FIXED, SEAMS = "map.obj", "start.obj", "fixed.txt", "seams.txt"
-#: Number of steps of `polish` as a step of its own.
-POLISHING_STEPS = 200
+# Names that scripts use, by the modules that they import them from.
+_IMPORTS = {
+    "quasiharmonic": ("BoundaryCurves", "atlas", "find_cuts", "injective_map", "io", "polish", "unwrap"),
+    "quasiharmonic.targets": ("boundary_to", "filled", "outline", "outline_curves"),
+    "quasiharmonic.apps.unwrapping.model_files": ("polygon_costs",),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,40 +73,81 @@ def island_words(only: Sequence[int] | None) -> list[str]:
     return [] if only is None else ["--islands", ",".join(map(str, only))]
 
 
-def arguments(**options: object) -> str:
-    """Return further arguments of a Python call; None and False are left out."""
-    return "".join(
-        f", {name}={value if isinstance(value, Code) else repr(value)}"
-        for name, value in options.items()
-        if value is not None and value is not False
-    )
-
-
 class Code(str):
     """Python code, as opposed to a text."""
 
     __slots__ = ()
 
 
-def write_script(lines: Sequence[str], *, names: Sequence[str] = (), modules: Sequence[str] = ()) -> str:
-    """Return a script with its imports: ``names`` of the library, and further ``modules`` lines."""
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Value of an argument, and how command and script spell it."""
+
+    value: Any
+    code: Code
+    words: Mapping[str, object]  # Options of the command
+    texts: Mapping[str, bytes]  # Files that command and script read
+
+
+def arguments(**options: object) -> str:
+    """Return further arguments of a Python call; None and False are left out."""
+    codes = {name: value.code if isinstance(value, Given) else value for name, value in options.items()}
+    return "".join(
+        f", {name}={value if isinstance(value, Code) else repr(value)}"
+        for name, value in codes.items()
+        if value is not None and value is not False
+    )
+
+
+def values(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments themselves."""
+    return {name: value.value if isinstance(value, Given) else value for name, value in options.items()}
+
+
+def record_call(
+    verb: str,
+    source: Source,
+    output: str,
+    options: Mapping[str, Any],
+    only: Sequence[int] | None = None,
+    *,
+    words: Sequence[str] = (),
+    before: Sequence[str] = (),
+) -> Recipe:
+    """Return the recipe of a call of a function of `atlas` for some islands, which the command of its name makes, too.
+
+    ``words`` are further words of the command, and ``before`` lines that make the function's ``mesh`` from the source.
+    """
+    given = [value for value in options.values() if isinstance(value, Given)]
+    plain = {name: value for name, value in options.items() if not isinstance(value, Given)}
+    chosen = {name: value for one in given for name, value in one.words.items()}
+    command = [verb, source.command, *words, *option_words(**plain, **chosen), *island_words(only)]
+    mesh = "mesh" if before else repr(source.name)
+    lines = [*before, f"result = atlas.{verb}({mesh}{arguments(**options, islands=only)})", "mesh = result.mesh"]
+    texts = {name: content for one in given for name, content in one.texts.items()}
+    return Recipe(write_command(command, output, source), write_script(lines), source.start, texts)
+
+
+def write_script(lines: Sequence[str]) -> str:
+    """Return a script with its imports."""
     text = "\n".join(lines)
     head = ["import numpy as np", ""] if "np." in text else []
-    head += [f"from quasiharmonic import {', '.join(sorted(set(names)))}"]
-    return "\n".join([*head, *modules, "", text, ""])
+    for module, names in _IMPORTS.items():
+        used = [name for name in names if re.search(rf"(?<![\w.]){name}[.(]", text)]
+        head += [f"from {module} import {', '.join(used)}"] if used else []
+    return "\n".join([*head, "", text, ""])
 
 
-def map_script(source: Source, only: Sequence[int] | None, smoothed: Sequence[int] | None, fixed: str | None) -> str:
+def map_script(source: Source, only: Sequence[int] | None, smoothed: Sequence[int] | None, fixed: Given | None) -> str:
     """Return a script that maps the islands ``only`` again and keeps their fixed vertices; None means all islands.
 
     The script then smooths the islands ``smoothed``; None means all.
     """
-    read = read_indices(fixed)
-    lines = [f"result = atlas.injective_map({source.name!r}{arguments(fixed=read, islands=only)})"]
+    lines = [f"result = atlas.injective_map({source.name!r}{arguments(fixed=fixed, islands=only)})"]
     if smoothed is None or len(smoothed):
-        more = arguments(fixed=read, islands=smoothed, energy="blend", max_iterations=SMOOTHING_STEPS)
+        more = arguments(fixed=fixed, islands=smoothed, energy="blend", max_iterations=SMOOTHING_STEPS)
         lines.append(f"result = atlas.polish(result.mesh{more})")
-    return write_script([*lines, "mesh = result.mesh"], names=["atlas"])
+    return write_script([*lines, "mesh = result.mesh"])
 
 
 def outline_script(
@@ -135,11 +182,4 @@ def outline_script(
         indent = "        " if checked else "    "
         lines.append(f"{indent}result = polish(island.V, island.F, result.uv{more})")
     lines += ["    places[k] = result.uv", "mesh = mesh.with_places(places)"]
-    used = [name for name in ("boundary_to", "filled", "outline") if any(f"{name}(" in line for line in lines)]
-    names = ["atlas", "injective_map", *(["polish"] if smoothed else [])]
-    return write_script(lines, names=names, modules=[f"from quasiharmonic.targets import {', '.join(used)}"])
-
-
-def read_indices(name: str | None) -> Code | None:
-    """Return the code that reads a list of vertices."""
-    return None if name is None else Code(f"np.loadtxt({name!r}, dtype=np.int64)")
+    return write_script(lines)

@@ -93,14 +93,16 @@ class SessionState:
     @property
     def pins(self) -> list[int]:
         """Fixed interior vertices, in the numbering of the page."""
-        starts = self.numbering.starts
-        return [int(v + start) for one, start in zip(self.islands, starts, strict=False) for v in one.pins]
+        return self._numbers([one.pins for one in self.islands])
 
     @property
     def corners(self) -> list[int]:
         """Corners of all islands, in the numbering of the page."""
-        starts = self.numbering.starts
-        return [int(v + start) for one, start in zip(self.islands, starts, strict=False) for v in one.corners]
+        return self._numbers([one.corners for one in self.islands])
+
+    def _numbers(self, vertices: list[tuple[int, ...]]) -> list[int]:
+        """Return vertices of each island in the numbering of the page."""
+        return [int(v + start) for some, start in zip(vertices, self.numbering.starts, strict=False) for v in some]
 
     def with_island(self, k: int, island: IslandState) -> SessionState:
         """Return the state with another island of index ``k``; the mesh is unchanged."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -44,17 +45,8 @@ def unwrap_model(
         bare = SeamedMesh(sheet.surface.V, sheet.surface.F)
         source, V, F, costs = make_start(bare if kept is None else kept), sheet.surface.V, sheet.surface.F, None
     uv = None if kept is None or kept.uv is None else kept.uv[kept.FT]
-    size = {"max_stretch": options.max_stretch, "resolution": options.resolution, "padding": options.padding}
-    result = unwrap(
-        V,
-        F,
-        max_stretch=options.max_stretch,
-        resolution=options.resolution,
-        padding=options.padding,
-        edge_costs=costs,
-        uv=uv,
-        callback=callback,
-    )
+    size: dict[str, Any] = {name: getattr(options, name) for name in ("max_stretch", "resolution", "padding")}
+    result = unwrap(V, F, edge_costs=costs, uv=uv, callback=callback, **size)
     FT = sheet.from_file(result.indices) if source.start is None else result.indices
     words = ["unwrap", source.command, *recipes.option_words(**size, keep_seams=uv is not None)]
     more = recipes.arguments(
@@ -67,9 +59,8 @@ def unwrap_model(
         f"result = unwrap(model.V, model.F{more})",
         "mesh = atlas.SeamedMesh(model.V, model.F, result.indices, result.uvs)",
     ]
-    module = "from quasiharmonic.apps.unwrapping.model_files import polygon_costs"
-    python = recipes.write_script(lines, names=["atlas", "io", "unwrap"], modules=[] if costs is None else [module])
-    recipe = Recipe(recipes.write_command(words, "unwrapped.obj", source), python, source.start)
+    command = recipes.write_command(words, "unwrapped.obj", source)
+    recipe = Recipe(command, recipes.write_script(lines), source.start)
     mesh = SeamedMesh(sheet.surface.V, sheet.surface.F, FT, result.uvs)
     after = as_it_is(state, mesh, recipe)
     return replace(after, from_file=False, selected=tuple(range(len(after.islands))))
