@@ -114,7 +114,9 @@ def takes(options: type[Options], keywords: type) -> Callable[[F], F]:
     """
     defaults = {one.name: one.default for one in fields(options)}
     shown = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=of.__forward_arg__)
+        inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=getattr(of, "__forward_arg__", of)
+        )
         for name, of in keywords.__annotations__.items()
     ]
 
@@ -153,12 +155,14 @@ class MapOptions(SolverOptions):
         "the fastest method, or the paper's pipeline, which starts with si-log (default: speed)",
         choices=STRATEGIES,
     )
-    polish: Any = option(None, choices=ENERGIES)
+    polish: Any = option(None)
     start: Any = option(None)
     max_iterations: int = option(MAX_ITERATIONS, "(default: 2000)", check=positive)
     record_every: int = option(0, check=count)
     slide: Any = option(False)
-    refine: bool = option(False, check=switch)
+    refine: bool = option(
+        False, "if no map exists, split as few inner edges as necessary (adds vertices at the end)", check=switch
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +185,7 @@ class HarmoniseOptions(SolverOptions):
     conformal: float = option(1e-3, check=tolerance)
     weights: Any = option(None)
     scaled: bool = option(True, check=switch)
-    max_iterations: int = option(40, check=positive)
+    max_iterations: int = option(40, "linear solves per round (default: 40)", check=positive)
     tol: float = option(1e-3, check=tolerance)
     reference: str = option("rest", check=reference_name)
 
@@ -200,14 +204,21 @@ class DistanceOptions(SolverOptions):
 class FlattenOptions(DistanceOptions):
     """Options of `quasiharmonic.flatten`."""
 
-    energy: Any = option("symmetric-dirichlet", "(default: symmetric-dirichlet)", choices=FLATTENED)
-    max_iterations: int = option(500, check=count)
+    energy: Any = option(
+        "symmetric-dirichlet",
+        "energy to lower; mips preserves only angles, distances preserves distances between nearby vertices "
+        "(default: symmetric-dirichlet)",
+        choices=FLATTENED,
+    )
+    max_iterations: int = option(
+        500, "maximum steps on each connected surface; 0 keeps the start (default: 500)", check=count
+    )
     tol: float = option(1e-4, check=tolerance)
     fixed: Any = option(None)
     target: Any = option(None)
     weights: Any = option(None)
     start: Any = option(None)
-    unit_square: bool = option(False, check=switch)
+    unit_square: bool = option(False, "scale the map evenly into the unit square", check=switch)
     gap: float = option(0.0, check=tolerance)
 
 

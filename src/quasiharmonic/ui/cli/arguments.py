@@ -5,18 +5,18 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import Field, fields
 from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from quasiharmonic.util import options
+from quasiharmonic.util.options import Options
+
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Option: TypeAlias = dict[str, Any]  # Keywords of `add_argument`
 
-# Copies of names in energies.polishing, solver.search.harmonising, energies.measures, solver.search.stages and
-# linsolve, so that the parser does not import these modules.
-ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
-FLATTENED = *ENERGIES, "distances"
-HARMONISED = "arap", "arap-unsigned", "area", "springs", *ENERGIES
+# Copies of names in energies.measures, so that the parser does not import this module.
 MEASURES = (
     "sigma1",
     "sigma2",
@@ -28,8 +28,6 @@ MEASURES = (
     "area_ratio",
     "shear",
 )
-STRATEGIES = "speed", "paper"
-LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 # Defaults for packing, in texels.
 RESOLUTION, PADDING = 1024, 4
 
@@ -74,6 +72,20 @@ def number(kind: Callable[[str], Any], words: str, *, metavar: str = "N", **rest
     return {"type": kind, "metavar": metavar, "help": words, **rest}
 
 
+def declared(operation: type[Options]) -> dict[str, Option]:
+    """Return the options of an operation: the fields of its class that have a help text."""
+    return {one.name: _declare(one) for one in fields(operation) if one.metadata["help"]}
+
+
+def _declare(one: Field[Any]) -> Option:
+    words, choices, check = (one.metadata[name] for name in ("help", "choices", "check"))
+    if one.default is False:
+        return flag(words)
+    if choices:
+        return choice(choices, words, default=one.default)
+    return number({options.positive: count, options.count: steps}.get(check, float), words, default=one.default)
+
+
 def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option) -> None:
     """Add options of `SHARED`, then options with these names and keywords; underscores stand for hyphens."""
     for name, option in [*((name, SHARED[name]) for name in shared), *own.items()]:
@@ -86,9 +98,9 @@ def add_files(parser: argparse.ArgumentParser, source: str, output: str, metavar
     parser.add_argument("-o", "--output", type=Path, required=True, help=output)
 
 
-def pick(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+def pick(given: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Return the values of options as keyword arguments of the same names."""
-    return {name: getattr(options, name) for name in names}
+    return {name: getattr(given, name) for name in names}
 
 
 def set_default(options: argparse.Namespace, name: str, default: object, *, asked: bool, belongs: str) -> None:
@@ -149,6 +161,7 @@ def _island_list(text: str) -> list[int]:
 
 #: The options that several commands take with the same meaning.
 SHARED: dict[str, Option] = {
+    **declared(options.MapOptions),
     "fixed": file("file of fixed vertices, 0-based, one per line (default: the boundary)"),
     "font": text("FONT", "for letters and words: a font file or the name of a font"),
     "corners": text(
@@ -164,7 +177,6 @@ SHARED: dict[str, Option] = {
         metavar="DEG",
         default=20.0,
     ),
-    "refine": flag("if no map exists, split as few inner edges as necessary (adds vertices at the end)"),
     "slide": flag("let boundary vertices slide along the outline while distortion is lowered; corners stay fixed"),
     "pieces": file(
         "file that assigns boundary vertices to sides of --to's outline, 'vertex side' on each line, 0-based; "
@@ -192,13 +204,8 @@ SHARED: dict[str, Option] = {
     "texture": text(
         "IMAGE", "add a texture, a PNG or JPEG file or checkerboard: beside an OBJ as .mtl and image, within a GLB"
     ),
-    "strategy": choice(
-        STRATEGIES, "the fastest method, or the paper's pipeline, which starts with si-log (default: speed)"
-    ),
-    "reference": choice(("equilateral", "rest", "corrected"), "reference triangles"),
+    "reference": choice(options.REFERENCES, "reference triangles"),
     "rings": number(count, "for distances: largest number of edges between two vertices (default: 20)"),
-    "max_iterations": number(count, "(default: 2000)", default=2000),
-    "linear_solver": choice(LINEAR_SOLVERS, "(default: the fastest one installed)", default="auto"),
     "surface": file(
         "the surface with the triangles of a FreeSurfer patch (default: beside the patch, such as "
         "lh.inflated for lh.cortex.patch.3d)",

@@ -40,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "targets of the boundary", "By default the targets are the texture coordinates (vt) of the input."
     )
     arguments.add_options(group.add_mutually_exclusive_group(), "fixed", to=arguments.text("OUTLINE", FORMS))
-    arguments.add_options(group, "font", "corners", "corner_angle", "cut", "seams", "refine")
+    arguments.add_options(group, "font", "corners", "corner_angle", "cut", "seams")
 
 
 def files(options: argparse.Namespace) -> tuple[Path | None, ...]:

@@ -18,17 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import (
-    ENERGIES,
-    add_command,
-    add_options,
-    choice,
-    count,
-    flag,
-    number,
-    pick,
-    set_default,
-)
+from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, count, flag, number, pick, set_default
+from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:
     import numpy as np

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import progress_line, report, targets
 from quasiharmonic.ui.cli.arguments import (
-    ENERGIES,
-    FLATTENED,
+    SHARED,
     add_command,
     add_options,
     byte_count,
@@ -37,6 +36,7 @@ from quasiharmonic.ui.cli.arguments import (
     text,
 )
 from quasiharmonic.ui.cli.streams import tell
+from quasiharmonic.util.options import ENERGIES, FLATTENED
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
@@ -123,8 +123,8 @@ def add_parser(commands: Commands) -> None:
     )
     add_options(
         solver,
-        *("font", "corners", "corner_angle", "refine", "strategy", "pieces", "reference"),
-        *("max_iterations", "linear_solver"),
+        *("font", "corners", "corner_angle", "refine", "pieces", "reference", "max_iterations", "linear_solver"),
+        strategy=SHARED["strategy"] | {"default": None},
     )
 
 

@@ -21,18 +21,18 @@ from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, written_map
 from quasiharmonic.ui.cli.arguments import (
-    FLATTENED,
     add_command,
     add_files,
     add_options,
     choice,
+    declared,
     file,
     flag,
     number,
     pick,
     set_default,
-    steps,
 )
+from quasiharmonic.util.options import FlattenOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
@@ -50,20 +50,13 @@ def add_parser(commands: Commands) -> None:
 
     parser = add_command(commands, "flatten", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map')} file to write")
-    energy = choice(
-        FLATTENED,
-        "energy to lower; mips preserves only angles, distances preserves distances between nearby vertices "
-        "(default: symmetric-dirichlet)",
-        default="symmetric-dirichlet",
-    )
     add_options(
         parser,
         "rings",
-        energy=energy,
+        **declared(FlattenOptions),
         weights=file("file of triangle weights, one positive number per line"),
         start=flag("start from the map in the input's texture coordinates (vt)"),
         fixed=file("file of vertices, 0-based, one per line, to fix at the input's vt"),
-        unit_square=flag("scale the map evenly into the unit square"),
     )
     add_options(
         parser,
@@ -73,11 +66,8 @@ def add_parser(commands: Commands) -> None:
         allowance=number(
             float, "distance of the cutting line outside the outline, in that unit", metavar="WIDTH", default=0.0
         ),
-        max_iterations=number(
-            steps, "maximum steps on each connected surface; 0 keeps the start (default: 500)", default=500
-        ),
     )
-    add_options(parser, "linear_solver", "texture", "json", "surface")
+    add_options(parser, "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -120,7 +110,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
     triangles = np.array([len(island.F) for island in found.mesh.islands])
     if (close := find_close_vertices(mesh.V, triangles)).size:
         streams.tell(describe_soup(close))
-    given |= pick(options, "start", "energy", "unit_square", "rings", "islands", "max_iterations", "linear_solver")
+    given |= pick(options, "start", "rings", "islands", *declared(FlattenOptions))
     with pipeline.working(options.input) as show:
         mapped = atlas.flatten(found.mesh, gap=_PIECE_GAP * options.allowance, callback=show, **given)
 

@@ -15,8 +15,9 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli.arguments import HARMONISED, add_command, add_files, add_options, choice, count, flag, number
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, declared, flag, number
 from quasiharmonic.ui.cli.commands import polish
+from quasiharmonic.util.options import HarmoniseOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
@@ -34,7 +35,7 @@ def add_parser(commands: Commands) -> None:
     add_options(
         parser,
         "fixed",
-        energy=choice(HARMONISED, "(default: arap)", default="arap"),
+        **declared(HarmoniseOptions),
         eta=number(
             float,
             "weight of the energy against injectivity, one for each round (default: four rounds, "
@@ -43,9 +44,8 @@ def add_parser(commands: Commands) -> None:
             nargs="+",
         ),
         unscaled=flag("compare lengths and areas without first scaling the map to the surface's area"),
-        max_iterations=number(count, "linear solves per round (default: 40)", default=40),
     )
-    add_options(parser, "pack", "resolution", "padding", "linear_solver", "texture", "json", "surface")
+    add_options(parser, "pack", "resolution", "padding", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -20,16 +20,17 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, progress_line, report, seam_options, slide_options, targets, written_map
 from quasiharmonic.ui.cli.arguments import (
-    ENERGIES,
     add_command,
     add_files,
     add_options,
     choice,
+    declared,
     file,
     flag,
     pick,
     set_default,
 )
+from quasiharmonic.util.options import ENERGIES, MapOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -75,7 +76,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_options(parser, "slide", "pieces")
     solver = parser.add_argument_group("solution")
-    add_options(solver, "strategy", "reference", "max_iterations", "linear_solver")
+    add_options(solver, "reference", *declared(MapOptions))
 
 
 def run(options: argparse.Namespace) -> int:
@@ -123,10 +124,10 @@ def _map(
         one = targets.make_problem(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
-        given = pick(options, "polish", "max_iterations", "linear_solver", "refine")
+        given = pick(options, "polish", *declared(MapOptions))
         slide = one.slide if options.polish else False
         with progress_line.line() as show:
-            result = solve(problem, strategy=options.strategy or "speed", slide=slide, callback=show, **given)
+            result = solve(problem, slide=slide, callback=show, **given)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:

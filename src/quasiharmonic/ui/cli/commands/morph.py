@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import ENERGIES, add_command, add_files, add_options, choice, file, flag, text
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, file, flag, text
+from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult

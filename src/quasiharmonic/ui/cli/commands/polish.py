@@ -16,18 +16,16 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, report, seam_options, slide_options, written_map
 from quasiharmonic.ui.cli.arguments import (
-    ENERGIES,
     add_command,
     add_files,
     add_options,
-    choice,
-    count,
+    declared,
     file,
     flag,
-    number,
     pick,
     text,
 )
+from quasiharmonic.util.options import PolishOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,8 +53,7 @@ def add_parser(commands: Commands) -> None:
         fixed=file(
             "file of fixed vertices, 0-based, one per line (default: the boundary; with --slide none but the corners)"
         ),
-        energy=choice(ENERGIES, "(default: symmetric-dirichlet)", default="symmetric-dirichlet"),
-        max_iterations=number(count, "(default: 200)", default=200),
+        **declared(PolishOptions),
         free=flag("free the boundary; each island stays near its position"),
     )
     add_options(
@@ -65,7 +62,7 @@ def add_parser(commands: Commands) -> None:
         "pieces",
         to=text("OUTLINE", "the outline of the boundary, as for qhm map (default: the polygon of the boundary)"),
     )
-    add_options(parser, "islands", "pack", "resolution", "padding", "linear_solver", "texture", "json", "surface")
+    add_options(parser, "islands", "pack", "resolution", "padding", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
