@@ -6,12 +6,13 @@ import math
 import os
 import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.errors import MeshFileError, check_path, reading
 from quasiharmonic.util.arrays import count_of
 
 # First bytes of common files that are not plain text.
@@ -162,6 +163,24 @@ def _collapse_blanks(block: bytes) -> bytes:
     while b"  " in block:
         block = block.replace(b"  ", b" ")
     return block.replace(b" \n", b"\n")
+
+
+def read_pairs(path: str | os.PathLike[str], what: str) -> Iterator[tuple[int, list[int]]]:
+    """Read lines of two whole numbers each; yield line numbers, counted from 1, and numbers.
+
+    Blanks, tabs, commas and colons separate the numbers. A comment starts with ``#``. MeshFileError if the file cannot
+    be read, or for any other line; ``what`` says what each line must be.
+    """
+    for at, line in enumerate(read_text(path).split(b"\n"), 1):
+        words = line.partition(b"#")[0].replace(b",", b" ").replace(b":", b" ").split()
+        if not words:
+            continue
+        if len(words) != 2 or not all(word.isdigit() for word in words):
+            shown_line = line[:60].decode("utf-8", "replace")
+            raise MeshFileError(path, f"is not {what}, two whole numbers from 0 on: {shown_line!r}", at)
+        with reading(path, line=at, remedy="indices count from 0"):
+            numbers = list(map(integer, words))
+        yield at, numbers
 
 
 def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, list[float]]]:

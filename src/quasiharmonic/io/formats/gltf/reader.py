@@ -313,9 +313,8 @@ def _local(node: dict[str, Any], index: int) -> FloatArray:
 def _numbers(node: dict[str, Any], name: str, default: list[int], index: int) -> FloatArray:
     """The numbers of a node's entry, as many as its default has; `ValueError` for anything else."""
     values = node.get(name, default)
-    if not isinstance(values, list) or len(values) != len(default):
-        count = f"{len(values)}" if isinstance(values, list) else ascii(values)[:40]
-        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {count}")
-    if not all(isinstance(value, int | float) for value in values):
-        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {ascii(values)[:40]}")
+    is_list = isinstance(values, list)
+    if not is_list or len(values) != len(default) or not all(isinstance(value, int | float) for value in values):
+        found = f"{len(values)}" if is_list and len(values) != len(default) else ascii(values)[:40]
+        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {found}")
     return np.array(values, dtype=np.float64)

@@ -71,19 +71,15 @@ class IslandState:
     def with_problem(self, problem: Problem) -> IslandState:
         """Return the island with another problem, whose analyses are kept."""
         other = replace(self, fixed=problem.fixed, target=problem.target)
-        return other._share(problem, self.__dict__.get("loops"))
+        # Store values that are known, so that they are not computed again.
+        other.__dict__["problem"] = problem
+        if "loops" in self.__dict__:
+            other.__dict__["loops"] = self.loops
+        return other
 
     def with_target(self, target: FloatArray) -> IslandState:
         """Return the island with other target positions, as after a drag; it then has no outline."""
         return replace(self.with_problem(self.problem.with_target(target)), outline=None, chosen=(), by_angle=False)
-
-    def _share(self, problem: Problem | None, loops: list[IntArray] | None) -> IslandState:
-        """Store values that are known, so that they are not computed again."""
-        if problem is not None:
-            self.__dict__["problem"] = problem
-        if loops is not None:
-            self.__dict__["loops"] = loops
-        return self
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the contents for a snapshot; what can be computed again is left out."""
