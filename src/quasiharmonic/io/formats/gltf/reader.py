@@ -56,23 +56,18 @@ class Primitive:
     end: int
 
 
+@dataclass(frozen=True, eq=False)
 class CarriedGltf(Carried):
     """A glTF document, the folder of its image files, and the relation of the surface to its primitives.
 
     ``rows`` (f, 3) has for every corner its vertex among those of all pools.
     """
 
-    def __init__(
-        self,
-        document: Document,
-        folder: Path,
-        pools: list[VertexPool],
-        parts: list[Primitive],
-        rows: IntArray,
-        mesh: MeshData,
-    ) -> None:
-        super().__init__(mesh.V, mesh.F)
-        self.document, self.folder, self.pools, self.parts, self.rows = document, folder, pools, parts, rows
+    document: Document
+    folder: Path
+    pools: list[VertexPool]
+    parts: list[Primitive]
+    rows: IntArray
 
     def parts_of(self, pool: int) -> list[Primitive]:
         """Return the primitives that use a pool, by its index."""
@@ -152,7 +147,8 @@ def _mesh(document: Document, source: str) -> MeshData | None:
         statement_faces=np.array([face for _, face in statements], dtype=np.int64),
         source=source,
     )
-    return replace(mesh, carried=CarriedGltf(document, Path(source).parent, pools, parts, rows, mesh))
+    carried = CarriedGltf(mesh.V, mesh.F, document, Path(source).parent, pools, parts, rows)
+    return replace(mesh, carried=carried)
 
 
 def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntArray, list[tuple[bytes, int]]]:
