@@ -33,21 +33,18 @@ _INTEGER = re.compile(rb"[+-]?[0-9]+")
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """Read the bytes of a file; MeshFileError if it does not exist or cannot be read."""
     check_path("path", path)
-    try:
-        mode = os.stat(path).st_mode
-        if stat.S_ISDIR(mode):
-            raise MeshFileError(path, "is a directory", remedy="name a file")
-        if not stat.S_ISREG(mode):
-            raise MeshFileError(path, "is not a regular file")
-        return Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise MeshFileError(path, "there is no such file") from error
-    except OSError as error:
-        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
-    except MeshFileError:
-        raise
-    except ValueError as error:
-        raise MeshFileError(path, f"is not a file name: {error}") from error
+    with reading(path, "is not a file name: "):
+        try:
+            mode = os.stat(path).st_mode
+            if stat.S_ISDIR(mode):
+                raise MeshFileError(path, "is a directory", remedy="name a file")
+            if not stat.S_ISREG(mode):
+                raise MeshFileError(path, "is not a regular file")
+            return Path(path).read_bytes()
+        except FileNotFoundError as error:
+            raise MeshFileError(path, "there is no such file") from error
+        except OSError as error:
+            raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
 
 
 def read_text(path: str | os.PathLike[str]) -> bytes:
