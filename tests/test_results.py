@@ -266,6 +266,9 @@ def test_meshes_are_accepted_in_place_of_arrays(surface, solved, tmp_path):
         np.testing.assert_array_equal(result.uv, solved.uv)
         np.testing.assert_array_equal(as_seamed_mesh(mesh).V, V)
     np.testing.assert_array_equal(as_seamed_mesh(path).islands[0].uv, solved.uv)
+    assert as_seamed_mesh(mapped := as_seamed_mesh(path)) is mapped
+    with pytest.raises(TypeError):
+        SeamedMesh(path)
     np.testing.assert_array_equal(qh.boundary_loops(F)[0], loop)
 
 

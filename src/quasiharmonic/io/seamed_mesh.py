@@ -23,6 +23,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     as_offsets,
     check_range,
+    corner_rows,
     count_of,
     edge_names,
     index_array,
@@ -112,11 +113,8 @@ class SeamedMesh:
         self.V, self.F = vertex_array(V), triangle_rows(F)
         check_range("F", self.F, len(self.V))
         self.uv = None if uv is None else map_array("uv", uv, finite=False)
-        self.FT = self.F if FT is None else triangle_rows(FT, "FT")
-        if len(self.FT) != len(self.F):
-            raise ValueError(f"FT must have as many rows as F, {len(self.F)}, not {len(self.FT)}")
-        rows = int(self.FT.max(initial=-1)) + 1 if self.uv is None else len(self.uv)
-        check_range("FT", self.FT, rows, "row", "rows", minimum=-1)
+        rows = None if self.uv is None else len(self.uv)
+        self.FT = corner_rows("FT", self.F if FT is None else FT, self.F, rows, copy=FT is not None)
         for array in (self.V, self.F, self.FT, self.uv):
             if array is not None:
                 array.flags.writeable = False

@@ -168,6 +168,18 @@ def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArr
     return array
 
 
+def corner_rows(name: str, values: ArrayLike, F: IntArray, rows: int | None = None, *, copy: bool = False) -> IntArray:
+    """Convert a table with a row index, or -1 for none, at every corner of triangles F (f, 3) to int64.
+
+    ``rows`` is the number of rows that exist; None if the table decides. Returns a copy only if ``copy``.
+    """
+    array = triangle_rows(values, name, copy=copy)
+    if len(array) != len(F):
+        raise ValueError(f"{name} must have as many rows as F, {len(F)}, not {len(array)}")
+    check_range(name, array, int(array.max(initial=-1)) + 1 if rows is None else rows, "row", "rows", minimum=-1)
+    return array
+
+
 def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = True) -> FloatArray:
     """Convert positions in the plane to (n, 2) float64, finite unless ``finite`` is False; returns a copy.
 

@@ -11,10 +11,10 @@ The package builds on `apps.gradients.layers`. Start reading here, then `callbac
 
 from __future__ import annotations
 
-try:
+from quasiharmonic.util.optional import explain_missing
+
+with explain_missing("quasiharmonic.jax needs JAX", "'quasiharmonic[jax]'"):
     import jax
-except ImportError as error:
-    raise ImportError("quasiharmonic.jax needs JAX: pip install 'quasiharmonic[jax]'") from error
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -9,10 +9,10 @@ The package builds on `apps.gradients.layers`. Start reading here, then `functio
 
 from __future__ import annotations
 
-try:
+from quasiharmonic.util.optional import explain_missing
+
+with explain_missing("quasiharmonic.torch needs PyTorch", "'quasiharmonic[torch]'"):
     import torch
-except ImportError as error:
-    raise ImportError("quasiharmonic.torch needs PyTorch: pip install 'quasiharmonic[torch]'") from error
 
 import numpy as np
 from numpy.typing import ArrayLike

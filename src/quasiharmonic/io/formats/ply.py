@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,12 +25,11 @@ _COLOUR = "red", "green", "blue", "alpha"
 _NORMAL = "nx", "ny", "nz"
 
 
+@dataclass(frozen=True, eq=False)
 class CarriedPly(Carried):
     """The tables of a PLY file, and its mesh."""
 
-    def __init__(self, tables: PlyTables, V: FloatArray, F: IntArray) -> None:
-        super().__init__(V, F)
-        self.tables = tables
+    tables: PlyTables
 
     def further(self) -> list[str]:
         read = {
@@ -131,7 +130,7 @@ def _mesh(tables: PlyTables, source: str) -> MeshData:
         normal_lines=None if normals is None else corners,
         source=source,
     )
-    return replace(mesh, carried=CarriedPly(tables, mesh.V, mesh.F))
+    return replace(mesh, carried=CarriedPly(mesh.V, mesh.F, tables))
 
 
 def _table(element: Element, *names: str) -> FloatArray | None:

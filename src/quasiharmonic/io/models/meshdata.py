@@ -17,6 +17,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_finite,
     check_range,
+    corner_rows,
     map_array,
     names_of,
     pad_to_space,
@@ -25,11 +26,12 @@ from quasiharmonic.util.arrays import (
 )
 
 
+@dataclass(frozen=True, eq=False)
 class Carried:
     """The contents of a file besides its mesh ``V, F``, for a writer of the same format."""
 
-    def __init__(self, V: FloatArray, F: IntArray) -> None:
-        self.V, self.F = V, F
+    V: FloatArray
+    F: IntArray
 
     def further(self) -> list[str]:
         """Return descriptions of the data besides the mesh, which only a writer of the same format keeps."""
@@ -127,9 +129,9 @@ class MeshData:
             check_finite("vt", "row", "rows", vt)
             object.__setattr__(self, "vt", vt)
         if self.FT is not None:
-            object.__setattr__(self, "FT", self._corners("FT", self.FT, 0 if self.vt is None else len(self.vt)))
+            object.__setattr__(self, "FT", corner_rows("FT", self.FT, F, 0 if self.vt is None else len(self.vt)))
         if self.FN is not None:
-            object.__setattr__(self, "FN", self._corners("FN", self.FN, self.normals.count(b"\n")))
+            object.__setattr__(self, "FN", corner_rows("FN", self.FN, F, self.normals.count(b"\n")))
 
     @property
     def faces(self) -> int:
@@ -173,14 +175,6 @@ class MeshData:
             If ``uv`` does not have shape (n, 2), or a position is not finite.
         """
         return MeshData(map_array("uv", uv, len(self.V)), self.F, polygons=self.polygons, source=self.source)
-
-    def _corners(self, name: str, values: ArrayLike, rows: int) -> IntArray:
-        """Check a table of row indices or -1 for every corner; return it as (f, 3) int64."""
-        table = triangle_rows(values, name, copy=False)
-        if len(table) != len(self.F):
-            raise ValueError(f"{name} must have as many rows as F, {len(self.F)}, not {len(table)}")
-        check_range(name, table, rows, "row", "rows", minimum=-1)
-        return table
 
 
 def polygon_mesh(

@@ -193,7 +193,7 @@ class _Drawing:
         self._check_style(tag, attributes.get("style", ""))
         if "transform" in attributes and "transform-origin" in attributes:
             raise self._error(f"<{tag}>: transform-origin is not supported", "apply the transform in a drawing program")
-        try:
+        with reading(self.path, f"<{tag}>: ", line=self.parser.CurrentLineNumber):
             transform = self.transforms[-1]
             if "transform" in attributes:
                 transform = transform @ _transform(attributes["transform"])
@@ -207,8 +207,6 @@ class _Drawing:
                 self.skipped = self.depth
             else:
                 self.transforms.append(transform)
-        except ValueError as error:
-            raise self._error(f"<{tag}>: {error}") from None
 
     def _end(self, name: str) -> None:
         if self.sheet is not None:

@@ -100,19 +100,10 @@ def read_edges(path: Path, n: int) -> NDArray[np.int64]:
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.lowlevel.textual import integer
+    from quasiharmonic.io.lowlevel.textual import read_pairs
 
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
-        words = line.partition("#")[0].replace(",", " ").replace(":", " ").split()
-        if not words:
-            continue
-        if len(words) != 2 or not all(word.isascii() and word.isdigit() for word in words):
-            raise MeshFileError(path, f"is not an edge, two whole numbers from 0 on: {line[:60]!r}", number)
-        try:
-            ends = [integer(word.encode()) for word in words]
-        except ValueError as error:
-            raise MeshFileError(path, str(error), number, "indices count from 0") from None
+    for number, ends in read_pairs(path, "an edge"):
         if max(ends) >= n:
             raise MeshFileError(path, f"vertex {max(ends)} of a mesh with {n}", number, "indices count from 0")
         rows.append(ends)

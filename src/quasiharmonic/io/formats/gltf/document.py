@@ -11,6 +11,7 @@ import binascii
 import json
 import os
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,12 @@ _PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "i
 DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError)
 
 
+@dataclass(frozen=True, eq=False)
 class Document:
     """A glTF file: its JSON, and the bytes of each of ``tree["bufferViews"]``."""
 
-    def __init__(self, tree: dict[str, Any], views: list[bytes | memoryview]) -> None:
-        self.tree = tree
-        self.views = views
+    tree: dict[str, Any]
+    views: list[bytes | memoryview]
 
     @property
     def size(self) -> int:

@@ -56,23 +56,18 @@ class Primitive:
     end: int
 
 
+@dataclass(frozen=True, eq=False)
 class CarriedGltf(Carried):
     """A glTF document, the folder of its image files, and the relation of the surface to its primitives.
 
     ``rows`` (f, 3) has for every corner its vertex among those of all pools.
     """
 
-    def __init__(
-        self,
-        document: Document,
-        folder: Path,
-        pools: list[VertexPool],
-        parts: list[Primitive],
-        rows: IntArray,
-        mesh: MeshData,
-    ) -> None:
-        super().__init__(mesh.V, mesh.F)
-        self.document, self.folder, self.pools, self.parts, self.rows = document, folder, pools, parts, rows
+    document: Document
+    folder: Path
+    pools: list[VertexPool]
+    parts: list[Primitive]
+    rows: IntArray
 
     def parts_of(self, pool: int) -> list[Primitive]:
         """Return the primitives that use a pool, by its index."""
@@ -152,7 +147,8 @@ def _mesh(document: Document, source: str) -> MeshData | None:
         statement_faces=np.array([face for _, face in statements], dtype=np.int64),
         source=source,
     )
-    return replace(mesh, carried=CarriedGltf(document, Path(source).parent, pools, parts, rows, mesh))
+    carried = CarriedGltf(mesh.V, mesh.F, document, Path(source).parent, pools, parts, rows)
+    return replace(mesh, carried=carried)
 
 
 def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntArray, list[tuple[bytes, int]]]:
@@ -313,9 +309,8 @@ def _local(node: dict[str, Any], index: int) -> FloatArray:
 def _numbers(node: dict[str, Any], name: str, default: list[int], index: int) -> FloatArray:
     """The numbers of a node's entry, as many as its default has; `ValueError` for anything else."""
     values = node.get(name, default)
-    if not isinstance(values, list) or len(values) != len(default):
-        count = f"{len(values)}" if isinstance(values, list) else ascii(values)[:40]
-        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {count}")
-    if not all(isinstance(value, int | float) for value in values):
-        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {ascii(values)[:40]}")
+    is_list = isinstance(values, list)
+    if not is_list or len(values) != len(default) or not all(isinstance(value, int | float) for value in values):
+        found = f"{len(values)}" if is_list and len(values) != len(default) else ascii(values)[:40]
+        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {found}")
     return np.array(values, dtype=np.float64)

@@ -182,15 +182,14 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
 
 def _array(path: Path, n: int, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
     from quasiharmonic import io
+    from quasiharmonic.io.errors import reading
     from quasiharmonic.util.arrays import real_array
     from quasiharmonic.util.untrusted import read_npy
 
-    try:
+    if not path.is_file():
+        raise io.MeshFileError(path, "there is no such file")
+    with reading(path, "not an array of numbers in NumPy's format: "):
         array = read_npy(path)
-    except FileNotFoundError as error:
-        raise io.MeshFileError(path, "there is no such file") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: not an array of numbers in NumPy's format: {error}") from error
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, fixed.size) and array.shape[2] == 2
     if not shaped or array.dtype.kind not in "iuf":
         raise ValueError(

@@ -137,7 +137,7 @@ def _convexity(mesh: MeshData, certified: WrittenMap) -> tuple[NDArray[np.int64]
     from quasiharmonic.geometry.exact.convexity import find_concave
     from quasiharmonic.util.arrays import count_of, names_of
 
-    bent = find_concave(mesh.polygons, certified.F, certified.uv)
+    bent = find_concave(mesh.rings, certified.F, certified.uv)
     if bent.size:
         return (
             bent,

@@ -244,6 +244,7 @@ def _read_table(path: Path) -> NDArray[np.float64]:
     import numpy as np
 
     from quasiharmonic import io
+    from quasiharmonic.io.errors import reading
     from quasiharmonic.util.arrays import real_array
     from quasiharmonic.util.untrusted import read_npy
 
@@ -252,7 +253,7 @@ def _read_table(path: Path) -> NDArray[np.float64]:
         return io.read_gifti_values(path)
     if path.suffix.lower() not in _TABLES:
         raise ValueError(f"--values {path}: supported: {', '.join(_TABLES)}, .gii")
-    try:
+    with reading(path, "not a table of numbers: ", (ValueError, EOFError)):
         if path.suffix.lower() == ".npy":
             return real_array(str(path), read_npy(path))
         lines = [line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
@@ -261,8 +262,6 @@ def _read_table(path: Path) -> NDArray[np.float64]:
         if rows and not any(_is_number(word) for word in rows[0]):
             rows = rows[1:]
         table = np.array(rows, dtype=np.float64)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path}: not a table of numbers: {error}") from error
     return table[:, 0] if table.ndim == 2 and table.shape[1] == 1 else table
 
 

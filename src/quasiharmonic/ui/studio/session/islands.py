@@ -71,9 +71,10 @@ class IslandState:
     def with_problem(self, problem: Problem) -> IslandState:
         """Return the island with another problem, whose analyses are kept."""
         other = replace(self, fixed=problem.fixed, target=problem.target)
-        known = {"problem": problem, "loops": self.__dict__.get("loops")}
-        # Stored, so that they are not computed again.
-        other.__dict__.update({name: value for name, value in known.items() if value is not None})
+        # Store values that are known, so that they are not computed again.
+        other.__dict__["problem"] = problem
+        if "loops" in self.__dict__:
+            other.__dict__["loops"] = self.loops
         return other
 
     def with_target(self, target: FloatArray) -> IslandState:

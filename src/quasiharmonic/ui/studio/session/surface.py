@@ -13,7 +13,6 @@ from quasiharmonic import io
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
 from quasiharmonic.apps.unwrapping.model_files import divide_polygons
 from quasiharmonic.geometry.surfaces import cat
-from quasiharmonic.io.models.meshdata import vertex_places
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem.inspection import MeshReport, inspect_mesh
 from quasiharmonic.util.arrays import IntArray
@@ -146,6 +145,4 @@ def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> S
 
 def has_complete_map(mesh: io.MeshData) -> bool:
     """Return whether every triangle of a file has texture coordinates."""
-    if mesh.FT is None or mesh.vt is None:
-        return False
-    return bool((mesh.FT >= 0).all()) and not np.isnan(vertex_places(mesh)[0][mesh.F]).any()
+    return not np.isnan(mesh.corner_uv).any()
