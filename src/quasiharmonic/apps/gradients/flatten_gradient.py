@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Scale, to_rows
+from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, Scale, to_rows
 from quasiharmonic.apps.gradients.freedom import Freedom
 from quasiharmonic.apps.gradients.gauge import Gauge
 from quasiharmonic.apps.gradients.minimum import Minimum
@@ -100,18 +100,18 @@ def flatten_derivative(
     scale = None
     if gauge is not None and gauge.keeps_area:
         scale = Scale(np.zeros_like(w), differentiate_surface_size(strain))
-    return Derivative(
-        place_map(minimum.w, exponent, domain.fixed, start),
+    equilibrium = Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
         inverse=minimum,
         strain=lambda: strain,
         rest_shape=domain.V.shape,
-        doubts=[*doubts, *minimum.doubts],
         unit=2.0**exponent,
         scale=scale,
         gauge=None if gauge is None else replace(gauge, w=minimum.w),
     )
+    uv = place_map(minimum.w, exponent, domain.fixed, start)
+    return Derivative(uv, equilibrium, [*doubts, *minimum.doubts])
 
 
 def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge | None:

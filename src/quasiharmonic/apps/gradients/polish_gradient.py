@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.derivative import Derivative, Scale, to_rows
+from quasiharmonic.apps.gradients.derivative import Derivative, Equilibrium, Scale, to_rows
 from quasiharmonic.apps.gradients.freedom import Freedom, OnCurves
 from quasiharmonic.apps.gradients.gauge import differentiate_map_size
 from quasiharmonic.apps.gradients.minimum import Minimum
@@ -97,18 +97,18 @@ def polish_derivative(
         freedom = OnCurves(measure, track, domain.fixed, domain.loops, exponent, linear_solver)
         scale = Scale(np.zeros_like(w), by_rest)
     minimum = Minimum(measure, w, freedom)
-    return Derivative(
-        place_map(minimum.w, exponent, np.setdiff1d(domain.fixed, freedom.sliding), start),
+    equilibrium = Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
         inverse=minimum,
         strain=lambda: strain,
         rest_shape=domain.V.shape,
-        doubts=minimum.doubts,
         unit=2.0**exponent,
         on_curves=None if track is None else find_curve_vertices(track),
         scale=scale,
     )
+    held = np.setdiff1d(domain.fixed, freedom.sliding)
+    return Derivative(place_map(minimum.w, exponent, held, start), equilibrium, minimum.doubts)
 
 
 def make_strain(domain: Domain) -> RestStrain:
