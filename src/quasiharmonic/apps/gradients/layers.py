@@ -192,12 +192,13 @@ class FlattenLayer(Layer):
         shape = tuple(getattr(rest, "shape", ()))
         if len(shape) < 2 or shape[-1] not in (2, 3):
             raise ValueError(f"rest must have shape (n, 2) or (n, 3), or batch axes before these, not {shape}")
-        arrays = {
-            "fixed": None if fixed is None else index_array("fixed", fixed),
-            "weights": None if weights is None else real_array("weights", weights),
-            "start": None if start is None else real_array("start", start),
-        }
-        return cls(index_array("F", F), (shape[-2], shape[-1]), replace(checked, **arrays))
+        checked = replace(
+            checked,
+            fixed=None if fixed is None else index_array("fixed", fixed),
+            weights=None if weights is None else real_array("weights", weights),
+            start=None if start is None else real_array("start", start),
+        )
+        return cls(index_array("F", F), (shape[-2], shape[-1]), checked)
 
     @cached_property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
