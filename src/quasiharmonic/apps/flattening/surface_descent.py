@@ -179,13 +179,19 @@ class SurfaceModel(MapModel):
     def __init__(
         self,
         energy: NewtonObjective,
-        coordinates: Coordinates,
-        system: NewtonSystem,
+        uv: FloatArray,
+        linear_solver: str,
+        fixed: IntArray,
         rim: Rim | None,
         pairs: Pairs | None,
     ) -> None:
         self.surface, self.guard, self._pairs = energy, None if rim is None else Guard(rim, energy), pairs
-        super().__init__(energy if self.guard is None else self.guard.energy, coordinates, system)
+        self._of_map = len(uv), fixed, linear_solver
+        super().__init__(
+            energy if self.guard is None else self.guard.energy,
+            Coordinates.of(uv, fixed, 0),
+            NewtonSystem(energy.F, energy.g, *self._of_map),
+        )
         self.slack = 1.0 if self.guard is None else self.guard.slack
 
     def start(self, uv: FloatArray) -> NewtonState:
@@ -211,7 +217,7 @@ class SurfaceModel(MapModel):
             return state
 
         def rebuild(F: IntArray, g: ComplexArray) -> None:
-            self.system = NewtonSystem(F, g, state.w.size, self.coordinates.fixed, self.system.solver.name)
+            self.system = NewtonSystem(F, g, *self._of_map)
 
         return self.guard.prepare(state, rebuild)
 
@@ -253,9 +259,7 @@ class SurfaceModel(MapModel):
 
     @cached_property
     def _rotation_path(self) -> RotationPath | None:
-        surface, coordinates = self.surface, self.coordinates
-        n = coordinates.fixed.size + self.system.free.size
-        return RotationPath.of(surface.F, surface.g, n, coordinates.fixed, self.system.solver.name)
+        return RotationPath.of(self.surface.F, self.surface.g, *self._of_map)
 
     def _search_rotating(self, state: NewtonState, full: ComplexArray, expected_decrease: float) -> NewtonState | None:
         """Take a full or longer step along a rotating path; None if the energy does not decrease enough."""
@@ -309,9 +313,7 @@ class SurfaceDescent(NewtonDescent):
         rim: Rim | None = None,
         pairs: Pairs | None = None,
     ) -> None:
-        coordinates = Coordinates.of(uv, np.asarray(fixed, dtype=np.int64), 0)
-        system = NewtonSystem(energy.F, energy.g, len(uv), coordinates.fixed, linear_solver)
-        model = SurfaceModel(energy, coordinates, system, rim, pairs)
+        model = SurfaceModel(energy, uv, linear_solver, np.asarray(fixed, dtype=np.int64), rim, pairs)
         super().__init__(model, model.start(uv))
 
     @property
