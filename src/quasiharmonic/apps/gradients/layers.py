@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apps.flattening.free_boundary import flatten_surface
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.flatten_gradient import flatten_derivative
-from quasiharmonic.apps.gradients.polish_gradient import polish_derivative
+from quasiharmonic.apps.gradients.flatten_gradient import differentiate_flattened
+from quasiharmonic.apps.gradients.polish_gradient import differentiate_polish
 from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
 from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.polishing import polish_options
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
@@ -163,15 +164,7 @@ class PolishLayer(Layer):
         problem, options = pose_problem(self.problem, arrays), self.options
         if uv is None:
             uv = _check_found(solve_problem(problem, options))
-        return polish_derivative(
-            problem.V,
-            problem.F,
-            uv,
-            fixed=problem.fixed,
-            energy=options.polish,
-            slide=options.slide,
-            linear_solver=options.linear_solver,
-        )
+        return differentiate_polish(problem.domain, uv, polish_options(options))
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,15 +202,7 @@ class FlattenLayer(Layer):
         V, options = arrays["rest"], self.options
         if uv is None:
             uv = _check_found(flatten_surface(V, self.F, replace(options, target=arrays.get("target"))))
-        return flatten_derivative(
-            V,
-            self.F,
-            uv,
-            fixed=() if options.fixed is None else options.fixed,
-            energy=options.energy,
-            weights=options.weights,
-            linear_solver=options.linear_solver,
-        )
+        return differentiate_flattened(V, self.F, uv, options)
 
 
 def pose_problem(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
