@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields
 from functools import wraps
+from numbers import Real
 from typing import Any, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -81,6 +82,12 @@ def function(name: str, value: Any) -> None:
     from quasiharmonic.util.arrays import check_callback
 
     check_callback(value)
+
+
+def motion_ratio(name: str, value: Any) -> None:
+    """Check a maximum displacement of vertices relative to that of the boundary, or None."""
+    if value is not None and (not isinstance(value, Real) or not float(value) >= 1):
+        raise ValueError(f"{name} must be a number of at least 1, not {value!r}: the boundary itself has ratio 1")
 
 
 def reference_name(name: str, value: Any) -> None:
@@ -243,3 +250,34 @@ class MorphOptions(SolverOptions):
     rest: Any = option(None)
     start: Any = option(None)
     tol: float = option(1e-8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovingOptions(Options):
+    """Options of `quasiharmonic.MovingMesh`; a sliding boundary in the plane needs ``settle`` of at least 1."""
+
+    energy: Any = option("blend", choices=ENERGIES)
+    settle: int = option(1, check=count)
+    slide: Any = option(False)
+    linear_solver: str = option("auto", choices=LINEAR_SOLVERS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RepairOptions(SolverOptions):
+    """Options of `quasiharmonic.repair`."""
+
+    fixed: Any = option(None)
+    whole: bool = option(False, check=switch)
+    unmirror: bool = option(False, check=switch)
+    max_iterations: int = option(MAX_ITERATIONS, check=positive)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnimationOptions(SolverOptions):
+    """Options of `quasiharmonic.animate`."""
+
+    polish: Any = option(None, choices=ENERGIES)
+    max_motion_ratio: float | None = option(None, check=motion_ratio)
+    fill_gaps: bool = option(False, check=switch)
+    start: Any = option(None)
+    max_iterations: int = option(MAX_ITERATIONS, check=positive)

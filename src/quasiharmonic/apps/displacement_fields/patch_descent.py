@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.apps.displacement_fields.grid import Grid
+from quasiharmonic.apps.displacement_fields.grid import PixelGrid, find_cells
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, Isotropic
 from quasiharmonic.energies.newton.line_search import backtrack_each
@@ -87,7 +87,9 @@ class ThinBarrier(Isotropic):
         return np.where(s > 0, s, 1)
 
 
-def descend_patches(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float) -> None:
+def descend_patches(
+    grid: PixelGrid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float
+) -> None:
     """Move the free pixels as near to their positions under a given field as possible.
 
     ``w`` (h, w) complex128 is changed in place. It is a map in the grid's unit whose determinants are above
@@ -106,7 +108,7 @@ def descend_patches(grid: Grid, w: ComplexArray, given: ComplexArray, patch: Int
 
 
 def _descend(
-    grid: Grid,
+    grid: PixelGrid,
     w: ComplexArray,
     given: ComplexArray,
     patch: IntArray,
@@ -131,7 +133,7 @@ class _Batch:
     """Patches that share one matrix."""
 
     def __init__(
-        self, grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float, weight: float
+        self, grid: PixelGrid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float, weight: float
     ) -> None:
         touched = find_cells(patch > 0)
         cells = grid.cells(*np.nonzero(touched))
@@ -200,10 +202,3 @@ class _Batch:
         t, value = backtrack_each(values, before, expected_decrease, longest, tries=_MAX_HALVINGS)
         self.here = trial
         return np.where(t > 0, before - value, 0)
-
-
-def find_cells(pixels: BoolArray) -> BoolArray:
-    """The cells (h − 1, w − 1) that have at least one of the pixels (h, w)."""
-    rows = pixels[:-1] | pixels[1:]
-    touched: BoolArray = rows[:, :-1] | rows[:, 1:]
-    return touched

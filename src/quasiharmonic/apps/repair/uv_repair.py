@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,14 +22,11 @@ from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    check_bool,
-    check_callback,
-    check_integer,
     count_of,
     names_of,
     vertex_indices,
 )
-from quasiharmonic.util.options import MAX_ITERATIONS
+from quasiharmonic.util.options import RepairOptions, takes
 from quasiharmonic.util.outcome import Outcome
 from quasiharmonic.util.progress import reports_progress
 
@@ -167,20 +164,22 @@ class RepairResult(Outcome):
         }
 
 
+class RepairKeywords(TypedDict, total=False):
+    """Types of the options of `repair`."""
+
+    fixed: ArrayLike | None
+    whole: bool
+    unmirror: bool
+    max_iterations: int
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+
+
 @accepts_mesh
 @reports_progress
+@takes(RepairOptions, RepairKeywords)
 def repair(
-    V: ArrayLike,
-    F: ArrayLike,
-    uv: ArrayLike,
-    *,
-    FT: ArrayLike | None = None,
-    fixed: ArrayLike | None = None,
-    whole: bool = False,
-    unmirror: bool = False,
-    max_iterations: int = MAX_ITERATIONS,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
+    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, FT: ArrayLike | None = None, **options: Unpack[RepairKeywords]
 ) -> RepairResult:
     """Repair the inverted triangles of a map, keeping its boundary and as much of its interior as possible.
 
@@ -237,47 +236,37 @@ def repair(
     >>> len(result.islands[0].inverted_before), result.injective, result.moved_vertices.tolist()
     (2, True, [0])
     """
-    check_integer("max_iterations", max_iterations, minimum=1)
-    check_bool("whole", whole)
-    check_bool("unmirror", unmirror)
-    check_callback(callback)
+    checked = RepairOptions(**options)
     mesh = SeamedMesh(V, F, FT, uv)
-    held = vertex_indices("fixed", () if fixed is None else fixed, len(mesh.V))
-    done = []
-    for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
-        if mirrored:
-            done.append(_report_mirrored(island, unmirror))
-            continue
-        one = IslandRepair(
-            mesh.V,
-            island,
-            fixed=held,
-            max_iterations=max_iterations,
-            linear_solver=linear_solver,
-            callback=callback,
-        )
-        before = island.triangles[one.inverted]
-        if before.size:
-            one.run(whole)
-        certificate = certify(island.F, one.uv)
-        done.append(
-            (
-                one.uv,
-                RepairedIsland(
-                    triangles=island.triangles,
-                    inverted_before=before,
-                    inverted=island.triangles[one.inverted],
-                    moved_vertices=np.unique(island.vertices[one.moved_mask]),
-                    mirrored=False,
-                    bijective=bool(certificate.bijective),
-                    reason="" if certificate.injective else one.reason,
-                    diagnosis=None if certificate.injective else one.diagnosis,
-                ),
-            )
-        )
+    fixed = vertex_indices("fixed", () if checked.fixed is None else checked.fixed, len(mesh.V))
+    done = [
+        _report_mirrored(island, checked.unmirror) if mirrored else _repair_island(mesh.V, island, fixed, checked)
+        for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True)
+    ]
     repaired = mesh.with_places([new for new, _ in done])
     assert repaired.uv is not None
     return RepairResult(repaired.uv, repaired.FT, tuple(report for _, report in done))
+
+
+def _repair_island(
+    V: FloatArray, island: Island, fixed: IntArray, options: RepairOptions
+) -> tuple[FloatArray, RepairedIsland]:
+    """Repair an island that is not mirrored; return its new positions and the report."""
+    one = IslandRepair(V, island, fixed, options)
+    before = island.triangles[one.inverted]
+    if before.size:
+        one.run()
+    certificate = certify(island.F, one.uv)
+    return one.uv, RepairedIsland(
+        triangles=island.triangles,
+        inverted_before=before,
+        inverted=island.triangles[one.inverted],
+        moved_vertices=np.unique(island.vertices[one.moved_mask]),
+        mirrored=False,
+        bijective=bool(certificate.bijective),
+        reason="" if certificate.injective else one.reason,
+        diagnosis=None if certificate.injective else one.diagnosis,
+    )
 
 
 def _report_mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:

@@ -70,7 +70,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, make invertible, write, report."""
     from quasiharmonic.apps.displacement_fields.nearest import InvertibleField, fold_free, nearest_invertible
-    from quasiharmonic.apps.tetrahedra.voxel_fields import describe_fixed
+    from quasiharmonic.apps.displacement_fields.voxels import describe_fixed
     from quasiharmonic.io.fields import field_suffix, read_field
 
     report.check_new({"-o": options.output, "--inverse": options.inverse}, options.json, inputs=(options.input,))

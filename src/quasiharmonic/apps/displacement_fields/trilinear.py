@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from quasiharmonic.apps.tetrahedra.voxel_fields import VoxelGrid
+from quasiharmonic.apps.displacement_fields.voxels import VoxelGrid
 from quasiharmonic.util.arrays import BoolArray, FloatArray
 from quasiharmonic.util.progress import heartbeat
 
@@ -21,8 +21,8 @@ def least_coefficients(grid: VoxelGrid, field: FloatArray) -> FloatArray:
     polynomial of degree two in each coordinate. It is at least its smallest Bernstein coefficient. Coefficients that
     may be rounding errors are lowered, so that positive ones are certain. A cell at rest has coefficients of 1.
     """
-    d, h, w = (count - 1 for count in grid.shape)
-    least = np.empty((d, h, w))
+    d, h, w = grid.cell_shape
+    least = np.empty(grid.cell_shape)
     scale = grid.spacing[:, None, None, None]
     for z in range(d):
         heartbeat()
