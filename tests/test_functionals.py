@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from quasiharmonic import Problem, certify, solve
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.solver.field.functionals import beltrami_energy, beltrami_gradient, neumann_target
+from quasiharmonic.solver.field.functionals import beltrami_gradient, neumann_target
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.solver.methods import LBFGS, Newton
@@ -261,7 +261,7 @@ def test_v3_of_any_map_is_the_energy_of_its_beltrami_residual():
 
     field = TANH.field(xi)
     value, gradient = beltrami_gradient(mesh, field, dw)
-    assert value == beltrami_energy(mesh, field, dw) == pytest.approx(energy(field.mu).sum(), rel=1e-12)
+    assert value == pytest.approx(energy(field.mu).sum(), rel=1e-12)
     h = 1e-6
     for direction in (1, 1j):
         slope = (energy(field.mu + h * direction) - energy(field.mu - h * direction)) / (2 * h)

@@ -19,7 +19,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,9 +32,9 @@ from quasiharmonic.energies.polishing import find_energy, scale_energy
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.problem import Domain
-from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, list_others, repeat_each, to_complex
 
 _MAX_STEPS = 200
 _TOLERANCE = 1e-6
@@ -74,11 +73,11 @@ class Plate:
         mass = np.bincount(F.ravel(), corner_area, minlength=n)[inside]
         area = float(rest_operators.m.sum())
         weight = np.bincount(pull.vertices, pull.weights, minlength=n) / area
-        self.rest: ComplexArray = V.view(np.complex128).ravel()
+        self.rest: ComplexArray = to_complex(V)
         towards = np.zeros((n, 2))
         towards[pull.vertices] = pull.positions
         self.second_order: csr_array = csr_array(L.T @ (L * (length**2 / area / mass)[:, None]))
-        self.weight, self.towards = weight, towards.view(np.complex128).ravel()
+        self.weight, self.towards = weight, to_complex(towards)
 
     def matrix(self) -> csr_array:
         """Matrix K (n, n) of the quadratic form ``Re xᴴ K x`` in displacements x."""
@@ -152,24 +151,20 @@ def bend_map(
     energy: str | Energy,
     length: float,
     pull: Pull,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
 ) -> MapResult:
     """Lower the energy of an injective map with its second-order term; append to the stages and history of its result.
 
-    The domain is planar, and ``length`` is ℓ in its unit. The status is one of `quasiharmonic.polish`, as are the
-    options.
+    The domain is planar, and ``length`` is ℓ in its unit. The status is one of `quasiharmonic.polish`.
     """
-    run = Run(callback)
-    inside = np.ones(domain.n, dtype=bool)
-    inside[np.concatenate(domain.loops)] = False
-    plate = Plate(domain.V, domain.F, np.flatnonzero(inside), length, pull)
+    run = Run()
+    inside = list_others(domain.n, np.concatenate(domain.loops))
+    plate = Plate(domain.V, domain.F, inside, length, pull)
     # As in `polish`, steps to inf or NaN are never accepted.
     with np.errstate(all="ignore"):
         deformation, exponent = scale_energy(domain, result.uv, find_energy(energy))
         unit = float(np.ldexp(1.0, exponent))
         constant = csr_array(2 * unit**2 * plate.matrix())
-        system = PlateSystem(deformation.F, deformation.g, domain.n, domain.fixed, linear_solver, constant)
+        system = PlateSystem(deformation.F, deformation.g, domain.n, domain.fixed, "auto", constant)
         coordinates = Coordinates.of(result.uv, domain.fixed, exponent)
         model = MapModel(deformation, coordinates, system, [PlateTerm(plate, unit)])
         descent = NewtonDescent(model, model.evaluate(in_units(result.uv, exponent)))

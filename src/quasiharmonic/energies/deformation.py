@@ -79,11 +79,7 @@ class DeformationEnergy:
         self._vertex_count = int(self.F.max(initial=-1)) + 1
         check_range("F", self.F, self._vertex_count)
         shapes = rest_shapes(V, self.F if rest_F is None else np.asarray(rest_F, dtype=np.int64))
-        if shapes.flat.size:
-            raise ValueError(
-                f"{names_of('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
-                "distortion is undefined there"
-            )
+        shapes.check_areas("distortion is undefined there")
         if area is not None and not 0 < area < np.inf:
             raise ValueError(f"the area of the map must be positive, not {area}")
         total = float(shapes.m.sum())
@@ -91,7 +87,11 @@ class DeformationEnergy:
         self.g: ComplexArray = scale * shapes.half_gradients()
         self.share: FloatArray = shapes.m / total
         if weights is not None:
-            self.share = self.share * _check_weights(weights, len(self.F))
+            array = _weight_array(weights, len(self.F))
+            bad = np.flatnonzero(~((array >= 0) & (array < np.inf)))
+            if bad.size:
+                raise ValueError(f"the weight is negative or not finite at {names_of('triangle', 'triangles', bad)}")
+            self.share = self.share * array
         self._det_per_area = scale**2 / shapes.m
 
     def with_references(
@@ -167,8 +167,7 @@ class DeformationEnergy:
         with np.errstate(all="ignore"):
             found = {"energy": (self.energy.density(d),), "first derivative": self.energy.gradient(d)}
             if second:
-                form = self.energy.curvature(d, negative=1.0)
-                found["second derivative"] = form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc
+                found["second derivative"] = self.energy.curvature(d, negative=1.0)
         for what, parts in found.items():
             wrong, not_a_number = np.zeros((2, len(self.F)), dtype=bool)
             for part in parts:
@@ -275,13 +274,11 @@ def _edges(corners: NDArray[np.integer], w: ComplexArray) -> tuple[ComplexArray,
     return w[corners[1]] - w0, w[corners[2]] - w0
 
 
-def _check_weights(weights: ArrayLike, f: int) -> FloatArray:
+def _weight_array(weights: ArrayLike, f: int) -> FloatArray:
+    """Convert weights of ``f`` triangles to a new (f,) float64 array, or raise a ValueError for another shape."""
     array = real_array("weights", weights)
     if array.shape != (f,):
         raise ValueError(f"weights must have shape ({f},), one for each triangle, not {array.shape}")
-    bad = np.flatnonzero(~((array >= 0) & (array < np.inf)))
-    if bad.size:
-        raise ValueError(f"the weight is negative or not finite at {names_of('triangle', 'triangles', bad)}")
     return array
 
 
@@ -290,9 +287,7 @@ def positive_weights(weights: ArrayLike, f: int) -> FloatArray:
 
     Raise a ValueError if the shape is wrong or a weight is not positive; the message names the first triangles.
     """
-    array = real_array("weights", weights)
-    if array.shape != (f,):
-        raise ValueError(f"weights must have shape ({f},), one for each triangle, not {array.shape}")
+    array = _weight_array(weights, f)
     bad = np.flatnonzero(~(array > 0))
     if bad.size:
         raise ValueError(f"the weight is not positive at {names_of('triangle', 'triangles', bad)}")

@@ -34,14 +34,13 @@ from quasiharmonic.util.arrays import (
     check_range,
     index_array,
     map_array,
+    morton_order,
     real_array,
 )
 from quasiharmonic.util.progress import heartbeat
 
 # Search radius in mean edge lengths per ring.
 _REACH = 1.3
-# Cells of the space-filling curve that orders the sources: 2^BITS along the longest side of their bounding box.
-_BITS = 10
 # Approximate number of pairs that `_sample_each_row` processes at a time.
 _PAIRS_PER_CHUNK = 1 << 20
 
@@ -232,7 +231,7 @@ def sample_distances(
     rng = np.random.default_rng(seed)
     used = np.unique(F) if among is None else among
     source = used if sampling.sources >= used.size else np.sort(rng.choice(used, sampling.sources, replace=False))
-    source = source[_morton_order(V[source])]
+    source = source[morton_order(V[source])]
     edges = edge_graph(F, len(V))
     row, target = neighbours_within(edges, source, sampling.rings)
     if among is not None:
@@ -246,18 +245,6 @@ def sample_distances(
     length = chain_lengths(segments, source, row, target, float(_REACH * sampling.rings * mean_edge))
     order = np.argsort(source[row], kind="stable")
     return SurfaceDistances(source[row][order], target[order], length[order], replace(sampling, sources=source.size))
-
-
-def _morton_order(points: FloatArray) -> IntArray:
-    """Order of points (n, d) along Morton's curve, so that consecutive points are close to each other."""
-    low = points.min(axis=0)
-    size = float((points.max(axis=0) - low).max())
-    cell = ((points - low) / (size if size > 0 else 1.0) * ((1 << _BITS) - 1)).astype(np.int64)
-    code = np.zeros(len(points), dtype=np.int64)
-    for bit in range(_BITS):
-        for axis, along in enumerate(cell.T):
-            code |= (along >> bit & 1) << (len(cell.T) * bit + axis)
-    return np.argsort(code, kind="stable")
 
 
 def _sample_each_row(row: IntArray, limit: int, rng: np.random.Generator) -> IntArray:

@@ -34,6 +34,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,8 +74,7 @@ class Deformation:
         return self.q.real**2 + self.q.imag**2
 
 
-@dataclass(frozen=True)
-class QuadraticForm:
+class QuadraticForm(NamedTuple):
     """A quadratic form in (dp, dq) on every triangle, stored as the ten coefficients of a form on ℝ⁴.
 
     ::
@@ -102,14 +102,8 @@ class QuadraticForm:
 
     def scaled(self, factor: FloatArray) -> QuadraticForm:
         """Return the form multiplied by one factor per triangle, (f,) float64."""
-        return QuadraticForm(
-            factor * self.pp,
-            factor * self.qq,
-            factor * self.p2,
-            factor * self.q2,
-            factor * self.pq,
-            factor * self.pqc,
-        )
+        pp, qq, p2, q2, pq, pqc = self
+        return QuadraticForm(factor * pp, factor * qq, factor * p2, factor * q2, factor * pq, factor * pqc)
 
     def matrices(self) -> FloatArray:
         """Symmetric matrices (f, 4, 4) float64 in the coordinates Re p, Im p, Re q, Im q."""

@@ -20,7 +20,9 @@ from quasiharmonic.util.arrays import (
     check_choice,
     check_range,
     count_of,
+    find_exponent,
     map_array,
+    to_complex,
     triangle_array,
     triangle_rows,
     vertex_array,
@@ -315,9 +317,9 @@ def mean_ratio(points: ArrayLike, F: ArrayLike) -> FloatArray:
 
 def _measure(V: FloatArray, F: IntArray, uv: FloatArray) -> Distortion:
     shapes = rest_shapes(V, F)
-    exponent = int(np.frexp(np.abs(uv).max(initial=0))[1]) - 1
+    exponent = find_exponent(uv) - 1
     unit = float(np.ldexp(1.0, exponent))
-    w = np.ldexp(uv, -exponent).view(np.complex128).ravel()
+    w = to_complex(np.ldexp(uv, -exponent))
     w0 = w[F[:, 0]]
     d1, d2 = w[F[:, 1]] - w0, w[F[:, 2]] - w0
     left, right = d1.real * d2.imag, d1.imag * d2.real

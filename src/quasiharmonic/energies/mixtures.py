@@ -92,14 +92,8 @@ def mixed_curvature(
     energy = energy_of(mixture)
     for part in blocks(det.size):
         form = energy.curvature(Deformation(p[part], q[part], det[part]), negative=negative).scaled(share[part])
-        pp[part], qq[part], p2[part], q2[part], pq[part], pqc[part] = (
-            form.pp,
-            form.qq,
-            form.p2,
-            form.q2,
-            form.pq,
-            form.pqc,
-        )
+        for whole, values in zip((pp, qq, p2, q2, pq, pqc), form, strict=True):
+            whole[part] = values
 
 
 def curvature_of_mixture(mixture: FloatArray, d: Deformation, share: FloatArray, negative: float) -> QuadraticForm:

@@ -31,13 +31,7 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import (
-    FloatArray,
-    IntArray,
-    describe,
-    map_array,
-    names_of,
-)
+from quasiharmonic.util.arrays import FloatArray, IntArray, describe, find_exponent, map_array, names_of
 from quasiharmonic.util.options import MapOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
@@ -249,8 +243,7 @@ def scale_energy(
     the domain's triangles unless others (t, 3) are given.
     """
     F = domain.F if triangles is None else triangles
-    # Scale so that products of coordinates neither overflow nor underflow. A power of two causes no rounding.
-    exponent = int(np.frexp(np.abs(uv).max())[1])
+    exponent = find_exponent(uv)
     area = float(signed_areas(F, in_units(uv, exponent)).sum())
     return DeformationEnergy(domain.V, F, energy, area=area, weights=weights), exponent
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.energies import Deformation, Energy, QuadraticForm, damp, inverse
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, names_of, own_triangles
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, own_triangles
 
 
 class MassSpring(Energy):
@@ -33,11 +33,7 @@ class MassSpring(Energy):
     def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
         F = own_triangles(F)
         shapes = rest_shapes(V, F)
-        if shapes.flat.size:
-            raise ValueError(
-                f"{names_of('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: "
-                "spring constants depend on the areas"
-            )
+        shapes.check_areas("spring constants depend on the areas")
         self._sides, self._lengths = shapes.sides, np.abs(shapes.sides)
         n = int(F.max()) + 1
         boundary = boundary_edges(F, n)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from functools import cache
+from importlib.util import find_spec
 from types import TracebackType
 from typing import ClassVar, Self
 
@@ -53,6 +55,8 @@ class LinearSolver(ABC):
 
     name: ClassVar[str]
     requirement: ClassVar[str]
+    #: Python package that contains the library; None if `present` does not depend on a package.
+    package: ClassVar[str | None] = None
     #: Whether the backend can use a given numbering instead of computing an order.
     takes_order: ClassVar[bool] = True
 
@@ -75,7 +79,7 @@ class LinearSolver(ABC):
     @classmethod
     def present(cls) -> bool:
         """Whether the library of this backend is installed; does not load it."""
-        return True
+        return cls.package is None or _is_installed(cls.package)
 
     def factor(self, values: ArrayLike) -> None:
         """Factor the matrix with these values.
@@ -198,6 +202,11 @@ class LinearSolver(ABC):
     @abstractmethod
     def _release(self) -> None:
         """Release the factor and the memory of the library."""
+
+
+@cache  # Searching for a missing package takes as long as solving for 100 unknowns.
+def _is_installed(package: str) -> bool:
+    return find_spec(package) is not None
 
 
 def _check_pattern(indptr: ArrayLike, indices: ArrayLike) -> tuple[Pattern, Pattern]:

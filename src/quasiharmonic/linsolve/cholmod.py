@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from functools import cache
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -22,12 +20,7 @@ class Cholmod(LinearSolver):
 
     name = "cholmod"
     requirement = "pip install scikit-sparse (which needs SuiteSparse and a C compiler)"
-
-    @classmethod
-    @cache  # searching for a missing package takes as long as solving for 100 unknowns
-    def present(cls) -> bool:
-        """Whether the package scikit-sparse is installed."""
-        return find_spec("sksparse") is not None
+    package = "sksparse"
 
     def _analyse(self) -> None:
         from scipy.sparse import csc_matrix

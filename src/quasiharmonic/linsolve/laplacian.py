@@ -12,10 +12,19 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve import make_solver, takes_order
 from quasiharmonic.linsolve.dissection import nested_dissection
 from quasiharmonic.linsolve.pattern import stiffness_pattern
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, as_offsets, own_triangles
+from quasiharmonic.util.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    as_offsets,
+    invert_indices,
+    list_others,
+    own_triangles,
+)
 from quasiharmonic.util.kernels import compiled
 
 # Number of unknowns from which dissection is used. For fewer unknowns minimum degree is equally good (10,000 unknowns:
@@ -58,9 +67,7 @@ class Laplacian:
     ) -> None:
         self.n = n
         F = own_triangles(F)
-        is_free = np.ones(n, dtype=bool)
-        is_free[fixed] = False
-        self.free = np.flatnonzero(is_free)
+        self.free = list_others(n, fixed)
         order = None
         if points is not None and self.free.size >= DISSECT_FROM and takes_order(linear_solver):
             # Half-edge e·f + t is edge e of triangle t, the layout of ReferenceMesh.edge_stiffness.
@@ -80,9 +87,7 @@ class Laplacian:
 
     def _find_unknowns(self) -> NDArray[np.int32]:
         """Index of the unknown of each vertex, -1 at fixed vertices; (n,)."""
-        unknown = np.full(self.n, -1, dtype=np.int32)
-        unknown[self.free] = np.arange(self.free.size, dtype=np.int32)
-        return unknown
+        return invert_indices(self.n, self.free).astype(np.int32)
 
     @cached_property
     def _border(self) -> tuple[IntArray, IntArray, IntArray]:
@@ -172,6 +177,31 @@ class FactoredLaplacian:
         np.subtract.at(out, head, pull)
         out[laplacian.free] = 0
         return out
+
+
+def embed_tutte(
+    F: IntArray,
+    w: ComplexArray,
+    fixed: IntArray,
+    weights: FloatArray | float = 1.0,
+    *,
+    linear_solver: str = "auto",
+) -> ComplexArray:
+    """Place every free vertex of w (n,) at the weighted mean of its neighbours; only fixed positions are read.
+
+    ``fixed`` (k,) has at least one vertex on every component of the mesh. ``weights`` (f,) are positive; the weight of
+    an edge is the sum over its triangles.
+
+    Raises
+    ------
+    quasiharmonic.linsolve.NotPositiveDefinite
+        If the system is not positive definite after rounding.
+    """
+    if len(np.unique(fixed)) == len(w):
+        return w
+    identity = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
+    stiffness = ReferenceMesh(np.zeros((len(w), 2)), F, "equilateral").edge_stiffness(identity * weights)
+    return Laplacian(F, len(w), fixed, linear_solver).factor(stiffness).extend(w)
 
 
 @compiled

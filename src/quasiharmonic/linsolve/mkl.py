@@ -18,6 +18,7 @@ import numpy as np
 from quasiharmonic.linsolve.base import LinearSolver, Pattern
 from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.threads import read_limit
 
 # PARDISO's phases.
 _ANALYSE = 11
@@ -224,8 +225,7 @@ def _largest_team() -> int:
         return 1
     if os.environ.get("OMP_MAX_ACTIVE_LEVELS", "").strip() == "0":
         return 1
-    given = [os.environ.get(name, "").strip() for name in _TEAM_LIMITS]
-    return max(1, min((int(text) for text in given if text.isdecimal()), default=sys.maxsize))
+    return max(1, read_limit(_TEAM_LIMITS))
 
 
 @cache

@@ -16,8 +16,6 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from functools import cache
-from importlib.util import find_spec
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,6 +25,7 @@ from quasiharmonic.linsolve.errors import NotPositiveDefinite
 from quasiharmonic.linsolve.qdldl import Qdldl
 from quasiharmonic.linsolve.superlu import SuperLU
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.threads import count_cores, read_limit
 
 # Minimum fill. By default rslab tries several orders. Its nested dissection takes five times as long to analyse
 # (300,000 unknowns: 3.3 s against 0.3 to 0.6 s), and its factor is less than twice as fast. rslab accepts no given
@@ -58,13 +57,8 @@ class Rslab(LinearSolver):
 
     name = "rslab"
     requirement = "pip install rslab"
+    package = "rslab"
     takes_order = False
-
-    @classmethod
-    @cache
-    def present(cls) -> bool:
-        """Whether the package rslab is installed."""
-        return find_spec("rslab") is not None
 
     def _analyse(self) -> None:
         from scipy.sparse import csc_matrix
@@ -179,6 +173,4 @@ def _import_and_wait(loaded: Future[Any]) -> None:
 
 def _threads() -> int:
     """Number of threads that the machine and the environment allow, up to the useful maximum."""
-    given = [os.environ.get(name, "").strip() for name in _LIMITS]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(_MAX_THREADS, cores, *(int(text) for text in given if text.isdecimal())))
+    return max(1, min(_MAX_THREADS, count_cores(), read_limit(_LIMITS)))

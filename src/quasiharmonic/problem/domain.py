@@ -20,7 +20,9 @@ from quasiharmonic.util.arrays import (
     IntArray,
     ReadOnly,
     fixed_vertices,
+    mark,
     names_of,
+    scale_to_unit,
     triangle_array,
     unchangeable,
     vertex_array,
@@ -117,19 +119,23 @@ class Domain(ReadOnly):
         return len(self.V)
 
     @property
+    def euler(self) -> int:
+        """Euler characteristic of the surface: vertices minus edges plus triangles."""
+        return self.n - len(self.edges.interior) - len(self.edges.boundary) + len(self.F)
+
+    @property
+    def handles(self) -> int:
+        """Number of handles of the surface, its genus."""
+        return (2 - len(self.loops) - self.euler) // 2
+
+    @property
     def pins(self) -> IntArray:
         """Fixed vertices that are not on the boundary, ascending."""
-        marked = np.zeros(self.n, dtype=bool)
-        marked[self.fixed] = True
-        marked[self.edges.boundary] = False
-        return np.flatnonzero(marked)
+        return np.flatnonzero(mark(self.n, self.fixed) & ~mark(self.n, self.edges.boundary))
 
     def check_boundary_fixed(self) -> None:
         """Raise a ValueError with the boundary vertices that are not fixed, for methods that need all of them fixed."""
-        marked = np.zeros(self.n, dtype=bool)
-        marked[self.edges.boundary] = True
-        marked[self.fixed] = False
-        missing = np.flatnonzero(marked)
+        missing = np.flatnonzero(mark(self.n, self.edges.boundary) & ~mark(self.n, self.fixed))
         if missing.size:
             raise ValueError(
                 f"the boundary {names_of('vertex', 'vertices', missing)} not in fixed: "
@@ -166,7 +172,5 @@ class Domain(ReadOnly):
         """
         if kind not in self._meshes:
             V = self.V
-            if kind != "equilateral":
-                V = np.ldexp(V, -int(np.frexp(np.max(np.abs(V)))[1]))
-            self._meshes[kind] = ReferenceMesh(V, self.F, kind)
+            self._meshes[kind] = ReferenceMesh(V if kind == "equilateral" else scale_to_unit(V), self.F, kind)
         return self._meshes[kind]

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.fans import fans
 from quasiharmonic.geometry.mesh.reference import flat_triangles
-from quasiharmonic.geometry.mesh.topology import Edges, boundary_edges, edges, find_twins, trace_loops
+from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, boundary_edges, edges, find_twins, trace_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_triangles
 from quasiharmonic.util.arrays import (
@@ -20,7 +20,9 @@ from quasiharmonic.util.arrays import (
     check_integer,
     check_range,
     count_of,
+    mark,
     repeat_each,
+    scale_to_unit,
     triangle_array,
     triangle_rows,
     vertex_array,
@@ -185,7 +187,7 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike) -> MeshReport:
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    collapsed = (F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0])
+    collapsed = are_collapsed(F)
     surface = F[~collapsed]
     split, part = fans(surface)
     defects = _defects(V, F, collapsed, split)
@@ -225,8 +227,7 @@ def find_close_vertices(V: FloatArray, triangles: IntArray) -> IntArray:
         return np.empty(0, dtype=np.int64)
     from scipy.spatial import KDTree
 
-    # In this unit, squares neither overflow nor underflow.
-    points = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
+    points = scale_to_unit(V)
     # A tree takes quadratic time for many points at the same position, so each position is in it once.
     order = np.lexsort(points.T)
     first = np.flatnonzero(np.concatenate([[True], (np.diff(points[order], axis=0) != 0).any(axis=1)]))
@@ -250,8 +251,7 @@ def _defects(V: FloatArray, F: IntArray, collapsed: BoolArray, split: IntArray) 
     repeated = np.flatnonzero((find_twins(F) < np.arange(len(F))) & ~collapsed)
     flat = flat_triangles(V, F)
     found = edges(F, len(V))
-    used = np.zeros(len(V), dtype=bool)
-    used[F] = True
+    used = mark(len(V), F)
     return {
         "triangles that use a vertex twice": np.flatnonzero(collapsed),
         "triangles repeated": repeated,

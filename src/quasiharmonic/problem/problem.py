@@ -24,6 +24,8 @@ from quasiharmonic.util.arrays import (
     count_of,
     describe,
     target_positions,
+    to_complex,
+    to_points,
 )
 from quasiharmonic.util.display import Displayable
 
@@ -216,6 +218,12 @@ class Problem(ReadOnly, Displayable):
         """The `Frame`, the coordinates in which the problem is solved."""
         return Frame(self.target)
 
+    def place_fixed(self, other: float = 0.0) -> FloatArray:
+        """Return positions (n, 2) with fixed vertices at their targets and both coordinates of the others ``other``."""
+        uv = np.full((self.n, 2), other)
+        uv[self.fixed] = self.target
+        return uv
+
     def positions(self, w: ComplexArray) -> FloatArray:
         """Return the positions of a map in the target's units, with fixed vertices exactly at their targets.
 
@@ -248,7 +256,7 @@ class Problem(ReadOnly, Displayable):
         """
         area = 0.0
         for loop in self.domain.loops:
-            x, y = self.fixed_positions[loop].view(np.float64).reshape(-1, 2).T
+            x, y = to_points(self.fixed_positions[loop]).T
             area += 0.5 * float((x[:-1] * y[1:] - y[:-1] * x[1:]).sum() + (x[-1] * y[0] - y[-1] * x[0]))
         # The frame has unit size, so rounding errors are far below this tolerance.
         return area > -1e-12 and bool(np.any(self.target != self.target[0]))
@@ -269,7 +277,7 @@ class Frame:
 
     def inward(self, uv: FloatArray) -> ComplexArray:
         """Return positions (n, 2) as complex numbers in the frame; (n,) complex128."""
-        return np.ldexp(uv - self.centre, -self._exponent).view(np.complex128).ravel()
+        return to_complex(np.ldexp(uv - self.centre, -self._exponent))
 
     def lengths(self, x: FloatArray) -> FloatArray:
         """Return lengths or displacements in the frame's unit, without translation; an array of the same shape."""
@@ -277,4 +285,4 @@ class Frame:
 
     def outward(self, w: ComplexArray) -> FloatArray:
         """Return complex numbers of the frame (n,) as positions; (n, 2) float64."""
-        return np.ldexp(w.view(np.float64).reshape(-1, 2), self._exponent) + self.centre
+        return np.ldexp(to_points(w), self._exponent) + self.centre

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.geometry.mesh.reference import rest_frames
-from quasiharmonic.geometry.mesh.topology import Edges, components, edges, trace_loops
+from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, components, edges, trace_loops
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.problem.problem import Problem
-from quasiharmonic.util.arrays import IntArray, as_offsets, index_array, real_array, repeat_each, triangle_rows
+from quasiharmonic.util.arrays import IntArray, as_offsets, index_array, mark, real_array, repeat_each, triangle_rows
 
 # Largest binary exponent of a mesh's size, in absolute value, so that lengths neither overflow nor underflow.
 _MAX_EXPONENT = 400
@@ -53,10 +53,8 @@ def set_up_batch(given: Sequence[Given]) -> list[Problem] | None:
     found = _surfaces(triangles, starts)
     if found is None:
         return None
-    on_boundary = np.zeros(len(positions), dtype=bool)
-    on_boundary[found.boundary] = True
-    on_boundary[all_fixed] = False
-    if on_boundary.any() or not _have_areas(positions, triangles, starts):
+    missing = mark(len(positions), found.boundary) & ~mark(len(positions), all_fixed)
+    if missing.any() or not _have_areas(positions, triangles, starts):
         return None
     try:
         loops = trace_loops(found.boundary)
@@ -85,16 +83,14 @@ def _renumber(own: Sequence[IntArray], starts: IntArray) -> IntArray | None:
 
 def _surfaces(F: IntArray, starts: IntArray) -> Edges | None:
     """Return the edges of the concatenated meshes, or None unless each is a connected surface with boundary."""
-    a, b, c = F.T
     n = int(starts[-1])
     found = edges(F, n)
-    if ((a == b) | (b == c) | (c == a)).any() or found.nonmanifold.size or found.inconsistent.size:
+    if are_collapsed(F).any() or found.nonmanifold.size or found.inconsistent.size:
         return None
     # A vertex of no triangle is a component of its own.
     if not np.array_equal(components(F, n), repeat_each(starts[:-1], np.diff(starts))):
         return None
-    bounded = np.zeros(starts.size - 1, dtype=bool)
-    bounded[np.searchsorted(starts, found.boundary[:, 0], side="right") - 1] = True
+    bounded = mark(starts.size - 1, np.searchsorted(starts, found.boundary[:, 0], side="right") - 1)
     return found if bounded.all() else None
 
 

@@ -129,6 +129,61 @@ def enumerate_each(counts: ArrayLike) -> tuple[IntArray, IntArray]:
     )
 
 
+def mark(n: int, *chosen: IntArray) -> BoolArray:
+    """Mask (n,) that is True at the given indices, arrays of any shape."""
+    marked = np.zeros(n, dtype=bool)
+    for indices in chosen:
+        marked[indices] = True
+    return marked
+
+
+def list_others(n: int, chosen: IntArray) -> IntArray:
+    """Ascending numbers below ``n`` that are not among the given ones."""
+    return np.flatnonzero(~mark(n, chosen))
+
+
+def invert_indices(n: int, chosen: IntArray) -> IntArray:
+    """Position in ``chosen`` (k,) of each number below ``n``, -1 for the others; (n,) int64."""
+    position = np.full(n, -1, dtype=np.int64)
+    position[chosen] = np.arange(len(chosen))
+    return position
+
+
+def to_complex(points: FloatArray) -> ComplexArray:
+    """Points (k, 2) as complex numbers x + iy, (k,)."""
+    return np.ascontiguousarray(points, dtype=np.float64).view(np.complex128).ravel()
+
+
+def to_points(w: ComplexArray) -> FloatArray:
+    """Complex numbers x + iy, (k,), as points (k, 2)."""
+    return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
+
+
+def sum_at(indices: IntArray, values: ComplexArray, n: int) -> ComplexArray:
+    """Sum complex values (k,) at each of ``n`` indices; (n,) complex128."""
+    return np.bincount(indices, values.real, minlength=n) + 1j * np.bincount(indices, values.imag, minlength=n)
+
+
+def to_integers(values: FloatArray) -> list[int]:
+    """Finite doubles, multiplied by a common power of two that makes all of them integers."""
+    ratios = [value.as_integer_ratio() for value in values.ravel().tolist()]
+    unit = max(denominator for _, denominator in ratios)  # all are powers of two
+    return [numerator * (unit // denominator) for numerator, denominator in ratios]
+
+
+def find_exponent(values: NDArray[np.floating]) -> int:
+    """Binary exponent e of the largest absolute value: ``2**-e`` scales it to between 1/2 and 1; 0 if all are zero.
+
+    Scaling by a power of two rounds nothing, and afterwards squares neither overflow nor underflow.
+    """
+    return int(np.frexp(np.abs(values).max(initial=0.0))[1])
+
+
+def scale_to_unit(values: FloatArray) -> FloatArray:
+    """Values scaled by a power of two so that the largest absolute value is between 1/2 and 1; see `find_exponent`."""
+    return np.ldexp(values, -find_exponent(values))
+
+
 def own_triangles(F: ArrayLike) -> IntArray:
     """Triangles as from `triangle_rows`, contiguous and unchangeable, as kernels require."""
     return unchangeable(triangle_rows(F, copy=False))
@@ -370,6 +425,25 @@ def check_callback(callback: Any) -> None:
     """Raise a ValueError unless the callback is callable or None. Called before any work that reports to it."""
     if callback is not None and not callable(callback):
         raise ValueError(f"callback must be callable, or None, not {describe(callback)}")
+
+
+# Cells of the curve of `morton_order`: 2 to this power along the longest side of the points' bounding box.
+_CURVE_BITS = 10
+
+
+def morton_order(points: FloatArray) -> IntArray:
+    """Order of points (n, d) along Morton's curve, so that consecutive points are close to each other."""
+    if not len(points):
+        return np.empty(0, dtype=np.int64)
+    # Halve first, so that the extent of numbers near the largest double does not overflow.
+    offset = points / 2 - points.min(axis=0) / 2
+    size = float(offset.max())
+    cell = (offset / (size if size > 0 else 1.0) * ((1 << _CURVE_BITS) - 1)).astype(np.int64)
+    code = np.zeros(len(points), dtype=np.int64)
+    for bit in range(_CURVE_BITS):
+        for axis, along in enumerate(cell.T):
+            code |= (along >> bit & 1) << (len(cell.T) * bit + axis)
+    return np.argsort(code, kind="stable")
 
 
 def work(force: ComplexArray, displacement: ComplexArray) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -20,6 +20,12 @@ def count_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def read_limit(names: Iterable[str]) -> int:
+    """Smallest number of threads that one of some environment variables allows; very large if none does."""
+    given = (os.environ.get(name, "").strip() for name in names)
+    return min((int(text) for text in given if text.isdecimal()), default=sys.maxsize)
 
 
 def make_executor(jobs: int, name: str) -> Executor:

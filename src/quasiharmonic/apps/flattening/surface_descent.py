@@ -84,7 +84,7 @@ class GuardedEnergy:
         """Second derivatives on the surface's triangles, then on those of the contacts."""
         surface = self.surface.curvature_of(derivatives.surface, negative=negative)
         between = self.contacts.curvature(derivatives.w).scaled(np.full(self.contacts.reach.shape, self.stiffness))
-        fields = zip(vars(surface).values(), vars(between).values(), strict=True)
+        fields = zip(surface, between, strict=True)
         return QuadraticForm(*(np.concatenate(both) for both in fields))
 
     def steps_to_collapse(self, w: ComplexArray, direction: ComplexArray) -> FloatArray:

@@ -166,7 +166,7 @@ class Minimum:
         """Raise a ValueError where the energy or a derivative of it is NaN or infinite."""
         forces = self.forces
         value = self._energy.value_of(self._deformation)
-        parts = value, forces.by_p, forces.by_q, *vars(forces.form).values()
+        parts = value, forces.by_p, forces.by_q, *forces.form
         if all(np.isfinite(part).all() for part in parts):
             return
         self._energy.check_numbers(self._deformation)

@@ -15,10 +15,10 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.energies.newton.line_search import backtrack
-from quasiharmonic.energies.newton.map_model import Coordinates, NewtonObjective, in_units, newton_descent
+from quasiharmonic.energies.newton.map_model import Coordinates, NewtonObjective, in_units, newton_descent, out_of_units
 from quasiharmonic.energies.newton.newton_descent import SHIFTS
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, sum_at
 
 # Step as a fraction of the distance to the first collapse of a triangle.
 _FRACTION = 0.8
@@ -77,7 +77,7 @@ class MovingDescent:
 
         def trial(t: float, bound: float) -> tuple[float, Coordinates | None]:
             w = start.w + t * displacement
-            there = np.ldexp(w[coordinates.fixed].view(np.float64).reshape(-1, 2), coordinates.exponent)
+            there = out_of_units(w[coordinates.fixed], coordinates.exponent)
             moved = coordinates.with_pinned(target if t == 1 else there)
             return 0.0, moved if is_injective(model.energy.F, moved.positions(w)) else None
 
@@ -99,7 +99,4 @@ class MovingDescent:
         form = energy.curvature_of(self.newton.state.derivatives)
         p, q = form.apply((g.conj() * displacement[corners]).sum(axis=0), (g * displacement[corners]).sum(axis=0))
         pull, at = (g * p + g.conj() * q).ravel(), corners.ravel()
-        both = np.bincount(at, pull.real, minlength=displacement.size) + 1j * np.bincount(
-            at, pull.imag, minlength=displacement.size
-        )
-        return both[self._model.system.free]
+        return sum_at(at, pull, displacement.size)[self._model.system.free]

@@ -17,7 +17,7 @@ from quasiharmonic.energies.newton.line_search import Trial, backtrack, extend
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent, NewtonState
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, to_complex, to_points
 
 # Maximum step, as a fraction of the step at which the first triangle would collapse.
 FRACTION = 0.9
@@ -31,12 +31,12 @@ _EXTENSION = 1.5
 
 def in_units(uv: FloatArray, exponent: int) -> ComplexArray:
     """Return positions (n, 2) as complex numbers (n,) in units of ``2 ** exponent``."""
-    return np.ldexp(uv, -exponent).view(np.complex128).ravel()
+    return to_complex(np.ldexp(uv, -exponent))
 
 
-def _out_of_units(w: ComplexArray, exponent: int) -> FloatArray:
+def out_of_units(w: ComplexArray, exponent: int) -> FloatArray:
     """Return positions (n, 2) from complex numbers (n,) in units of ``2 ** exponent``."""
-    return np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
+    return np.ldexp(to_points(w), exponent)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class Coordinates:
     def of(cls, uv: FloatArray, fixed: IntArray, exponent: int) -> Coordinates:
         """Return the conversion for maps that start from positions (n, 2)."""
         w = in_units(uv, exponent)
-        inexact = np.flatnonzero((_out_of_units(w, exponent) != uv).any(axis=1))
+        inexact = np.flatnonzero((out_of_units(w, exponent) != uv).any(axis=1))
         return cls(fixed, uv[fixed], exponent, inexact, uv[inexact], w[inexact])
 
     def with_pinned(self, pinned: FloatArray) -> Coordinates:
@@ -77,7 +77,7 @@ class Coordinates:
 
     def positions(self, w: ComplexArray) -> FloatArray:
         """Convert a map (n,) to positions (n, 2)."""
-        uv = _out_of_units(w, self.exponent)
+        uv = out_of_units(w, self.exponent)
         unmoved = w[self.inexact] == self.inexact_w
         uv[self.inexact[unmoved]] = self.inexact_uv[unmoved]
         uv[self.fixed] = self.pinned

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
 from quasiharmonic.linsolve.pattern import stiffness_pattern
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, work
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, list_others, repeat_each, work
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat
 
@@ -49,11 +49,8 @@ class NewtonSystem:
     """
 
     def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
-        is_free = np.ones(n, dtype=bool)
-        is_free[fixed] = False
-        self.free = np.flatnonzero(is_free)
-        place = np.full(n, -1, dtype=np.int32)
-        place[self.free] = np.arange(self.free.size)
+        self.free = list_others(n, fixed)
+        place = invert_indices(n, self.free).astype(np.int32)
         self.take_gradients(g)
         self._pattern(F, place)
         self.solver = make_solver(self._indptr, self._indices, name=linear_solver)

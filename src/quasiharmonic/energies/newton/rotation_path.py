@@ -21,7 +21,7 @@ import numpy as np
 
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, sum_at
 
 
 def rates(F: IntArray, g: ComplexArray, w: ComplexArray, direction: ComplexArray) -> ComplexArray:
@@ -82,5 +82,4 @@ class RotationPath:
 
     def _gather(self, load: ComplexArray, n: int) -> ComplexArray:
         """Sum the loads (3, f) of triangle corners at every vertex (n,)."""
-        at, load = self._corners.ravel(), load.ravel()
-        return np.bincount(at, load.real, minlength=n) + 1j * np.bincount(at, load.imag, minlength=n)
+        return sum_at(self._corners.ravel(), load.ravel(), n)

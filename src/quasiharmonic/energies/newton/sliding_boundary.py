@@ -27,7 +27,7 @@ import numpy as np
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import QuadraticForm, damp
 from quasiharmonic.energies.newton.line_search import Trial, backtrack, extend
-from quasiharmonic.energies.newton.map_model import FRACTION, HALVINGS, Coordinates, in_units
+from quasiharmonic.energies.newton.map_model import FRACTION, HALVINGS, Coordinates, MapModel, in_units
 from quasiharmonic.energies.newton.newton_descent import NewtonState
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves, Track, sliding_curves
@@ -35,7 +35,7 @@ from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.geometry.exact.certificate import inverted_triangles, is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.problem import Domain, Problem
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, names_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, names_of
 
 # Weight of the barrier, as a share of the current energy.
 _WEIGHT = 1e-2
@@ -61,9 +61,7 @@ def move_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) 
 
 def move_onto(slide: bool | BoundaryCurves, problem: Problem) -> Problem:
     """Return the problem with its boundary's target moved onto the curves it slides along."""
-    positions = np.zeros((problem.n, 2))
-    positions[problem.fixed] = problem.target
-    loops = problem.domain.loops
+    positions, loops = problem.place_fixed(), problem.domain.loops
     track = sliding_curves(slide, loops, positions).lay(loops, positions)
     return problem.with_target(track.uv[problem.fixed])
 
@@ -112,8 +110,7 @@ class SlidingSystem(NewtonSystem):
         size = self.free.size
         self.sliding = sliding
         self.at: IntArray = np.searchsorted(self.free, sliding)
-        slider = np.full(size, -1)
-        slider[self.at] = np.arange(sliding.size)
+        slider = invert_indices(size, self.at)
         row = np.searchsorted(self._indptr, self._side_slots[0], side="right") - 1
         ends = slider[row // 2], slider[self._indices[self._side_slots[0]] // 2]
         # Blocks with a row or a column of a sliding vertex, and the numbers of these vertices.
@@ -155,7 +152,7 @@ class SlidingSystem(NewtonSystem):
         self._diagonal = values[self._first]
 
 
-class SlidingModel:
+class SlidingModel(MapModel):
     """The model of a Newton descent whose boundary vertices slide on curves; see `NewtonModel`.
 
     Parameters
@@ -178,7 +175,8 @@ class SlidingModel:
         The barrier and its factor, in the energy's units.
     """
 
-    slack = 1.0
+    energy: DeformationEnergy
+    system: SlidingSystem
 
     def __init__(
         self,
@@ -190,16 +188,16 @@ class SlidingModel:
         linear_solver: str,
         system: SlidingSystem | None = None,
     ) -> None:
-        self.energy, self._track, self._loops = energy, track, list(loops)
+        self._track, self._loops = track, list(loops)
         self.deviation_barrier = DeviationBarrier(track, self._loops)
-        self.coordinates = Coordinates.of(track.uv, np.setdiff1d(fixed, track.vertices), exponent)
+        coordinates = Coordinates.of(track.uv, np.setdiff1d(fixed, track.vertices), exponent)
         if system is not None and np.array_equal(system.sliding, track.vertices):
             system.take_gradients(energy.g)
-            self.system = system
         else:
-            self.system = SlidingSystem(
-                energy.F, energy.g, len(track.uv), self.coordinates.fixed, linear_solver, sliding=track.vertices
+            system = SlidingSystem(
+                energy.F, energy.g, len(track.uv), coordinates.fixed, linear_solver, sliding=track.vertices
             )
+        super().__init__(energy, coordinates, system)
         both = (self.deviation_barrier.pairs >= 0).all(axis=1)
         self._both = np.flatnonzero(both)
         self.system.couple(self.deviation_barrier.pairs[both])
@@ -214,10 +212,6 @@ class SlidingModel:
         derivatives = self.energy.deform(w)
         energy = self.energy.value_of(derivatives)
         return self.prepare(NewtonState(w, derivatives, energy, _Boundary(self._track.s, energy)))
-
-    def positions(self, w: ComplexArray) -> FloatArray:
-        """Convert a map to positions (n, 2); see `Coordinates`."""
-        return self.coordinates.positions(w)
 
     def mean_energy(self, state: NewtonState) -> float:
         """The energy at a state, without the barrier."""
@@ -262,26 +256,23 @@ class SlidingModel:
         by_ends, by_both = self.deviation_barrier.derivatives(s)
         unit = self.weight * 2.0**self.coordinates.exponent
         barrier_gradient = np.zeros(s.size)
-        for end in (0, 1):
-            number = self.deviation_barrier.pairs[:, end]
-            np.add.at(barrier_gradient, number[number >= 0], unit * by_ends[number >= 0, end])
+        self._add_at_ends(barrier_gradient, unit * by_ends)
         return barrier_gradient, unit * 2.0**self.coordinates.exponent * by_both
+
+    def _add_at_ends(self, total: FloatArray, values: FloatArray) -> None:
+        """Add values (e, 2) at the ends of the barrier's edges to the total (k,) of each sliding vertex."""
+        for number, value in zip(self.deviation_barrier.pairs.T, values.T, strict=True):
+            np.add.at(total, number[number >= 0], value[number >= 0])
 
     def assemble(self, state: NewtonState, negative: float) -> None:
         """See `NewtonModel`."""
         system, frame = self.system, self._frame
         assert frame is not None
         system.curve_stiffness = damp(frame.forces, negative)
-        for end in (0, 1):
-            number = self.deviation_barrier.pairs[:, end]
-            np.add.at(system.curve_stiffness, number[number >= 0], frame.barrier_hessian[number >= 0, end, end])
+        self._add_at_ends(system.curve_stiffness, frame.barrier_hessian.diagonal(axis1=1, axis2=2))
         both_move = (system.tangent[self.deviation_barrier.pairs[self._both]] != 0).all(axis=1)
         system.coupling = np.where(both_move, frame.barrier_hessian[self._both, 0, 1], 0)
         system.assemble(self.energy.curvature_of(state.derivatives, negative=negative))
-
-    def solve(self, load: ComplexArray) -> ComplexArray:
-        """See `NewtonModel`."""
-        return self.system.solve(load)
 
     def restrict(
         self, state: NewtonState, gradient: ComplexArray, direction: ComplexArray, expected_decrease: float
@@ -300,8 +291,7 @@ class SlidingModel:
     ) -> tuple[NewtonState, bool] | None:
         """See `NewtonModel`; maps of a step are projected to the curves."""
         at, vertices = self.system.at, self._track.vertices
-        full = np.zeros_like(state.w)
-        full[self.system.free] = direction
+        full = self.displacement(direction, state.w.size)
         full[vertices] = self.system.tangent * direction[at].real
         along = np.ldexp(direction[at].real, self.coordinates.exponent)
         limit = FRACTION * float(self.energy.steps_to_collapse(state.w, full).min())
@@ -349,10 +339,6 @@ class SlidingModel:
         if not is_injective(self.energy.F, uv) or (self._simple and check_loops(self._loops, uv)[1]):
             return value, None
         return value, NewtonState(w, derivatives, value, _Boundary(there, energy))
-
-    def check_numbers(self, state: NewtonState) -> None:
-        """See `NewtonModel`."""
-        self.energy.check_numbers(state.derivatives)
 
 
 def _along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:

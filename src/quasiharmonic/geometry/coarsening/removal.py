@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import edge_keys
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, repeat_each
 from quasiharmonic.util.kernels import compiled
 
 #: Maximum number of neighbours of a vertex to remove.
@@ -188,6 +188,5 @@ def _adds_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[Boo
     lost[np.delete(repeated, first)] = True
     size = [rings.shape[1] for rings in candidates]
     claimed = repeat_each([len(rings) - 3 for rings in candidates], size)
-    good = np.ones(claimed.size, dtype=bool)
-    good[repeat_each(np.arange(claimed.size), claimed)[lost]] = False
+    good = ~mark(claimed.size, repeat_each(np.arange(claimed.size), claimed)[lost])
     return np.split(good, np.cumsum(size)[:-1])

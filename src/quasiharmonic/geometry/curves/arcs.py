@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.predicates import two_product, two_sum
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, check_finite, real_array
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, check_finite, real_array, to_complex
 
 # Longest arc in radians, so that a few nodes integrate its length to rounding.
 _MAX_ARC = np.pi / 4
@@ -97,7 +97,7 @@ def split_piece(i: int, piece: ArrayLike | Arc) -> list[Piece]:
 def _pad(control: FloatArray) -> ComplexArray:
     """Control points, or centre and axes (k, 2), in the format of `Piece`."""
     four = np.zeros(4, dtype=np.complex128)
-    four[: len(control)] = as_complex(control)
+    four[: len(control)] = to_complex(control)
     return four
 
 
@@ -106,7 +106,7 @@ def _cusps(control: FloatArray) -> list[float]:
 
     There both coordinates of the derivative vanish, so the complex polynomial has a real root.
     """
-    points = as_complex(control - control[0])
+    points = to_complex(control - control[0])
     if len(points) < 3:
         return []
     if len(points) == 3:
@@ -159,11 +159,6 @@ def subcurve(control: FloatArray, t: float, u: float) -> FloatArray:
             points = (1 - share) * points[:-1] + share * points[1:]
         found.append(points[0])
     return np.array(found)
-
-
-def as_complex(points: ArrayLike) -> ComplexArray:
-    """Convert points (k, 2) to complex numbers (k,)."""
-    return np.ascontiguousarray(points, dtype=np.float64).view(np.complex128).ravel()
 
 
 def angle_at(angles: FloatArray, t: FloatArray) -> FloatArray:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.curves.arcs import as_complex
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.util.arrays import (
     BoolArray,
@@ -19,8 +18,10 @@ from quasiharmonic.util.arrays import (
     check_range,
     describe,
     index_array,
+    invert_indices,
     loop_arrays,
     names_of,
+    to_complex,
 )
 
 # Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
@@ -177,7 +178,7 @@ class BoundaryCurves:
         marks = one.corners(self.corner_angle)
         found = []
         for mark, corner in zip(marks, one.position(marks), strict=True):
-            distances = np.abs(as_complex(positions - corner))
+            distances = np.abs(to_complex(positions - corner))
             found.append((float(distances.min()), int(np.argmin(distances)), float(mark)))
         taken: dict[int, float] = {}
         for distance, member, mark in sorted(found):
@@ -329,8 +330,7 @@ def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> Non
             f"boundary vertices {i} and {j} have the same position on curve {k}: separate them, or "
             f"keep their order along the curve"
         )
-    rank = np.full(n, -1)
-    rank[chain.vertices] = np.arange(count)
+    rank = invert_indices(n, chain.vertices)
     for loop in loops:
         here, there = rank[loop], rank[np.roll(loop, -1)]
         apart = np.abs(here - there)

@@ -17,7 +17,6 @@ from quasiharmonic.geometry.curves.arcs import (
     ZERO_DERIVATIVE,
     Arc,
     angle_at,
-    as_complex,
     count_chords,
     gauss_rule,
     make_lines,
@@ -26,7 +25,15 @@ from quasiharmonic.geometry.curves.arcs import (
     split_piece,
     subcurve,
 )
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, enumerate_each
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    enumerate_each,
+    to_complex,
+    to_points,
+)
 
 # Squares, and products of four numbers, of coordinates below this do not overflow
 _MAX_SIZE = 1e75
@@ -143,7 +150,7 @@ class Curve:
             t, u = begin if k == first else 0.0, stop if k == last else 1.0
             if t == u:
                 continue
-            points = self._control[k % m].view(np.float64).reshape(-1, 2)
+            points = to_points(self._control[k % m])
             if self._degree[k % m]:
                 found.append(subcurve(points[: self._degree[k % m] + 1], t, u))
                 continue
@@ -243,7 +250,7 @@ class Curve:
         Exact up to rounding for points on a curve that does not meet itself. For other points the chords select the
         candidate.
         """
-        z = as_complex(points)
+        z = to_complex(points)
         chord, share = self._nearest_chord(z)
         here, at = self._chord_piece[chord], self._chord_first[chord] + share * self._chord_width[chord]
         best = np.full(z.size, np.inf)

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.loops import Obstacle, Reason, check_loops, join_items, simple_loops
 from quasiharmonic.geometry.exact.triangles import find_multiply_wound, triangle_signs
-from quasiharmonic.geometry.mesh.topology import edges, trace_loops
+from quasiharmonic.geometry.mesh.topology import are_collapsed, edges, trace_loops
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -259,7 +259,7 @@ def _find_loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
     parts, repeated = edges(F, n), np.empty(0, dtype=np.int64)
     # An edge from a vertex to itself is never interior, so only the other kinds of edges need a test.
     if any((some[:, 0] == some[:, 1]).any() for some in (parts.boundary, parts.inconsistent, parts.nonmanifold)):
-        repeated = np.flatnonzero((F[:, (1, 2, 0)] == F).any(axis=1))
+        repeated = np.flatnonzero(are_collapsed(F))
     wrong = (
         (repeated.tolist(), "triangles repeat a vertex"),
         (_edge_names(parts.nonmanifold), "edges are in three or more triangles"),

@@ -25,8 +25,8 @@ import numpy as np
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.exact.sweep import triangulate
 from quasiharmonic.geometry.exact.triangles import triangle_signs
-from quasiharmonic.geometry.mesh.topology import edge_keys, edges
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges, label_components, pair_keys
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, to_integers
 
 # Bound with a margin on the rounding of an orientation, relative to the sum of the magnitudes of its terms.
 _ORIENTATION_BOUND = 4e-16
@@ -72,7 +72,7 @@ def constrained_delaunay(points: FloatArray, segments: IntArray, hull: IntArray)
         triangulation = Triangulation.of_points(points, hull)
         F = triangulation.triangles()
     n = len(points)
-    required = edge_keys(segments[:, 0], segments[:, 1], n)
+    required = pair_keys(segments, n)
     tails, heads = F.ravel(), np.roll(F, -1, axis=1).ravel()
     missing = segments[~np.isin(required, edge_keys(tails, heads, n))]
     if not len(missing):
@@ -89,7 +89,8 @@ def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
 
     The algorithm runs in plain Python and suits polygons of up to a few hundred corners.
     """
-    corners = _scale_to_integers(points)
+    integers = to_integers(points)
+    corners = list(zip(integers[::2], integers[1::2], strict=True))
     if sum(corners[k - 1][0] * y - x * corners[k - 1][1] for k, (x, y) in enumerate(corners)) < 0:
         return None
     triangulation = Triangulation(points, np.array(triangulate(corners), dtype=np.int64))
@@ -99,12 +100,19 @@ def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
     return triangulation.triangles()
 
 
-def _scale_to_integers(points: FloatArray) -> list[tuple[int, int]]:
-    """Scale points by a power of two to integers, exactly."""
-    ratios = [value.as_integer_ratio() for value in points.ravel().tolist()]
-    finest = max(denominator for _, denominator in ratios)
-    integers = [numerator * (finest // denominator) for numerator, denominator in ratios]
-    return list(zip(integers[::2], integers[1::2], strict=True))
+def select_inside(F: IntArray, rim: IntArray, n: int) -> BoolArray:
+    """Select the triangles (t, 3) to the left of directed edges that form loops, and those joined to them inside.
+
+    ``rim`` (m, 2) has the edges as pairs of ``n`` points. Triangles are joined across all other edges.
+    """
+    tails, heads, owner = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.arange(F.size) // 3
+    keys = edge_keys(tails, heads, n)
+    open_ = np.flatnonzero(~np.isin(keys, pair_keys(rim, n)))
+    order = open_[np.argsort(keys[open_], kind="stable")]
+    pair = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    part = label_components(owner[order[pair]], owner[order[pair + 1]], len(F))
+    forward = np.isin(tails * n + heads, rim[:, 0] * n + rim[:, 1])
+    return mark(len(F), part[owner[forward]])[part]
 
 
 def delaunay_by_qhull(points: FloatArray) -> IntArray:
@@ -131,7 +139,7 @@ def _covers(F: IntArray, points: FloatArray, hull: IntArray) -> bool:
     if found.nonmanifold.size or found.inconsistent.size or len(found.boundary) != len(hull):
         return False
     around = edge_keys(hull, np.roll(hull, -1), len(points))
-    there = edge_keys(found.boundary[:, 0], found.boundary[:, 1], len(points))
+    there = pair_keys(found.boundary, len(points))
     return bool(np.array_equal(np.sort(around), np.sort(there)))
 
 

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.geometry.mesh.elements import corner_triangles, element_rows
 from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
-from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
+from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, to_integers
 
 # Relative to the product of the extents. Differences, products and at most 36 terms each lose one unit, 2⁻⁵³.
 _RELATIVE_BOUND = 64 * 2.0**-53 * float(np.abs(FORMS).sum(axis=(1, 2)).max())
@@ -82,9 +82,7 @@ def _find_inverted_curved(nodes: FloatArray) -> IntArray:
 
 def _is_positive_everywhere(nodes: FloatArray) -> bool:
     """Whether the Jacobian determinant of one element (6, 2) is positive everywhere, in integer arithmetic."""
-    ratios = [value.as_integer_ratio() for value in nodes.ravel().tolist()]
-    unit = max(denominator for _, denominator in ratios)  # all are powers of two
-    integers = [numerator * (unit // denominator) for numerator, denominator in ratios]
+    integers = to_integers(nodes)
     x, y = integers[::2], integers[1::2]
     a, b, c, ab, bc, ca = (
         sum(s * p * q for row, p in zip(form, x, strict=True) for s, q in zip(row, y, strict=True))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_ea
 from quasiharmonic.util.kernels import compiled
 
 SignArray = NDArray[np.int8]
+Row = TypeVar("Row", bound=np.generic)
 
 # Maximum number of pairs of boundary edges to list. A collapsed boundary has billions.
 _MAX_CROSSINGS = 1000
@@ -169,7 +171,7 @@ def _may_meet(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> Boo
 def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
     """Tell which of many loops are simple, (k,) bool; contacts between different loops do not matter."""
     simple = np.ones(len(loops), dtype=bool)
-    vertices, starts, following = _concatenate_loops(loops)
+    vertices, starts, following = concatenate_loops(loops)
     p = uv.take(vertices, 0)
     for i, j in _find_doubtful(p, np.arange(len(p)), following, starts):
         q = p[following]
@@ -264,13 +266,13 @@ class _Curves:
 
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:
-        tail, start, following = _concatenate_loops(loops)
+        tail, start, following = concatenate_loops(loops)
         head, owner = tail[following], repeat_each(np.arange(len(loops)), np.diff(start))
         return cls(start, owner, np.stack([tail, head], 1), uv[tail], uv[head], following)
 
 
-def _concatenate_loops(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the concatenated loops (k,), their offsets (l + 1,), and the index of each vertex's successor (k,)."""
+def concatenate_loops(loops: Sequence[NDArray[Row]]) -> tuple[NDArray[Row], IntArray, IntArray]:
+    """Return concatenated loops (k,) or (k, 2), their offsets (l + 1,), and the index of each row's successor (k,)."""
     starts = np.cumsum([0, *map(len, loops)])
     following = np.arange(1, starts[-1] + 1)
     following[starts[1:] - 1] = starts[:-1]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, enumerate_each, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, enumerate_each, invert_indices, mark, repeat_each
 from quasiharmonic.util.kernels import compiled
 
 # Finest cells have integer coordinates below 2 to this power. A cell ``s`` halvings coarser has these coordinates
@@ -61,8 +61,7 @@ class _Level:
 
     def without(self, cells: IntArray) -> _Level:
         """Return the level with empty lists for the given cells."""
-        kept = np.ones(self.length.size, dtype=np.bool_)
-        kept[cells] = False
+        kept = ~mark(self.length.size, cells)
         triangle = self.triangle[repeat_each(kept, self.length)]
         return _Level(self.coordinates, np.where(kept, self.length, 0), triangle, self.crowded)
 
@@ -130,8 +129,7 @@ class NestedGrid:
     def _refine(self, level: _Level, shift: int, capacity: int) -> tuple[IntArray, _Level]:
         """Choose the cells of a level to divide; return them with their parts, of at most ``capacity`` entries."""
         split = np.flatnonzero((level.length > _LONG_LIST) & ~level.crowded)
-        number = np.full(level.length.size, -1, dtype=np.int64)
-        number[split] = np.arange(split.size)
+        number = invert_indices(level.length.size, split)
         parent = repeat_each(number, level.length)
         concerned = np.flatnonzero(parent >= 0)
         finer = self._divide(level.triangle[concerned], parent[concerned], 4 * level.coordinates[split], 4, 4, shift)

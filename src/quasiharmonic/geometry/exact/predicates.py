@@ -31,7 +31,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, repeat_each, to_integers
 
 SignArray = NDArray[np.int8]
 
@@ -220,9 +220,7 @@ def _split(a: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _decide_in_integers(x: FloatArray) -> int:
     """Orientation of one triple (6,) in integer arithmetic."""
-    ratios = [value.as_integer_ratio() for value in x.tolist()]
-    unit = max(denominator for _, denominator in ratios)  # all are powers of two
-    ax, ay, bx, by, cx, cy = (numerator * (unit // denominator) for numerator, denominator in ratios)
+    ax, ay, bx, by, cx, cy = to_integers(x)
     det: int = (ax - cx) * (by - cy) - (ay - cy) * (bx - cx)
     return (det > 0) - (det < 0)
 
@@ -327,8 +325,7 @@ def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterat
     depth = int(max(sizes.max(initial=1) - 1, 0)).bit_length()
     # Each group has its own tree. All trees have the same depth.
     leaf = np.arange(len(lo)) + repeat_each((np.arange(groups) << depth) - starts[:-1], sizes)
-    number = np.full(groups << depth, -1)
-    number[leaf] = np.arange(len(lo))
+    number = invert_indices(groups << depth, leaf)
     leaves = np.full((2, groups << depth, 2), np.array([np.inf, -np.inf])[:, None, None])
     leaves[0, leaf], leaves[1, leaf] = lo, hi
     tree = _box_tree(leaves[0], leaves[1], depth)

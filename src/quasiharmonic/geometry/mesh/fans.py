@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
-from quasiharmonic.util.arrays import BoolArray, IntArray, check_range, edge_names
+from quasiharmonic.geometry.mesh.topology import edge_keys, label_components, pair_keys
+from quasiharmonic.util.arrays import BoolArray, IntArray, check_range, edge_names, mark
 
 
 def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
@@ -107,12 +107,11 @@ def open_along(F: IntArray, cut: IntArray, n: int) -> Corners:
     """
     check_range("edges", cut, n)
     # Few sides have both ends on a cut, and only these are searched.
-    marked = np.zeros(n, dtype=bool)
-    marked[cut] = True
+    marked = mark(n, cut)
     at_corner = marked[F]
     open_side = at_corner & at_corner[:, (1, 2, 0)]
     sides = edge_keys(F[open_side], F[:, (1, 2, 0)][open_side], n)
-    wanted = edge_keys(cut[:, 0], cut[:, 1], n)
+    wanted = pair_keys(cut, n)
     unknown = ~np.isin(wanted, sides)
     if unknown.any():
         raise ValueError(f"{edge_names(cut[unknown])}: not an edge of the mesh")

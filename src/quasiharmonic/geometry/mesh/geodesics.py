@@ -30,7 +30,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, as_offsets, names_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, as_offsets, invert_indices
 from quasiharmonic.util.progress import heartbeat
 
 # Number of sources in one Dijkstra run, on the subgraph around them.
@@ -65,10 +65,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
         If triangles have no area after ``lowest`` is applied.
     """
     shapes = rest_shapes(V, F, lowest=lowest)
-    if shapes.flat.size:
-        raise ValueError(
-            f"{names_of('triangle', 'triangles', shapes.flat)} of zero area in the rest mesh: repair the mesh first"
-        )
+    shapes.check_areas("repair the mesh first")
     n, f = len(V), len(F)
     # Half-edges, corner by corner; the next half-edge of a triangle is f further.
     side = shapes.sides.ravel()
@@ -151,8 +148,7 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
         for _, part in _split_sources(left):
             inside, graph, own = _subgraph_around(segments, sources[part], limit)
             distance = dijkstra(graph, indices=own, limit=limit)
-            index = np.full(segments.shape[0], -1)
-            index[inside] = np.arange(inside.size)
+            index = invert_indices(segments.shape[0], inside)
             for k, source in enumerate(part.tolist()):
                 pairs = slice(first[source], first[source + 1])
                 at = index[target[pairs]]

@@ -11,7 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, names_of, repeat_each
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    names_of,
+    repeat_each,
+    scale_to_unit,
+)
 
 # Ears whose scores differ by less count as equal, and the first one is cut, so that rounding does not decide.
 _SCORE_TOLERANCE = 1e-9
@@ -103,8 +111,7 @@ def triangulate_polygons(V: FloatArray, vertices: IntArray, starts: IntArray) ->
     """
     sizes = np.diff(starts)
     _check_rings(vertices, sizes)
-    # Scale to about unit size, so that no square overflows or underflows.
-    V = np.ldexp(V, -int(np.frexp(np.abs(V).max(initial=0.0))[1]))
+    V = scale_to_unit(V)
     T = np.empty((len(vertices) - 2 * len(sizes), 3), dtype=np.int64)
     first = starts[:-1] - 2 * np.arange(len(sizes))
     for size in np.unique(sizes).tolist():

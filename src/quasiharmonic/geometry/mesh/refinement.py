@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.geometry.mesh.topology import edges as sort_edges
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -19,6 +20,9 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
     vertex_array,
 )
+
+#: Weights of old vertices in a new vertex.
+Shares = dict[int, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,11 @@ class Refined:
     parents: IntArray
     weights: FloatArray
 
+    def shares(self) -> list[Shares]:
+        """The weights of old vertices in every new vertex."""
+        rows = zip(self.parents.tolist(), self.weights.tolist(), strict=True)
+        return [{old: share for old, share in zip(*row, strict=True) if share} for row in rows]
+
     def extend(self, values: ArrayLike) -> FloatArray:
         """Interpolate values (n, …) at the old vertices to all vertices, linearly on the old triangles."""
         old = np.asarray(values, dtype=np.float64)
@@ -62,24 +71,28 @@ def compose(first: Refined, second: Refined) -> Refined:
     """Compose two successive refinements into one, with three parents for each vertex."""
     n = len(first.V) - len(first.parents)
 
-    def shares(vertex: int) -> dict[int, float]:
-        if vertex < n:
-            return {vertex: 1.0}
-        row = zip(first.parents[vertex - n].tolist(), first.weights[vertex - n].tolist(), strict=True)
-        return {parent: weight for parent, weight in row if weight}
+    shares = first.shares()
+    later = [combine_shares(row, shares, n) for row in second.shares()]
+    return Refined(second.V, second.F, first.parent[second.parent], *parents_and_weights([*shares, *later]))
 
-    combined = [shares(n + k) for k in range(len(first.parents))]
-    for row, weights in zip(second.parents.tolist(), second.weights.tolist(), strict=True):
-        total: dict[int, float] = {}
-        for vertex, weight in zip(row, weights, strict=True):
-            for parent, share in shares(vertex).items():
-                total[parent] = total.get(parent, 0.0) + weight * share
-        combined.append(total)
-    # Every new vertex lies in one old triangle, so it has at most three parents.
-    parents = np.array([(*sorted(row), max(row), max(row))[:3] for row in combined], dtype=np.int64).reshape(-1, 3)
-    shared = [[*(row[parent] for parent in sorted(row)), 0.0, 0.0][:3] for row in combined]
-    weights_ = np.array(shared, dtype=np.float64).reshape(-1, 3)
-    return Refined(second.V, second.F, first.parent[second.parent], parents, weights_)
+
+def combine_shares(row: Shares, shares: Sequence[Shares], n: int) -> Shares:
+    """Express a vertex between vertices of a refinement by old vertices; ``n`` is their number.
+
+    ``row`` has the weights of those vertices. ``shares`` has the weights of old vertices for each added one.
+    """
+    total: Shares = {}
+    for vertex, weight in row.items():
+        for old, share in ({vertex: 1.0} if vertex < n else shares[vertex - n]).items():
+            total[old] = total.get(old, 0.0) + weight * share
+    return total
+
+
+def parents_and_weights(shares: Sequence[Shares]) -> tuple[IntArray, FloatArray]:
+    """Arrays (s, 3) as in `Refined` of the old vertices and weights; a vertex in an old triangle has at most three."""
+    parents = np.array([(*sorted(row), max(row), max(row))[:3] for row in shares], dtype=np.int64).reshape(-1, 3)
+    weights = [[*(row[old] for old in sorted(row)), 0.0, 0.0][:3] for row in shares]
+    return parents, np.array(weights, dtype=np.float64).reshape(-1, 3)
 
 
 def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
@@ -90,13 +103,13 @@ def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool 
     wanted = np.unique(np.sort(_pairs(edges), axis=1), axis=0)
     found = sort_edges(F, n)
     allowed = [found.interior, np.sort(found.boundary, axis=1)]
-    _check_known(wanted, _keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
+    _check_known(wanted, pair_keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
     check_bool("boundary", boundary)
     if not boundary:
-        _check_known(wanted, _keys(found.interior, n), n, "on the boundary; pass boundary=True to split it")
+        _check_known(wanted, pair_keys(found.interior, n), n, "on the boundary; pass boundary=True to split it")
 
     V = np.concatenate([V, V[wanted[:, 0]] / 2 + V[wanted[:, 1]] / 2])
-    keys = _keys(wanted, n)
+    keys = pair_keys(wanted, n)
     # Midpoint of the side opposite to each corner, or -1.
     sides = edge_keys(F[:, (1, 2, 0)].ravel(), F[:, (2, 0, 1)].ravel(), n)
     at = np.minimum(np.searchsorted(keys, sides), max(len(keys) - 1, 0))
@@ -159,10 +172,6 @@ def _pairs(edges: ArrayLike) -> IntArray:
 
 def _check_known(wanted: IntArray, known: IntArray, n: int, reason: str) -> None:
     inside = ((wanted >= 0) & (wanted < n)).all(axis=1)
-    bad = wanted[~(inside & np.isin(_keys(wanted, n), known))]
+    bad = wanted[~(inside & np.isin(pair_keys(wanted, n), known))]
     if len(bad):
         raise ValueError(f"cannot split {edge_names(bad)}: {reason}")
-
-
-def _keys(pairs: IntArray, n: int) -> IntArray:
-    return edge_keys(pairs[:, 0], pairs[:, 1], n)

@@ -130,6 +130,17 @@ def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> I
     return keys
 
 
+def pair_keys(pairs: IntArray, n: int) -> IntArray:
+    """The `edge_keys` of edges (k, 2) given by their ends; (k,) int64."""
+    return edge_keys(pairs[:, 0], pairs[:, 1], n)
+
+
+def are_collapsed(F: IntArray) -> BoolArray:
+    """Whether each triangle (f, 3) uses a vertex twice; (f,) bool."""
+    collapsed: BoolArray = (F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0])
+    return collapsed
+
+
 def find_twins(F: IntArray) -> IntArray:
     """Return for each triangle (f, 3) the first one with the same three vertices, in any order."""
     twin = np.arange(len(F))

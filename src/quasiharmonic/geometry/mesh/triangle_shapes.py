@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.reference import rest_frames
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, vertex_array
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, find_exponent, names_of, pad_to_space, vertex_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +40,12 @@ class RestShapes:
         """Ascending indices of the triangles whose area is zero in floating point."""
         return np.flatnonzero(~(self.m > 0))
 
+    def check_areas(self, reason: str) -> None:
+        """Raise a ValueError with the triangles of zero area and the reason why areas are needed, if there are any."""
+        flat = self.flat
+        if flat.size:
+            raise ValueError(f"{names_of('triangle', 'triangles', flat)} of zero area in the rest mesh: {reason}")
+
     def half_gradients(self) -> ComplexArray:
         """Half the gradients ``γᵢ/2`` of the hat functions (3, f) in inverse units; NaN for triangles without area.
 
@@ -55,10 +61,8 @@ def rest_shapes(V: ArrayLike, F: NDArray[np.integer], *, lowest: float = 0.0) ->
     ``lowest`` is the minimum height as a fraction of the longest side; lower triangles are raised to this height.
     """
     positions = vertex_array(V, finite=False)
-    exponent = int(np.frexp(np.abs(positions).max(initial=0))[1]) - 1
-    surface = np.zeros((len(positions), 3))
-    surface[:, : positions.shape[1]] = np.ldexp(positions, -exponent)
-    z1, z2 = rest_frames(surface, F)
+    exponent = find_exponent(positions) - 1
+    z1, z2 = rest_frames(pad_to_space(np.ldexp(positions, -exponent)), F)
     if lowest:
         longest = np.maximum(np.maximum(z1, np.abs(z2)), np.abs(z2 - z1))
         z1 = np.where(z1 > 0, z1, longest)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, box_pairs_between, segment_relation
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, morton_order
 from quasiharmonic.util.progress import heartbeat
 
 # Number of segments per batch.
@@ -25,8 +25,8 @@ def clear(
     if not len(p):
         return result
     # Sort along a space-filling curve, so that few boxes overlap.
-    order = _curve(p / 2 + q / 2)
-    walls = walls[_curve(positions[walls[:, 0]] / 2 + positions[walls[:, 1]] / 2)]
+    order = morton_order(p / 2 + q / 2)
+    walls = walls[morton_order(positions[walls[:, 0]] / 2 + positions[walls[:, 1]] / 2)]
     r, s = positions[walls.T]
     tail, head = walls.T
     low, high = np.minimum(r, s), np.maximum(r, s)
@@ -47,16 +47,3 @@ def clear(
             blocked[i[relation != SegmentRelation.DISJOINT]] = True
         result[part] = ~blocked
     return result
-
-
-def _curve(points: FloatArray) -> IntArray:
-    """Return the order of points along a space-filling curve (Morton 1966); (k,) int64."""
-    if not len(points):
-        return np.empty(0, dtype=np.int64)
-    low, high = points.min(axis=0) / 2, points.max(axis=0) / 2
-    size = np.max(high - low)
-    cell = ((points / 2 - low) / (size if size > 0 else 1) * 0xFFFF).astype(np.int64)
-    # Move each bit k to bit 2k.
-    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
-        cell = (cell | cell << shift) & mask
-    return np.argsort(cell[:, 0] | cell[:, 1] << 1, kind="stable")

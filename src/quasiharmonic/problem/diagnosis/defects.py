@@ -12,7 +12,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.loops import winding
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import label_components, pair_keys
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.curves import TargetCurves
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
@@ -34,14 +34,14 @@ def inverted_fixed_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obs
     triangles = np.flatnonzero(fixture.fixed[problem.F].all(axis=1))
     corners = problem.F[triangles]
     sign = orientation(*(fixture.positions[corners[:, k]] for k in range(3)))
-    boundary = edge_keys(problem.domain.edges.boundary[:, 0], problem.domain.edges.boundary[:, 1], problem.n)
+    boundary = pair_keys(problem.domain.edges.boundary, problem.n)
     for t, abc, s in zip(triangles[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
         sides = np.stack([abc, np.roll(abc, -1)], axis=1)
         message = (
             f"All vertices of {names_of('triangle', 'triangles', t[None])} are fixed, "
             f"and the target {'inverts' if s < 0 else 'flattens'} it."
         )
-        split = sides[~np.isin(edge_keys(sides[:, 0], sides[:, 1], problem.n), boundary)]
+        split = sides[~np.isin(pair_keys(sides, problem.n), boundary)]
         yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
 
 
@@ -52,15 +52,10 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
     """
     if not len(fixture.chords):
         return
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
 
     # Triangles that share a free vertex belong to one patch, and so do those at two joined free vertices.
-    free = ~fixture.fixed
-    interior = problem.domain.edges.interior
-    inner = interior[free[interior].all(axis=1)]
-    graph = csr_array((np.ones(len(inner), dtype=np.int8), inner.T), shape=(problem.n, problem.n))
-    label = connected_components(graph, directed=False)[1]
+    free, inner = ~fixture.fixed, fixture.inner
+    label = label_components(inner[:, 0], inner[:, 1], problem.n)
     open_triangles = np.flatnonzero(free[problem.F].any(axis=1))
     corners = problem.F[open_triangles]
     patch = label[corners[np.arange(len(corners)), np.argmax(free[corners], axis=1)]]
@@ -74,11 +69,11 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
     twice_area: dict[int, int] = {}
     for k, (px, py), (qx, qy) in zip(of.tolist(), fixture.points(edge[:, 0]), fixture.points(edge[:, 1]), strict=True):
         twice_area[k] = twice_area.get(k, 0) + px * qy - py * qx
-    boundary = edge_keys(problem.domain.edges.boundary[:, 0], problem.domain.edges.boundary[:, 1], problem.n)
+    boundary = pair_keys(problem.domain.edges.boundary, problem.n)
     for k in sorted(k for k, area in twice_area.items() if area <= 0):
         around = edge[of == k]
         message = f"The fixed {edge_names(around)} around a part of the mesh leave it no positive area."
-        split = around[~np.isin(edge_keys(around[:, 0], around[:, 1], problem.n), boundary)]
+        split = around[~np.isin(pair_keys(around, problem.n), boundary)]
         yield Obstruction(
             Kind.INVERTED_PATCH,
             Forbids.INJECTIVE,

@@ -99,7 +99,7 @@ def diagnose(V: Any, *arguments: Any, **options: Any) -> Diagnosis:
     problem = V if isinstance(V, Problem) else Problem(V, *arguments, **options)
     fixture = Fixture.of(problem)
     curves = TargetCurves(fixture.positions, problem.domain.loops)
-    euler = problem.n - len(problem.domain.edges.interior) - len(problem.domain.edges.boundary) + len(problem.F)
+    euler = problem.domain.euler
     area = _twice_area(fixture, curves)
     if area < 0 and _fits_mirrored(curves, euler):
         message = "The target has the opposite orientation to the mesh: every loop runs the wrong way around."
@@ -189,7 +189,7 @@ def _loop_obstructions(problem: Problem, curves: TargetCurves, euler: int, area:
     every = np.arange(len(problem.domain.loops))
     turning, ranges = curves.turning, curves.winding_range
     proper = _proper(curves)
-    genus = (2 - len(problem.domain.loops) - euler) // 2
+    genus = problem.domain.handles
 
     if area <= 0:
         message = "The target encloses no positive area."

@@ -8,7 +8,7 @@ import numpy as np
 
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import Convex, Lattice, line
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices
 from quasiharmonic.util.progress import heartbeat
 
 
@@ -24,6 +24,10 @@ class Fixture:
         Whether a vertex is fixed.
     chords : (c, 2) int64
         Interior edges with both ends fixed.
+    joined : (j, 2) int64
+        Interior edges with one end fixed; columns: free vertex, fixed vertex.
+    inner : (i, 2) int64
+        Edges with both ends free.
     lattice : Lattice
         The target positions as integers, in the order of ``Problem.fixed``.
     row : (n,) int64
@@ -33,19 +37,28 @@ class Fixture:
     positions: FloatArray
     fixed: BoolArray
     chords: IntArray
+    joined: IntArray
+    inner: IntArray
     lattice: Lattice
     row: IntArray
 
     @staticmethod
     def of(problem: Problem) -> Fixture:
         """Return the fixed elements of a problem."""
-        positions = np.full((problem.n, 2), np.nan)
-        positions[problem.fixed] = problem.target
-        row = np.full(problem.n, -1)
-        row[problem.fixed] = np.arange(len(problem.fixed))
-        interior = problem.domain.edges.interior
-        chords = interior[(row[interior] >= 0).all(axis=1)]
-        return Fixture(positions, row >= 0, chords, Lattice(problem.target), row)
+        row = invert_indices(problem.n, problem.fixed)
+        fixed, interior = row >= 0, problem.domain.edges.interior
+        ends = fixed[interior].sum(axis=1)
+        mixed = interior[ends == 1]
+        joined = np.where(fixed[mixed[:, :1]], mixed[:, ::-1], mixed)
+        return Fixture(
+            problem.place_fixed(np.nan),
+            fixed,
+            interior[ends == 2],
+            joined,
+            interior[ends == 0],
+            Lattice(problem.target),
+            row,
+        )
 
     def points(self, vertices: IntArray) -> list[tuple[int, int]]:
         """Return integer positions of fixed vertices."""
@@ -117,8 +130,7 @@ class Stars:
 
     def take(self, chosen: IntArray) -> Stars:
         """Return some of the stars, given their indices in ascending order."""
-        at = np.full(len(self), -1)
-        at[chosen] = np.arange(len(chosen))
+        at = invert_indices(len(self), chosen)
         near, beyond = at[self.of_neighbour], at[self.of_opposite]
         a, b = near >= 0, beyond >= 0
         return Stars(self.vertices[chosen], near[a], self.neighbours[a], beyond[b], self.opposite[b])
@@ -132,10 +144,7 @@ def stars(problem: Problem, fixture: Fixture, folds: IntArray) -> Stars:
     near the middle one. At ``folds`` (k,), the vertices where the boundary reverses its direction, there is no such
     point.
     """
-    fixed = fixture.fixed
-    interior = problem.domain.edges.interior
-    joined = interior[fixed[interior[:, 0]] != fixed[interior[:, 1]]]
-    joined = np.where(fixed[joined[:, :1]], joined[:, ::-1], joined)  # columns: free, fixed
+    fixed, joined = fixture.fixed, fixture.joined
     two = np.flatnonzero(fixed[problem.F].sum(axis=1) == 2)
     free = np.argmin(fixed[problem.F[two]], axis=1)
     corner = problem.F[two[:, None], (free[:, None] + [0, 1, 2]) % 3]  # columns: free, fixed edge

@@ -17,7 +17,7 @@ from quasiharmonic.problem.diagnosis.curves import Corners
 from quasiharmonic.problem.diagnosis.fixture import Fixture
 from quasiharmonic.problem.diagnosis.links import Polygon
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, vertex_names
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices
 
 # Largest number of edges between the vertices of a pair to check.
 LONGEST = 8
@@ -42,19 +42,11 @@ class Shortcuts:
 
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners) -> None:
         self._loop = problem.domain.loops[0]
-        free = ~fixture.fixed
-        interior = problem.domain.edges.interior
-        inner = interior[free[interior].all(axis=1)]
-        mixed = interior[free[interior[:, 0]] != free[interior[:, 1]]]
-        mixed = np.where(free[mixed[:, :1]], mixed[:, ::-1], mixed)  # columns: fixed, free
-        index = np.full(problem.n, -1)
-        index[self._loop] = np.arange(len(self._loop))
-        mixed = mixed[index[mixed[:, 0]] >= 0]
-        both = np.concatenate([inner, inner[:, ::-1]])
+        free, place = fixture.joined[:, 0], invert_indices(problem.n, self._loop)[fixture.joined[:, 1]]
+        free, place = free[place >= 0], place[place >= 0]
+        both = np.concatenate([fixture.inner, fixture.inner[:, ::-1]])
         self._inner = csr_array((np.ones(len(both)), both.T), shape=(problem.n, problem.n))
-        self._ends = csr_array(
-            (np.ones(len(mixed)), (index[mixed[:, 0]], mixed[:, 1])), shape=(len(self._loop), problem.n)
-        )
+        self._ends = csr_array((np.ones(len(free)), (place, free)), shape=(len(self._loop), problem.n))
         self._fixture = fixture
         self._corners = corners
         self._sides = np.stack([self._loop, np.roll(self._loop, -1)], axis=1)

@@ -20,7 +20,7 @@ from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, smallest_conflict, vertex_names
 from quasiharmonic.problem.diagnosis.views import Views
-from quasiharmonic.util.arrays import IntArray, edge_names
+from quasiharmonic.util.arrays import IntArray, edge_names, mark
 
 # Number of fixed vertices, far apart from each other, that are checked first.
 _FIRST_CHECKED = 8
@@ -166,6 +166,5 @@ class Sight:
         view = self._views.wedges(eye)
         if wedges is None:
             return view.parts(area)
-        chosen = np.zeros(len(view), dtype=bool)
-        chosen[wedges] = True
+        chosen = mark(len(view), wedges)
         return view.parts(area, chosen)

@@ -19,7 +19,7 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.problem.diagnosis.clipping import Lattice, cross
 from quasiharmonic.problem.diagnosis.effort import Effort
 from quasiharmonic.problem.diagnosis.wedges import Wedges
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, scale_to_unit
 
 SignArray = NDArray[np.int8]
 
@@ -48,8 +48,8 @@ class Views:
         self, ends: IntArray, positions: FloatArray, lattice: Lattice, corner: IntArray, effort: Effort
     ) -> None:
         self._ends, self._positions, self._lattice, self._corner = ends, positions, lattice, corner
-        # For inexact computations: scaled to magnitude one, to avoid overflow.
-        self._scaled = np.ldexp(positions, -int(np.frexp(np.abs(positions).max())[1]))
+        # For inexact computations.
+        self._scaled = scale_to_unit(positions)
         self._cache: dict[int, Wedges] = {}
         self._effort = effort
 

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.geometry.mesh.refinement import Refined, Shares, combine_shares, parents_and_weights
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
-def as_refined(V: FloatArray, F: IntArray, triangles: IntArray, shares: Sequence[dict[int, float]]) -> Refined:
+def as_refined(V: FloatArray, F: IntArray, triangles: IntArray, shares: Sequence[Shares]) -> Refined:
     """Return the relation of a refined mesh to the original mesh ``V``, ``F``.
 
     ``triangles`` (t, 3) are the new ones, each within an original one, in any order. For each added vertex, in order,
@@ -30,25 +30,14 @@ def as_refined(V: FloatArray, F: IntArray, triangles: IntArray, shares: Sequence
     # Unsplit triangles keep their order of corners.
     whole = (np.sort(triangles, axis=1) == np.sort(F[parent], axis=1)).all(axis=1)
     triangles[whole] = F[parent[whole]]
-    parents = np.array([(*sorted(row), max(row), max(row))[:3] for row in shares], dtype=np.int64).reshape(-1, 3)
-    weights = np.array([[*(row[v] for v in sorted(row)), 0.0, 0.0][:3] for row in shares]).reshape(-1, 3)
+    parents, weights = parents_and_weights(shares)
     added = np.einsum("sk,skd->sd", weights, V[parents])
     return Refined(np.concatenate([V, added]), triangles, parent, parents, weights)
 
 
-def midpoints(n: int, parents: Sequence[tuple[int, int]]) -> list[dict[int, float]]:
+def midpoints(n: int, parents: Sequence[tuple[int, int]]) -> list[Shares]:
     """Return the weights of original vertices in vertices that are midpoints of two earlier vertices each."""
-    shares: list[dict[int, float]] = []
-    for pair in parents:
-        total: dict[int, float] = {}
-        for vertex in pair:
-            for old, share in ({vertex: 1.0} if vertex < n else shares[vertex - n]).items():
-                total[old] = total.get(old, 0.0) + share / 2
-        shares.append(total)
+    shares: list[Shares] = []
+    for a, b in parents:
+        shares.append(combine_shares({a: 0.5, b: 0.5}, shares, n))
     return shares
-
-
-def shares_of(refined: Refined) -> list[dict[int, float]]:
-    """Return the weights of original vertices in the added vertices of a refinement."""
-    rows = zip(refined.parents.tolist(), refined.weights.tolist(), strict=True)
-    return [{old: share for old, share in zip(*row, strict=True) if share} for row in rows]

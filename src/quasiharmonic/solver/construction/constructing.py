@@ -15,7 +15,7 @@ from quasiharmonic.solver.construction.cutting import Cutting, TooManyError
 from quasiharmonic.solver.construction.embedding import embed_pieces
 from quasiharmonic.solver.construction.opening import thin_refinement
 from quasiharmonic.solver.construction.simplicity import is_simple
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, scale_to_unit
 
 # Maximum number of added vertices per mesh vertex before another way to cut is tried.
 _ADDED_PER_VERTEX = 50
@@ -89,8 +89,7 @@ def construct_and_thin(
     TooManyError
         If more than ``max_added`` vertices would be added.
     """
-    # Scale to a magnitude of about one, so that no product overflows.
-    exponent = int(np.frexp(np.abs(problem.target).max())[1])
+    exponent = find_exponent(problem.target)
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent), reference="equilateral")
 
     def certify_map(refined: Refined, uv: FloatArray) -> Construction:
@@ -133,10 +132,8 @@ def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certifi
     bad = np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
     if not bad.size:
         return bad
-    # Scale to a magnitude of about one, so that distances neither overflow nor underflow.
-    scale = -int(np.frexp(np.abs(problem.target).max())[1])
-    middles = np.nan_to_num(np.ldexp(uv[F[bad]], scale)).mean(axis=1)
-    _, nearest = cKDTree(np.ldexp(problem.target, scale)).query(middles)
+    middles = np.nan_to_num(np.ldexp(uv[F[bad]], -find_exponent(problem.target))).mean(axis=1)
+    _, nearest = cKDTree(scale_to_unit(problem.target)).query(middles)
     return np.unique(problem.fixed[nearest])
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from quasiharmonic.linsolve.laplacian import embed_tutte
 from quasiharmonic.problem import Problem
-from quasiharmonic.solver.construction.embedding import embed_tutte
 from quasiharmonic.solver.construction.halfedges import Edge
 from quasiharmonic.solver.construction.regions import Regions
 from quasiharmonic.solver.construction.sheet import Sheet
 from quasiharmonic.solver.construction.sides import edges_along_sides
 from quasiharmonic.solver.construction.walks import walk
-from quasiharmonic.util.arrays import ComplexArray
+from quasiharmonic.util.arrays import ComplexArray, invert_indices
 from quasiharmonic.util.progress import heartbeat
 
 
@@ -50,8 +50,7 @@ class Cutting:
     def __init__(self, problem: Problem, guide: ComplexArray | None = None, max_added: int | None = None) -> None:
         self._max_added = max_added
         domain = problem.domain
-        point = np.full(problem.n, -1)
-        point[problem.fixed] = np.arange(len(problem.fixed))
+        point = invert_indices(problem.n, problem.fixed)
         self.regions = Regions(problem.target, [point[loop] for loop in domain.loops], point[domain.pins])
         self.sheet = Sheet(problem.F, problem.n, domain.pins.tolist())
         self.positions: dict[int, complex] = {}

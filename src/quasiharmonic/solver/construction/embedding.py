@@ -8,13 +8,12 @@ import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
-from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.linsolve.laplacian import embed_tutte
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import LocalRepair, RandomRestarts, Untangling
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, IntArray
 
 # Number of weight updates.
 _WEIGHT_UPDATES = 4
@@ -25,24 +24,6 @@ _MAX_RATIO = 1e6
 # Methods that untangle the last triangles and may also move vertices on cuts. Each is limited, because double precision
 # may be insufficient.
 _REPAIRS = LocalRepair(tries=30), Untangling(iterations=200), RandomRestarts(max_failures=20, tries=20)
-
-
-def embed_tutte(F: IntArray, w: ComplexArray, fixed: IntArray, weights: FloatArray | float = 1.0) -> ComplexArray:
-    """Place every free vertex of w (n,) at the weighted mean of its neighbours; only fixed positions are read.
-
-    ``fixed`` (k,) has at least one vertex on every component of the mesh. ``weights`` (f,) are positive; the weight of
-    an edge is the sum over its triangles.
-
-    Raises
-    ------
-    quasiharmonic.linsolve.NotPositiveDefinite
-        If the system is not positive definite after rounding.
-    """
-    if len(np.unique(fixed)) == len(w):
-        return w
-    identity = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
-    stiffness = ReferenceMesh(np.zeros((len(w), 2)), F, "equilateral").edge_stiffness(identity * weights)
-    return Laplacian(F, len(w), fixed).factor(stiffness).extend(w)
 
 
 def embed_pieces(problem: Problem, w: ComplexArray, fixed: IntArray) -> ComplexArray:

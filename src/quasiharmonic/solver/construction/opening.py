@@ -10,11 +10,11 @@ import numpy as np
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.refinement import Refined
 from quasiharmonic.problem import Frame, Problem
-from quasiharmonic.solver.construction.ancestry import as_refined, shares_of
+from quasiharmonic.solver.construction.ancestry import as_refined
 from quasiharmonic.solver.construction.thinning import Thinning
 from quasiharmonic.solver.methods.local_repair import Patch
 from quasiharmonic.solver.methods.untangling import GRADINGS, open_triangles, untangle
-from quasiharmonic.util.arrays import ComplexArray, FloatArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, find_exponent, invert_indices, to_complex, to_points
 
 # Maximum number of rounds of evening out and thinning.
 _ROUNDS = 6
@@ -31,8 +31,7 @@ def thin_refinement(problem: Problem, refined: Refined, uv: FloatArray) -> tuple
 
     Return the new refinement and its map, which is exactly the given one if no vertex was removed.
     """
-    # Scale to a magnitude of about one, so that no product overflows.
-    exponent = int(np.frexp(np.abs(problem.target).max())[1])
+    exponent = find_exponent(problem.target)
     given, uv = uv, np.ldexp(uv, -exponent)
     if not np.array_equal(np.ldexp(uv, exponent), given):
         # Leave coordinates with too large a span unchanged: scaling would round them and could invert triangles.
@@ -59,7 +58,7 @@ def _open_triangles(problem: Problem, refined: Refined, uv: FloatArray, grading:
 
 def _remove_vertices(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 0) -> tuple[Refined, FloatArray]:
     """Remove vertices by thinning, and by untangling around up to ``tries`` of the rest."""
-    shares = shares_of(refined)
+    shares = refined.shares()
     thinning = Thinning(problem.F, problem.fixed, refined.F, shares, uv @ np.array([1, 1j]))
     thinning.thin()
     for vertex in sorted(thinning.left, reverse=True)[:tries]:
@@ -68,17 +67,16 @@ def _remove_vertices(problem: Problem, refined: Refined, uv: FloatArray, tries: 
         return refined, uv
     left = sorted(thinning.left)
     kept = np.concatenate([np.arange(problem.n), left]).astype(np.int64)
-    number = np.full(len(uv), -1)
-    number[kept] = np.arange(len(kept))
+    number = invert_indices(len(uv), kept)
     V = refined.V[: problem.n]
     triangles = number[np.array(thinning.mesh.triangles(), dtype=np.int64)]
     refined = as_refined(V, problem.F, triangles, [shares[vertex - problem.n] for vertex in left])
-    return refined, thinning.w[kept].view(np.float64).reshape(-1, 2)
+    return refined, to_points(thinning.w[kept])
 
 
 def _untangle_patch(frame: Frame, patch: Patch, w: ComplexArray) -> ComplexArray:
     """Untangle a map of a patch, in units of the target; return the last map."""
-    inward = frame.inward(w.view(np.float64).reshape(-1, 2))
+    inward = frame.inward(to_points(w))
     steps = untangle(patch.F, inward, np.flatnonzero(patch.fixed), grading=GRADINGS[0])
     *_, last = inward, *islice(steps, _STEPS)
-    return np.where(patch.fixed, w, frame.outward(last).view(np.complex128).ravel())
+    return np.where(patch.fixed, w, to_complex(frame.outward(last)))

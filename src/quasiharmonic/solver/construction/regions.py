@@ -16,9 +16,9 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay
+from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay, select_inside
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.solver.construction.halfedges import Edge
+from quasiharmonic.solver.construction.halfedges import Edge, HalfEdges
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # A turn counts as straight if the point is off the line by at most this many roundings of the largest coordinate.
@@ -50,9 +50,7 @@ class Regions:
         self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
         self._tolerance = _ROUNDINGS * float(np.spacing(np.abs(points).max()))
         rim = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
-        self.apex: dict[Edge, int] = {}
-        for a, b, c in _triangles_within(points, rim).tolist():
-            self.apex[a, b], self.apex[b, c], self.apex[c, a] = c, a, b
+        self.apex = HalfEdges(_triangles_within(points, rim)).apex
         self.cuts = {(a, b) for a, b in self.apex if (b, a) in self.apex}
         self._join()
         self._loop = np.full(len(points), -1)
@@ -159,19 +157,7 @@ def _triangles_within(points: FloatArray, rim: IntArray) -> IntArray:
     frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     k = len(points)
     T = constrained_delaunay(np.concatenate([points, frame]), rim, k + np.arange(4))
-    walls = {(a, b) for a, b in rim.tolist()}
-    sides = zip(T.ravel().tolist(), np.roll(T, -1, axis=1).ravel().tolist(), strict=True)
-    left = {side: k // 3 for k, side in enumerate(sides)}
-    inside = np.zeros(len(T), dtype=np.bool_)
-    waiting = [left[edge] for edge in walls]
-    while waiting:
-        t = waiting.pop()
-        if not inside[t]:
-            inside[t] = True
-            corners = T[t].tolist()
-            ahead = zip(corners, corners[1:] + corners[:1], strict=True)
-            waiting += [left[b, a] for a, b in ahead if (a, b) not in walls]
-    return T[inside]
+    return T[select_inside(T, rim, k + 4)]
 
 
 def _order_by_halves(weight: dict[int, int], beside: dict[int, list[tuple[int, Edge]]]) -> list[Edge]:

@@ -16,7 +16,6 @@ from fractions import Fraction
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.solver.construction.halfedges import HalfEdges, Triangle
 from quasiharmonic.solver.methods.local_repair import Patch
 from quasiharmonic.util.arrays import ComplexArray, IntArray
@@ -165,14 +164,11 @@ class Thinning:
             for a, b in self.mesh.link(vertex)
             if vertex < a and vertex < b and a in inside and b in inside
         ]
-        vertices, F = np.unique(np.array(rows), return_inverse=True)
-        F = F.reshape(-1, 3).astype(np.int64)
-        fixed = np.isin(vertices, self._fixed)
-        fixed[boundary_edges(F, len(vertices))] = True
-        stay = vertices[F[fixed[F].all(axis=1)]].tolist()
-        if fixed.all() or any(self._quality_in_map(*corners) <= 0 for corners in stay):
+        patch = Patch.of(np.array(rows), self._fixed)
+        stay = patch.vertices[patch.F[patch.fixed[patch.F].all(axis=1)]].tolist()
+        if patch.fixed.all() or any(self._quality_in_map(*corners) <= 0 for corners in stay):
             return None
-        return Patch(F, vertices, fixed)
+        return patch
 
 
 def quality(p: complex, q: complex, r: complex) -> float:

@@ -132,7 +132,29 @@ class Neumann(Functional):
         return at.field.pull(at.field.pull_twist(*twist(self.mesh, at.dw, spread)))
 
 
-class Poisson(Functional):
+class DualFunctional(Functional):
+    """A functional that needs the solution with the target's Neumann data, one more solve for each tensor field."""
+
+    sees_positions = False
+
+    def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
+        super().__init__(problem, mesh)
+        self._cached: tuple[TensorField, ComplexArray] | None = None
+
+    def response(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """Return ``L† g`` up to a constant, computed once for a tensor field."""
+        # Return a local variable, because another thread may overwrite the cache at any time.
+        cached = self._cached
+        if cached is None or cached[0] is not at.field:
+            cached = self._cached = at.field, self._respond(at)
+        return cached[1]
+
+    @abstractmethod
+    def _respond(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """Compute `response`."""
+
+
+class Poisson(DualFunctional):
     """V₄, the Poisson functional (eq. 29, 44), dual to V₃.
 
     ``L†`` is applied by a solve with one fixed vertex: the kernel of L contains only constants, and the Neumann data
@@ -140,24 +162,15 @@ class Poisson(Functional):
     """
 
     name = "poisson"
-    sees_positions = False
+    _one_fixed: Laplacian | None = None
 
-    def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
-        super().__init__(problem, mesh)
-        self._one_fixed: Laplacian | None = None
-        self._cached: tuple[TensorField, ComplexArray] | None = None
-
-    def response(self, at: QuasiHarmonicMap) -> ComplexArray:
-        """Return ``L† g`` up to a constant, the map with the target's Neumann data; (n,) complex128."""
-        # Return a local variable, because another thread may overwrite the cache at any time.
-        cached = self._cached
-        if cached is None or cached[0] is not at.field:
-            if self._one_fixed is None:
-                first, solver = self.problem.fixed[:1], at.operator.laplacian.solver.name
-                self._one_fixed = Laplacian(self.problem.F, self.problem.n, first, solver)
-            factored = self._one_fixed.factor(self.mesh.edge_stiffness(at.field.entries()))
-            cached = self._cached = at.field, factored.respond(neumann_target(self.problem, at.w))
-        return cached[1]
+    def _respond(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """Compute the map with the target's Neumann data; (n,) complex128."""
+        if self._one_fixed is None:
+            first, solver = self.problem.fixed[:1], at.operator.laplacian.solver.name
+            self._one_fixed = Laplacian(self.problem.F, self.problem.n, first, solver)
+        factored = self._one_fixed.factor(self.mesh.edge_stiffness(at.field.entries()))
+        return factored.respond(neumann_target(self.problem, at.w))
 
     def value(self, at: QuasiHarmonicMap) -> float:
         return 0.5 * work(neumann_target(self.problem, at.w), self.response(at) - at.w)
@@ -167,7 +180,7 @@ class Poisson(Functional):
         return -0.5 * at.field.pull(at.field.pull_twist(*twist(self.mesh, d, d)))
 
 
-class EdgePoisson(Functional):
+class EdgePoisson(DualFunctional):
     """V₄ in Crouzeix–Raviart elements: linear on each triangle, continuous at the midpoints of edges.
 
     On a disk, their discrete rotated gradients and the gradients of linear elements are orthogonal complements in the
@@ -178,7 +191,7 @@ class EdgePoisson(Functional):
     """
 
     name = "edge-poisson"
-    sees_positions = False
+    _one_fixed: Laplacian | None = None
 
     def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
         super().__init__(problem, mesh)
@@ -193,24 +206,18 @@ class EdgePoisson(Functional):
         self._separate_mesh = copy(mesh)
         self._separate_mesh.F = np.arange(F.size).reshape(-1, 3)
         self._separate_mesh.n = F.size
-        self._one_fixed: Laplacian | None = None
-        self._cached: tuple[TensorField, ComplexArray] | None = None
 
-    def response(self, at: QuasiHarmonicMap) -> ComplexArray:
-        """Return ``L† g`` at the midpoints of edges, up to a constant; (e,) complex128, edges sorted by their ends."""
-        # See `Poisson.response`.
-        cached = self._cached
-        if cached is None or cached[0] is not at.field:
-            size = int(self._edges.max()) + 1
-            if self._one_fixed is None:
-                solver = at.operator.laplacian.solver.name
-                self._one_fixed = Laplacian(self._edges, size, self._boundary_edges[:1], solver)
-            # The basis function of an edge has −2 times the gradient of the opposite corner's hat function.
-            factored = self._one_fixed.factor(4 * self.mesh.edge_stiffness(at.field.entries()))
-            load = np.zeros(size, dtype=np.complex128)
-            load[self._boundary_edges] = self._neumann_target(at.w)
-            cached = self._cached = at.field, factored.respond(load)
-        return cached[1]
+    def _respond(self, at: QuasiHarmonicMap) -> ComplexArray:
+        """Compute the solution at the midpoints of edges; (e,) complex128, edges sorted by their ends."""
+        size = int(self._edges.max()) + 1
+        if self._one_fixed is None:
+            solver = at.operator.laplacian.solver.name
+            self._one_fixed = Laplacian(self._edges, size, self._boundary_edges[:1], solver)
+        # The basis function of an edge has −2 times the gradient of the opposite corner's hat function.
+        factored = self._one_fixed.factor(4 * self.mesh.edge_stiffness(at.field.entries()))
+        load = np.zeros(size, dtype=np.complex128)
+        load[self._boundary_edges] = self._neumann_target(at.w)
+        return factored.respond(load)
 
     def value(self, at: QuasiHarmonicMap) -> float:
         middle = 0.5 * (at.w[self._tail] + at.w[self._head])
@@ -247,18 +254,12 @@ class Sobolev(Poisson):
 FUNCTIONALS: dict[str, type[Functional]] = {c.name: c for c in (Neumann, Sobolev, Dirichlet, Poisson, EdgePoisson)}
 
 
-def beltrami_energy(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> float:
-    """Return V₃ of any map: its A-Dirichlet energy minus its signed area, in the target's units of area (eq. 27).
-
-    It is ``Σ 2m |q − μp|² / (1 − |μ|²)``, which is non-negative. ``dw`` are the derivatives of the map.
-    """
-    return beltrami_gradient(mesh, field, dw)[0]
-
-
 def beltrami_gradient(mesh: ReferenceMesh, field: TensorField, dw: Derivatives) -> tuple[float, ComplexArray]:
     """Return V₃ of any map and its partial gradient in μ for the fixed map, ``−4m (q − μp) (p̄ − μq̄) / (1 − |μ|²)²``.
 
-    At the quasi-harmonic map of the tensors this is the total gradient. See `beltrami_energy`.
+    V₃ is the map's A-Dirichlet energy minus its signed area, ``Σ 2m |q − μp|² / (1 − |μ|²)``, in the target's units of
+    area (eq. 27). It is non-negative. At the quasi-harmonic map of the tensors the gradient is the total one. ``dw``
+    are the derivatives of the map.
     """
     density, gradient = beltrami_terms(mesh.m, field, dw.p, dw.q)
     return 2.0 * float(density.sum()), gradient

@@ -19,14 +19,18 @@ from typing import ClassVar
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay, delaunay_of_polygon
+from quasiharmonic.geometry.exact.constrained_delaunay import (
+    BlockedError,
+    constrained_delaunay,
+    delaunay_of_polygon,
+    select_inside,
+)
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.geometry.exact.point_location import PointLocator
-from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates
 from quasiharmonic.solver.methods.vector_adam import VectorAdam
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer
+from quasiharmonic.util.arrays import ComplexArray, IntArray, check_integer, to_points
 
 # Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
 _EVEN_SHARE = 0.5
@@ -105,8 +109,8 @@ def composite_map(objective: Objective) -> ComplexArray | None:
     onto_disk = objective.operator(unit).extend(onto_disk)
     free = objective.laplacian.free
     corners = onto_disk[loop][F]
-    locator = PointLocator(_to_points(corners))
-    points = _to_points(onto_disk[free])
+    locator = PointLocator(to_points(corners).reshape(-1, 3, 2))
+    points = to_points(onto_disk[free])
     triangle = locator.find(points)
     if (triangle < 0).any():
         return None
@@ -121,7 +125,7 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
     """
     k = len(outline)
     ring = np.arange(k)
-    points = _to_points(outline)
+    points = to_points(outline)
     if not simple_loops([ring], points).all():
         return None
     if k <= _DIRECT_UP_TO:
@@ -135,24 +139,8 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
     except (BlockedError, ValueError):
         return None
     # If the polygon runs clockwise, the rest of the box is to its left, and the number of triangles differs.
-    F = F[_select_inside(F, k)]
+    F = F[select_inside(F, sides, k + 4)]
     return F if len(F) == k - 2 else None
-
-
-def _select_inside(F: IntArray, k: int) -> BoolArray:
-    """Select the triangles to the left of the sides 0→1→…→k−1→0, and those connected to them across other edges."""
-    tails, heads, owner = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.repeat(np.arange(len(F)), 3)
-    corners = (tails < k) & (heads < k)
-    forward, backward = corners & (heads == (tails + 1) % k), corners & (tails == (heads + 1) % k)
-    open_ = np.flatnonzero(~(forward | backward))
-    keys = edge_keys(tails[open_], heads[open_], k + 4)
-    order = np.argsort(keys, kind="stable")
-    pair = np.flatnonzero(keys[order][1:] == keys[order][:-1])
-    one, other = owner[open_[order[pair]]], owner[open_[order[pair + 1]]]
-    part = label_components(one, other, len(F))
-    inside: BoolArray = np.zeros(len(F), dtype=bool)
-    inside[part[owner[forward]]] = True
-    return inside[part]
 
 
 def _corners_of_disk(outline: ComplexArray) -> ComplexArray:
@@ -162,7 +150,3 @@ def _corners_of_disk(outline: ComplexArray) -> ComplexArray:
     share = (1 - _EVEN_SHARE) * length / length.sum() + _EVEN_SHARE / k
     along: ComplexArray = np.exp(2j * np.pi * (np.cumsum(share) - share))
     return along
-
-
-def _to_points(w: ComplexArray) -> FloatArray:
-    return np.stack([w.real, w.imag], axis=-1)

@@ -27,7 +27,7 @@ from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
 from quasiharmonic.solver.methods.local_repair import Effort, Patch, patch_around, remap_patches
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer, invert_indices
 from quasiharmonic.util.progress import heartbeat
 
 Generator = np.random.Generator
@@ -139,8 +139,7 @@ def best_shift(F: IntArray, x: FloatArray, y: FloatArray, fixed: BoolArray) -> F
     wide = np.repeat(np.ptp(x[F], axis=1), 3)
     unit = np.bincount(F.ravel(), wide, len(x)) / np.maximum(np.bincount(F.ravel(), minlength=len(x)), 1)
     free = np.flatnonzero(~fixed)
-    column = np.full(len(x), -1)
-    column[free] = np.arange(free.size)
+    column = invert_indices(len(x), free)
     entry = np.where(fixed[F], 0.0, dy * unit[F])
     scale = np.abs(entry).max(axis=1)
     concerned = np.flatnonzero(scale > 0)

@@ -19,7 +19,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
 from quasiharmonic.solver.methods.untangling import untangle
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer, mark
 
 # Maximum number of inverted triangles for which local repair begins.
 MAX_INVERTED = 50
@@ -61,6 +61,15 @@ class Patch(NamedTuple):
     F: IntArray
     vertices: IntArray
     fixed: BoolArray
+
+    @classmethod
+    def of(cls, F: IntArray, fixed: IntArray) -> Patch:
+        """Return the patch of triangles (p, 3) of a mesh with these fixed vertices."""
+        vertices, renumbered = np.unique(F, return_inverse=True)
+        renumbered = renumbered.reshape(-1, 3).astype(np.int64)
+        stays = np.isin(vertices, fixed)
+        stays[boundary_edges(renumbered, vertices.size)] = True
+        return cls(renumbered, vertices, stays)
 
 
 class Effort:
@@ -179,8 +188,7 @@ def _untangle_patch(
 
 def patch_around(problem: Problem, triangle: int, rings: int, max_triangles: int) -> Patch | None:
     """Return the triangles within some rings of one; None if they are too many or have no free vertex."""
-    inside = np.zeros(problem.n, dtype=bool)
-    inside[problem.F[triangle]] = True
+    inside = mark(problem.n, problem.F[triangle])
     for _ in range(rings):
         inside[problem.F[inside[problem.F].any(axis=1)]] = True
         # Connected triangles have at most two vertices each, plus one; this bound avoids visiting all triangles at a
@@ -188,11 +196,8 @@ def patch_around(problem: Problem, triangle: int, rings: int, max_triangles: int
         if np.count_nonzero(inside) > 2 * max_triangles + 1:
             return None
     F = problem.F[inside[problem.F].all(axis=1)]
-    vertices, renumbered = np.unique(F, return_inverse=True)
-    renumbered = renumbered.reshape(-1, 3).astype(np.int64)
-    fixed = np.isin(vertices, problem.fixed)
-    fixed[boundary_edges(renumbered, vertices.size)] = True
-    return None if len(F) > max_triangles or fixed.all() else Patch(renumbered, vertices, fixed)
+    patch = Patch.of(F, problem.fixed)
+    return None if len(F) > max_triangles or patch.fixed.all() else patch
 
 
 def remap_patches(

@@ -28,7 +28,7 @@ from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, TensorDescent
-from quasiharmonic.util.arrays import ComplexArray
+from quasiharmonic.util.arrays import ComplexArray, sum_at
 
 _FIRST_DAMPING = 1e-2
 _MAX_DAMPING = 1e12
@@ -105,11 +105,8 @@ class SecondOrderModel:
         unit = np.divide(field.xi, field.rho, out=np.ones_like(field.xi), where=field.rho > 0)
         self.unit = unit
         r = field.ratio * field.rho
-        D, slope, second_derivative = (
-            field.defect,
-            field.slope,
-            here.objective.parameterisation.second_derivative(field.rho),
-        )
+        D, slope = field.defect, field.slope
+        second_derivative = here.objective.parameterisation.second_derivative(field.rho)
         rho = np.where(field.rho > 0, field.rho, 1.0)
         # Derivatives of c and s by |ξ|, through r.
         c1 = 4 * r / D**2 * slope
@@ -179,12 +176,12 @@ class SecondOrderModel:
         g = 0.5 * mesh.gamma
         parts = (by_p * g + by_q * g.conj()).ravel()
         corner = mesh.F.T.ravel()
-        return np.bincount(corner, parts.real, mesh.n) + 1j * np.bincount(corner, parts.imag, mesh.n)
+        return sum_at(corner, parts, mesh.n)
 
 
 def _less_squares(form: QuadraticForm, *vectors: tuple[ComplexArray, ComplexArray]) -> QuadraticForm:
     """Return the form minus the squares ``Re(conj(b_p) dp + conj(b_q) dq)²``."""
-    pp, qq, p2, q2, pq, pqc = form.pp, form.qq, form.p2, form.q2, form.pq, form.pqc
+    pp, qq, p2, q2, pq, pqc = form
     for bp, bq in vectors:
         cp, cq = bp.conj(), bq.conj()
         pp = pp - 0.5 * (bp * cp).real

@@ -39,7 +39,7 @@ from quasiharmonic.solver.methods.local_repair import (
 )
 from quasiharmonic.solver.methods.reweighting import reweight
 from quasiharmonic.solver.methods.untangling import GRADINGS, untangle
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, check_integer
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, check_integer, mark
 
 Generator: TypeAlias = np.random.Generator
 
@@ -151,8 +151,7 @@ def _choose_position(rng: Generator, problem: Problem, patch: Patch, w: ComplexA
 
     None if there is no such vertex or position.
     """
-    near = np.zeros(len(w), dtype=bool)
-    near[patch.F[signed_areas(patch.F, w) <= 0]] = True
+    near = mark(len(w), patch.F[signed_areas(patch.F, w) <= 0])
     if rng.random() < 0.5:
         near[patch.F[near[patch.F].any(axis=1)]] = True
     candidates = np.flatnonzero(near & ~patch.fixed)

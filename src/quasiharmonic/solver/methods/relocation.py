@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, invert_indices, mark
 from quasiharmonic.util.kernels import compiled
 
 # Maximum number of inverted triangles for a try: with more it usually fails, and without compiled kernels it is slower
@@ -80,8 +80,7 @@ def relocate_each(F: IntArray, w: ComplexArray, fixed: IntArray, mesh: IntArray)
 
     Return the map (n,) of all meshes, and which meshes (m,) have no inverted triangle.
     """
-    free = np.ones(len(w), dtype=bool)
-    free[fixed] = False
+    free = ~mark(len(w), fixed)
     moved, untangled = np.empty_like(w), np.empty(int(mesh[-1]) + 1, dtype=bool)
     place_inverted(np.ascontiguousarray(F), free, mesh, w, moved, untangled)
     return moved, untangled
@@ -148,8 +147,7 @@ class _Stars(NamedTuple):
 
 def _divide(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     """Divide interior vertices, in ascending order, into groups whose vertices share no triangle."""
-    number = np.full(n, -1)
-    number[vertices] = np.arange(vertices.size)
+    number = invert_indices(n, vertices)
     around = F[_any_corner(number[F] >= 0)]
     triangle, corner = np.nonzero(number[around] >= 0)
     own = number[around[triangle, corner]]

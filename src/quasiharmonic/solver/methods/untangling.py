@@ -24,12 +24,11 @@ from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Deformation, Isotropic
 from quasiharmonic.energies.newton.line_search import backtrack, extend
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
-from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.linsolve.laplacian import embed_tutte
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_integer
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_integer, scale_to_unit, to_complex
 
 # Powers of the boundary edges' lengths, tried in this order.
 GRADINGS = 0.5, 0.0, 1.0
@@ -48,6 +47,8 @@ _MIN_EPSILON = 5e-3
 _MIN_DETERMINANT = 1e-30
 # For `open_triangles`: an ε so small that the energy is a barrier,
 _BARRIER_EPSILON = 1e-9
+# the maximum number of steps,
+_OPENING_STEPS = 10
 # and the least relative decrease per step.
 _MIN_OPENING_DECREASE = 1e-2
 # Smallest reference triangle relative to the largest,
@@ -191,22 +192,20 @@ def untangle(
         descent.energy.epsilon *= 1 - 0.5 * root / (abs(min_det) + root)
 
 
-def open_triangles(
-    F: IntArray, w: ComplexArray, fixed: IntArray, *, grading: float, linear_solver: str = "auto", steps: int = 10
-) -> ComplexArray:
-    """Take Newton steps from a map without inverted triangles towards triangles of even shape and size.
+def open_triangles(F: IntArray, w: ComplexArray, fixed: IntArray, *, grading: float) -> ComplexArray:
+    """Take a few Newton steps from a map without inverted triangles towards triangles of even shape and size.
 
-    See `untangle`. At most ``steps`` steps are taken, fewer if they no longer lower the energy noticeably. The result
-    has no inverted triangles in floating point.
+    See `untangle`. The steps end when they no longer lower the energy noticeably. The result has no inverted triangles
+    in floating point.
     """
-    references = _equilateral_references(F, w, grading, linear_solver)
+    references = _equilateral_references(F, w, grading, "auto")
     if references is None:
         return w
     with np.errstate(all="ignore"):
-        descent = RegularisedDescent(F, w, fixed, references, linear_solver, 1.0)
+        descent = RegularisedDescent(F, w, fixed, references, "auto", 1.0)
         descent.energy.epsilon = _BARRIER_EPSILON
         before = descent.value()
-        for _ in range(steps):
+        for _ in range(_OPENING_STEPS):
             after = descent.step(before)
             if after is None or not descent.min_det > 0:
                 break
@@ -226,7 +225,7 @@ class _References(NamedTuple):
     @classmethod
     def at(cls, rest: FloatArray, F: IntArray) -> _References:
         """Return the triangles at the rest positions (n, 2)."""
-        return cls(rest[F], signed_areas(F, rest.view(np.complex128).ravel()))
+        return cls(rest[F], signed_areas(F, to_complex(rest)))
 
 
 def _equilateral_references(F: IntArray, w: ComplexArray, grading: float, linear_solver: str) -> _References | None:
@@ -246,12 +245,9 @@ def _equilateral_references(F: IntArray, w: ComplexArray, grading: float, linear
     log = np.zeros(n, dtype=np.complex128)
     log += np.bincount(rim.ravel(), np.repeat(np.log(length), 2), n) * (grading / np.maximum(ends, 1))
     if grading != 0:
-        laplacian = Laplacian(F, n, np.flatnonzero(ends), linear_solver)
-        unit = np.broadcast_to(np.array([[1.0], [0.0], [1.0]]), (3, len(F)))
-        log = laplacian.factor(ReferenceMesh(np.zeros((n, 2)), F, "equilateral").edge_stiffness(unit)).extend(log)
+        log = embed_tutte(F, log, np.flatnonzero(ends), linear_solver=linear_solver)
     sizes: FloatArray = np.exp(log.real[F].mean(axis=1))
-    # Scale to a magnitude of about one, so that no square underflows.
-    sizes = np.ldexp(sizes, -int(np.frexp(sizes.max())[1]))
+    sizes = scale_to_unit(sizes)
     sizes = np.maximum(sizes, _MIN_RELATIVE_SIZE * sizes.max())
     sizes = sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
     if not sizes.min() > _MIN_SIZE:

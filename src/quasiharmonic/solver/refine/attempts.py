@@ -22,7 +22,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.mesh.refinement import Refined, compose, split_edges
-from quasiharmonic.geometry.mesh.topology import edge_keys, edges
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, Status
 from quasiharmonic.problem.run import Run
@@ -34,7 +34,7 @@ from quasiharmonic.solver.search.record import RepairBudget
 from quasiharmonic.solver.search.search import allowed_repairs, search_map
 from quasiharmonic.solver.search.stages import Stages, quick_stages, stages_of, without_restarts
 from quasiharmonic.targets.boundary.chords import flattened_edges
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, mark
 from quasiharmonic.util.options import MapOptions
 
 # Names of the attempts.
@@ -251,9 +251,8 @@ def _edges_around_inverted(refined: Refined, certificate: Certificate) -> IntArr
     """Interior edges (s, 2) of triangles that are not positive, and of their neighbours."""
     F, n = refined.F, len(refined.V)
     bad = np.concatenate([certificate.inverted, certificate.degenerate])
-    near = np.zeros(n, dtype=np.bool_)
-    near[F[bad]] = True
+    near = mark(n, F[bad])
     tail, head = F[near[F].any(axis=1)], np.roll(F[near[F].any(axis=1)], -1, axis=1)
     beside = np.unique(edge_keys(tail.ravel(), head.ravel(), n))
     inner = edges(F, n).interior
-    return inner[np.isin(edge_keys(inner[:, 0], inner[:, 1], n), beside)]
+    return inner[np.isin(pair_keys(inner, n), beside)]

@@ -149,9 +149,7 @@ def _contours(outline: Sequence[ArrayLike] | FloatArray | str | PathLike[str], s
 
 def _check_fit(surface: Domain, contours: list[NestedContour]) -> None:
     """Raise unless the surface and the region inside the contours have the same topology."""
-    loops, f = len(surface.loops), len(surface.F)
-    euler = surface.n - len(surface.edges.interior) - len(surface.edges.boundary) + f
-    handles = (2 - loops - euler) // 2
+    loops, handles = len(surface.loops), surface.handles
     if handles:
         raise ValueError(
             f"the surface has {'a handle' if handles == 1 else f'{handles} handles'} and fits into no outline: "

@@ -9,14 +9,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.topology import edges, trace_loops
 from quasiharmonic.io.adapters.objects import mesh_triangles
-from quasiharmonic.targets.outlines.contours import as_complex
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_non_negative,
     fixed_vertices,
+    invert_indices,
     names_of,
+    scale_to_unit,
     target_positions,
+    to_complex,
     triangle_array,
     triangle_rows,
 )
@@ -27,8 +29,7 @@ STRAIGHT = 1e-9
 
 def chords_of(loop: IntArray, interior: IntArray, n: int) -> IntArray:
     """Return the interior edges (e, 2) between two vertices of a loop, as positions in it, smaller first; (c, 2)."""
-    position = np.full(n, -1)
-    position[loop] = np.arange(len(loop))
+    position = invert_indices(n, loop)
     found = position[interior]
     return np.sort(found[(found >= 0).all(axis=1)], axis=1)
 
@@ -72,8 +73,7 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     missing = np.setdiff1d(found.boundary, fixed)
     if missing.size:
         raise ValueError(f"the boundary {names_of('vertex', 'vertices', missing)} not in fixed")
-    # Scale to magnitude about one, to avoid overflow and underflow.
-    places = np.ldexp(places, -int(np.frexp(np.abs(places).max(initial=0))[1]))
+    places = scale_to_unit(places)
     position = np.full((n, 2), np.nan)
     position[fixed] = places
     min_bulge = tolerance * float(np.ptp(places, axis=0).max()) if len(places) else 0.0
@@ -86,7 +86,7 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
 
 def flat_chords(chords: IntArray, positions: FloatArray, min_bulge: float) -> Iterator[int]:
     """Yield rows of chords between whose ends the loop bends outwards by at most ``min_bulge``."""
-    w = as_complex(positions)
+    w = to_complex(positions)
     for k, (i, j) in enumerate(chords.tolist()):
         if min(_bulge(w[i : j + 1]), _bulge(np.concatenate([w[j:], w[: i + 1]]))) <= min_bulge:
             yield k

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, points_at
 from quasiharmonic.targets.boundary.turning import BoundaryLoop, mean_turns
-from quasiharmonic.targets.outlines.contours import as_complex, turns
 from quasiharmonic.targets.outlines.contours import corners as corners_of
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, describe, index_array, names_of
+from quasiharmonic.targets.outlines.contours import turns
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, describe, index_array, names_of, to_complex
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
 # Maximum distance from the outline for a point to count as on it, as a share of the outline's larger side.
@@ -190,7 +190,7 @@ def pins_by_angle(
     runs = lengths[positions - 1] / lengths[-1]
     alike = _likeness(turning + 0j, mean_turns(sides, turns(contour), sharp) + 0j)
     alike += _likeness(_gaps(runs) + 0j, _gaps(ends) + 0j)
-    seen, goal = as_complex(flat[positions]), as_complex(contour[sharp])
+    seen, goal = to_complex(flat[positions]), to_complex(contour[sharp])
     upright = _likeness(seen - seen.mean(), goal - goal.mean())
     first = int(np.argmax(np.where(alike >= alike.max() - _SIMILAR, upright, -np.inf)))
     return list(zip(np.roll(positions, -first).tolist(), ends.tolist(), strict=True))

@@ -15,7 +15,7 @@ from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.lowlevel.textual import integer
 from quasiharmonic.targets.boundary.corner_pins import Corners
-from quasiharmonic.util.arrays import IntArray, pad_to_space, triangle_array, vertex_array
+from quasiharmonic.util.arrays import IntArray, pad_to_space, scale_to_unit, triangle_array, vertex_array
 
 FORMS = "V, V:K and V:X:Y, where near:x,y,z may stand for the vertex V"
 _NEAR = "near:"
@@ -137,10 +137,8 @@ def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArr
     if not loops:
         raise ValueError("the surface is closed: it has no boundary vertices")
     border = np.sort(np.concatenate(loops))
-    here, there = pad_to_space(points[border]), pad_to_space(wanted)
-    # Scale by a power of two near the largest coordinate, so that squares neither overflow nor underflow.
-    exponent = int(np.frexp(max(np.abs(here).max(), np.abs(there).max(initial=0)))[1])
-    here, there = np.ldexp(here, -exponent), np.ldexp(there, -exponent)
+    both = scale_to_unit(np.concatenate([pad_to_space(points[border]), pad_to_space(wanted)]))
+    here, there = both[: len(border)], both[len(border) :]
     return np.array([border[np.argmin(((here - place) ** 2).sum(axis=1))] for place in there], dtype=np.int64)
 
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain
-from quasiharmonic.targets.outlines.contours import as_complex
-from quasiharmonic.util.arrays import ComplexArray, FloatArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, to_complex
 
 # Number of choices per loop for which the full energy is computed.
 _CANDIDATES = 8
@@ -63,10 +62,10 @@ def choose_least_stretch(
     def work(i: int, offsets: list[ComplexArray], force: ComplexArray) -> FloatArray:
         return np.array([np.vdot(offset, force[loops[i]]).real for offset in offsets])
 
-    of_given = {i: as_complex(positions) for i, positions in given.items()}
+    of_given = {i: to_complex(positions) for i, positions in given.items()}
     offsets = {}
     for i, positions in choices.items():
-        turned = [as_complex(points) for points in positions]
+        turned = [to_complex(points) for points in positions]
         of_given[i] = np.full(len(loops[i]), np.mean([points.mean() for points in turned]))
         offsets[i] = [points - of_given[i] for points in turned]
     pull = forces(of_given)
@@ -104,13 +103,13 @@ def _middles(surface: Domain, outer: int, positions: FloatArray) -> ComplexArray
     fixed = np.append(surface.loops[outer], surface.n + outer)
     laplacian = Laplacian(F, n, fixed).factor(np.full((3, len(F)), -1.0))
     w = np.zeros(n, dtype=np.complex128)
-    w[surface.loops[outer]] = as_complex(positions)
+    w[surface.loops[outer]] = to_complex(positions)
     return laplacian.extend(w)[surface.n :]
 
 
 def _centroid(contour: FloatArray) -> complex:
     """Centroid of the area inside a contour."""
-    w = as_complex(contour - contour[0])
+    w = to_complex(contour - contour[0])
     following = np.roll(w, -1)
     cross = (w.conj() * following).imag
     return complex(*contour[0]) + complex((cross * (w + following)).sum() / (3 * cross.sum()))

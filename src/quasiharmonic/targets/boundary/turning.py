@@ -24,7 +24,17 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, pad_to_space, triangle_array, vertex_array
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_integer,
+    find_exponent,
+    mark,
+    pad_to_space,
+    scale_to_unit,
+    triangle_array,
+    vertex_array,
+)
 
 # Total turning in radians that is added, spread evenly, so that corners divide a straight side evenly.
 _ADDED_TURNING = 0.01
@@ -120,13 +130,10 @@ def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    # Scale by a power of two to unit size, so that squares neither overflow nor underflow.
-    exponent = int(np.frexp(np.abs(V).max())[1])
+    exponent = find_exponent(V)
     V = np.ldexp(V, -exponent)
     loops = boundary_loops(F, len(V))
-    on_boundary = np.zeros(len(V), dtype=bool)
-    for loop in loops:
-        on_boundary[loop] = True
+    on_boundary = mark(len(V), *loops)
     angle = _angle_sums(V, F[on_boundary[F].any(axis=1)])
     lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
     return [
@@ -196,8 +203,7 @@ def outermost(loops: Sequence[IntArray], space: FloatArray) -> int:
 
 def in_space(V: FloatArray) -> FloatArray:
     """Return positions (n, 3), centred and scaled to about unit size to avoid overflow."""
-    V = pad_to_space(V)
-    V = np.ldexp(V, -int(np.frexp(np.abs(V).max())[1]))
+    V = pad_to_space(scale_to_unit(V))
     return np.asarray(V - V.mean(axis=0))
 
 

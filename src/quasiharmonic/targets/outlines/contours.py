@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_finite, real_array
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, find_exponent, real_array
 
 # A path of lines and Bézier curves, joined end to start, as control points (degree + 1, 2) of each piece.
 Pieces = list[FloatArray]
@@ -37,17 +37,12 @@ def signed_area(contour: ArrayLike) -> float:
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
-def as_complex(points: FloatArray) -> ComplexArray:
-    """Return points (k, 2) as complex numbers x + iy, (k,)."""
-    return np.ascontiguousarray(points).view(np.complex128).ravel()
-
-
 def in_unit(contours: Sequence[FloatArray]) -> tuple[list[FloatArray], int]:
     """Scale contours to coordinates of at most about 1, so that squares neither overflow nor underflow.
 
     The scale is a power of two, which causes no rounding; the second result is its exponent.
     """
-    exponent = max(int(np.frexp(np.abs(c).max())[1]) for c in contours)
+    exponent = max(find_exponent(c) for c in contours)
     return [np.ldexp(c, -exponent) for c in contours], exponent
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.exact.loops import contacts, winding
+from quasiharmonic.geometry.exact.loops import concatenate_loops, contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
 from quasiharmonic.targets.outlines.contours import check_contour, distinct, in_unit, signed_area
 from quasiharmonic.util.arrays import FloatArray, check_sequence, repeat_each
@@ -117,12 +117,8 @@ def _clockwise(contour: FloatArray) -> bool:
 
 def _check_simple(contours: list[FloatArray]) -> None:
     """Raise if two sides of contours share more than the point that joins them."""
-    length = np.array([len(c) for c in contours])
-    start = np.concatenate([[0], np.cumsum(length)])
-    owner = repeat_each(np.arange(len(contours)), length)
-    following = np.arange(1, start[-1] + 1)
-    following[start[1:] - 1] = start[:-1]
-    points = np.concatenate(contours)
+    points, start, following = concatenate_loops(contours)
+    owner = repeat_each(np.arange(len(contours)), np.diff(start))
     met = contacts(points, np.stack([np.arange(start[-1]), following], axis=1), _MAX_MEETINGS)
     if not len(met.pairs):
         return

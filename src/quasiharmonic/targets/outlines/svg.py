@@ -18,10 +18,10 @@ import numpy as np
 from quasiharmonic.geometry.curves.arcs import Arc
 from quasiharmonic.io.errors import MeshFileError, check_path, reading
 from quasiharmonic.io.lowlevel.textual import read_text
-from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces, as_complex, flatten
+from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces, flatten
 from quasiharmonic.targets.outlines.nesting import arrange
 from quasiharmonic.targets.outlines.svgpath import commands, parse_path
-from quasiharmonic.util.arrays import FloatArray, check_numbers
+from quasiharmonic.util.arrays import FloatArray, check_numbers, to_complex
 
 _SVG = "http://www.w3.org/2000/svg"
 MAX_BYTES = 64 << 20
@@ -112,7 +112,7 @@ def svg_paths(path: str | os.PathLike[str], *, arcs: bool = False) -> list[Piece
 
 def _breadth(contour: FloatArray) -> float:
     """Sum of the areas of the triangles that the sides span with the first point; 0 only for collinear points."""
-    w = as_complex(contour - contour[0])
+    w = to_complex(contour - contour[0])
     return float(np.abs((w.conj() * np.roll(w, -1)).imag).sum()) / 2
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from quasiharmonic.geometry.curves.arcs import Arc
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces
+from quasiharmonic.util.arrays import to_points
 
 _BLANKS = re.compile(r"[ \t\r\n\f]*")
 _COMMA = re.compile(r"[ \t\r\n\f]*,?[ \t\r\n\f]*")
@@ -169,7 +170,7 @@ class _Pen:
 
     def _piece(self, points: list[complex]) -> None:
         every = np.array([self.here, *points])
-        self.subpaths[-1].append(every.view(np.float64).reshape(-1, 2))
+        self.subpaths[-1].append(to_points(every))
         self.here = points[-1]
         self.count += 1
 
@@ -201,7 +202,7 @@ class _Pen:
         centre = (self.here + end) / 2 + axis * complex(middle.real * rx, middle.imag * ry)
 
         if self.arcs:
-            rows = np.array([centre, axis * rx, 1j * axis * ry]).view(np.float64).reshape(-1, 2)
+            rows = to_points(np.array([centre, axis * rx, 1j * axis * ry]))
             self.subpaths[-1].append(Arc(rows[0], rows[1], rows[2], first, first + angle))
             self.here = end
             self.count += 1
