@@ -19,7 +19,7 @@ from quasiharmonic.util.arrays import (
     names_of,
     real_array,
 )
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import SummarisedOutcome
 from quasiharmonic.util.tables import make_dataframe
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class FrameStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Animation(Outcome, Sequence[MapResult]):
+class Animation(SummarisedOutcome, Sequence[MapResult]):
     """A sequence of maps: ``animation[t]`` is the `MapResult` of frame t.
 
     Attributes
@@ -99,11 +99,6 @@ class Animation(Outcome, Sequence[MapResult]):
     def success(self) -> bool:
         """Whether every frame is a success and the work was not interrupted."""
         return not self.interrupted and bool(self.frames) and all(frame.success for frame in self.frames)
-
-    @property
-    def message(self) -> str:
-        """The first line of `summary`."""
-        return self.summary().partition("\n")[0]
 
     @property
     def uv(self) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, AtlasVerdict, certify, mirrored_islands
+from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, AtlasVerdict, IslandReport, certify, mirrored_islands
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import is_injective
@@ -18,7 +18,7 @@ from quasiharmonic.geometry.mesh.surface_checks import manifold_edges
 from quasiharmonic.io import MeshData, refined_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
+from quasiharmonic.util.arrays import FloatArray, names_of
 from quasiharmonic.util.outcome import Outcome
 
 # The status of an atlas is the first of these that one of its islands has; without any, that of the first island.
@@ -35,7 +35,7 @@ _FURTHEST_LAST = (
 
 
 @dataclass(frozen=True, eq=False)
-class MappedIsland:
+class MappedIsland(IslandReport):
     """The result for one island.
 
     Attributes
@@ -48,18 +48,11 @@ class MappedIsland:
         The result, in the island's own numbering.
     """
 
-    triangles: IntArray
-    mirrored: bool
     result: MapResult
 
     def to_dict(self) -> dict[str, Any]:
         """The result for JSON."""
-        return {
-            "first_triangle": int(self.triangles[0]),
-            "triangles": len(self.triangles),
-            "mirrored": self.mirrored,
-            **self.result.to_dict(),
-        }
+        return {**super().to_dict(), **self.result.to_dict()}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.displacement_fields.grid import (
     Grid,
+    NearestField,
     check_field,
     check_fixed,
     check_unfolded,
@@ -35,7 +36,6 @@ from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import inspect_faces
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
-from quasiharmonic.util.outcome import Outcome
 from quasiharmonic.util.progress import heartbeat
 
 # Orders of the axes x, y, z, and the sign that makes the determinant of the steps positive at rest.
@@ -58,7 +58,7 @@ _BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class InvertibleVolume(Outcome):
+class InvertibleVolume(NearestField):
     """The nearest displacement field on voxels without folds that was found.
 
     Attributes
@@ -80,24 +80,13 @@ class InvertibleVolume(Outcome):
     seconds : float
     """
 
-    field: FloatArray
-    moved_mask: BoolArray
-    folds: int
     remaining: BoolArray
     bijective: bool
-    patches: int
-    distance: float
-    seconds: float
 
     @property
     def success(self) -> bool:
         """Whether no cell remains: every tetrahedron is positive, decided exactly, and above the bound."""
         return not self.remaining.any()
-
-    @property
-    def message(self) -> str:
-        """The text of `summary`."""
-        return self.summary()
 
     def summary(self) -> str:
         """Describe the field in one or two sentences."""
