@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, overload
 
@@ -84,9 +84,6 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
 
     def __len__(self) -> int:
         return len(self.frames)
-
-    def __iter__(self) -> Iterator[MapResult]:
-        return iter(self.frames)
 
     @overload
     def __getitem__(self, index: int) -> MapResult: ...

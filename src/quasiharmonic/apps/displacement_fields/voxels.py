@@ -124,6 +124,16 @@ class VoxelGrid(Grid):
         """Return the first voxels (k,) of cells given by a mask, voxels counted slice by slice."""
         return np.flatnonzero(np.pad(cells, ((0, 1), (0, 1), (0, 1))))
 
+    def each_layer(self, field: FloatArray, scale: FloatArray) -> Iterator[tuple[int, FloatArray, list[FloatArray]]]:
+        """Yield the number of every layer of cells, positions (3, 2, h, w), and their differences along x, y and z.
+
+        The differences are divided by ``scale``, which has an entry for each coordinate.
+        """
+        for z in range(self.shape[0] - 1):
+            heartbeat()
+            p = np.moveaxis(self.positions(field, z, z + 2), -1, 0)
+            yield z, p, [np.diff(p, axis=axis) / scale[:, None, None, None] for axis in (3, 2, 1)]
+
     def tetrahedra(self, cells: IntArray) -> IntArray:
         """The tetrahedra (6 k, 4) of cells given by their first voxels (k,), voxels counted slice by slice."""
         steps = np.array([1, self.shape[2], self.shape[1] * self.shape[2]])
@@ -147,14 +157,10 @@ def in_units(field: FloatArray, spacing: ArrayLike) -> tuple[VoxelGrid, FloatArr
 
 def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | None) -> BoolArray:
     """Cells (d − 1, h − 1, w − 1) with a determinant not above a bound; for None, not positive, decided exactly."""
-    d, h, w = grid.cell_shape
+    _, h, w = grid.cell_shape
     folds = np.zeros(grid.cell_shape, dtype=np.bool_)
     # For the bound, a cell has volume 1. Exact signs are those of the positions as stored.
-    scale = np.ones((3, 1, 1, 1)) if min_jacobian is None else grid.spacing[:, None, None, None]
-    for z in range(d):
-        heartbeat()
-        p = np.moveaxis(grid.positions(field, z, z + 2), -1, 0)
-        steps = [np.diff(p, axis=axis) / scale for axis in (3, 2, 1)]
+    for z, p, steps in grid.each_layer(field, np.ones(3) if min_jacobian is None else grid.spacing):
         unsure = np.zeros((h, w), dtype=np.bool_)
         for order, sign in _ORDERS:
             at = [0, 0, 0]
@@ -267,10 +273,7 @@ def _repair_patch(
     energy = ShapeEnergy(T, rest, floor=min(_AIM * min_jacobian + 1e-9, 0.99))
     descent = Descent(energy, free, before, anchor=(before, 1.0 / len(T)))
     with np.errstate(all="ignore"):
-        if not energy.determinants(before).min() > energy.floor:
-            for _ in descent.untangle(_UNTANGLING_STEPS):
-                pass
-        if not energy.determinants(descent.X).min() > energy.floor:
+        if not descent.make_valid(_UNTANGLING_STEPS):
             return False
         for weight in _WEIGHTS:
             descent.anchor = before, 1.0 / (weight * len(T))

@@ -121,7 +121,7 @@ def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: 
     equilibrium = Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
-        inverse=minimum,
+        inverse=minimum.solve,
         strain=lambda: strain,
         rest_shape=domain.V.shape,
         unit=2.0**exponent,

@@ -134,7 +134,7 @@ class RepairResult(SummarisedOutcome):
 
     def summary(self) -> str:
         """Describe the repair, in total and for every island that needed it."""
-        before, now = (sum(len(getattr(i, name)) for i in self.islands) for name in ("inverted_before", "inverted"))
+        before, now = self._count_inverted()
         lines = [
             f"{count_of('island', 'islands', len(self.islands))}: "
             f"{count_of('triangle', 'triangles', before)} inverted before, {now} now; "
@@ -142,14 +142,19 @@ class RepairResult(SummarisedOutcome):
         ]
         return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
 
+    def _count_inverted(self) -> tuple[int, int]:
+        """Numbers of inverted triangles before and after the repair."""
+        return sum(len(i.inverted_before) for i in self.islands), sum(len(i.inverted) for i in self.islands)
+
     def to_dict(self) -> dict[str, Any]:
         """The report for JSON, without the map."""
+        before, now = self._count_inverted()
         return {
             "success": self.success,
             "message": self.message,
             "injective": self.injective,
-            "inverted_before": sum(len(island.inverted_before) for island in self.islands),
-            "inverted": sum(len(island.inverted) for island in self.islands),
+            "inverted_before": before,
+            "inverted": now,
             "moved_vertices": len(self.moved_vertices),
             "islands": [island.to_dict() for island in self.islands],
         }

@@ -239,8 +239,7 @@ def _search(descent: Descent, options: TetrahedraOptions) -> tuple[FloatArray, T
             return best[-1][1], status, descent.iterations
         status = _polish(descent, options, run)
         return descent.X, status, descent.iterations
-    positive = bool(energy.determinants(descent.X).min() > 0)
-    return descent.X if positive else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
+    return descent.X if descent.is_valid() else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
 
 
 def _untangle(descent: Descent, options: TetrahedraOptions, run: Run, best: list[tuple[int, FloatArray]]) -> int:
