@@ -21,18 +21,6 @@ from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, names_of
 from quasiharmonic.util.outcome import Outcome
 
-# The status of an atlas is the first of these that one of its islands has; without any, that of the first island.
-_FURTHEST_LAST = (
-    Status.INTERRUPTED,
-    Status.IMPOSSIBLE,
-    Status.TOO_MANY_SPLITS,
-    Status.PRECISION_LIMIT,
-    Status.OUT_OF_ITERATIONS,
-    Status.COLLAPSED,
-    Status.STILL_FALLING,
-    Status.EXHAUSTED,
-)
-
 
 @dataclass(frozen=True, eq=False)
 class MappedIsland(IslandReport):
@@ -89,8 +77,7 @@ class MappedAtlas(Outcome):
     @property
     def status(self) -> Status:
         """The status of the island that made the least progress."""
-        found = [island.result.status for island in self.islands]
-        return next((status for status in _FURTHEST_LAST if status in found), found[0])
+        return Status.most_severe(island.result.status for island in self.islands)
 
     def places(self) -> list[FloatArray]:
         """Return the vertex positions of every island, in the order of its result."""

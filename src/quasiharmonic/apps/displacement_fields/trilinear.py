@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 
 from quasiharmonic.apps.displacement_fields.voxels import VoxelGrid
+from quasiharmonic.apps.tetrahedra.energy import cross
 from quasiharmonic.util.arrays import BoolArray, FloatArray
 
 # Coefficients of at most this multiple of a bound of their terms may be rounding errors.
@@ -29,12 +30,12 @@ def least_coefficients(grid: VoxelGrid, field: FloatArray) -> FloatArray:
             a = by_x[:, k, j : j + h]
             for i, n in product(range(2), repeat=2):
                 b = by_y[:, n, :, i : i + w]
-                cross = np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+                normal = cross(a, b)
                 size = np.abs(a).sum(axis=0) * np.abs(b).sum(axis=0)
                 for m, q in product(range(2), repeat=2):
                     c = by_z[:, 0, q : q + h, m : m + w]
                     at = k + n, j + q, i + m
-                    total[at] += (cross * c).sum(axis=0)
+                    total[at] += (normal * c).sum(axis=0)
                     bound[at] += size * np.abs(c).sum(axis=0)
         # A coefficient is the sum of its terms divided by three binomial coefficients.
         share = np.array([1.0, 0.5, 1.0])

@@ -32,7 +32,7 @@ from quasiharmonic.apps.displacement_fields.grid import (
 )
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
 from quasiharmonic.apps.tetrahedra.descent import Descent
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
+from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, cross, dot
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import inspect_faces
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
@@ -169,12 +169,7 @@ def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | 
                 edges.append(steps[axis][:, at[2], at[1] : at[1] + h, at[0] : at[0] + w])
                 at[axis] = 1
             a, b, c = edges
-            terms = (
-                a[0] * (b[1] * c[2] - b[2] * c[1]),
-                a[1] * (b[2] * c[0] - b[0] * c[2]),
-                a[2] * (b[0] * c[1] - b[1] * c[0]),
-            )
-            D = sign * (terms[0] + terms[1] + terms[2])
+            D = sign * dot(a, cross(b, c))
             if min_jacobian is not None:
                 folds[z] |= ~(min_jacobian < D)
             else:
