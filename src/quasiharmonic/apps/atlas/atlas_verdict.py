@@ -27,7 +27,23 @@ _MAX_PAIRS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class IslandVerdict:
+class IslandReport:
+    """Base of the reports on one island: its triangles (k,), ascending, and whether it is mirrored."""
+
+    triangles: IntArray
+    mirrored: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report for JSON, with the first triangle and the number of triangles."""
+        return {
+            "first_triangle": int(self.triangles[0]),
+            "triangles": len(self.triangles),
+            "mirrored": self.mirrored,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class IslandVerdict(IslandReport):
     """The verdict on one island, in the mesh's numbering.
 
     Attributes
@@ -43,8 +59,6 @@ class IslandVerdict:
         Triangles that are not strictly positive (mirrored islands: not strictly negative).
     """
 
-    triangles: IntArray
-    mirrored: bool
     certificate: Certificate
     inverted: IntArray
 
@@ -69,9 +83,7 @@ class IslandVerdict:
     def to_dict(self) -> dict[str, Any]:
         """The verdict for JSON, with the first triangle and the number of triangles."""
         return {
-            "first_triangle": int(self.triangles[0]),
-            "triangles": len(self.triangles),
-            "mirrored": self.mirrored,
+            **super().to_dict(),
             "injective": self.injective,
             "bijective": self.bijective,
             "inverted": self.inverted.tolist(),

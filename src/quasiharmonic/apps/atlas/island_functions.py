@@ -20,7 +20,8 @@ from quasiharmonic.apps.atlas.mapped_atlas import (
 )
 from quasiharmonic.apps.flattening import free_boundary
 from quasiharmonic.apps.flattening.layout import fit_unit_square, place_in_row
-from quasiharmonic.energies.deformation import positive_weights
+from quasiharmonic.energies.deformation import positive_weights, signed_areas
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.curves.boundary_curves import sliding_curves
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
@@ -338,16 +339,11 @@ def _scale_to_surface(islands: Sequence[Island], surface: FloatArray) -> list[tu
         island.F[:, ::-1] if is_mirrored(island.F, uv) else island.F
         for island, uv in zip(islands, positions, strict=True)
     ]
-    plane = np.array([np.abs(_doubled_areas(uv, rows)).sum() / 2 for uv, rows in zip(positions, F, strict=True)])
+    plane = np.array([np.abs(signed_areas(rows, in_units(uv, 0))).sum() for uv, rows in zip(positions, F, strict=True)])
     known = (plane > 0) & (surface > 0)
     mean = surface[known].sum() / plane[known].sum() if known.any() else 1.0
     scales = np.sqrt(np.divide(surface, plane, out=np.full(len(plane), mean), where=known))
     return [(uv * scale, rows) for uv, scale, rows in zip(positions, scales.tolist(), F, strict=True)]
-
-
-def _doubled_areas(uv: FloatArray, F: IntArray) -> FloatArray:
-    a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def _surface_areas(mesh: SeamedMesh) -> FloatArray:

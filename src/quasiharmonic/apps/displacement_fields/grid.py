@@ -22,6 +22,7 @@ References
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, real_array
+from quasiharmonic.util.outcome import SummarisedOutcome
 
 # Corner triangles of a cell whose vertices are numbered along x and then along y.
 _TRIANGLES = np.array([[0, 1, 2], [1, 3, 0], [2, 0, 3], [3, 2, 1]])
@@ -95,6 +97,33 @@ class Grid:
     def points(self) -> FloatArray:
         """Positions of the pixels or voxels; (h, w, 2) or (d, h, w, 3)."""
         return self.positions(np.zeros((*self.shape, len(self.shape))))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NearestField(SummarisedOutcome):
+    """The nearest displacement field without folds that was found, and its distance from the given one.
+
+    Attributes
+    ----------
+    field : (h, w, 2) or (d, h, w, 3) float64
+        The new field.
+    moved_mask : (h, w) or (d, h, w) bool
+        Pixels or voxels whose displacement changed; the others are bitwise unchanged.
+    folds : int
+        Number of cells that the given field folds: a determinant is not above ``min_jacobian``.
+    patches : int
+        Number of separate regions of the grid in which the field changed.
+    distance : float
+        Root mean square distance from the given field, over all pixels or voxels, in the field's unit.
+    seconds : float
+    """
+
+    field: FloatArray
+    moved_mask: BoolArray
+    folds: int
+    patches: int
+    distance: float
+    seconds: float
 
 
 class PixelGrid(Grid):

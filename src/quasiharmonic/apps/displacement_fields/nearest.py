@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.displacement_fields.grid import (
+    NearestField,
     PixelGrid,
     check_field,
     check_fixed,
@@ -30,7 +31,6 @@ from quasiharmonic.apps.displacement_fields.voxels import (
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, check_choice, count_of
-from quasiharmonic.util.outcome import Outcome
 
 #: How a field on voxels is sampled between them.
 INTERPOLATIONS = "linear", "trilinear"
@@ -43,7 +43,7 @@ _MAX_ROUNDS = 12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class InvertibleField(Outcome):
+class InvertibleField(NearestField):
     """A displacement field without folds, and its distance from the given one.
 
     Attributes
@@ -64,23 +64,12 @@ class InvertibleField(Outcome):
     seconds : float
     """
 
-    field: FloatArray
-    moved_mask: BoolArray
     certificate: Certificate
-    folds: int
-    patches: int
-    distance: float
-    seconds: float
 
     @property
     def success(self) -> bool:
         """Whether the field is injective (certified)."""
         return self.certificate.injective
-
-    @property
-    def message(self) -> str:
-        """The text of `summary`."""
-        return self.summary()
 
     def summary(self) -> str:
         """Describe the field in one or two sentences."""

@@ -20,6 +20,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -104,37 +105,39 @@ def descend_patches(
         for number in range(int(batch[-1]) + 1):
             todo = np.flatnonzero((batch == number) & (size > 0))
             for weight in _WEIGHTS:
-                _descend(grid, w, given, patch, todo, min_jacobian, weight)
+                _descend(_Patches(grid, w, given, patch, min_jacobian), todo, weight)
 
 
-def _descend(
-    grid: PixelGrid,
-    w: ComplexArray,
-    given: ComplexArray,
-    patch: IntArray,
-    todo: IntArray,
-    min_jacobian: float,
-    weight: float,
-) -> None:
+class _Patches(NamedTuple):
+    """The arguments of `descend_patches`."""
+
+    grid: PixelGrid
+    w: ComplexArray
+    given: ComplexArray
+    patch: IntArray
+    min_jacobian: float
+
+
+def _descend(patches: _Patches, todo: IntArray, weight: float) -> None:
     """Converge the patches ``todo`` for one weight of the barrier; the matrix only has patches that still move."""
     steps = _MAX_STEPS
     while todo.size and steps:
-        batch = _Batch(grid, w, given, np.where(np.isin(patch, todo), patch, 0), min_jacobian, weight)
+        batch = _Batch(patches, todo, weight)
         moving = np.ones(todo.size, dtype=bool)
         while steps and 2 * np.count_nonzero(moving) > todo.size:
             heartbeat()
             moving &= batch.step(moving)
             steps -= 1
-        batch.enter(w)
+        batch.enter(patches.w)
         todo = todo[moving]
 
 
 class _Batch:
     """Patches that share one matrix."""
 
-    def __init__(
-        self, grid: PixelGrid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float, weight: float
-    ) -> None:
+    def __init__(self, patches: _Patches, todo: IntArray, weight: float) -> None:
+        grid, w, given, patch, min_jacobian = patches
+        patch = np.where(np.isin(patch, todo), patch, 0)
         touched = find_cells(patch > 0)
         cells = grid.cells(*np.nonzero(touched))
         pixels, local = np.unique(cells, return_inverse=True)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.displacement_fields.grid import (
     Grid,
+    NearestField,
     check_field,
     check_fixed,
     check_unfolded,
@@ -31,11 +32,10 @@ from quasiharmonic.apps.displacement_fields.grid import (
 )
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
 from quasiharmonic.apps.tetrahedra.descent import Descent
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
+from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, cross, dot
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import inspect_faces
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
-from quasiharmonic.util.outcome import Outcome
 from quasiharmonic.util.progress import heartbeat
 
 # Orders of the axes x, y, z, and the sign that makes the determinant of the steps positive at rest.
@@ -58,7 +58,7 @@ _BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class InvertibleVolume(Outcome):
+class InvertibleVolume(NearestField):
     """The nearest displacement field on voxels without folds that was found.
 
     Attributes
@@ -80,24 +80,13 @@ class InvertibleVolume(Outcome):
     seconds : float
     """
 
-    field: FloatArray
-    moved_mask: BoolArray
-    folds: int
     remaining: BoolArray
     bijective: bool
-    patches: int
-    distance: float
-    seconds: float
 
     @property
     def success(self) -> bool:
         """Whether no cell remains: every tetrahedron is positive, decided exactly, and above the bound."""
         return not self.remaining.any()
-
-    @property
-    def message(self) -> str:
-        """The text of `summary`."""
-        return self.summary()
 
     def summary(self) -> str:
         """Describe the field in one or two sentences."""
@@ -135,6 +124,16 @@ class VoxelGrid(Grid):
         """Return the first voxels (k,) of cells given by a mask, voxels counted slice by slice."""
         return np.flatnonzero(np.pad(cells, ((0, 1), (0, 1), (0, 1))))
 
+    def each_layer(self, field: FloatArray, scale: FloatArray) -> Iterator[tuple[int, FloatArray, list[FloatArray]]]:
+        """Yield the number of every layer of cells, positions (3, 2, h, w), and their differences along x, y and z.
+
+        The differences are divided by ``scale``, which has an entry for each coordinate.
+        """
+        for z in range(self.shape[0] - 1):
+            heartbeat()
+            p = np.moveaxis(self.positions(field, z, z + 2), -1, 0)
+            yield z, p, [np.diff(p, axis=axis) / scale[:, None, None, None] for axis in (3, 2, 1)]
+
     def tetrahedra(self, cells: IntArray) -> IntArray:
         """The tetrahedra (6 k, 4) of cells given by their first voxels (k,), voxels counted slice by slice."""
         steps = np.array([1, self.shape[2], self.shape[1] * self.shape[2]])
@@ -158,14 +157,10 @@ def in_units(field: FloatArray, spacing: ArrayLike) -> tuple[VoxelGrid, FloatArr
 
 def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | None) -> BoolArray:
     """Cells (d − 1, h − 1, w − 1) with a determinant not above a bound; for None, not positive, decided exactly."""
-    d, h, w = grid.cell_shape
+    _, h, w = grid.cell_shape
     folds = np.zeros(grid.cell_shape, dtype=np.bool_)
     # For the bound, a cell has volume 1. Exact signs are those of the positions as stored.
-    scale = np.ones((3, 1, 1, 1)) if min_jacobian is None else grid.spacing[:, None, None, None]
-    for z in range(d):
-        heartbeat()
-        p = np.moveaxis(grid.positions(field, z, z + 2), -1, 0)
-        steps = [np.diff(p, axis=axis) / scale for axis in (3, 2, 1)]
+    for z, p, steps in grid.each_layer(field, np.ones(3) if min_jacobian is None else grid.spacing):
         unsure = np.zeros((h, w), dtype=np.bool_)
         for order, sign in _ORDERS:
             at = [0, 0, 0]
@@ -174,12 +169,7 @@ def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | 
                 edges.append(steps[axis][:, at[2], at[1] : at[1] + h, at[0] : at[0] + w])
                 at[axis] = 1
             a, b, c = edges
-            terms = (
-                a[0] * (b[1] * c[2] - b[2] * c[1]),
-                a[1] * (b[2] * c[0] - b[0] * c[2]),
-                a[2] * (b[0] * c[1] - b[1] * c[0]),
-            )
-            D = sign * (terms[0] + terms[1] + terms[2])
+            D = sign * dot(a, cross(b, c))
             if min_jacobian is not None:
                 folds[z] |= ~(min_jacobian < D)
             else:
@@ -278,10 +268,7 @@ def _repair_patch(
     energy = ShapeEnergy(T, rest, floor=min(_AIM * min_jacobian + 1e-9, 0.99))
     descent = Descent(energy, free, before, anchor=(before, 1.0 / len(T)))
     with np.errstate(all="ignore"):
-        if not energy.determinants(before).min() > energy.floor:
-            for _ in descent.untangle(_UNTANGLING_STEPS):
-                pass
-        if not energy.determinants(descent.X).min() > energy.floor:
+        if not descent.make_valid(_UNTANGLING_STEPS):
             return False
         for weight in _WEIGHTS:
             descent.anchor = before, 1.0 / (weight * len(T))

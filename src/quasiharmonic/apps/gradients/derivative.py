@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,13 +55,6 @@ class Doubt(Enum):
     CLIPPED = "Tensors have the largest anisotropy that double precision allows, and no longer depend on μ."
 
 
-class Inverse(Protocol):
-    """The inverse of the derivative of the forces by the free positions; symmetric."""
-
-    def solve(self, load: ComplexArray) -> ComplexArray:
-        """Return the displacement (n,) of all vertices under a load (n,); zero at fixed vertices."""
-
-
 @dataclass(frozen=True, eq=False)
 class Scale:
     """A factor s between the scales of a map and its surface.
@@ -82,14 +74,15 @@ class Scale:
 class Equilibrium:
     """The forces at a map, all that they depend on, and the inverse of their derivative.
 
-    ``fixed`` (k,) are the fixed vertices, and ``on_curves`` those of them whose positions curves determine.
+    ``fixed`` (k,) are the fixed vertices, and ``on_curves`` those of them whose positions curves determine. ``inverse``
+    returns the displacement (n,) of all vertices under a load (n,), zero at fixed vertices; it is symmetric.
     ``strain`` makes the strain of the rest triangles when it is first used. ``unit`` is the unit of the forces' map,
     and ``rest_shape`` the shape of the rest positions.
     """
 
     fixed: IntArray
     forces: Forces
-    inverse: Inverse
+    inverse: Callable[[ComplexArray], ComplexArray]
     strain: Callable[[], Strain] | None
     rest_shape: tuple[int, ...]
     unit: float = 1.0
@@ -232,7 +225,7 @@ class Derivative:
         more = 0.0 if of.scale is None else of.scale.change(held, moved)
         if of.scaled:
             load += more * of.forces.by_scale
-        dw = held - of.inverse.solve(load)
+        dw = held - of.inverse(load)
         if of.gauge is not None:
             dw = of.gauge.select(dw, held, more)
         return to_rows(of.unit * dw)
@@ -259,7 +252,7 @@ class Derivative:
         on_pin, on_scale = 0j, 0.0
         if of.gauge is not None:
             pull, on_pin, on_scale = of.gauge.pull_back(pull)
-        adjoint = of.inverse.solve(pull)
+        adjoint = of.inverse(pull)
         if of.scaled:
             on_scale -= work(of.forces.by_scale, adjoint)
         return Gradients(of, pull, of.forces.respond(adjoint), on_pin, on_scale)

@@ -20,7 +20,7 @@ from quasiharmonic.energies.polishing import check_injective, find_energy
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
-from quasiharmonic.util.arrays import ComplexArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray
 from quasiharmonic.util.options import FlattenOptions, takes
 
 # Energies with a relative difference of at most this are equal, as in `flattening.piece`.
@@ -87,7 +87,7 @@ def flatten_derivative(
 def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: FlattenOptions) -> Derivative:
     """Converge a flattened map to rounding, and differentiate it; see `flatten_derivative`."""
     domain = Domain(V, F, () if options.fixed is None else options.fixed)
-    chosen, linear_solver = find_energy(options.energy), options.linear_solver
+    chosen = find_energy(options.energy)
     start = check_injective(domain, uv, NOT_FOUND)
     strain = make_strain(domain)
     exponent = int(np.frexp(np.abs(domain.V).max())[1])
@@ -99,21 +99,29 @@ def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: 
         weights=None if options.weights is None else positive_weights(options.weights, len(domain.F)),
     )
     gauge = _gauge(measure, w, domain)
+
+    def find_minimum(w: ComplexArray, *, converge: bool = True) -> Minimum:
+        fixed, sliding, tangent = domain.fixed, None, None
+        if gauge is not None:
+            fixed, sliding, tangent = replace(gauge, w=w).constraints()
+        freedom = Freedom(measure, w.size, fixed, options.linear_solver, sliding, tangent)
+        return Minimum(measure, w, freedom, converge=converge)
+
     if gauge is not None and gauge.keeps_area:
         # First converge at any scale, then scale to the surface's area.
-        w = _minimum(measure, w, gauge, domain.fixed, linear_solver).w
+        w = find_minimum(w).w
         size = float(np.ldexp(strain.m, -2 * exponent).sum())
         w = (w - w.mean()) * np.sqrt(size / signed_areas(domain.F, w).sum()) + w.mean()
-    minimum, doubts = _minimum(measure, w, gauge, domain.fixed, linear_solver), []
+    minimum, doubts = find_minimum(w), []
     if _overlaps(domain, minimum.w) and not _overlaps(domain, w):
-        minimum, doubts = _minimum(measure, w, gauge, domain.fixed, linear_solver, converge=False), [Doubt.CONTACT]
+        minimum, doubts = find_minimum(w, converge=False), [Doubt.CONTACT]
     scale = None
     if gauge is not None and gauge.keeps_area:
         scale = Scale(np.zeros_like(w), differentiate_surface_size(strain))
     equilibrium = Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
-        inverse=minimum,
+        inverse=minimum.solve,
         strain=lambda: strain,
         rest_shape=domain.V.shape,
         unit=2.0**exponent,
@@ -133,21 +141,6 @@ def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge
         here, doubled = measure.value(w), measure.value(2 * w)
     pin = int(domain.fixed[0]) if domain.fixed.size else None
     return Gauge(w, pin, abs(doubled - here) <= _EQUAL_ENERGY * here, domain.loops)
-
-
-def _minimum(
-    measure: DeformationEnergy,
-    w: ComplexArray,
-    gauge: Gauge | None,
-    fixed: IntArray,
-    linear_solver: str,
-    *,
-    converge: bool = True,
-) -> Minimum:
-    sliding, tangent = None, None
-    if gauge is not None:
-        fixed, sliding, tangent = replace(gauge, w=w).constraints()
-    return Minimum(measure, w, Freedom(measure, w.size, fixed, linear_solver, sliding, tangent), converge=converge)
 
 
 def _overlaps(domain: Domain, w: ComplexArray) -> bool:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apps.flattening.free_boundary import flatten_surface
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.flatten_gradient import differentiate_flattened
+from quasiharmonic.apps.gradients.flatten_gradient import FlattenDerivativeKeywords, differentiate_flattened
 from quasiharmonic.apps.gradients.polish_gradient import differentiate_polish
 from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
 from quasiharmonic.energies.energies import Energy
@@ -56,14 +56,10 @@ class SolvedKeywords(TypedDict, total=False):
     linear_solver: str
 
 
-class FlattenedKeywords(TypedDict, total=False):
+class FlattenedKeywords(FlattenDerivativeKeywords, total=False):
     """Types of the options of a flattened layer."""
 
-    fixed: ArrayLike | None
-    energy: str | Energy
-    weights: ArrayLike | None
     start: ArrayLike | None
-    linear_solver: str
 
 
 @dataclass(frozen=True, kw_only=True)

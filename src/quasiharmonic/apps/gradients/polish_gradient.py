@@ -114,7 +114,7 @@ def differentiate_polish(domain: Domain, uv: ArrayLike, options: PolishOptions) 
     equilibrium = Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
-        inverse=minimum,
+        inverse=minimum.solve,
         strain=lambda: strain,
         rest_shape=domain.V.shape,
         unit=2.0**exponent,

@@ -20,21 +20,10 @@ from quasiharmonic.apps.gradients.forces import Forces, TensorForces
 from quasiharmonic.apps.gradients.strain import CorrectedStrain, RestStrain, Strain
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.linsolve.laplacian import FactoredLaplacian
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH, beltrami_coefficients
 from quasiharmonic.util.arrays import ComplexArray, check_choice
-
-
-class _Response:
-    """The inverse that `Derivative` needs, from a factored Laplacian."""
-
-    def __init__(self, operator: FactoredLaplacian) -> None:
-        self._operator = operator
-
-    def solve(self, load: ComplexArray) -> ComplexArray:
-        return self._operator.respond(load)
 
 
 def quasi_harmonic_derivative(
@@ -104,7 +93,7 @@ def quasi_harmonic_derivative(
     equilibrium = Equilibrium(
         fixed=problem.fixed,
         forces=Forces(corners, problem.n, half, mesh.m, dw.p, dw.q, by_p, by_q, form),
-        inverse=_Response(operator),
+        inverse=operator.respond,
         strain=strain,
         rest_shape=problem.V.shape,
         tensors=TensorForces(field),

@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from quasiharmonic.apps.flattening.pins.obstructions import renumber_obstruction
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
@@ -244,13 +245,7 @@ def _check_interrupt(result: MapResult) -> MapResult:
 
 def _renumber(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obstruction:
     """Renumber the elements of an obstruction; its message then names the new numbers."""
-    there = replace(
-        found,
-        vertices=vertices[found.vertices],
-        edges=vertices[found.edges],
-        triangles=triangles[found.triangles],
-        split=vertices[found.split],
-    )
+    there = renumber_obstruction(found, vertices, triangles)
     if np.array_equal(vertices, np.arange(len(vertices))) and np.array_equal(triangles, np.arange(len(triangles))):
         return there
     elements = (

@@ -12,7 +12,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.atlas.atlas_verdict import mirrored_islands
+from quasiharmonic.apps.atlas.atlas_verdict import IslandReport, mirrored_islands
 from quasiharmonic.apps.repair.island_repair import IslandRepair
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
@@ -27,12 +27,12 @@ from quasiharmonic.util.arrays import (
     vertex_indices,
 )
 from quasiharmonic.util.options import RepairOptions, takes
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import SummarisedOutcome
 from quasiharmonic.util.progress import reports_progress
 
 
 @dataclass(frozen=True, eq=False)
-class RepairedIsland:
+class RepairedIsland(IslandReport):
     """The repair report of one island; indices are the mesh's, from 0.
 
     Attributes
@@ -54,11 +54,9 @@ class RepairedIsland:
         The obstruction to a map with this boundary, computed if triangles are still inverted.
     """
 
-    triangles: IntArray
     inverted_before: IntArray
     inverted: IntArray
     moved_vertices: IntArray
-    mirrored: bool
     bijective: bool
     reason: str = ""
     diagnosis: Diagnosis | None = None
@@ -87,9 +85,7 @@ class RepairedIsland:
     def to_dict(self) -> dict[str, Any]:
         """The report for JSON, with the first triangle and the number of triangles."""
         return {
-            "first_triangle": int(self.triangles[0]),
-            "triangles": len(self.triangles),
-            "mirrored": self.mirrored,
+            **super().to_dict(),
             "injective": self.injective,
             "bijective": self.bijective,
             "inverted_before": self.inverted_before.tolist(),
@@ -101,7 +97,7 @@ class RepairedIsland:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RepairResult(Outcome):
+class RepairResult(SummarisedOutcome):
     """A repaired map with a report for every island.
 
     Attributes
@@ -125,11 +121,6 @@ class RepairResult(Outcome):
         return self.injective
 
     @property
-    def message(self) -> str:
-        """The first line of `summary`."""
-        return self.summary().partition("\n")[0]
-
-    @property
     def injective(self) -> bool:
         """Whether there is an island, and every triangle of every island is strictly positive."""
         return bool(self.islands) and all(island.injective for island in self.islands)
@@ -143,7 +134,7 @@ class RepairResult(Outcome):
 
     def summary(self) -> str:
         """Describe the repair, in total and for every island that needed it."""
-        before, now = (sum(len(getattr(i, name)) for i in self.islands) for name in ("inverted_before", "inverted"))
+        before, now = self._count_inverted()
         lines = [
             f"{count_of('island', 'islands', len(self.islands))}: "
             f"{count_of('triangle', 'triangles', before)} inverted before, {now} now; "
@@ -151,14 +142,19 @@ class RepairResult(Outcome):
         ]
         return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
 
+    def _count_inverted(self) -> tuple[int, int]:
+        """Numbers of inverted triangles before and after the repair."""
+        return sum(len(i.inverted_before) for i in self.islands), sum(len(i.inverted) for i in self.islands)
+
     def to_dict(self) -> dict[str, Any]:
         """The report for JSON, without the map."""
+        before, now = self._count_inverted()
         return {
             "success": self.success,
             "message": self.message,
             "injective": self.injective,
-            "inverted_before": sum(len(island.inverted_before) for island in self.islands),
-            "inverted": sum(len(island.inverted) for island in self.islands),
+            "inverted_before": before,
+            "inverted": now,
             "moved_vertices": len(self.moved_vertices),
             "islands": [island.to_dict() for island in self.islands],
         }
