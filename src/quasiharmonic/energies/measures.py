@@ -212,8 +212,7 @@ class Distortion(Displayable):
 
     def plot(self, measure: str = "isometric") -> Figure:
         """Draw surface and map coloured by a measure, and its histogram, with `quasiharmonic.plot.plot_distortion`."""
-        figure: Figure = self._draw("distortion", measure=measure)
-        return figure
+        return self._draw("distortion", measure=measure)
 
     def to_dict(self) -> dict[str, Any]:
         """Return counts and the summaries of all measures for JSON, with None for undefined summaries."""

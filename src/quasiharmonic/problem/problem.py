@@ -210,8 +210,7 @@ class Problem(ReadOnly, Displayable):
 
     def plot(self) -> Figure:
         """Draw the surface beside the target positions of its boundary and pins; return a matplotlib Figure."""
-        figure: Figure = self._draw("problem")
-        return figure
+        return self._draw("problem")
 
     @cached_property
     def frame(self) -> Frame:

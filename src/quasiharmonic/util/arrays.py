@@ -137,9 +137,20 @@ def mark(n: int, *chosen: IntArray) -> BoolArray:
     return marked
 
 
+def any_corner(marked: BoolArray) -> BoolArray:
+    """Whether each triangle has a marked corner (f, 3); (f,) bool, many times faster than NumPy's ``any``."""
+    some: BoolArray = marked[:, 0] | marked[:, 1] | marked[:, 2]
+    return some
+
+
 def list_others(n: int, chosen: IntArray) -> IntArray:
     """Ascending numbers below ``n`` that are not among the given ones."""
     return np.flatnonzero(~mark(n, chosen))
+
+
+def cyclic_pairs(loop: IntArray) -> IntArray:
+    """Pairs (k, 2) of each element of a closed loop (k,) and the next, such as the edges of a boundary loop."""
+    return np.stack([loop, np.roll(loop, -1)], axis=1)
 
 
 def invert_indices(n: int, chosen: IntArray) -> IntArray:

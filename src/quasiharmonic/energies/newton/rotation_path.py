@@ -71,7 +71,7 @@ class RotationPath:
             beyond_p = turned * (p + t * strain_p) - (p + t * dp)
             beyond_q = turned * (q + t * strain_q) - (q + t * dq)
             load = self._area * (beyond_p * self._g + beyond_q * self._g.conj())
-            return w + t * direction + self._laplacian.respond(self._gather(load, w.size))
+            return w + t * direction + self._laplacian.respond(sum_at(self._corners.ravel(), load.ravel(), w.size))
 
         return at
 
@@ -79,7 +79,3 @@ class RotationPath:
         """``∂w/∂z`` and ``∂w/∂z̄`` on every triangle, (f,) complex128 each."""
         corners = w[self._corners]
         return np.sum(self._g.conj() * corners, axis=0), np.sum(self._g * corners, axis=0)
-
-    def _gather(self, load: ComplexArray, n: int) -> ComplexArray:
-        """Sum the loads (3, f) of triangle corners at every vertex (n,)."""
-        return sum_at(self._corners.ravel(), load.ravel(), n)

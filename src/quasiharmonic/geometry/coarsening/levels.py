@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.coarsening.removal import allocate_round, fill_rings, remove_vertices, split_by_degree
-from quasiharmonic.util.arrays import BoolArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, IntArray, any_corner
 from quasiharmonic.util.progress import heartbeat
 
 # A round that can remove only this fraction of the vertices is not carried out.
@@ -106,8 +106,7 @@ def coarsen(F: IntArray, n: int, fixed: BoolArray, goal: int) -> Coarsening:
 
 def has_marked_corner(T: IntArray, marked: BoolArray) -> BoolArray:
     """Whether each triangle has a marked corner; (f,) bool."""
-    corners = marked.take(T)
-    return corners[:, 0] | corners[:, 1] | corners[:, 2]
+    return any_corner(marked.take(T))
 
 
 def _removals(names: IntArray, vertices: IntArray, rings: IntArray, of_degree: IntArray) -> list[Removal]:

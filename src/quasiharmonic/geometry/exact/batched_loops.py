@@ -36,24 +36,6 @@ def certify_each(
         rims = [loops[k][0] + vertices[k] for k in candidates.tolist()]
         good[candidates] = simple_loops(rims, positions)
     return [
-        _bijective_certificate(F[k], uv[k], loops[k]) if good[k] else certify(F[k], uv[k], loops=loops[k])
+        Certificate(F[k], uv[k], True, loops=tuple(loops[k])) if good[k] else certify(F[k], uv[k], loops=loops[k])
         for k in range(len(F))
     ]
-
-
-def _bijective_certificate(F: IntArray, uv: FloatArray, loops: Sequence[IntArray]) -> Certificate:
-    """Certificate of a bijective map."""
-    none = np.empty(0, dtype=np.int64)
-    return Certificate(
-        triangles=len(F),
-        inverted=none,
-        degenerate=none,
-        nonfinite=none,
-        bijective=True,
-        reasons=(),
-        loops=tuple(loops),
-        crossings=np.empty((0, 4), dtype=np.int64),
-        multiply_wound=none,
-        F=F,
-        uv=uv,
-    )

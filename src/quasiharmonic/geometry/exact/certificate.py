@@ -31,11 +31,10 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.loops import Obstacle, Reason, check_loops, join_items, simple_loops
 from quasiharmonic.geometry.exact.triangles import find_multiply_wound, triangle_signs
@@ -54,19 +53,25 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+def _none() -> IntArray:
+    """No elements."""
+    return np.empty(0, dtype=np.int64)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(ReadOnly, Displayable):
     """Result of the exact test of a map; returned by `certify`.
 
     Attributes
     ----------
-    triangles : int
-        Number of triangles.
+    F : (f, 3) int64
+    uv : (n, 2) float64
+        Triangles and map that were checked, as copies. All arrays are read-only and cannot be made writeable.
+    bijective : bool or None
+        Whether the map is injective and covers no point twice; None if the boundary was not checked.
     inverted, degenerate, nonfinite : (k,) int64
         Ascending indices of triangles. Inverted triangles are clockwise. Degenerate triangles have exactly zero area;
         they include those that repeat a vertex. Nonfinite triangles have a NaN or infinite coordinate.
-    bijective : bool or None
-        Whether the map is injective and covers no point twice; None if the boundary was not checked.
     reasons : tuple of Reason
         Why the map is not bijective. The loops are checked even if triangles are inverted.
     loops : tuple of (l,) int64
@@ -77,9 +82,6 @@ class Certificate(ReadOnly, Displayable):
     multiply_wound : (k,) int64
         Vertices with only positive triangles around them whose angles add up to more than 2π. At an interior vertex the
         triangles wind more than once; at a boundary vertex the two ends of the fan overlap. See the notes.
-    F : (f, 3) int64
-    uv : (n, 2) float64
-        Triangles and map that were checked, as copies. All arrays are read-only and cannot be made writeable.
 
     Notes
     -----
@@ -90,17 +92,16 @@ class Certificate(ReadOnly, Displayable):
     empty if the boundary was not checked (`bijective` is None) or if the mesh is not a surface.
     """
 
-    triangles: int
-    inverted: IntArray
-    degenerate: IntArray
-    nonfinite: IntArray
-    bijective: bool | None
-    reasons: tuple[Reason, ...]
-    loops: tuple[IntArray, ...]
-    crossings: IntArray
-    multiply_wound: IntArray
     F: IntArray
     uv: FloatArray
+    bijective: bool | None
+    inverted: IntArray = field(default_factory=_none)
+    degenerate: IntArray = field(default_factory=_none)
+    nonfinite: IntArray = field(default_factory=_none)
+    reasons: tuple[Reason, ...] = ()
+    loops: tuple[IntArray, ...] = ()
+    crossings: IntArray = field(default_factory=lambda: _none().reshape(0, 4))
+    multiply_wound: IntArray = field(default_factory=_none)
 
     def __post_init__(self) -> None:
         self._seal()
@@ -112,17 +113,10 @@ class Certificate(ReadOnly, Displayable):
                 object.__setattr__(self, name, unchangeable(value))
         object.__setattr__(self, "loops", tuple(unchangeable(loop) for loop in self.loops))
 
-    def _read_only(self) -> tuple[NDArray[Any], ...]:
-        return (
-            self.F,
-            self.uv,
-            self.inverted,
-            self.degenerate,
-            self.nonfinite,
-            self.crossings,
-            self.multiply_wound,
-            *self.loops,
-        )
+    @property
+    def triangles(self) -> int:
+        """Number of triangles."""
+        return len(self.F)
 
     @property
     def injective(self) -> bool:
@@ -157,8 +151,7 @@ class Certificate(ReadOnly, Displayable):
 
     def plot(self) -> Figure:
         """Draw the certified map, with non-positive triangles in red and marks on boundary edges that meet."""
-        figure: Figure = self._draw("certificate")
-        return figure
+        return self._draw("certificate")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the certificate in plain Python types, fit for JSON; each loop as its first vertex and its length."""
@@ -195,7 +188,7 @@ def certify(
     """
     F, uv = unchangeable(F), unchangeable(uv)
     sign, nonfinite = triangle_signs(F, uv)
-    inverted = degenerate = np.empty(0, dtype=np.int64)
+    inverted = degenerate = _none()
     reasons: list[Reason] = []
     if not len(F):
         reasons.append(Reason(Obstacle.NO_TRIANGLES, "there are no triangles"))
@@ -205,7 +198,7 @@ def certify(
         text = f"of {len(F)} triangles, {_count_by_kind(inverted, degenerate, nonfinite)}"
         reasons.append(Reason(Obstacle.NOT_INJECTIVE, text))
     known: list[IntArray] = []
-    crossings, multiply_wound = np.empty((0, 4), dtype=np.int64), np.empty(0, dtype=np.int64)
+    crossings, multiply_wound = _none().reshape(0, 4), _none()
     if boundary and len(F):
         known, defects = _find_loops(F, len(uv)) if loops is None else (list(loops), [])
         reasons += defects
@@ -221,17 +214,16 @@ def certify(
             text = f"triangles wind more than once around {names_of('vertex', 'vertices', multiply_wound)}"
             reasons.append(Reason(Obstacle.MULTIPLY_WOUND, text))
     return Certificate(
-        triangles=len(F),
+        F,
+        uv,
+        not reasons if boundary else None,
         inverted=inverted,
         degenerate=degenerate,
         nonfinite=nonfinite,
-        bijective=not reasons if boundary else None,
         reasons=tuple(reasons),
         loops=tuple(known),
         crossings=crossings,
         multiply_wound=multiply_wound,
-        F=F,
-        uv=uv,
     )
 
 
@@ -256,7 +248,7 @@ def _count_by_kind(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray
 
 def _find_loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
     """Boundary loops, or the reasons why there are no valid loops."""
-    parts, repeated = edges(F, n), np.empty(0, dtype=np.int64)
+    parts, repeated = edges(F, n), _none()
     # An edge from a vertex to itself is never interior, so only the other kinds of edges need a test.
     if any((some[:, 0] == some[:, 1]).any() for some in (parts.boundary, parts.inconsistent, parts.nonmanifold)):
         repeated = np.flatnonzero(are_collapsed(F))

@@ -26,7 +26,7 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.exact.sweep import triangulate
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges, label_components, pair_keys
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, to_integers
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, mark, to_integers
 
 # Bound with a margin on the rounding of an orientation, relative to the sum of the magnitudes of its terms.
 _ORIENTATION_BOUND = 4e-16
@@ -95,9 +95,20 @@ def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
         return None
     triangulation = Triangulation(points, np.array(triangulate(corners), dtype=np.int64))
     sides = np.arange(len(points))
-    triangulation.require(np.stack([sides, np.roll(sides, -1)], axis=1))
+    triangulation.require(cyclic_pairs(sides))
     triangulation.legalise()
     return triangulation.triangles()
+
+
+def triangulate_inside(points: FloatArray, rim: IntArray, low: FloatArray, high: FloatArray) -> IntArray:
+    """Return the constrained Delaunay triangles (t, 3) to the left of directed edges ``rim`` (m, 2) that form loops.
+
+    ``low`` and ``high`` (2,) are corners of a box around all points. Raises as `constrained_delaunay`.
+    """
+    k = len(points)
+    box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    F = constrained_delaunay(np.concatenate([points, box]), rim, k + np.arange(4))
+    return F[select_inside(F, rim, k + 4)]
 
 
 def select_inside(F: IntArray, rim: IntArray, n: int) -> BoolArray:

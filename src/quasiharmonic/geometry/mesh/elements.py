@@ -94,10 +94,8 @@ def join_elements(blocks: Sequence[IntArray]) -> IntArray:
         raise ValueError(
             "the mesh has both six-node triangles and other elements: all elements must have the same order"
         )
-    width = max(sizes, default=3)
     # A triangle among quadrilaterals repeats its last node.
-    padded = [block[:, [*range(block.shape[1]), 2][:width]] for block in blocks if len(block)]
-    return np.concatenate([np.empty((0, width), dtype=np.int64), *padded])
+    return _join_rows(blocks, 3)
 
 
 def join_solids(blocks: Sequence[IntArray]) -> IntArray:
@@ -105,8 +103,14 @@ def join_solids(blocks: Sequence[IntArray]) -> IntArray:
 
     A tetrahedron among hexahedra repeats its last node.
     """
-    width = max((block.shape[1] for block in blocks if len(block)), default=4)
-    padded = [block[:, [*range(block.shape[1]), *[3] * 4][:width]] for block in blocks if len(block)]
+    return _join_rows(blocks, 4)
+
+
+def _join_rows(blocks: Sequence[IntArray], shortest: int) -> IntArray:
+    """Join blocks of elements into rows of the largest length; shorter rows repeat their last node."""
+    rows = [block for block in blocks if len(block)]
+    width = max((block.shape[1] for block in rows), default=shortest)
+    padded = [np.pad(block, ((0, 0), (0, width - block.shape[1])), mode="edge") for block in rows]
     return np.concatenate([np.empty((0, width), dtype=np.int64), *padded])
 
 

@@ -7,7 +7,7 @@ corner is the intersection of two of the original lines.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -37,11 +37,30 @@ def reverse(along: Line) -> Line:
     return -a, -b, -c
 
 
-def _meet(first: Line, second: Line) -> Line:
-    """Return the intersection of two lines, in homogeneous coordinates."""
+def join(first: Line, second: Line) -> Line:
+    """Return the intersection of two lines, or the line through two points; all in homogeneous coordinates.
+
+    The line is positive to the left of the direction from the first point to the second.
+    """
     a, b, c = first
     d, e, f = second
     return b * f - c * e, c * d - a * f, a * e - b * d
+
+
+class Rounding:
+    """Conversion of integer points to doubles of magnitude one; ``low`` and ``high`` bound the points."""
+
+    def __init__(self, points: Sequence[Point]) -> None:
+        xs, ys = zip(*points, strict=True)
+        self.low, self.high = (min(xs), min(ys)), (max(xs), max(ys))
+        self.centre = (self.low[0] + self.high[0]) // 2, (self.low[1] + self.high[1]) // 2
+        self.unit = max(self.high[0] - self.low[0], self.high[1] - self.low[1], 1)
+
+    def round(self, points: Iterable[tuple[int, int, int]]) -> FloatArray:
+        """Return points in homogeneous coordinates, centred, scaled and rounded; (k, 2) float64."""
+        (cx, cy), unit = self.centre, self.unit
+        # Python rounds quotients of integers once, for any size.
+        return np.array([((x - cx * w) / (unit * w), (y - cy * w) / (unit * w)) for x, y, w in points])
 
 
 @dataclass(frozen=True)
@@ -65,7 +84,7 @@ class Convex:
         (x0, y0), (x1, y1) = low, high
         corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
         sides = [line(corners[i], corners[(i + 1) % 4]) for i in range(4)]
-        return Convex(sides, [_meet(sides[i - 1], sides[i]) for i in range(4)])
+        return Convex(sides, [join(sides[i - 1], sides[i]) for i in range(4)])
 
     def cut(self, along: Line) -> Convex | None:
         """Return the part to the left of a line, or None if it has no area."""
@@ -84,10 +103,10 @@ class Convex:
                 corners.append(self.corners[i])
             elif after > 0:
                 lines.append(side)
-                corners.append(_meet(along, side))
+                corners.append(join(along, side))
             if here > 0 and after <= 0:
                 lines.append(along)
-                corners.append(self.corners[i + 1 - len(sides)] if after == 0 else _meet(side, along))
+                corners.append(self.corners[i + 1 - len(sides)] if after == 0 else join(side, along))
         return Convex(lines, corners)
 
 
@@ -110,20 +129,13 @@ class Lattice:
         integers = [m << s for m, s in zip(mantissa.ravel().tolist(), shift.ravel().tolist(), strict=True)]
         self.points: list[Point] = list(zip(integers[::2], integers[1::2], strict=True))
         self._lowest = lowest - 53
-        xs, ys = integers[::2], integers[1::2]
-        self.low, self.high = (min(xs), min(ys)), (max(xs), max(ys))
-        self._centre = (self.low[0] + self.high[0]) // 2, (self.low[1] + self.high[1]) // 2
-        self._unit = max(self.high[0] - self.low[0], self.high[1] - self.low[1], 1)
-        self.approximate = self._approximate([(x, y, 1) for x, y in self.points])
-
-    def _approximate(self, points: Sequence[tuple[int, int, int]]) -> FloatArray:
-        (cx, cy), unit = self._centre, self._unit
-        # Python rounds quotients of integers once, for any size.
-        return np.array([((x - cx * w) / (unit * w), (y - cy * w) / (unit * w)) for x, y, w in points])
+        self._rounding = Rounding(self.points)
+        self.low, self.high = self._rounding.low, self._rounding.high
+        self.approximate = self._rounding.round((x, y, 1) for x, y in self.points)
 
     def corners(self, area: Convex) -> FloatArray:
         """Return corners of a polygon in the coordinates of ``approximate``; (r, 2) float64."""
-        return self._approximate(area.corners)
+        return self._rounding.round(area.corners)
 
     def middle(self, area: Convex) -> tuple[float, float]:
         """Return a position in the middle of a polygon: the mean of three distant corners, rounded once."""

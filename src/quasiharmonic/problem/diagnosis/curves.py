@@ -19,7 +19,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.loops import Contacts, contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, repeat_each
 from quasiharmonic.util.progress import heartbeat
 
 # Limit on the pairs of meeting edges to collect; a longer list would not help the user.
@@ -62,7 +62,7 @@ class TargetCurves:
     def __init__(self, positions: FloatArray, loops: list[IntArray]) -> None:
         self.positions = positions
         self.loops = [_from_lowest(positions, loop) for loop in loops]
-        self.ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops])
+        self.ends = np.concatenate([cyclic_pairs(loop) for loop in self.loops])
         self.loop_of = repeat_each(np.arange(len(loops)), [len(loop) for loop in self.loops])
 
     @cached_property
@@ -140,6 +140,14 @@ class TargetCurves:
             left = self._left_at_start(index) + np.cumsum([0, *along.values()])
             ranges.append((left.min() - 1, left.max()))
         return np.array(ranges, dtype=np.int64)
+
+    @property
+    def proper(self) -> bool:
+        """Whether the loops are simple, disjoint, and nested as holes in one outer loop."""
+        if not self.simple or self.turning is None or self.winding_range is None:
+            return False
+        low, high = self.winding_range.T
+        return self.turning.count(1) == 1 and bool((low >= 0).all() and (high <= 1).all())
 
     def _crossing_position(self, edge: int, other: int) -> Fraction:
         """Return the position along an edge where another crosses it, from 0 at its tail to 1 at its head."""

@@ -17,7 +17,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.curves import TargetCurves
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, smallest_conflict, vertex_names
-from quasiharmonic.util.arrays import edge_names, names_of
+from quasiharmonic.util.arrays import cyclic_pairs, edge_names, names_of
 
 
 def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
@@ -36,7 +36,7 @@ def inverted_fixed_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obs
     sign = orientation(*(fixture.positions[corners[:, k]] for k in range(3)))
     boundary = pair_keys(problem.domain.edges.boundary, problem.n)
     for t, abc, s in zip(triangles[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
-        sides = np.stack([abc, np.roll(abc, -1)], axis=1)
+        sides = cyclic_pairs(abc)
         message = (
             f"All vertices of {names_of('triangle', 'triangles', t[None])} are fixed, "
             f"and the target {'inverts' if s < 0 else 'flattens'} it."
@@ -74,29 +74,22 @@ def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction
         around = edge[of == k]
         message = f"The fixed {edge_names(around)} around a part of the mesh leave it no positive area."
         split = around[~np.isin(pair_keys(around, problem.n), boundary)]
-        yield Obstruction(
-            Kind.INVERTED_PATCH,
-            Forbids.INJECTIVE,
-            message,
-            edges=around,
-            triangles=open_triangles[patch == k],
-            split=split,
-        )
+        inside = open_triangles[patch == k]
+        yield Obstruction(Kind.INVERTED_PATCH, Forbids.INJECTIVE, message, edges=around, triangles=inside, split=split)
 
 
-def misplaced_pins(problem: Problem, fixture: Fixture, curves: TargetCurves, proper: bool) -> Iterator[Obstruction]:
+def misplaced_pins(problem: Problem, fixture: Fixture, curves: TargetCurves) -> Iterator[Obstruction]:
     """Yield pins whose positions no map can reach.
 
     The number of pins at a position must not exceed the winding number of the boundary there. If the boundary winds at
-    most once, pins must lie inside, at distinct positions. ``proper`` tells whether the curves are simple and properly
-    nested.
+    most once, pins must lie inside, at distinct positions.
     """
     pins = problem.domain.pins
     if not pins.size:
         return
     where, same, times = np.unique(fixture.positions[pins], axis=0, return_inverse=True, return_counts=True)
     covered, on = winding(where, curves.tails, curves.heads)
-    bad = np.where(on, proper, covered < times)
+    bad = np.where(on, curves.proper, covered < times)
     for k in np.flatnonzero(bad).tolist():
         here = pins[same.ravel() == k]
         if on[k]:
@@ -120,16 +113,9 @@ def half_planes(star: Star, fixture: Fixture) -> Obstruction | None:
     )
     needed = star.opposite[conflict]
     vertex = np.array([star.vertex])
-    ends = np.unique(needed)
     message = (
         f"{vertex_names(vertex).capitalize()} must lie to the left of the fixed {edge_names(needed)}, "
         "but no point of the target's bounding box does."
     )
-    return Obstruction(
-        Kind.HALF_PLANES,
-        Forbids.INJECTIVE,
-        message,
-        vertices=vertex,
-        edges=needed,
-        split=np.stack([np.full(len(ends), star.vertex), ends], axis=1),
-    )
+    split = star.edges_to(needed)
+    return Obstruction(Kind.HALF_PLANES, Forbids.INJECTIVE, message, vertices=vertex, edges=needed, split=split)

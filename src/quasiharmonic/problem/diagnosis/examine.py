@@ -109,15 +109,14 @@ def diagnose(V: Any, *arguments: Any, **options: Any) -> Diagnosis:
             (reversed_,), ("all other conditions, which need target and mesh of the same orientation",), problem
         )
 
-    proper = _proper(curves)
-    unchecked = list(_list_unchecked(curves, proper))
+    unchecked = list(_list_unchecked(curves))
     found = list(_loop_obstructions(problem, curves, euler, area))
-    found += misplaced_pins(problem, fixture, curves, proper)
+    found += misplaced_pins(problem, fixture, curves)
     found += collapsed_edges(problem, fixture)
     found += inverted_fixed_triangles(problem, fixture)
     found += inverted_patches(problem, fixture)
     chords, corners = fixture.chords, None
-    if proper:
+    if curves.proper:
         corners = Corners(curves)
         bad = list(bad_chords(problem, fixture, curves, corners))
         found += bad
@@ -132,7 +131,7 @@ def diagnose(V: Any, *arguments: Any, **options: Any) -> Diagnosis:
         shortcuts = Shortcuts(problem, fixture, corners)
         found += shortcuts.find()
         unchecked.append(f"link distances of boundary vertices that are {shortcuts.unchecked} or more edges apart")
-    elif proper:
+    elif curves.proper:
         unchecked.append("link distances of fixed vertices that are three or more edges apart, around holes")
     return Diagnosis(tuple(found), tuple(unchecked), problem)
 
@@ -173,14 +172,6 @@ def _fits_mirrored(curves: TargetCurves, euler: int) -> bool:
     return mirrored.winding_range is None or bool((mirrored.winding_range[:, 0] >= 0).all())
 
 
-def _proper(curves: TargetCurves) -> bool:
-    """Return whether the loops are simple, disjoint, and nested as holes in one outer loop."""
-    if not curves.simple or curves.turning is None or curves.winding_range is None:
-        return False
-    low, high = curves.winding_range.T
-    return curves.turning.count(1) == 1 and bool((low >= 0).all() and (high <= 1).all())
-
-
 def _loop_obstructions(problem: Problem, curves: TargetCurves, euler: int, area: int) -> Iterator[Obstruction]:
     """Yield obstructions by the loops as a whole.
 
@@ -188,7 +179,6 @@ def _loop_obstructions(problem: Problem, curves: TargetCurves, euler: int, area:
     """
     every = np.arange(len(problem.domain.loops))
     turning, ranges = curves.turning, curves.winding_range
-    proper = _proper(curves)
     genus = problem.domain.handles
 
     if area <= 0:
@@ -197,9 +187,9 @@ def _loop_obstructions(problem: Problem, curves: TargetCurves, euler: int, area:
     if genus > 0:
         handles = "a handle" if genus == 1 else f"{genus} handles"
         message = f"The surface has {handles} and cannot be mapped into the plane without overlap."
-        forbids = Forbids.INJECTIVE if proper else Forbids.BIJECTIVE
+        forbids = Forbids.INJECTIVE if curves.proper else Forbids.BIJECTIVE
         yield Obstruction(Kind.GENUS, forbids, message)
-    if ranges is not None and curves.simple and not proper:
+    if ranges is not None and curves.simple and not curves.proper:
         yield _find_misnested(curves, euler)
     elif ranges is not None and (ranges[:, 0] < 0).any():
         loops = np.flatnonzero(ranges[:, 0] < 0)
@@ -259,9 +249,9 @@ def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
         )
 
 
-def _list_unchecked(curves: TargetCurves, proper: bool) -> Iterator[str]:
+def _list_unchecked(curves: TargetCurves) -> Iterator[str]:
     """Yield descriptions of the conditions that were not checked, and why."""
-    if proper:
+    if curves.proper:
         return
     yield "edges between fixed vertices and visibility from vertices, which need a simple target"
     if curves.turning is None:

@@ -99,6 +99,11 @@ class Star:
     neighbours: IntArray
     opposite: IntArray
 
+    def edges_to(self, ends: IntArray) -> IntArray:
+        """Return the edges (k, 2) from the vertex to some of its neighbours, given repeatedly and in any shape."""
+        ends = np.unique(ends)
+        return np.stack([np.full(len(ends), self.vertex), ends], axis=1)
+
 
 @dataclass(frozen=True)
 class Stars:

@@ -24,7 +24,7 @@ from itertools import pairwise
 import numpy as np
 
 from quasiharmonic.geometry.exact.sweep import triangulate
-from quasiharmonic.problem.diagnosis.clipping import MARGIN
+from quasiharmonic.problem.diagnosis.clipping import MARGIN, Rounding, join
 from quasiharmonic.util.arrays import IntArray
 from quasiharmonic.util.progress import heartbeat
 
@@ -57,11 +57,8 @@ class Polygon:
         self._parent, self._depth = [-1] * len(self.triangles), [0] * len(self.triangles)
         self._build_tree()
         self._triangle_at = {corner: t for t, triangle in enumerate(self.triangles) for corner in triangle}
-        xs, ys = zip(*corners, strict=True)
-        self._centre = (min(xs) + max(xs)) // 2, (min(ys) + max(ys)) // 2
-        self._unit = max(max(xs) - min(xs), max(ys) - min(ys))
-        (x, y), unit = self._centre, self._unit
-        self._approximate = np.array([((px - x) / unit, (py - y) / unit) for px, py in corners])
+        self._rounding = Rounding(corners)
+        self._approximate = self._rounding.round(self._points)
         self.work = len(corners)
 
     def _build_tree(self) -> None:
@@ -109,14 +106,14 @@ class Polygon:
                     k = at_right = at_left
                     to_left = to_right = _NOWHERE
                     continue
-                at_right, to_right = k, _cross(path[-1], right[k])
+                at_right, to_right = k, join(path[-1], right[k])
             if _side(to_left, left[k]) <= 0:
                 if _side(to_right, left[k]) < 0:
                     path.append(right[at_right])
                     k = at_left = at_right
                     to_left = to_right = _NOWHERE
                     continue
-                at_left, to_left = k, _cross(path[-1], left[k])
+                at_left, to_left = k, join(path[-1], left[k])
         path.append(self._points[goal])
         # Drop corners at which the path does not turn.
         return [p for k, p in enumerate(path) if k in (0, len(path) - 1) or _turn(path[k - 1], p, path[k + 1])]
@@ -149,7 +146,7 @@ class Polygon:
 
     def _extend_ray(self, before: Point, bend: Point) -> tuple[Point, int]:
         """Return where the ray from a point through a corner leaves the polygon, and a triangle there."""
-        along = _cross(before, bend)
+        along = join(before, bend)
         sides = self._sides(along)
         # `distance` is the distance from the bend, up to a positive factor.
         x, y, w = before
@@ -168,7 +165,7 @@ class Polygon:
         # it.
         for start, end in zip(beside[crossed].tolist(), np.roll(beside, -1)[crossed].tolist(), strict=True):
             if end == (start + 1) % n:
-                p = _cross(along, _cross(self._points[start], self._points[end]))
+                p = join(along, join(self._points[start], self._points[end]))
                 p = p if p[2] > 0 else (-p[0], -p[1], -p[2])
                 exits.append((distance(p), p, self._of_side[start, end]))
             else:
@@ -181,7 +178,7 @@ class Polygon:
     def _sides(self, line: Point) -> IntArray:
         """Return the side of a line of each corner: 1 for left, -1 for right, 0 on the line."""
         a, b, c = line
-        (x, y), unit, size = self._centre, self._unit, max(abs(a), abs(b))
+        (x, y), unit, size = self._rounding.centre, self._rounding.unit, max(abs(a), abs(b))
         # Python rounds quotients of integers once, for any size.
         value = self._approximate @ (a / size, b / size) + (a * x + b * y + c) / (size * unit)
         sides = np.where(value > 0, 1, -1)
@@ -196,11 +193,6 @@ def _with_last(triangle: tuple[int, int, int], corner: int) -> tuple[int, int, i
     return (b, c, a) if corner == a else (c, a, b) if corner == b else triangle
 
 
-def _cross(p: Point, q: Point) -> Point:
-    """Return the line through two points, positive to the left of the direction from the first to the second."""
-    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
-
-
 def _side(line: Point, p: Point) -> int:
     """Return 1 for a point to the left of a line, -1 for one to its right, 0 on it."""
     value = line[0] * p[0] + line[1] * p[1] + line[2] * p[2]
@@ -212,7 +204,7 @@ def _turn(p: Point, q: Point, r: Point) -> int:
     if p[2] == q[2] == r[2] == 1:
         value = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
         return (value > 0) - (value < 0)
-    return _side(_cross(p, q), r)
+    return _side(join(p, q), r)
 
 
 def _common_end(paths: list[list[Point]]) -> int:

@@ -9,7 +9,6 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from quasiharmonic.util.arrays import IntArray, ReadOnly, names_of
 from quasiharmonic.util.display import Displayable
@@ -49,8 +48,13 @@ class Kind(Enum):
     HIDDEN = "Split the edges between the vertex and the fixed vertices, because no point sees all of them."
 
 
-def _ints(values: ArrayLike, *shape: int) -> IntArray:
-    return np.array(values, dtype=np.int64).reshape(shape)
+# The fields of an obstruction with elements, and the shape of each.
+_ELEMENTS = {"vertices": (-1,), "edges": (-1, 2), "triangles": (-1,), "loops": (-1,), "split": (-1, 2)}
+
+
+def _none() -> IntArray:
+    """No elements."""
+    return np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,21 +84,19 @@ class Obstruction(ReadOnly):
     kind: Kind
     forbids: Forbids
     message: str
-    vertices: IntArray = field(default_factory=lambda: _ints([], -1))
-    edges: IntArray = field(default_factory=lambda: _ints([], -1, 2))
-    triangles: IntArray = field(default_factory=lambda: _ints([], -1))
-    loops: IntArray = field(default_factory=lambda: _ints([], -1))
-    split: IntArray = field(default_factory=lambda: _ints([], -1, 2))
+    vertices: IntArray = field(default_factory=_none)
+    edges: IntArray = field(default_factory=_none)
+    triangles: IntArray = field(default_factory=_none)
+    loops: IntArray = field(default_factory=_none)
+    split: IntArray = field(default_factory=_none)
 
     def __post_init__(self) -> None:
-        for name in ("vertices", "triangles", "loops"):
-            object.__setattr__(self, name, _ints(getattr(self, name), -1))
-        for name in ("edges", "split"):
-            object.__setattr__(self, name, _ints(getattr(self, name), -1, 2))
+        for name, shape in _ELEMENTS.items():
+            object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.int64).reshape(shape))
         self._seal()
 
-    def _read_only(self) -> tuple[IntArray, ...]:
-        return self.vertices, self.edges, self.triangles, self.loops, self.split
+    def _read_only(self) -> list[IntArray]:
+        return [getattr(self, name) for name in _ELEMENTS]
 
     @property
     def advice(self) -> str:
@@ -108,11 +110,7 @@ class Obstruction(ReadOnly):
             "forbids": self.forbids.name.lower(),
             "message": self.message,
             "advice": self.advice,
-            "vertices": self.vertices.tolist(),
-            "edges": self.edges.tolist(),
-            "triangles": self.triangles.tolist(),
-            "loops": self.loops.tolist(),
-            "split": self.split.tolist(),
+            **{name: getattr(self, name).tolist() for name in _ELEMENTS},
         }
 
 
@@ -149,7 +147,7 @@ class Diagnosis(Displayable):
     def split(self) -> IntArray:
         """Edges that the obstructions advise to split, each once; (s, 2) int64, smaller index first."""
         every = [np.sort(o.split, axis=1) for o in self.obstructions]
-        return np.unique(np.concatenate([_ints([], -1, 2), *every]), axis=0)
+        return np.unique(np.concatenate([_none().reshape(0, 2), *every]), axis=0)
 
     def summary(self, most: int = 5) -> str:
         """Return the diagnosis as text.
@@ -197,8 +195,7 @@ class Diagnosis(Displayable):
         ValueError
             If ``problem`` is None.
         """
-        figure: Figure = self._draw("diagnosis")
-        return figure
+        return self._draw("diagnosis")
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON: the forbidden classes, every obstruction, the edges to split."""

@@ -95,7 +95,6 @@ class Sight:
             ]
         vertex = np.array([star.vertex])
         beside = f", from the left of {edge_names(edges)}" if len(edges) else ""
-        ends = np.unique(np.concatenate([seen, edges.ravel()]))
         return Obstruction(
             Kind.HIDDEN,
             Forbids.INJECTIVE,
@@ -103,7 +102,7 @@ class Sight:
             f"but no point of the target sees all of them{beside}.",
             vertices=np.concatenate([vertex, seen]),
             edges=edges,
-            split=np.stack([np.full(len(ends), star.vertex), ends], axis=1),
+            split=star.edges_to(np.concatenate([seen, edges.ravel()])),
         )
 
     def _apart_first(self, vertices: IntArray) -> IntArray:

@@ -15,7 +15,7 @@ from quasiharmonic.solver.construction.cutting import Cutting, TooManyError
 from quasiharmonic.solver.construction.embedding import embed_pieces
 from quasiharmonic.solver.construction.opening import thin_refinement
 from quasiharmonic.solver.construction.simplicity import is_simple
-from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, scale_to_unit
+from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, scale_to_unit, to_complex
 
 # Maximum number of added vertices per mesh vertex before another way to cut is tried.
 _ADDED_PER_VERTEX = 50
@@ -102,7 +102,7 @@ def construct_and_thin(
         uncut = as_refined(problem.V, problem.F, problem.F, [])
         yield certify_map(uncut, np.zeros((problem.n, 2)) if guide is None else np.ldexp(guide, -exponent))
         return
-    near = None if guide is None else np.ldexp(guide, -exponent) @ np.array([1, 1j])
+    near = None if guide is None else to_complex(np.ldexp(guide, -exponent))
     refined, uv = _embed_pieces(unit, Cutting(unit, near, max_added))
     made = certify_map(refined, uv)
     yield made

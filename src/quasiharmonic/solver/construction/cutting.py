@@ -11,7 +11,7 @@ from quasiharmonic.solver.construction.regions import Regions
 from quasiharmonic.solver.construction.sheet import Sheet
 from quasiharmonic.solver.construction.sides import edges_along_sides
 from quasiharmonic.solver.construction.walks import walk
-from quasiharmonic.util.arrays import ComplexArray, invert_indices
+from quasiharmonic.util.arrays import ComplexArray, invert_indices, to_complex
 from quasiharmonic.util.progress import heartbeat
 
 
@@ -54,14 +54,17 @@ class Cutting:
         self.regions = Regions(problem.target, [point[loop] for loop in domain.loops], point[domain.pins])
         self.sheet = Sheet(problem.F, problem.n, domain.pins.tolist())
         self.positions: dict[int, complex] = {}
-        self._target = (problem.target @ np.array([1, 1j])).tolist()
+        self._target = to_complex(problem.target).tolist()
         # The copy at each corner of the target's triangles, keyed by the half-edge that begins there.
         fixed = problem.fixed.tolist()
         self._copy_at = {(a, b): fixed[a] for a, b in self.regions.apex}
         self._closed = set[Edge]()
         bridges = self.regions.bridges()
         if guide is not None or bridges:
-            self._guide = (_tutte_embedding(problem) if guide is None else guide).tolist()
+            if guide is None:
+                # Tutte's embedding may have inverted triangles.
+                guide = embed_tutte(problem.F, to_complex(problem.place_fixed()), problem.fixed)
+            self._guide = guide.tolist()
         for a, b in bridges:
             self._cut(a, b)
         if guide is None:
@@ -103,13 +106,6 @@ class Cutting:
         share = np.cumsum(steps)[:-1] / steps.sum()
         for copy, t in zip(path[1:-1], share.tolist(), strict=True):
             self.positions[self.sheet.vertex[copy]] = (1 - t) * start + t * end
-
-
-def _tutte_embedding(problem: Problem) -> ComplexArray:
-    """Return Tutte's embedding of the problem, which may have inverted triangles."""
-    w = np.zeros(problem.n, dtype=np.complex128)
-    w[problem.fixed] = problem.target @ np.array([1, 1j])
-    return embed_tutte(problem.F, w, problem.fixed)
 
 
 def _circle_embedding(sheet: Sheet) -> list[complex]:

@@ -59,7 +59,7 @@ def _open_triangles(problem: Problem, refined: Refined, uv: FloatArray, grading:
 def _remove_vertices(problem: Problem, refined: Refined, uv: FloatArray, tries: int = 0) -> tuple[Refined, FloatArray]:
     """Remove vertices by thinning, and by untangling around up to ``tries`` of the rest."""
     shares = refined.shares()
-    thinning = Thinning(problem.F, problem.fixed, refined.F, shares, uv @ np.array([1, 1j]))
+    thinning = Thinning(problem.F, problem.fixed, refined.F, shares, to_complex(uv))
     thinning.thin()
     for vertex in sorted(thinning.left, reverse=True)[:tries]:
         thinning.remove_by_untangling(vertex, partial(_untangle_patch, problem.frame), _RINGS)

@@ -16,10 +16,10 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay, select_inside
+from quasiharmonic.geometry.exact.constrained_delaunay import triangulate_inside
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.solver.construction.halfedges import Edge, HalfEdges
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, cyclic_pairs
 
 # A turn counts as straight if the point is off the line by at most this many roundings of the largest coordinate.
 _ROUNDINGS = 4.0
@@ -49,8 +49,9 @@ class Regions:
         self.points = points
         self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
         self._tolerance = _ROUNDINGS * float(np.spacing(np.abs(points).max()))
-        rim = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
-        self.apex = HalfEdges(_triangles_within(points, rim)).apex
+        rim = np.concatenate([cyclic_pairs(loop) for loop in loops])
+        low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
+        self.apex = HalfEdges(triangulate_inside(points, rim, low, high)).apex
         self.cuts = {(a, b) for a, b in self.apex if (b, a) in self.apex}
         self._join()
         self._loop = np.full(len(points), -1)
@@ -149,15 +150,6 @@ class Regions:
                 if (b, a) in self.apex and (a, b) not in self.cuts:
                     waiting.append((b, a))
         return region
-
-
-def _triangles_within(points: FloatArray, rim: IntArray) -> IntArray:
-    """Return the constrained Delaunay triangles to the left of directed edges that form loops."""
-    low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
-    frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-    k = len(points)
-    T = constrained_delaunay(np.concatenate([points, frame]), rim, k + np.arange(4))
-    return T[select_inside(T, rim, k + 4)]
 
 
 def _order_by_halves(weight: dict[int, int], beside: dict[int, list[tuple[int, Edge]]]) -> list[Edge]:

@@ -11,6 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.topology import trace_loops
 from quasiharmonic.solver.construction.halfedges import Edge, HalfEdges, Triangle
 from quasiharmonic.util.arrays import IntArray
 
@@ -51,16 +52,8 @@ class Sheet(HalfEdges):
 
     def loops(self) -> list[list[int]]:
         """Return the boundary copies in order, loop by loop, with the surface to the left."""
-        found: list[list[int]] = []
-        seen = set[int]()
-        for start in sorted(self.following):
-            if start not in seen:
-                loop = [start]
-                while (ahead := self.following[loop[-1]]) != start:
-                    loop.append(ahead)
-                seen.update(loop)
-                found.append(loop)
-        return found
+        boundary = np.array(list(self.following.items()), dtype=np.int64).reshape(-1, 2)
+        return [loop.tolist() for loop in trace_loops(boundary)]
 
     def split(self, a: int, b: int) -> int:
         """Add a vertex at the midpoint of an interior edge; return its copy."""

@@ -101,6 +101,10 @@ class Descent(SearchStage):
     label: ClassVar[str]
     #: Whether the method moves vertices and derives the tensors from them.
     moves_vertices: ClassVar[bool] = False
+    #: Number of iterates and relative decrease that define a stall. The count restarts at each improvement: a triangle
+    #: is untangled, or the objective falls by at least that fraction. The stage has stalled after more than that many
+    #: iterates without one. None for methods that detect the end themselves.
+    patience: ClassVar[tuple[int, float] | None] = None
 
     @property
     def name(self) -> str:
@@ -115,16 +119,6 @@ class Descent(SearchStage):
     def run(self, search: StageRunner) -> None:
         """See `SearchStage`."""
         search.attempt(self)
-
-    @property
-    def patience(self) -> tuple[int, float] | None:
-        """Number of iterates and relative decrease that define a stall.
-
-        The count restarts at each improvement: a triangle is untangled, or the objective falls by at least that
-        fraction. The stage has stalled after more than that many iterates without one. None for methods that detect
-        the end themselves.
-        """
-        return None
 
     def objective(self, problem: Problem, linear_solver: str) -> Objective:
         """Return the objective that is descended, or that measures the maps."""
@@ -208,6 +202,7 @@ class TensorDescent(Descent):
     parameterisation: str = "tanh"
     reference: Reference = "equilateral"
     iterations: int = 1000
+    patience: ClassVar[tuple[int, float] | None] = (300, 1e-3)
 
     def __post_init__(self) -> None:
         check_choice("parameterisation", self.parameterisation, PARAMETERISATIONS)
@@ -218,11 +213,6 @@ class TensorDescent(Descent):
     def name(self) -> str:
         """Name of this stage in reports."""
         return f"{self.label}, {self.parameterisation}"
-
-    @property
-    def patience(self) -> tuple[int, float] | None:
-        """See `Descent`."""
-        return 300, 1e-3
 
     def objective(self, problem: Problem, linear_solver: str) -> Objective:
         """Return the objective V₃."""

@@ -19,18 +19,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.constrained_delaunay import (
-    BlockedError,
-    constrained_delaunay,
-    delaunay_of_polygon,
-    select_inside,
-)
+from quasiharmonic.geometry.exact.constrained_delaunay import delaunay_of_polygon, triangulate_inside
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates
 from quasiharmonic.solver.methods.vector_adam import VectorAdam
-from quasiharmonic.util.arrays import ComplexArray, IntArray, check_integer, to_points
+from quasiharmonic.util.arrays import ComplexArray, IntArray, check_integer, cyclic_pairs, to_points
 
 # Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
 _EVEN_SHARE = 0.5
@@ -56,15 +51,12 @@ class Composite(VectorAdam):
     direct: int = 6
 
     label: ClassVar[str] = "composite"
+    #: Short: close to a solution it is found soon; the rest is for local repair.
+    patience: ClassVar[tuple[int, float] | None] = (10, 0.5)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_integer("direct", self.direct, minimum=0)
-
-    @property
-    def patience(self) -> tuple[int, float]:
-        """A short patience: close to a solution it is found soon; the rest is for local repair."""
-        return 10, 0.5
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; without a composite all steps are those of `VectorAdam`."""
@@ -131,15 +123,13 @@ def polygon_triangles(outline: ComplexArray) -> IntArray | None:
     if k <= _DIRECT_UP_TO:
         return delaunay_of_polygon(points)
     low, high = points.min(axis=0), points.max(axis=0)
-    low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-    box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-    sides = np.stack([ring, np.roll(ring, -1)], axis=1)
+    margin = _MARGIN * (high - low)
+    sides = cyclic_pairs(ring)
     try:
-        F = constrained_delaunay(np.concatenate([points, box]), sides, k + np.arange(4))
-    except (BlockedError, ValueError):
+        F = triangulate_inside(points, sides, low - margin, high + margin)
+    except ValueError:
         return None
     # If the polygon runs clockwise, the rest of the box is to its left, and the number of triangles differs.
-    F = F[select_inside(F, sides, k + 4)]
     return F if len(F) == k - 2 else None
 
 

@@ -48,11 +48,8 @@ class Newton(TensorDescent):
     """
 
     label: ClassVar[str] = "newton"
-
-    @property
-    def patience(self) -> tuple[int, float] | None:
-        """A short patience: Newton steps are expensive, and if they succeed they do so early."""
-        return 40, 0.1
+    #: Short: Newton steps are expensive, and if they succeed they do so early.
+    patience: ClassVar[tuple[int, float] | None] = (40, 0.1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; converged when no step lowers the energy."""

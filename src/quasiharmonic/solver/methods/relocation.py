@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, invert_indices, mark
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, any_corner, invert_indices, mark
 from quasiharmonic.util.kernels import compiled
 
 # Maximum number of inverted triangles for a try: with more it usually fails, and without compiled kernels it is slower
@@ -114,7 +114,7 @@ def place_inverted(
         # Relocate the moved vertices again, together with their neighbours.
         near = np.zeros(len(w), dtype=bool)
         T, of = F[untangled[mesh]], mesh[untangled[mesh]]
-        near[T[_any_corner((w != given)[T])]] = True
+        near[T[any_corner((w != given)[T])]] = True
         groups, there = _divide(T, np.flatnonzero(near & free), len(w)), w.copy()
         for _ in range(_SHARING):
             _relocate_groups(there, groups)
@@ -123,12 +123,6 @@ def place_inverted(
         back = T[spoilt[of]]
         there[back] = w[back]
         w[:] = there
-
-
-def _any_corner(marked: BoolArray) -> BoolArray:
-    """Which triangles have a marked corner, (f,) bool; many times faster than NumPy's any."""
-    some: BoolArray = marked[:, 0] | marked[:, 1] | marked[:, 2]
-    return some
 
 
 def _relocate_groups(w: ComplexArray, groups: list[_Stars]) -> None:
@@ -148,7 +142,7 @@ class _Stars(NamedTuple):
 def _divide(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
     """Divide interior vertices, in ascending order, into groups whose vertices share no triangle."""
     number = invert_indices(n, vertices)
-    around = F[_any_corner(number[F] >= 0)]
+    around = F[any_corner(number[F] >= 0)]
     triangle, corner = np.nonzero(number[around] >= 0)
     own = number[around[triangle, corner]]
     order = np.argsort(own, kind="stable")

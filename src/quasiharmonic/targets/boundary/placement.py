@@ -10,7 +10,7 @@ from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.targets.boundary.chord_clearance import clear_chords
 from quasiharmonic.targets.boundary.chords import STRAIGHT, flat_chords
 from quasiharmonic.targets.boundary.correspondence import Held, find_start, max_deviation, places_along, points_at
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, cyclic_pairs
 
 # Maximum number of starts to try, nearest to the best fit first, if chords lack space.
 _MAX_STARTS = 256
@@ -59,7 +59,7 @@ class Placement:
         if next(flat_chords(self.chords, positions, min_bulge), None) is not None:
             return False
         here = np.arange(len(positions))
-        return not len(contacts(positions, np.stack([here, np.roll(here, -1)], axis=1), 0).pairs)
+        return not len(contacts(positions, cyclic_pairs(here), 0).pairs)
 
     def fit(self, flat: FloatArray) -> FloatArray:
         """Positions from the best start, or from the nearest start that leaves chords space if one exists."""
