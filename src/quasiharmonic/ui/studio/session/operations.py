@@ -6,7 +6,7 @@ A step depends on the model, on its options and, if it starts from a map, on tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from quasiharmonic.apps.repair.fitting import find_corner_vertices, fit_boundary
 from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops, edges
+from quasiharmonic.geometry.mesh.topology import boundary_edges, edges, trace_loops
 from quasiharmonic.io import MeshData
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Problem
@@ -76,19 +76,22 @@ def map_to_outline(
     ``corners`` are boundary vertices of the first selected island and the outline's corners that they go to. "auto"
     chooses vertices by angle; without corners arc length decides.
     """
-    only, posed = choose(state), list[Problem]()
+    only, posed = choose(state), list[tuple[Problem, list[int]]]()
     source = find_source(state, with_map=only is not None)
     own = state.active.island.vertices
     named = () if isinstance(corners, str) else tuple((int(own[v]), k) for v, k in corners)
     spec = CornerSpec("auto" if isinstance(corners, str) else named) if corners else None
-    fills: list[bool] = []
+    width, fills = np.ptp(np.concatenate(outline.contours)[:, 0]), False
 
     def lower(island: Island) -> MapResult:
+        nonlocal fills
         asked = None if spec is None else spec.within(island.vertices)
-        fitted = fit_boundary(island.V, island.F, outline.contours, corners=asked, beside=len(posed))
-        posed.append(fitted.problem)
-        fills.append(bool(fitted.filled_holes))
-        return solve_smoothly(fitted.problem, callback)
+        copy = [contour + np.array([len(posed) * 1.05 * width, 0.0]) for contour in outline.contours]
+        fitted = fit_boundary(island.V, island.F, copy, corners=asked)
+        problem, fills = fitted.problem, fills or bool(fitted.filled_holes)
+        onto = filled(copy) if fitted.filled_holes else copy
+        posed.append((problem, find_corner_vertices(problem.fixed, problem.target, onto)))
+        return solve_smoothly(problem, callback)
 
     mapped = each_island(state.mesh, lower, reflect=False, only=only)
     word = corners if corners == "auto" else ",".join(f"{v}:{k}" for v, k in named) or None
@@ -98,30 +101,18 @@ def map_to_outline(
     python = recipes.outline_script(
         source,
         outline.to,
-        any(fills),
+        fills,
         corners if corners == "auto" else dict(corners),
         state.selected,
         small,
-        checked=not all(mapped.islands[k].result.injective for k in state.selected),
     )
-    texts = {} if outline.content is None else {outline.to: outline.content}
-    recipe = Recipe(command, python, source.start, texts, outline.to)
+    recipe = Recipe(command, python, source.start, outline.texts, outline.to)
     after = rebuild(state, mapped, recipe)
-    for i, k in enumerate(state.selected):
-        right = i * 1.05 * np.ptp(np.concatenate(outline.contours)[:, 0])
-        contours = filled(outline.contours) if fills[i] else outline.contours
-        copies = [contour + np.array([right, 0.0]) for contour in contours] if i else contours
-        one = after.islands[k]
-        found = find_corner_vertices(posed[i].fixed, posed[i].target, copies)
-        one = replace(
-            one,
-            outline=outline,
-            corners=tuple(found),
-            chosen=() if isinstance(corners, str) or i else tuple(corners),
-            by_angle=corners == "auto",
-            pins=(),
-        )
-        after = after.with_island(k, one.with_problem(posed[i]))
+    for i, (k, (problem, found)) in enumerate(zip(state.selected, posed, strict=True)):
+        chosen = () if isinstance(corners, str) or i else tuple(corners)
+        by_angle = corners == "auto"
+        one = replace(after.islands[k], outline=outline, corners=tuple(found), chosen=chosen, by_angle=by_angle)
+        after = after.with_island(k, one.with_problem(problem))
     return after
 
 
@@ -154,7 +145,7 @@ def map_in_place(
         mapped = atlas.polish(start, islands=only, callback=callback, **recipes.values(options))
         recipe = recipes.record_call("polish", source, "again.obj", options, only)
     recipe = replace(recipe, anew=anew, dragged=start is not state.mesh)
-    return rebuild(state, mapped, recipe, keep=True, corners=True)
+    return rebuild(state, mapped, recipe, keep=("pins", "corners"))
 
 
 def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
@@ -166,14 +157,13 @@ def polish_islands(state: SessionState, energy: str, slide: bool, callback: Call
     mapped = atlas.polish(state.mesh, islands=only, callback=callback, **recipes.values(options))
     recipe = recipes.record_call("polish", source, "again.obj", options, only)
     recipe = replace(recipe, outline=None if outline is None else outline.to)
-    return rebuild(state, mapped, recipe, keep=True, outlines=True)
+    return rebuild(state, mapped, recipe, keep=("pins", "corners", "outline", "chosen", "by_angle"))
 
 
 def _sliding_curves(outline: Outline) -> Given:
     """Return the curves of an outline, for a boundary that slides."""
     code = Code(f"BoundaryCurves(outline_curves({outline.to!r}))")
-    texts = {} if outline.content is None else {outline.to: outline.content}
-    return Given(BoundaryCurves(outline.curves()), code, {"slide": True, "to": outline.to}, texts)
+    return Given(BoundaryCurves(outline.curves()), code, {"slide": True, "to": outline.to}, outline.texts)
 
 
 def flatten_islands(state: SessionState, callback: Callback = None) -> SessionState:
@@ -190,7 +180,7 @@ def flatten_islands(state: SessionState, callback: Callback = None) -> SessionSt
     mapped = atlas.flatten(mesh, islands=only, callback=callback, **recipes.values(options))
     words, before = (["--cut"], _cut_lines(source, state)) if cut else ([], [])
     recipe = recipes.record_call("flatten", source, "flat.obj", options, only, words=words, before=before)
-    after = rebuild(state, mapped, recipe, keep=not cut)
+    after = rebuild(state, mapped, recipe, keep=() if cut else ("pins",))
     return replace(after, from_file=state.from_file and not cut)
 
 
@@ -234,10 +224,8 @@ def _cos_sin(degrees: float) -> tuple[float, float]:
 def is_flattenable(island: Island) -> bool:
     """Whether an island has a boundary and no handle."""
     found, n = edges(island.F, len(island.vertices)), len(island.vertices)
-    if not len(found.boundary):
-        return False
-    euler = n - len(found.interior) - len(found.boundary) + len(island.F)
-    return euler == 2 - len(boundary_loops(island.F, n))
+    loops = len(trace_loops(found.boundary))
+    return loops > 0 and n - len(found.interior) - len(found.boundary) + len(island.F) == 2 - loops
 
 
 def solve_smoothly(problem: Problem, callback: Callback) -> MapResult:
@@ -256,12 +244,9 @@ def rebuild(
     state: SessionState,
     mapped: MappedAtlas,
     recipe: Recipe,
-    *,
-    keep: bool = False,
-    corners: bool = False,
-    outlines: bool = False,
+    keep: Collection[str] = (),
 ) -> SessionState:
-    """Return the state after a step; with ``keep`` pins stay, with ``corners`` and ``outlines`` these, too."""
+    """Return the state after a step; islands that are the same keep the constraints named in ``keep``."""
     changed = set(range(len(mapped.islands))) if len(mapped.islands) != len(state.islands) else set(state.selected)
     if any(one.result.status is Status.INTERRUPTED for one in mapped.islands):
         raise KeyboardInterrupt
@@ -278,19 +263,9 @@ def rebuild(
             result = replace(result, uv=uv, certificate=certify(island.F, uv))
         new = IslandState(island, one.mirrored, result)
         if before is not None and keep and np.array_equal(before.island.F, island.F):
-            new = replace(new, pins=before.pins, corners=before.corners if corners else ())
-            if outlines:
-                new = replace(
-                    new,
-                    outline=before.outline,
-                    corners=before.corners,
-                    chosen=before.chosen,
-                    by_angle=before.by_angle,
-                )
+            new = replace(new, **{name: getattr(before, name) for name in keep})
         islands.append(fix_where_it_is(new))
-    return replace(
-        state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=_still(state, islands), drawn=None
-    )
+    return _with_map(state, mapped.mesh, islands, recipe)
 
 
 def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, *, keep: bool = False) -> SessionState:
@@ -305,7 +280,7 @@ def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, *, keep: boo
         result = MapResult(uv=uv, status=Status.INJECTIVE if found.injective else Status.STALLED, certificate=found)
         pins = state.islands[k].pins if keep and k < len(state.islands) else ()
         islands.append(fix_where_it_is(IslandState(island, mirrored, result, pins=pins)))
-    return replace(state, mesh=mesh, islands=tuple(islands), recipe=recipe, selected=_still(state, islands), drawn=None)
+    return _with_map(state, mesh, islands, recipe)
 
 
 def fix_where_it_is(one: IslandState) -> IslandState:
@@ -316,9 +291,10 @@ def fix_where_it_is(one: IslandState) -> IslandState:
     return replace(one, fixed=fixed, target=one.result.uv[fixed])
 
 
-def _still(state: SessionState, islands: Sequence[IslandState]) -> tuple[int, ...]:
-    """Return the selection if the islands are still the same; otherwise all of them."""
-    return state.selected if len(islands) == len(state.islands) else tuple(range(len(islands)))
+def _with_map(state: SessionState, mesh: SeamedMesh, islands: list[IslandState], recipe: Recipe) -> SessionState:
+    """Return the state with another map; all islands are selected if their number has changed."""
+    selected = state.selected if len(islands) == len(state.islands) else tuple(range(len(islands)))
+    return replace(state, mesh=mesh, islands=tuple(islands), recipe=recipe, selected=selected, drawn=None)
 
 
 def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> Given | None:

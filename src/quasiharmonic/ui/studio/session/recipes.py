@@ -151,35 +151,24 @@ def map_script(source: Source, only: Sequence[int] | None, smoothed: Sequence[in
 
 
 def outline_script(
-    source: Source, to: str, filled: bool, corners: object, islands: Sequence[int], smoothed: bool, checked: bool
+    source: Source, to: str, filled: bool, corners: object, islands: Sequence[int], smoothed: bool
 ) -> str:
-    """Return a script that maps islands to an outline; several of them to copies side by side.
-
-    ``smoothed`` if it smooths the maps, and ``checked`` if only those without inverted triangles.
-    """
+    """Return a script that maps islands to copies of an outline, side by side; it smooths them if ``smoothed``."""
     contours = f"outline({to!r})"
+    more = arguments(fixed=Code("fixed"), energy="blend", max_iterations=SMOOTHING_STEPS)
+    smoothing = ["    if result.injective:", f"        result = polish(island.V, island.F, result.uv{more})"]
     lines = [
         f"mesh = atlas.as_seamed_mesh({source.name!r})",
         f"contours = {f'filled({contours})' if filled else contours}",
+        "width = np.ptp(np.concatenate(contours)[:, 0])",
         "places = [island.uv for island in mesh.islands]",
-    ]
-    if len(islands) > 1:
-        lines += [
-            "width = (1 + 0.05) * np.ptp(np.concatenate(contours)[:, 0])",
-            f"for i, k in enumerate({list(islands)}):",
-            "    island = mesh.islands[k]",
-            "    copy = [contour + np.array([i * width, 0.0]) for contour in contours]",
-        ]
-    else:
-        lines += [f"for k in {list(islands)}:", "    island = mesh.islands[k]", "    copy = contours"]
-    lines += [
+        f"for i, k in enumerate({list(islands)}):",
+        "    island = mesh.islands[k]",
+        "    copy = [contour + np.array([i * 1.05 * width, 0.0]) for contour in contours]",
         f"    fixed, target = boundary_to(island.V, island.F, copy{arguments(corners=corners or None)})",
         "    result = injective_map(island.V, island.F, fixed, target)",
+        *(smoothing if smoothed else []),
+        "    places[k] = result.uv",
+        "mesh = mesh.with_places(places)",
     ]
-    if smoothed:
-        more = arguments(fixed=Code("fixed"), energy="blend", max_iterations=SMOOTHING_STEPS)
-        lines += ["    if result.injective:"] if checked else []
-        indent = "        " if checked else "    "
-        lines.append(f"{indent}result = polish(island.V, island.F, result.uv{more})")
-    lines += ["    places[k] = result.uv", "mesh = mesh.with_places(places)"]
     return write_script(lines)

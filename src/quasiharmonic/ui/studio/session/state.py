@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -38,7 +38,7 @@ class SessionState:
     recipe: Recipe  # How the map was computed
     selected: tuple[int, ...] = (0,)  # Indices of the selected islands, ascending, at least one
     from_file: bool = True  # Whether the seams are those of the file
-    drawn: IntArray | None = field(default=None)  # (k, 2): edges of the seams that the user drew, if they changed
+    drawn: IntArray | None = None  # (k, 2): edges of the seams that the user drew, if they changed
 
     @cached_property
     def numbering(self) -> Numbering:
@@ -107,13 +107,11 @@ class SessionState:
     def with_island(self, k: int, island: IslandState) -> SessionState:
         """Return the state with another island of index ``k``; the mesh is unchanged."""
         islands = (*self.islands[:k], island, *self.islands[k + 1 :])
-        other = replace(self, islands=islands)
-        other.__dict__["numbering"] = self.numbering
-        return other
+        return replace(self, islands=islands)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the contents for a snapshot; what can be computed again is left out."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("numbering", "overlapping")}
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
 
 def place(one: IslandState) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,25 +18,25 @@ from quasiharmonic.ui.studio.session.recipes import Code, Recipe, Source
 from quasiharmonic.ui.studio.session.state import SessionState
 
 
-@dataclass(frozen=True)
-class UnwrapOptions:
-    """Options of `unwrap` that the page offers."""
-
-    max_stretch: float = 1.5
-    resolution: int = 2048
-    padding: float = 4.0
-    keep_seams: bool = False
-
-
 def unwrap_model(
-    state: SessionState, options: UnwrapOptions, callback: Callable[[UnwrapStep], object] | None = None
+    state: SessionState,
+    callback: Callable[[UnwrapStep], object] | None = None,
+    *,
+    max_stretch: float = 1.5,
+    resolution: int = 2048,
+    padding: float = 4.0,
+    keep_seams: bool = False,
 ) -> SessionState:
-    """Unwrap the whole model; with ``keep_seams``, or after seams were drawn, along the current seams at least."""
+    """Unwrap the whole model; with ``keep_seams``, or after seams were drawn, along the current seams at least.
+
+    The other options are those of `unwrap`.
+    """
     sheet = state.sheet
+    size: dict[str, Any] = {"max_stretch": max_stretch, "resolution": resolution, "padding": padding}
     kept: SeamedMesh | None = None
     if state.drawn is not None:
         kept = _with_any_positions(SeamedMesh(sheet.surface.V, sheet.surface.F).cut(state.drawn))
-    elif options.keep_seams and state.mapped:
+    elif keep_seams and state.mapped:
         kept = state.mesh
     if kept is None and not sheet.turned:
         source, V, F = Source(sheet.name, None), sheet.mesh.V, sheet.mesh.F
@@ -45,7 +45,6 @@ def unwrap_model(
         bare = SeamedMesh(sheet.surface.V, sheet.surface.F)
         source, V, F, costs = make_start(bare if kept is None else kept), sheet.surface.V, sheet.surface.F, None
     uv = None if kept is None or kept.uv is None else kept.uv[kept.FT]
-    size: dict[str, Any] = {name: getattr(options, name) for name in ("max_stretch", "resolution", "padding")}
     result = unwrap(V, F, edge_costs=costs, uv=uv, callback=callback, **size)
     FT = sheet.from_file(result.indices) if source.start is None else result.indices
     words = ["unwrap", source.command, *recipes.option_words(**size, keep_seams=uv is not None)]
