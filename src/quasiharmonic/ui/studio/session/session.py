@@ -382,27 +382,13 @@ class Session:
     ) -> None:
         """Send the whole map, or that of the dragged island, with its certificate; otherwise only the target."""
         state, drag = self.state, self._drag_state
-        header: dict[str, Any] = {
-            "kind": "map",
-            "seq": seq,
-            "after": self._after,
-            "fit": False,
-            "origin": self._origin.tolist(),
-        }
+        header = {"kind": "map", "seq": seq, "after": self._after, "fit": False, "origin": self._origin.tolist()}
         header |= {**frames.handle_fields(state), **fields}
         arrays: dict[str, Array] = {}
         if everything or shown is not None:
-            changed = None
-            uv = state.uv
-            if shown is not None and drag is not None:
-                start = int(state.numbering.starts[drag.island])
-                moved = shown.uv * state.islands[drag.island].sign
-                uv[start : start + len(moved)] = moved
-                changed = drag.island, moved, shown.certificate
-            more, found = frames.map_arrays(state, self._origin, changed=changed)
-            header |= more
-            arrays |= found
-            header |= self._measured.look(uv, now=seq < 0) | {"scale": self._measured.scale}
+            dragged = None if shown is None or drag is None else (drag.island, shown)
+            more, arrays, uv = frames.map_message(state, self._origin, dragged)
+            header |= more | self._measured.look(uv, now=seq < 0)
         targets = {} if asked is None or drag is None else {drag.island: asked}
         if targets or (everything and not state.in_place):
             arrays["asked"] = frames.asked_boundary(state, targets, self._origin)

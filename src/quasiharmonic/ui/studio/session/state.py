@@ -125,11 +125,10 @@ class DistortionMonitor:
     def __init__(self, V: FloatArray, F: Array) -> None:
         self._V, self._F = V, F
         self._when, self._cost = -np.inf, 0.0
-        self.numbers: dict[str, Any] = {}
-        self.scale = 1.0
+        self._numbers: dict[str, Any] = {}
 
     def look(self, uv: FloatArray, *, now: bool) -> dict[str, Any]:
-        """Return energy, worst stretch and used space of a map; recent values unless ``now`` is True."""
+        """Return energy, worst stretch, used space and scale of a map; recent values unless ``now`` is True."""
         began = time.perf_counter()
         if now or began - self._when > max(0.15, 8 * self._cost):
             measured = distortion(self._V, self._F, uv)
@@ -137,16 +136,16 @@ class DistortionMonitor:
             with np.errstate(invalid="ignore"):
                 energy = float(measured.share[defined] @ measured.symmetric_dirichlet[defined])
             worst = float(measured.isometric[defined].max()) if defined.any() else np.inf
-            self.numbers = {
+            self._numbers = {
                 "energy": energy if np.isfinite(energy) else None,
                 "worst": worst if np.isfinite(worst) else None,
                 "used": _find_used_space(self._F, uv),
                 "packed": bool(uv.min() >= 0 and uv.max() <= 1),
+                "scale": measured.scale if np.isfinite(measured.scale) else 1.0,
             }
-            self.scale = measured.scale if np.isfinite(measured.scale) else 1.0
             self._when = time.perf_counter()
             self._cost = self._when - began
-        return self.numbers
+        return self._numbers
 
 
 def _find_used_space(F: Array, uv: FloatArray) -> float | None:

@@ -16,11 +16,10 @@ _INDEX = "index"
 class Snapshot(NamedTuple):
     """Contents of a session."""
 
-    states: list[Any]  # The undo history
+    states: dict[int, Any]  # The undo history, by the numbers of the states, which name their files
     at: int  # The state that is shown
     texture: Texture | None
     saved: int  # Number of the state that was saved last
-    numbers: list[int]  # Numbers of the states, which name their files
 
 
 class Storage:
@@ -36,14 +35,14 @@ class Storage:
     def write(self, snapshot: Snapshot) -> None:
         """Write a snapshot; states that are no longer part of it are removed."""
         kept = set()
-        for number, state in zip(snapshot.numbers, snapshot.states, strict=True):
+        for number, state in snapshot.states.items():
             sheet = state.sheet
             contents = {f"sheet-{sheet.key}": sheet, f"state-{number}": (replace(state, sheet=None), sheet.key)}
             for name, content in contents.items():
                 if not (self.folder / name).exists():
                     self._replace(name, content)
             kept |= set(contents)
-        self._replace(_INDEX, snapshot._replace(states=[]))
+        self._replace(_INDEX, snapshot._replace(states=dict.fromkeys(snapshot.states)))
         for path in self.folder.iterdir():
             if path.name.startswith(("state-", "sheet-")) and path.name not in kept:
                 path.unlink(missing_ok=True)
@@ -53,8 +52,8 @@ class Storage:
         sheet = cache(lambda key: self._load(f"sheet-{key}"))
         try:
             index: Snapshot = self._load(_INDEX)
-            stored = [self._load(f"state-{number}") for number in index.numbers]
-            return index._replace(states=[replace(state, sheet=sheet(key)) for state, key in stored])
+            stored = {number: self._load(f"state-{number}") for number in index.states}
+            return index._replace(states={k: replace(state, sheet=sheet(key)) for k, (state, key) in stored.items()})
         except Exception:  # A damaged pickle can raise anything; the session then starts anew.
             return None
 
