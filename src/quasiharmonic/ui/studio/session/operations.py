@@ -95,23 +95,15 @@ def map_to_outline(
 
     mapped = each_island(state.mesh, lower, reflect=False, only=only)
     word = corners if corners == "auto" else ",".join(f"{v}:{k}" for v, k in named) or None
-    options = recipes.option_words(to=outline.to, corners=word)
-    command = recipes.write_command(["map", source.command, *options, *recipes.island_words(only)], "again.obj", source)
+    options = {"to": Given(outline, Code(), {"to": outline.to, "corners": word}, outline.texts)}
     small = all(len(state.islands[k].island.F) <= LARGEST_SMOOTHED for k in state.selected)
-    python = recipes.outline_script(
-        source,
-        outline.to,
-        fills,
-        corners if corners == "auto" else dict(corners),
-        state.selected,
-        small,
-    )
-    recipe = Recipe(command, python, source.start, outline.texts, outline.to)
-    after = rebuild(state, mapped, recipe)
+    chosen = corners if isinstance(corners, str) else dict(corners)
+    lines = recipes.outline_lines(source, outline.to, fills, chosen, state.selected, small)
+    recipe = recipes.record_call("map", source, "again.obj", options, only, lines=lines)
+    after = rebuild(state, mapped, replace(recipe, outline=outline.to))
     for i, (k, (problem, found)) in enumerate(zip(state.selected, posed, strict=True)):
-        chosen = () if isinstance(corners, str) or i else tuple(corners)
-        by_angle = corners == "auto"
-        one = replace(after.islands[k], outline=outline, corners=tuple(found), chosen=chosen, by_angle=by_angle)
+        by_angle, given = corners == "auto", () if isinstance(corners, str) or i else tuple(corners)
+        one = replace(after.islands[k], outline=outline, corners=tuple(found), chosen=given, by_angle=by_angle)
         after = after.with_island(k, one.with_problem(problem))
     return after
 
@@ -134,12 +126,11 @@ def map_in_place(
     done = mapped.islands if only is None else [mapped.islands[k] for k in only]
     anew = all(one.result.injective for one in done)
     if anew or not follows:
-        recipe = recipes.record_call("map", source, "again.obj", {"fixed": fixed}, only)
         chosen = list(range(len(mapped.islands))) if only is None else only
         small = max(len(one.triangles) for one in done) <= LARGEST_SMOOTHED
         smoothed = [k for k in chosen if small and mapped.islands[k].result.injective]
-        python = recipes.map_script(source, only, only if smoothed == chosen else smoothed, fixed)
-        recipe = replace(recipe, python=python)
+        lines = recipes.map_lines(source, only, only if smoothed == chosen else smoothed, fixed)
+        recipe = recipes.record_call("map", source, "again.obj", {"fixed": fixed}, only, lines=lines)
     else:
         options = {"energy": "blend", "max_iterations": SMOOTHING_STEPS, "fixed": fixed}
         mapped = atlas.polish(start, islands=only, callback=callback, **recipes.values(options))
@@ -178,8 +169,11 @@ def flatten_islands(state: SessionState, callback: Callback = None) -> SessionSt
         mesh = cut_apart(mesh, polygons=_polygons(state, source), disks_too=True)
     options = {"fixed": _saved_list(pins) if pins and not cut else None}
     mapped = atlas.flatten(mesh, islands=only, callback=callback, **recipes.values(options))
-    words, before = (["--cut"], _cut_lines(source, state)) if cut else ([], [])
-    recipe = recipes.record_call("flatten", source, "flat.obj", options, only, words=words, before=before)
+    words, lines = ["--cut"] if cut else [], list[str]()
+    if cut:
+        lines = [f"mesh = atlas.as_seamed_mesh({source.name!r})", *_cut_lines(state, source)]
+        lines += recipes.call_lines("flatten", "mesh", {}, None)
+    recipe = recipes.record_call("flatten", source, "flat.obj", options, only, words=words, lines=lines)
     after = rebuild(state, mapped, recipe, keep=() if cut else ("pins",))
     return replace(after, from_file=state.from_file and not cut)
 
@@ -190,13 +184,12 @@ def pack_all(state: SessionState, resolution: int, padding: float) -> SessionSta
     laid = atlas.flatten(state.mesh, start=True, max_iterations=0)
     mesh = atlas.pack(laid.mesh, resolution=resolution, padding=padding)
     size = {"resolution": resolution, "padding": padding}
-    words = ["flatten", source.command, "--start", "--max-iterations", "0", "--pack", *recipes.option_words(**size)]
-    command = recipes.write_command(words, "packed.obj", source)
+    words = ["--start", "--max-iterations", "0", "--pack"]
     lines = [
         f"flat = atlas.flatten({source.name!r}, start=True, max_iterations=0).mesh",
         f"mesh = atlas.pack(flat{recipes.arguments(**size)})",
     ]
-    recipe = Recipe(command, recipes.write_script(lines), source.start)
+    recipe = recipes.record_call("flatten", source, "packed.obj", size, words=words, lines=lines)
     return as_it_is(state, mesh, recipe, keep=True)
 
 
@@ -323,16 +316,12 @@ def _polygons(state: SessionState, source: Source) -> Any:
     return state.sheet.mesh.polygons if source.start is None else None
 
 
-def _cut_lines(source: Source, state: SessionState) -> list[str]:
-    """Return the lines that cut a surface as ``--cut`` does."""
+def _cut_lines(state: SessionState, source: Source) -> list[str]:
+    """Return the lines that cut a mesh as ``--cut`` does."""
     if _polygons(state, source) is None:
-        return [
-            f"mesh = atlas.as_seamed_mesh({source.name!r})",
-            "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))",
-        ]
+        return ["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"]
     return [
-        f"model = io.read_mesh({source.name!r})",
-        "mesh, inside = atlas.as_seamed_mesh(model), model.polygons.diagonals(model.F)",
+        f"inside = io.read_mesh({source.name!r}).polygons.diagonals(mesh.F)",
         "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams, forbidden_edges=inside))",
     ]
 
@@ -353,12 +342,13 @@ def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> 
         f"mesh = atlas.as_seamed_mesh({source.name!r})",
         "mesh = atlas.SeamedMesh(mesh.V, mesh.F)",
         *([f"mesh = mesh.cut(np.loadtxt({SEAMS!r}, dtype=np.int64).reshape(-1, 2))"] if len(drawn) else []),
-        *(["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"] if cut else []),
+        *(_cut_lines(state, source) if cut else []),
+        *recipes.call_lines("flatten", "mesh", {}, None),
     ]
-    words = ["--seams", SEAMS if len(drawn) else "none", *recipes.option_words(cut=cut)]
-    recipe = recipes.record_call("flatten", source, "flat.obj", {}, words=words, before=lines)
     texts = {SEAMS: "".join(f"{a} {b}\n" for a, b in drawn.tolist()).encode()} if len(drawn) else {}
-    after = rebuild(state, mapped, replace(recipe, texts=texts))
+    options = {"seams": Given(drawn, Code(), {"seams": SEAMS if texts else "none", "cut": cut}, texts)}
+    recipe = recipes.record_call("flatten", source, "flat.obj", options, lines=lines)
+    after = rebuild(state, mapped, recipe)
     return replace(after, from_file=False, selected=tuple(range(len(mapped.islands))))
 
 
