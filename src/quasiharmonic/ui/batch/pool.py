@@ -27,7 +27,7 @@ def core_count() -> int:
         return os.cpu_count() or 1
 
 
-def on_this_machine(groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> Generator[Finished | None]:
+def solve_in_processes(groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> Generator[Finished | None]:
     """Solve problems, several at a time; yield None regularly while no problem is finished.
 
     The problems of a group may be solved together. A problem whose process ran out of memory is solved again in a new
