@@ -23,12 +23,13 @@ from quasiharmonic.ui.batch.archives.outputs import Outputs
 from quasiharmonic.ui.batch.archives.scratch import scratch_folder
 from quasiharmonic.ui.batch.lock import lock_folder, lock_name
 from quasiharmonic.ui.batch.loose import LooseProblems
-from quasiharmonic.ui.batch.pool import core_count, solve_in_processes
+from quasiharmonic.ui.batch.pool import solve_in_processes
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, group_small
 from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
 from quasiharmonic.ui.batch.shards import WHOLE, Shard, read_shard, shard_of, table_name
 from quasiharmonic.ui.batch.supervisor import Finished, resident
 from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
+from quasiharmonic.util.threads import count_cores
 
 
 class DataSet(Protocol):
@@ -219,7 +220,7 @@ def _solve(
     todo = data.problems()
     if scheduler is None:
         groups = group_small(todo) if data.orders.settings.together else ([files] for files in todo)
-        jobs = jobs or core_count()
+        jobs = jobs or count_cores()
         # Not more workers than problems, if their number is known.
         finished = solve_in_processes(groups, data.orders, min(jobs, data.total or jobs))
     else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import deque
 from collections.abc import Generator, Iterator
@@ -17,14 +16,6 @@ from quasiharmonic.ui.batch.supervisor import ClosedError, Finished, Supervisor
 _POLL_INTERVAL = 0.2
 # Number of problems waiting to be solved alone from which this is done before the end.
 _MANY = 16
-
-
-def core_count() -> int:
-    """Return the number of cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
 
 
 def solve_in_processes(groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> Generator[Finished | None]:
