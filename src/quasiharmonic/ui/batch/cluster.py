@@ -26,7 +26,7 @@ _CONNECTION_LOST = (
 _mine = threading.local()
 
 
-def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> Generator[Finished | None]:
+def solve_on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> Generator[Finished | None]:
     """Solve problems on a cluster; yield None regularly while no problem is finished.
 
     The scheduler is an address, or a client or a cluster. If a worker is lost, its problem goes to another worker. The

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 import zlib
 from collections.abc import Iterable
 from io import BytesIO
@@ -198,6 +197,8 @@ def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     from matplotlib import rc_context
     from matplotlib.animation import FFMpegWriter
 
+    from quasiharmonic.io.lowlevel.atomic import encode_by
+
     pictures = iter(pictures)
     first = next(pictures, None)
     if first is None:
@@ -207,12 +208,13 @@ def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     image = figure.add_axes((0, 0, 1, 1))
     image.set_axis_off()
     shown = image.imshow(first, interpolation="none")
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "animation.mp4"
+
+    def write(target: str) -> None:
         # Browsers and phones play yuv420p.
         writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p"])
-        with rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(figure, str(target), dpi=100):
+        with rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(figure, target, dpi=100):
             for picture in chain([first], pictures):
                 shown.set_data(picture)
                 writer.grab_frame()
-        return target.read_bytes()
+
+    return encode_by("animation.mp4", write)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.io.errors import check_path, reading
 from quasiharmonic.io.models.textures import Texture, read_texture
@@ -17,9 +18,9 @@ from quasiharmonic.ui.plot.canvas import (
     RED,
     as_mesh,
     caption,
+    draw_edges,
     new_figure,
     not_positive,
-    outline,
     panels,
     save_picture,
     verdict,
@@ -94,7 +95,7 @@ def plot_texture(
     _show(surface, seen.points, _render(seen.points, seen.depth, F, board, color, inverted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
     _show(plane, board, _render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
-    outline(plane, F, board)
+    draw_edges(plane, board, boundary_edges(F, len(board)))
     verdict(plane, "map", len(inverted))
     return figure
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import BinaryIO, NamedTuple
 
 from quasiharmonic.io.lowlevel.atomic import writing
 from quasiharmonic.ui.batch.archives import results
-from quasiharmonic.ui.batch.archives.tar_stream import Damage, pack_member
 from quasiharmonic.ui.batch.records import Record
 
 # Keys of a record that are kept, to decide whether it is still valid, and to count it in the archive's metadata.
@@ -51,8 +49,8 @@ class Journal:
                 if not results.is_parquet(path):
                     os.replace(path, self.part)
                 else:
-                    for key, record, data in results.read_results(path):
-                        self.add(key, record, data)
+                    for result in results.read_results(path):
+                        self.add(*result)
             self._repair()
 
     def record(self, key: str) -> Record | None:
@@ -62,8 +60,7 @@ class Journal:
 
     def add(self, key: str, record: Record, data: bytes | None) -> None:
         """Append a result; OutputError if it cannot be written."""
-        packed = b"" if data is None else pack_member(key + results.MAP, data)
-        packed += pack_member(key + results.RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
+        packed = results.pack_result(key, record, data)
         with writing(self.part), open(self.part, "ab") as file:
             start = file.tell()
             file.write(packed)
@@ -71,15 +68,12 @@ class Journal:
 
     def finish(self, order: Sequence[str], stamp: str, settings: str) -> None:
         """Write the finished archive, in the given order of names, and delete the journal."""
-        entries = [(key, self.entries[key]) for key in order]
-        about = results.describe((entry.record for _, entry in entries), stamp, settings)
+        entries = [self.entries[key] for key in order]
+        about = results.describe((entry.record for entry in entries), stamp, settings)
         with writing(self.path):
             # An archive without problems has no journal.
             with open(self.part, "a+b") as file:
-                if results.is_parquet(self.path):
-                    results.write_parquet(self.path, about, _unpacked(file, entries))
-                else:
-                    results.write_tar(self.path, about, _packed(file, entries))
+                results.write_results(self.path, about, _read_entries(file, entries))
             self.part.unlink()
 
     def _note(self, key: str, start: int, end: int, record: Record) -> None:
@@ -92,21 +86,15 @@ class Journal:
         with open(self.part, "r+b") as file:
             end = 0
             for one in results.read_tar_results(file, maps=False):
-                if isinstance(one, Damage) or one.record is None:
+                if one.result is None:
                     break
-                self._note(one.key, one.start, one.end, one.record)
+                self._note(one.result.key, one.start, one.end, one.result.record)
                 end = one.end
             file.truncate(end)
 
 
-def _packed(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator[bytes]:
-    for _, entry in entries:
+def _read_entries(file: BinaryIO, entries: Iterable[_Entry]) -> Iterator[results.Result]:
+    for entry in entries:
         file.seek(entry.start)
-        yield file.read(entry.end - entry.start)
-
-
-def _unpacked(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator[tuple[str, Record, bytes | None]]:
-    for packed in _packed(file, entries):
-        for one in results.read_tar_results(io.BytesIO(packed)):
-            if not isinstance(one, Damage) and one.record is not None:
-                yield one.key, one.record, one.data
+        packed = io.BytesIO(file.read(entry.end - entry.start))
+        yield from (one.result for one in results.read_tar_results(packed) if one.result is not None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -69,12 +68,8 @@ def fetch(location: str, folder: Path) -> Path:
 
 
 def send(path: Path, location: str) -> None:
-    """Copy a file to a location. OutputError if it cannot be written."""
+    """Copy a file to a URL. OutputError if it cannot be written."""
     with writing(location):
-        if not is_url(location):
-            Path(location).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, location)
-            return
         system, target = _open(location)
         # A folder of an object store needs not exist.
         _retry(lambda: system.makedirs(target.rpartition("/")[0], exist_ok=True), location)
@@ -82,11 +77,8 @@ def send(path: Path, location: str) -> None:
 
 
 def read_start(location: str, size: int) -> bytes | None:
-    """Return the first bytes of a file; None if there is none."""
+    """Return the first bytes of an object by URL; None if there is none."""
     try:
-        if not is_url(location):
-            with open(location, "rb") as file:
-                return file.read(size)
         system, path = _open(location)
         return _retry(lambda: system.cat_file(path, start=0, end=size), location)
     except FileNotFoundError:

@@ -33,7 +33,7 @@ from quasiharmonic.ui.studio.session.setup import (
 from quasiharmonic.ui.studio.session.state import DistortionMonitor, SessionState, describe_obstructions
 from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import Sheet, make_first_sheet, read_upload
-from quasiharmonic.ui.studio.session.unwrapping import UnwrapOptions, unwrap_model
+from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
 
@@ -197,14 +197,11 @@ class Session:
         self._keep(operations.flatten_islands(self.state, self._step), fit=True)
 
     def _do_unwrap(self, frame: Frame) -> None:
-        options = UnwrapOptions(
-            float(validation.amount(frame, "max_stretch", 1, 10, 1.5)),
-            int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, 2048)),
-            float(validation.amount(frame, "padding", 0, 64, 4)),
-            frame.header.get("keep_seams") is True,
-        )
+        max_stretch, size = float(validation.amount(frame, "max_stretch", 1, 10, 1.5)), _read_size(frame, 2048)
+        keep_seams = frame.header.get("keep_seams") is True
         self._busy("unwrapping")
-        self._keep(unwrap_model(self.state, options, self._step), fit=True)
+        after = unwrap_model(self.state, self._step, max_stretch=max_stretch, keep_seams=keep_seams, **size)
+        self._keep(after, fit=True)
 
     def _do_place(self, frame: Frame) -> None:
         """Move or rotate the selected islands."""
@@ -217,10 +214,9 @@ class Session:
     def _do_pack(self, frame: Frame) -> None:
         self._refuse_drawn()
         operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        resolution = int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, 1024))
+        size = _read_size(frame, 1024)
         self._busy("packing")
-        padding = float(validation.amount(frame, "padding", 0, 64, 4))
-        self._keep(operations.pack_all(self.state, resolution, padding), fit=True)
+        self._keep(operations.pack_all(self.state, **size), fit=True)
 
     def _do_polish(self, frame: Frame) -> None:
         energy, slide = validation.text(frame, "energy"), frame.header.get("slide") is True
@@ -386,27 +382,13 @@ class Session:
     ) -> None:
         """Send the whole map, or that of the dragged island, with its certificate; otherwise only the target."""
         state, drag = self.state, self._drag_state
-        header: dict[str, Any] = {
-            "kind": "map",
-            "seq": seq,
-            "after": self._after,
-            "fit": False,
-            "origin": self._origin.tolist(),
-        }
+        header = {"kind": "map", "seq": seq, "after": self._after, "fit": False, "origin": self._origin.tolist()}
         header |= {**frames.handle_fields(state), **fields}
         arrays: dict[str, Array] = {}
         if everything or shown is not None:
-            changed = None
-            uv = state.uv
-            if shown is not None and drag is not None:
-                start = int(state.numbering.starts[drag.island])
-                moved = shown.uv * state.islands[drag.island].sign
-                uv[start : start + len(moved)] = moved
-                changed = drag.island, moved, shown.certificate
-            more, found = frames.map_arrays(state, self._origin, changed=changed)
-            header |= more
-            arrays |= found
-            header |= self._measured.look(uv, now=seq < 0) | {"scale": self._measured.scale}
+            dragged = None if shown is None or drag is None else (drag.island, shown)
+            more, arrays, uv = frames.map_message(state, self._origin, dragged)
+            header |= more | self._measured.look(uv, now=seq < 0)
         targets = {} if asked is None or drag is None else {drag.island: asked}
         if targets or (everything and not state.in_place):
             arrays["asked"] = frames.asked_boundary(state, targets, self._origin)
@@ -415,6 +397,14 @@ class Session:
     def _busy(self, what: str) -> None:
         self._working = True
         self._tell({"kind": "busy", "what": what}, {})
+
+
+def _read_size(frame: Frame, resolution: int) -> dict[str, Any]:
+    """Return resolution, by default the given one, and padding of a texture."""
+    return {
+        "resolution": int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, resolution)),
+        "padding": float(validation.amount(frame, "padding", 0, 64, 4)),
+    }
 
 
 def _finite(value: float) -> float | None:
