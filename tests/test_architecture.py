@@ -123,12 +123,95 @@ def test_no_cycle_between_subpackages():
             for whole in modules:
                 if whole[0] == parts[0] and whole[1:2] != parts[1:2] and (ROOT / "/".join(whole[:2])).is_dir():
                     graph.setdefault(parts[:2], set()).add(whole[:2])
-    while graph:
-        leaves = {other for others in graph.values() for other in others} - set(graph)
-        free = {one for one, others in graph.items() if others <= leaves}
-        assert free, f"a cycle among {sorted('.'.join(one) for one in graph)}"
-        graph = {one: others - free - leaves for one, others in graph.items() if one not in free}
-        leaves |= free
+    assert in_circles(graph) == []
+
+
+def in_circles(graph):
+    """Members of circles of a graph, and members between circles; ``graph`` has the set of what each imports."""
+    while True:
+        among = {one: others & set(graph) for one, others in graph.items()}
+        imported_by_one = set().union(*among.values())
+        smaller = {one: others for one, others in among.items() if others and one in imported_by_one}
+        if len(smaller) == len(graph):
+            return sorted(".".join(one) for one in graph)
+        graph = smaller
+
+
+def module_of(path):
+    """The parts of the dotted name of a file's module, without the library's name."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return parts[:-1] if parts[-1] == "__init__" else parts
+
+
+def lazy_names(stub):
+    """A dictionary from the names in the ``__init__.pyi`` of a package to the modules that they are imported from."""
+    nodes = (node for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8"))) if isinstance(node, ast.ImportFrom))
+    package = module_of(stub.with_suffix(".py"))
+    return {alias.asname: (*package, *(node.module or "").split(".")) for node in nodes for alias in node.names}
+
+
+def graph_of_files(trees, lazy):
+    """The set of modules that each module imports at any position: at the top, in functions, and for type checkers.
+
+    ``trees`` has the syntax tree of each module. ``lazy`` has the names that a package imports on first use,
+    with their modules: a file that uses such a name imports its module.
+    """
+
+    def find(of, name):
+        return (*of, name) if (*of, name) in trees else lazy.get(of, {}).get(name, of)
+
+    graph = {}
+    for module, tree in trees.items():
+        graph[module], packages = set(), {}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                graph[module] |= {tuple(alias.name.split(".")[1:]) for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "quasiharmonic":
+                of = tuple(node.module.split(".")[1:])
+                found = {alias.asname or alias.name: find(of, alias.name) for alias in node.names}
+                packages |= {name: other for name, other in found.items() if other in lazy}
+                graph[module] |= set(found.values())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in packages:
+                graph[module].add(find(packages[node.value.id], node.attr))
+        graph[module] = (graph[module] & set(trees)) - {module}
+    return graph
+
+
+@pytest.mark.long
+def test_no_circle_of_files():
+    trees = {module_of(path): ast.parse(path.read_text(encoding="utf-8"), path) for path in ROOT.rglob("*.py")}
+    lazy = {module_of(path.with_suffix(".py")): lazy_names(path) for path in ROOT.rglob("__init__.pyi")}
+    graph = graph_of_files(trees, lazy)
+    assert ("io", "mesh_files") in graph["ui", "cli", "material"]
+    assert in_circles(graph) == []
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from quasiharmonic.io import files",
+        "import quasiharmonic.io.files",
+        "def f():\n    from quasiharmonic.io.files import read",
+        "if TYPE_CHECKING:\n    from quasiharmonic.io.files import read",
+        "from quasiharmonic.io import read",
+        "from quasiharmonic import io as files\ndef f():\n    return files.read",
+        "from quasiharmonic.io.between import between",
+    ],
+)
+def test_a_circle_of_files_is_found(code):
+    texts = {
+        (): "",
+        ("io",): "",
+        ("io", "meshes"): code,
+        ("io", "between"): "def f():\n    from quasiharmonic.io import files",
+        ("io", "files"): "from quasiharmonic.io.meshes import Mesh",
+        ("io", "last"): "from quasiharmonic.io import files",
+    }
+    trees = {module: ast.parse(text) for module, text in texts.items()}
+    assert {"io.files", "io.meshes"} <= set(in_circles(graph_of_files(trees, {("io",): {"read": ("io", "files")}})))
+    trees["io", "meshes"] = ast.parse("import numpy")
+    assert in_circles(graph_of_files(trees, {})) == []
 
 
 def test_every_package_states_where_to_start_reading():

@@ -67,17 +67,6 @@ class TestPolish:
         assert "injective" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
 
-    def test_energy_names_are_those_of_the_library(self):
-        from quasiharmonic import linsolve
-        from quasiharmonic.energies.polishing import ENERGIES
-        from quasiharmonic.solver.search import harmonising, stages
-        from quasiharmonic.ui.cli import arguments
-
-        assert tuple(stages.STRATEGIES) == arguments.STRATEGIES
-        assert set(arguments.ENERGIES) == set(ENERGIES)
-        assert set(arguments.HARMONISED) == set(harmonising.ENERGIES)
-        assert set(arguments.LINEAR_SOLVERS) - {"auto"} == set(linsolve.BACKENDS)
-
 
 class TestHarmonise:
     @pytest.mark.slow

@@ -218,7 +218,7 @@ def test_convergence_plot_without_finite_values():
 def test_a_problem_is_drawn_with_pins_and_marked_triangles():
     inner = np.setdiff1d(np.arange(len(V)), LOOP)[:2]
     figure = plot.plot_problem(V, F, [*LOOP, *inner], [*BEAN, [0, 0], [0.1, 0]], vertices=LOOP[:3], edges=[LOOP[:2]])
-    pins, (red,) = figure.axes[1].lines[1].get_xydata(), [figure.axes[1].lines[3].get_xydata()]
+    pins, red = (line.get_xydata() for line in figure.axes[1].lines)
     np.testing.assert_array_equal(pins, [[0, 0], [0.1, 0]])
     np.testing.assert_array_equal(red, BEAN[:3])
 

@@ -255,8 +255,7 @@ def test_record_stores_intermediate_maps(dome):
 # --- by way of a coarse mesh
 
 
-# Rings of the pairs, and vertices of the coarse mesh.
-RINGS, LEAST = 13, 800
+RINGS, LEAST = 13, 800  # of the pairs, and vertices of the coarse mesh
 
 
 @pytest.fixture(scope="module")

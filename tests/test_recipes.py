@@ -34,6 +34,7 @@ def test_all_recipes_are_tested():
         "A file format",
         "An outline",
         "A subcommand",
+        "An option",
     }
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import quasiharmonic as qh
 from quasiharmonic import Problem, Status, distortion, io, results
-from quasiharmonic.atlas import SeamedMesh
+from quasiharmonic.atlas import SeamedMesh, as_seamed_mesh
 from quasiharmonic.atlas import flatten as flatten_islands
 from quasiharmonic.surfaces import cat, disk
 from shared.polygons import circle
@@ -264,8 +264,11 @@ def test_meshes_are_accepted_in_place_of_arrays(surface, solved, tmp_path):
         np.testing.assert_array_equal(qh.boundary_loops(mesh)[0], loop)
         (result,) = qh.injective_maps([(mesh, loop, target)])
         np.testing.assert_array_equal(result.uv, solved.uv)
-        np.testing.assert_array_equal(SeamedMesh(mesh).V, V)
-    np.testing.assert_array_equal(SeamedMesh(path).islands[0].uv, solved.uv)
+        np.testing.assert_array_equal(as_seamed_mesh(mesh).V, V)
+    np.testing.assert_array_equal(as_seamed_mesh(path).islands[0].uv, solved.uv)
+    assert as_seamed_mesh(mapped := as_seamed_mesh(path)) is mapped
+    with pytest.raises(TypeError):
+        SeamedMesh(path)
     np.testing.assert_array_equal(qh.boundary_loops(F)[0], loop)
 
 

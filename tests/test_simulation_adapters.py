@@ -15,7 +15,7 @@ import pytest
 from quasiharmonic import distortion, morph, surfaces
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.io import MeshFileError
-from quasiharmonic.io.adapters.cells import planar_cells
+from quasiharmonic.io.adapters.cells import simulation_cells
 from quasiharmonic.io.fem.files import read_fem
 from quasiharmonic.ui.cli import main
 from shared.simulation import quadrilaterals, second_order
@@ -84,7 +84,7 @@ for mesh, (_, elements) in STAND_INS.values():
 @pytest.mark.parametrize("name", STAND_INS)
 def test_supported_elements_are_converted(name):
     mesh, (points, F) = STAND_INS[name]
-    found = planar_cells(mesh)
+    found = simulation_cells(mesh)
     assert np.array_equal(found[0], points)
     assert np.array_equal(found[1], F)
     expected = morph(points, F, *dent(points))

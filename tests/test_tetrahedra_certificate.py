@@ -212,7 +212,7 @@ def test_qhm_check_certifies_the_file(suffix, tmp_path, capsys):
     form = {"file_format": "gmsh22"} if suffix == ".msh" else {}
     meshlane.write(path, meshlane.Mesh(X, [("triangle", walls), ("tetra", T)]), **form)
     read = read_volume(path)
-    np.testing.assert_array_equal(read.T, T)
+    np.testing.assert_array_equal(read.F, T)
     np.testing.assert_array_equal(read.points, X)
     assert main(["check", str(path), "--json", str(tmp_path / "report.json")]) == 0
     assert "Injective: the boundary does not meet itself" in capsys.readouterr().out

@@ -366,7 +366,7 @@ def test_qhm_morph_keeps_everything_but_positions(suffix, tmp_path, capsys):
     assert "Injective" in capsys.readouterr().out
     moved = read_volume(out)
     np.testing.assert_array_equal(moved.points, points)
-    np.testing.assert_array_equal(moved.T, T)
+    np.testing.assert_array_equal(moved.F, T)
     # With the old positions every byte is the old one.
     assert moved.parts.replace_points(X) == path.read_bytes() or suffix == ".msh"
     assert main(["check", str(out)]) == 0

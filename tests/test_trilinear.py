@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic.apps.displacement_fields.nearest import fold_free
-from quasiharmonic.apps.tetrahedra.trilinear import least_coefficients
-from quasiharmonic.apps.tetrahedra.voxel_fields import VoxelGrid
+from quasiharmonic.apps.displacement_fields.trilinear import least_coefficients
+from quasiharmonic.apps.displacement_fields.voxels import VoxelGrid
 from quasiharmonic.ui.cli import main
 
 

@@ -104,11 +104,11 @@ def test_programs_are_compiled_once():
         return 0
 
     for _ in range(3):
-        program(PolishLayer(problem, "mips", False, 1.0 * V, "auto"))
-        program(FlattenLayer.of(V, F.copy(), None, None, energy="mips", weights=None, start=None, solver="auto"))
+        program(PolishLayer.of(problem, {"polish": "mips", "start": 1.0 * V}))
+        program(FlattenLayer.of(V, F.copy(), None, {"energy": "mips"}))
     assert len(traced) == 2
-    program(PolishLayer(problem, "mips", False, 1.1 * V, "auto"))
-    program(PolishLayer(held_ring(), "mips", False, 1.0 * V, "auto"))
+    program(PolishLayer.of(problem, {"polish": "mips", "start": 1.1 * V}))
+    program(PolishLayer.of(held_ring(), {"polish": "mips", "start": 1.0 * V}))
     assert len(traced) == 4
 
 

@@ -1,5 +1,6 @@
 # The public names. `__init__.py` imports each when it is first used.
 
+from .adapters.objects import write_map as write_map
 from .errors import MeshFileError as MeshFileError
 from .errors import OutputError as OutputError
 from .fields import DisplacementField as DisplacementField
@@ -36,7 +37,6 @@ from .mesh_files import check_output as check_output
 from .mesh_files import not_held as not_held
 from .mesh_files import read_mesh as read_mesh
 from .mesh_files import read_written as read_written
-from .mesh_files import write_map as write_map
 from .mesh_files import write_mapped as write_mapped
 from .models.cut_seams import cut_at_seams as cut_at_seams
 from .models.cut_seams import mapped as mapped

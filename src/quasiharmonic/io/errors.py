@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 # Longest description of a fault, in characters. A file may have very long text in place of a number.
 _MAX_LENGTH = 300
@@ -51,6 +53,28 @@ class MeshFileError(ValueError):
         text = f"{self.what}{at}{then}"
         # Escape invalid Unicode, so that the message stays printable.
         return f"{printable(self.path)}: {text.encode('utf-8', 'backslashreplace').decode()}"
+
+
+@contextmanager
+def reading(
+    path: str | os.PathLike[str],
+    fault: str = "",
+    damage: type[Exception] | tuple[type[Exception], ...] = ValueError,
+    *,
+    describe: Callable[[Exception], str] = str,
+    line: int | None = None,
+    remedy: str = "",
+) -> Iterator[None]:
+    """Raise errors about the contents of a file, of the types ``damage``, as `MeshFileError`.
+
+    Its fault is ``fault`` and the description of the error. A `MeshFileError` is not changed: it names its own file.
+    """
+    try:
+        yield
+    except MeshFileError:
+        raise
+    except damage as error:
+        raise MeshFileError(path, f"{fault}{describe(error)}", line, remedy) from error
 
 
 class OutputError(OSError):

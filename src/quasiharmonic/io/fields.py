@@ -14,17 +14,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.errors import MeshFileError, check_path
-from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.itk_headers import check_header
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import check_size, read_npy
 
 NIFTI = ".nii", ".nii.gz"
@@ -128,10 +128,8 @@ def read_field(path: str | os.PathLike[str]) -> DisplacementField:
 
 
 def _read_npy(path: str | os.PathLike[str]) -> DisplacementField:
-    try:
+    with reading(path, "is not an array of numbers in NumPy's format .npy: "):
         array = read_npy(path)
-    except ValueError as error:
-        raise MeshFileError(path, f"is not an array of numbers in NumPy's format .npy: {error}") from error
 
     def encode(components: FloatArray, suffix: str) -> bytes:
         from io import BytesIO
@@ -144,20 +142,16 @@ def _read_npy(path: str | os.PathLike[str]) -> DisplacementField:
 
 
 def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
-    try:
+    with explain_missing("NIfTI files need nibabel", "nibabel"):
         import nibabel
-    except ImportError as error:
-        raise ImportError(f"NIfTI files need nibabel ({error}): pip install nibabel") from error
     read_bytes(path)  # Raises an error that names what is wrong with the path.
-    try:
-        # Damaged files cause errors of many types.
+    # Damaged files cause errors of many types.
+    with reading(path, "is not valid NIfTI: ", Exception):
         image: Any = nibabel.load(path)
         check_size(8 * prod(image.shape), "its header announces")
         data = np.asarray(image.dataobj, dtype=np.float64)
         affine = np.asarray(image.affine, dtype=np.float64)
         intent = int(image.header["intent_code"])
-    except Exception as error:
-        raise MeshFileError(path, f"is not valid NIfTI: {error}") from error
     volume = data.ndim > 3 and data.shape[2] > 1
     count = data.shape[-1]
     if data.ndim < 3 or count not in ((3,) if volume else (2, 3)) or any(n != 1 for n in data.shape[2 + volume : -1]):
@@ -175,27 +169,19 @@ def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
         values = np.moveaxis(components.T, 0, -1).reshape(data.shape)
         made = type(image)(values, image.affine, image.header)
         made.set_data_dtype(np.float64)
-        with TemporaryDirectory() as folder:
-            part = Path(folder, f"field{suffix}")
-            nibabel.save(made, part)
-            return part.read_bytes()
+        return encode_by(f"field{suffix}", lambda part: nibabel.save(made, part))
 
     components = np.moveaxis(data.reshape(*data.shape[: 2 + volume], count).T, 0, -1)
     return _in_grid_axes(path, components, columns[:count], encode, NIFTI)
 
 
 def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
-    try:
+    with explain_missing("ITK's files need SimpleITK", "SimpleITK"):
         import SimpleITK
-    except ImportError as error:
-        raise ImportError(f"ITK's files need SimpleITK ({error}): pip install SimpleITK") from error
     try:
-        check_header(read_bytes(path), field_suffix(path))
-        image = SimpleITK.ReadImage(os.fspath(path))
-    except MeshFileError:
-        raise
-    except ValueError as error:
-        raise MeshFileError(path, str(error)) from error
+        with reading(path):
+            check_header(read_bytes(path), field_suffix(path))
+            image = SimpleITK.ReadImage(os.fspath(path))
     except RuntimeError as error:
         raise MeshFileError(path, f"SimpleITK cannot read it: {str(error).splitlines()[-1]}") from error
     n, count = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
@@ -213,10 +199,7 @@ def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
         made.CopyInformation(image)
         for key in image.GetMetaDataKeys():
             made.SetMetaData(key, image.GetMetaData(key))
-        with TemporaryDirectory() as folder:
-            part = Path(folder, f"field{suffix}")
-            SimpleITK.WriteImage(made, str(part))
-            return part.read_bytes()
+        return encode_by(f"field{suffix}", lambda part: SimpleITK.WriteImage(made, part))
 
     return _in_grid_axes(path, array.reshape(*array.shape[-1 - axes : -1], count), columns, encode, ITK)
 

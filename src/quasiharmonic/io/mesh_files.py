@@ -5,12 +5,9 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 
-from numpy.typing import ArrayLike
-
-from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays
 from quasiharmonic.io.lowlevel.atomic import check_writable
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.io.registry import find_format
+from quasiharmonic.io.registry import find_format, find_function
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshData:
@@ -25,35 +22,7 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshData:
     MeshFileError
         If the format is not supported, or the file is not valid in its format.
     """
-    read = find_format(path, "read").read
-    assert read is not None
-    return read(path)
-
-
-def write_map(path: str | os.PathLike[str], mesh: MeshLike, uv: ArrayLike) -> None:
-    """Write a mesh with one position per vertex as its map; see `write_mapped`.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file to write.
-    mesh : MeshData, path or mesh object
-        A path is read. Of a mesh object of another library, positions and triangles are written.
-    uv : (n, 2) float
-        Position of every vertex in the plane.
-
-    Raises
-    ------
-    MeshFileError, OutputError
-        As `write_mapped`.
-    ValueError
-        If ``uv`` has another shape or is not finite.
-    """
-    if isinstance(mesh, str | os.PathLike):
-        mesh = read_mesh(mesh)
-    elif not isinstance(mesh, MeshData):
-        mesh = MeshData(*mesh_arrays(mesh))
-    write_mapped(path, mesh.with_map(getattr(uv, "uv", uv)))
+    return find_function(path, "read")(path)
 
 
 def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
@@ -78,13 +47,11 @@ def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
     OutputError
         If the file cannot be written. An existing file is then unchanged.
     """
-    write = find_format(path, "write_map").write_map
-    assert write is not None
-    write(path, mesh)
+    find_function(path, "write_map")(path, mesh)
 
 
 def check_output(path: str | os.PathLike[str]) -> None:
-    """Check before a computation whether `write_map` could write to ``path``.
+    """Check before a computation whether `write_mapped` could write to ``path``.
 
     Raises
     ------

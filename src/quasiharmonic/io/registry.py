@@ -93,13 +93,16 @@ class Format:
     encode_values: Callable[[FloatArray, IntArray, FloatArray, Mapping[str, FloatArray]], bytes] | None = None
 
 
-def import_later(module: str, name: str) -> Callable[..., Any]:
-    """Return a function of a module of this package that is imported when it is first called."""
+def import_later(module: str, **names: str) -> dict[str, Any]:
+    """Return functions by the field of `Format`, given their names in a module of this package.
 
-    def call(*args: Any) -> Any:
-        return getattr(import_module(f"{__package__}.{module}"), name)(*args)
+    The module is imported when one of them is first called.
+    """
 
-    return call
+    def later(name: str) -> Callable[..., Any]:
+        return lambda *args: getattr(import_module(f"{__package__}.{module}"), name)(*args)
+
+    return {field: later(name) for field, name in names.items()}
 
 
 #: All formats, in the order of help texts and messages.
@@ -107,77 +110,66 @@ FORMATS: tuple[Format, ...] = (
     Format(
         name="OBJ",
         suffix=".obj",
-        read=import_later("formats.obj", "read_obj"),
-        write_map=import_later("formats.obj", "write_obj"),
-        list_losses=import_later("formats.obj", "not_in_obj"),
         seams=True,
         image=True,
-        companions=import_later("models.materials", "companions"),
+        **import_later("formats.obj", read="read_obj", write_map="write_obj", list_losses="not_in_obj"),
+        **import_later("models.materials", companions="companions"),
     ),
     Format(
         name="OFF",
         suffix=".off",
-        read=import_later("formats.off", "read_off"),
-        write_map=import_later("formats.off", "write_off_map"),
         list_losses=lambda mesh: ["the surface: only the map is written"],
+        **import_later("formats.off", read="read_off", write_map="write_off_map"),
     ),
     Format(
         name="PLY",
         suffix=".ply",
-        read=import_later("formats.ply", "read_ply"),
-        write_map=import_later("formats.ply", "write_ply"),
-        list_losses=import_later("formats.ply", "not_in_ply"),
         seams=True,
-        encode_values=import_later("formats.per_triangle", "encode_ply"),
+        **import_later("formats.ply", read="read_ply", write_map="write_ply", list_losses="not_in_ply"),
+        **import_later("formats.per_triangle", encode_values="encode_ply"),
     ),
     *(
         Format(
             name=name,
             suffix=suffix,
-            read=import_later("formats.gltf.reader", "read_gltf"),
-            write_map=import_later("formats.gltf.writer", "write_gltf"),
-            list_losses=import_later("formats.gltf.writer", "not_in_gltf"),
             seams=True,
             image=True,
             single_file=suffix == ".glb",
+            **import_later("formats.gltf.reader", read="read_gltf"),
+            **import_later("formats.gltf.writer", write_map="write_gltf", list_losses="not_in_gltf"),
         )
         for name, suffix in (("GLB", ".glb"), ("glTF", ".gltf"))
     ),
-    Format(name="STL", suffix=".stl", read=import_later("formats.stl", "read_stl")),
+    Format(name="STL", suffix=".stl", **import_later("formats.stl", read="read_stl")),
     Format(
         name="GIFTI",
         suffix=".gii",
         pattern=r".*\.gii\.gz",
-        read=import_later("formats.neuro", "read_gifti"),
-        write_map=import_later("formats.neuro", "write_gifti"),
-        list_losses=import_later("formats.neuro", "not_in_flat_surface"),
         requires="nibabel",
+        **import_later("formats.neuro", read="read_gifti", write_map="write_gifti", list_losses="not_in_flat_surface"),
     ),
     Format(
         name="FreeSurfer patch",
         suffix=".patch.3d",
         pattern=r".*\.patch(\.\w+)?",
-        read=import_later("formats.neuro", "read_patch"),
-        read_written=import_later("formats.neuro", "read_written_patch"),
-        write_map=import_later("formats.neuro", "write_patch"),
-        list_losses=import_later("formats.neuro", "not_in_patch"),
         single_file=False,
+        **import_later("formats.neuro", read="read_patch", write_map="write_patch", list_losses="not_in_patch"),
+        **import_later("formats.neuro", read_written="read_written_patch"),
     ),
     Format(
         name="FreeSurfer surface",
         suffix=".surf",
         pattern=r"[lr]h\..+",
-        read=import_later("formats.neuro", "read_freesurfer"),
-        write_map=import_later("formats.neuro", "write_freesurfer"),
-        list_losses=import_later("formats.neuro", "not_in_flat_surface"),
         requires="nibabel",
+        **import_later("formats.neuro", read="read_freesurfer", write_map="write_freesurfer"),
+        **import_later("formats.neuro", list_losses="not_in_flat_surface"),
     ),
-    Format(name="Gmsh (version 2 or 4)", suffix=".msh", read_elements=import_later("fem.gmsh", "read_gmsh")),
-    Format(name="legacy VTK", suffix=".vtk", read_elements=import_later("fem.legacy_vtk", "read_legacy_vtk")),
-    Format(name="VTU", suffix=".vtu", read_elements=import_later("fem.vtu", "read_vtu")),
-    Format(name="MFEM", suffix=".mesh", read_elements=import_later("fem.mfem", "read_mfem")),
-    Format(name="CSV", suffix=".csv", encode_values=import_later("formats.per_triangle", "encode_csv")),
-    Format(name="NPZ", suffix=".npz", encode_values=import_later("formats.per_triangle", "encode_npz")),
+    Format(name="Gmsh (version 2 or 4)", suffix=".msh", **import_later("fem.gmsh", read_elements="read_gmsh")),
+    Format(name="legacy VTK", suffix=".vtk", **import_later("fem.legacy_vtk", read_elements="read_legacy_vtk")),
+    Format(name="VTU", suffix=".vtu", **import_later("fem.vtu", read_elements="read_vtu")),
+    Format(name="MFEM", suffix=".mesh", **import_later("fem.mfem", read_elements="read_mfem")),
+    Format(name="CSV", suffix=".csv", **import_later("formats.per_triangle", encode_values="encode_csv")),
+    Format(name="NPZ", suffix=".npz", **import_later("formats.per_triangle", encode_values="encode_npz")),
 )
 
 
@@ -205,6 +197,12 @@ def find_format(path: FilePath, *needs: Feature) -> Format:
         fault = f"{suffix} files {_FAULTS[lacking[0]]}" if suffix else "has no suffix, so its format is unknown"
         raise MeshFileError(path, fault, remedy=f"supported: {', '.join(suffixes(*needs))}")
     return form
+
+
+def find_function(path: FilePath, name: Feature) -> Callable[..., Any]:
+    """Return a function of the format of a file, such as that of the field ``read``; errors as `find_format`."""
+    found: Callable[..., Any] = getattr(find_format(path, name), name)
+    return found
 
 
 def format_of(path: FilePath) -> Format | None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +23,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     as_offsets,
     check_range,
+    corner_rows,
     count_of,
     edge_names,
     index_array,
@@ -32,9 +32,6 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
     vertex_array,
 )
-
-if TYPE_CHECKING:
-    from quasiharmonic.io.adapters.objects import MeshLike
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +70,8 @@ class SeamedMesh:
 
     Parameters
     ----------
-    V : (n, 2) or (n, 3) array, or a mesh or path in place of all arguments
-        Positions. A file keeps its seams and its map.
+    V : (n, 2) or (n, 3) array
+        Positions.
     F : (f, 3) array of int
         Triangles.
     FT : (f, 3) array of int, optional
@@ -86,6 +83,10 @@ class SeamedMesh:
     ------
     ValueError
         If the shapes do not fit, or a vertex or row does not exist; the message names them.
+
+    See Also
+    --------
+    quasiharmonic.atlas.as_seamed_mesh : Accepts a file, or a mesh of another library.
 
     Attributes
     ----------
@@ -108,26 +109,12 @@ class SeamedMesh:
     FT: IntArray
     uv: FloatArray | None
 
-    @overload
-    def __init__(
-        self, V: ArrayLike, F: ArrayLike, FT: ArrayLike | None = None, uv: ArrayLike | None = None
-    ) -> None: ...
-    @overload
-    def __init__(self, V: MeshLike) -> None: ...
-    def __init__(self, V: Any, F: Any = None, FT: ArrayLike | None = None, uv: ArrayLike | None = None) -> None:
-        from quasiharmonic.io.adapters.objects import seamed_mesh, stands_for_mesh
-
-        if F is None and (isinstance(V, SeamedMesh) or stands_for_mesh(V)):
-            mesh = seamed_mesh(V)
-            V, F, FT, uv = mesh.V, mesh.F, mesh.FT, mesh.uv
+    def __init__(self, V: ArrayLike, F: ArrayLike, FT: ArrayLike | None = None, uv: ArrayLike | None = None) -> None:
         self.V, self.F = vertex_array(V), triangle_rows(F)
         check_range("F", self.F, len(self.V))
         self.uv = None if uv is None else map_array("uv", uv, finite=False)
-        self.FT = self.F if FT is None else triangle_rows(FT, "FT")
-        if len(self.FT) != len(self.F):
-            raise ValueError(f"FT must have as many rows as F, {len(self.F)}, not {len(self.FT)}")
-        rows = int(self.FT.max(initial=-1)) + 1 if self.uv is None else len(self.uv)
-        check_range("FT", self.FT, rows, "row", "rows", minimum=-1)
+        rows = None if self.uv is None else len(self.uv)
+        self.FT = corner_rows("FT", self.F if FT is None else FT, self.F, rows, copy=FT is not None)
         for array in (self.V, self.F, self.FT, self.uv):
             if array is not None:
                 array.flags.writeable = False

@@ -170,11 +170,6 @@ def to_points(w: ComplexArray) -> FloatArray:
     return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
 
 
-def to_space(points: FloatArray) -> FloatArray:
-    """Points (n, 2) or (n, 3) as points in space (n, 3), with zeros for a missing coordinate."""
-    return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
-
-
 def sum_at(indices: IntArray, values: ComplexArray, n: int) -> ComplexArray:
     """Sum complex values (k,) at each of ``n`` indices; (n,) complex128."""
     return np.bincount(indices, values.real, minlength=n) + 1j * np.bincount(indices, values.imag, minlength=n)
@@ -215,6 +210,11 @@ def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> Float
     return array
 
 
+def pad_to_space(V: FloatArray) -> FloatArray:
+    """Return positions (n, 3); those in the plane get a third coordinate of zero."""
+    return V if V.shape[1] == 3 else np.column_stack([V, np.zeros(len(V))])
+
+
 def triangle_array(F: ArrayLike, n: int) -> IntArray:
     """Convert triangles (f, 3) among ``n`` vertices, at least one, to int64; returns a copy."""
     array = triangle_rows(F)
@@ -231,6 +231,18 @@ def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArr
         return np.empty((0, 3), dtype=np.int64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"{name} must have shape (f, 3), triangles only, not {array.shape}")
+    return array
+
+
+def corner_rows(name: str, values: ArrayLike, F: IntArray, rows: int | None = None, *, copy: bool = False) -> IntArray:
+    """Convert a table with a row index, or -1 for none, at every corner of triangles F (f, 3) to int64.
+
+    ``rows`` is the number of rows that exist; None if the table decides. Returns a copy only if ``copy``.
+    """
+    array = triangle_rows(values, name, copy=copy)
+    if len(array) != len(F):
+        raise ValueError(f"{name} must have as many rows as F, {len(F)}, not {len(array)}")
+    check_range(name, array, int(array.max(initial=-1)) + 1 if rows is None else rows, "row", "rows", minimum=-1)
     return array
 
 

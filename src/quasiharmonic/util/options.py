@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields
 from functools import wraps
+from numbers import Real
 from typing import Any, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -83,6 +84,12 @@ def function(name: str, value: Any) -> None:
     check_callback(value)
 
 
+def motion_ratio(name: str, value: Any) -> None:
+    """Check a maximum displacement of vertices relative to that of the boundary, or None."""
+    if value is not None and (not isinstance(value, Real) or not float(value) >= 1):
+        raise ValueError(f"{name} must be a number of at least 1, not {value!r}: the boundary itself has ratio 1")
+
+
 def reference_name(name: str, value: Any) -> None:
     """Check the name of reference triangles."""
     from quasiharmonic.util.arrays import check_choice
@@ -114,7 +121,9 @@ def takes(options: type[Options], keywords: type) -> Callable[[F], F]:
     """
     defaults = {one.name: one.default for one in fields(options)}
     shown = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=of.__forward_arg__)
+        inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name], annotation=getattr(of, "__forward_arg__", of)
+        )
         for name, of in keywords.__annotations__.items()
     ]
 
@@ -153,12 +162,14 @@ class MapOptions(SolverOptions):
         "the fastest method, or the paper's pipeline, which starts with si-log (default: speed)",
         choices=STRATEGIES,
     )
-    polish: Any = option(None, choices=ENERGIES)
+    polish: Any = option(None)
     start: Any = option(None)
     max_iterations: int = option(MAX_ITERATIONS, "(default: 2000)", check=positive)
     record_every: int = option(0, check=count)
     slide: Any = option(False)
-    refine: bool = option(False, check=switch)
+    refine: bool = option(
+        False, "if no map exists, split as few inner edges as necessary (adds vertices at the end)", check=switch
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +192,7 @@ class HarmoniseOptions(SolverOptions):
     conformal: float = option(1e-3, check=tolerance)
     weights: Any = option(None)
     scaled: bool = option(True, check=switch)
-    max_iterations: int = option(40, check=positive)
+    max_iterations: int = option(40, "linear solves per round (default: 40)", check=positive)
     tol: float = option(1e-3, check=tolerance)
     reference: str = option("rest", check=reference_name)
 
@@ -200,14 +211,21 @@ class DistanceOptions(SolverOptions):
 class FlattenOptions(DistanceOptions):
     """Options of `quasiharmonic.flatten`."""
 
-    energy: Any = option("symmetric-dirichlet", "(default: symmetric-dirichlet)", choices=FLATTENED)
-    max_iterations: int = option(500, check=count)
+    energy: Any = option(
+        "symmetric-dirichlet",
+        "energy to lower; mips preserves only angles, distances preserves distances between nearby vertices "
+        "(default: symmetric-dirichlet)",
+        choices=FLATTENED,
+    )
+    max_iterations: int = option(
+        500, "maximum steps on each connected surface; 0 keeps the start (default: 500)", check=count
+    )
     tol: float = option(1e-4, check=tolerance)
     fixed: Any = option(None)
     target: Any = option(None)
     weights: Any = option(None)
     start: Any = option(None)
-    unit_square: bool = option(False, check=switch)
+    unit_square: bool = option(False, "scale the map evenly into the unit square", check=switch)
     gap: float = option(0.0, check=tolerance)
 
 
@@ -232,3 +250,34 @@ class MorphOptions(SolverOptions):
     rest: Any = option(None)
     start: Any = option(None)
     tol: float = option(1e-8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovingOptions(Options):
+    """Options of `quasiharmonic.MovingMesh`; a sliding boundary in the plane needs ``settle`` of at least 1."""
+
+    energy: Any = option("blend", choices=ENERGIES)
+    settle: int = option(1, check=count)
+    slide: Any = option(False)
+    linear_solver: str = option("auto", choices=LINEAR_SOLVERS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RepairOptions(SolverOptions):
+    """Options of `quasiharmonic.repair`."""
+
+    fixed: Any = option(None)
+    whole: bool = option(False, check=switch)
+    unmirror: bool = option(False, check=switch)
+    max_iterations: int = option(MAX_ITERATIONS, check=positive)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnimationOptions(SolverOptions):
+    """Options of `quasiharmonic.animate`."""
+
+    polish: Any = option(None, choices=ENERGIES)
+    max_motion_ratio: float | None = option(None, check=motion_ratio)
+    fill_gaps: bool = option(False, check=switch)
+    start: Any = option(None)
+    max_iterations: int = option(MAX_ITERATIONS, check=positive)

@@ -22,3 +22,16 @@ class Outcome:
     def __bool__(self) -> bool:
         """Return `success`."""
         return self.success
+
+
+class SummarisedOutcome(Outcome):
+    """Base of results whose `message` is the first line of their `summary`."""
+
+    def summary(self) -> str:
+        """Describe the result in one or several lines."""
+        raise NotImplementedError
+
+    @property
+    def message(self) -> str:
+        """The first line of `summary`."""
+        return self.summary().partition("\n")[0]

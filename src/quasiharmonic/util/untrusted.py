@@ -42,6 +42,12 @@ def check_size(size: int, what: str) -> None:
         raise ValueError(f"{what} {size:,} bytes, more than the bound of {_bound.get():,}")
 
 
+def check_end(end: int, available: int) -> None:
+    """Raise a ValueError if data must be read up to a position behind those that are there."""
+    if end > available:
+        raise ValueError("it ends too early")
+
+
 def parse_json(text: str | bytes) -> Any:
     """Return the contents of JSON; ValueError if it is invalid or nested too deeply."""
     try:

@@ -37,6 +37,7 @@ from quasiharmonic.util.arrays import (
     real_array,
     triangle_array,
 )
+from quasiharmonic.util.optional import explain_missing
 
 #: ARAP, and a barrier that keeps triangles from collapsing.
 _ELASTIC = Combination((1.0, ARAP()), (0.1, AreaBarrier()))
@@ -338,8 +339,6 @@ def thicken(corners: FloatArray, gap: float) -> FloatArray:
 
 
 def _shapely() -> Any:
-    try:
+    with explain_missing("the air is triangulated by Shapely", "'quasiharmonic[shapes]'"):
         import shapely
-    except ImportError as error:
-        raise ImportError("the air is triangulated by Shapely: pip install 'quasiharmonic[shapes]'") from error
     return shapely

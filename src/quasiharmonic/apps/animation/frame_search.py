@@ -7,7 +7,6 @@ boundaries are tried, and only then a general search (`quasiharmonic.solve`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.search.stages import Stages
 from quasiharmonic.util.arrays import BoolArray, FloatArray
+from quasiharmonic.util.options import AnimationOptions
 
 # Maximum number of short steps. A frame close to the previous one hardly ever needs more; if they fail, a diagnosis
 # follows.
@@ -37,22 +37,14 @@ class FrameSearch:
     ``frames`` are the results so far. ``work`` says whether Ctrl-C ended the work early.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        targets: FloatArray,
-        max_iterations: int,
-        linear_solver: str,
-        callback: Callable[[FrameStep], object] | None,
-    ) -> None:
-        self._problem, self._targets = problem, targets
-        self._max_iterations, self._linear_solver, self._callback = max_iterations, linear_solver, callback
+    def __init__(self, problem: Problem, targets: FloatArray, options: AnimationOptions) -> None:
+        self._problem, self._targets, self._options = problem, targets, options
         self.frames: list[MapResult] = []
         self.work = Run()
 
-    def run(self, start: ArrayLike | None) -> list[MapResult]:
+    def run(self) -> list[MapResult]:
         """Search for the map of every frame and return the results."""
-        last = start
+        last = self._options.start
         move = 0.0
         before: int | None = None
         with self.work.until_interrupted():
@@ -67,8 +59,8 @@ class FrameSearch:
                         boundary = find_longest(target - self._targets[before])
                         move = max(move, find_longest(frame.uv - self.frames[before].uv) / boundary)
                     before, last = t, frame.uv
-                if self._callback is not None:
-                    self._callback(FrameStep(t, len(self._targets), 0, move))
+                if self._options.callback is not None:
+                    self._options.callback(FrameStep(t, len(self._targets), 0, move))
         return self.frames
 
     def search(self, target: FloatArray, start: ArrayLike | None, last: FloatArray | None = None) -> MapResult:
@@ -86,7 +78,7 @@ class FrameSearch:
             by_halves = None if last is None else self._search_by_halves(target, start, last, _HALVINGS)
             if by_halves is not None:
                 return by_halves
-        return self._solve(problem, start, self._max_iterations)
+        return self._solve(problem, start, self._options.max_iterations)
 
     def _search_by_halves(self, target: FloatArray, start: ArrayLike, last: FloatArray, times: int) -> MapResult | None:
         """Search for the map of a target via the boundary halfway from the last, by short steps; None if that fails."""
@@ -102,7 +94,7 @@ class FrameSearch:
 
     def _search_nearby(self, problem: Problem, start: ArrayLike) -> MapResult:
         """Return the result of a few short steps from a map."""
-        few = min(_SOON, self._max_iterations)
+        few = min(_SOON, self._options.max_iterations)
         # As in the default strategy, pins need si-log.
         parameterisation = "si-log" if problem.domain.pins.size else "tanh"
         short = VectorAdam(parameterisation=parameterisation, schedule=_SHORT_STEPS, iterations=few)
@@ -111,9 +103,8 @@ class FrameSearch:
     def _solve(
         self, problem: Problem, start: ArrayLike | None, iterations: int, strategy: str | Stages = "speed"
     ) -> MapResult:
-        result = solve(
-            problem, strategy=strategy, start=start, max_iterations=iterations, linear_solver=self._linear_solver
-        )
+        solver = self._options.linear_solver
+        result = solve(problem, strategy=strategy, start=start, max_iterations=iterations, linear_solver=solver)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         return result

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from numbers import Real
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,27 +21,29 @@ from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import FloatArray, check_bool, check_callback, check_integer
-from quasiharmonic.util.options import MAX_ITERATIONS
+from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.options import AnimationOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
 # Default maximum vertex displacement, relative to the maximum boundary displacement.
 _LIMIT = 3.0
 
 
+class AnimationKeywords(TypedDict, total=False):
+    """Types of the options of `animate`."""
+
+    polish: str | Energy | None
+    max_motion_ratio: float | None
+    fill_gaps: bool
+    start: ArrayLike | None
+    max_iterations: int
+    linear_solver: str
+    callback: Callable[[FrameStep], object] | None
+
+
 @reports_progress
-def animate(
-    problem: Problem,
-    targets: Iterable[ArrayLike],
-    *,
-    polish: str | Energy | None = None,
-    max_motion_ratio: float | None = None,
-    fill_gaps: bool = False,
-    start: ArrayLike | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    linear_solver: str = "auto",
-    callback: Callable[[FrameStep], object] | None = None,
-) -> Animation:
+@takes(AnimationOptions, AnimationKeywords)
+def animate(problem: Problem, targets: Iterable[ArrayLike], **options: Unpack[AnimationKeywords]) -> Animation:
     """Map a surface to a sequence of targets; each map is certified and close to the previous one.
 
     Parameters
@@ -97,31 +99,25 @@ def animate(
     >>> bool(animation.found.all()), animation.largest_move <= 3
     (True, True)
     """
-    energy = None if polish is None else find_energy(polish)
+    checked = AnimationOptions(**options)
+    energy = None if checked.polish is None else find_energy(checked.polish)
     check_problem("animate", problem)
-    if max_motion_ratio is not None and (not isinstance(max_motion_ratio, Real) or not max_motion_ratio >= 1):
-        raise ValueError(
-            f"max_motion_ratio must be a number of at least 1, not {max_motion_ratio!r}: "
-            "the boundary itself has ratio 1"
-        )
-    if max_motion_ratio is not None and energy is None:
+    limit = checked.max_motion_ratio
+    if limit is not None and energy is None:
         raise ValueError("max_motion_ratio applies only to polished frames: give an energy as well")
-    check_integer("max_iterations", max_iterations, minimum=1)
-    check_bool("fill_gaps", fill_gaps)
-    check_callback(callback)
     positions = check_targets(targets, len(problem.fixed))
-    following = FrameSearch(problem, positions, max_iterations, linear_solver, callback)
-    frames = following.run(start)
+    following = FrameSearch(problem, positions, checked)
+    frames = following.run()
     asked, bridged = positions[: len(frames)], np.zeros(len(frames), dtype=bool)
-    if fill_gaps and not following.work.interrupted:
+    if checked.fill_gaps and not following.work.interrupted:
         asked, bridged = following.fill_gaps()
     energies = np.full(len(frames), np.nan)
     if energy is not None:
-        max_motion_ratio = _LIMIT if max_motion_ratio is None else float(max_motion_ratio)
+        limit = _LIMIT if limit is None else float(limit)
         if not following.work.interrupted:
-            smoothing = MotionSmoothing(problem.domain, energy, max_motion_ratio, linear_solver)
-            energies = _smooth_frames(smoothing, following, asked, callback)
-    return Animation(frames, asked, bridged, energies, max_motion_ratio, following.work.interrupted)
+            smoothing = MotionSmoothing(problem.domain, energy, limit, checked.linear_solver)
+            energies = _smooth_frames(smoothing, following, asked, checked.callback)
+    return Animation(frames, asked, bridged, energies, limit, following.work.interrupted)
 
 
 def _smooth_frames(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, overload
 
@@ -19,7 +19,7 @@ from quasiharmonic.util.arrays import (
     names_of,
     real_array,
 )
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import SummarisedOutcome
 from quasiharmonic.util.tables import make_dataframe
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class FrameStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Animation(Outcome, Sequence[MapResult]):
+class Animation(SummarisedOutcome, Sequence[MapResult]):
     """A sequence of maps: ``animation[t]`` is the `MapResult` of frame t.
 
     Attributes
@@ -85,9 +85,6 @@ class Animation(Outcome, Sequence[MapResult]):
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __iter__(self) -> Iterator[MapResult]:
-        return iter(self.frames)
-
     @overload
     def __getitem__(self, index: int) -> MapResult: ...
     @overload
@@ -99,11 +96,6 @@ class Animation(Outcome, Sequence[MapResult]):
     def success(self) -> bool:
         """Whether every frame is a success and the work was not interrupted."""
         return not self.interrupted and bool(self.frames) and all(frame.success for frame in self.frames)
-
-    @property
-    def message(self) -> str:
-        """The first line of `summary`."""
-        return self.summary().partition("\n")[0]
 
     @property
     def uv(self) -> FloatArray:

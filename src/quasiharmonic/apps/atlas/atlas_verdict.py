@@ -11,7 +11,7 @@ import numpy as np
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
-from quasiharmonic.io.adapters.objects import MeshLike, seamed_mesh
+from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of
 from quasiharmonic.util.tables import make_dataframe
@@ -27,7 +27,23 @@ _MAX_PAIRS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class IslandVerdict:
+class IslandReport:
+    """Base of the reports on one island: its triangles (k,), ascending, and whether it is mirrored."""
+
+    triangles: IntArray
+    mirrored: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report for JSON, with the first triangle and the number of triangles."""
+        return {
+            "first_triangle": int(self.triangles[0]),
+            "triangles": len(self.triangles),
+            "mirrored": self.mirrored,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class IslandVerdict(IslandReport):
     """The verdict on one island, in the mesh's numbering.
 
     Attributes
@@ -43,8 +59,6 @@ class IslandVerdict:
         Triangles that are not strictly positive (mirrored islands: not strictly negative).
     """
 
-    triangles: IntArray
-    mirrored: bool
     certificate: Certificate
     inverted: IntArray
 
@@ -69,9 +83,7 @@ class IslandVerdict:
     def to_dict(self) -> dict[str, Any]:
         """The verdict for JSON, with the first triangle and the number of triangles."""
         return {
-            "first_triangle": int(self.triangles[0]),
-            "triangles": len(self.triangles),
-            "mirrored": self.mirrored,
+            **super().to_dict(),
             "injective": self.injective,
             "bijective": self.bijective,
             "inverted": self.inverted.tolist(),
@@ -168,7 +180,7 @@ def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
     >>> print(certify(SeamedMesh(V, F, uv=V)).summary())
     1 island: 1 injective, 1 bijective.
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     judged = []
     for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         found = certificate.certify(island.F[:, ::-1] if mirrored else island.F, island.uv)

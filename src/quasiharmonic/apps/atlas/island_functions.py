@@ -20,12 +20,13 @@ from quasiharmonic.apps.atlas.mapped_atlas import (
 )
 from quasiharmonic.apps.flattening import free_boundary
 from quasiharmonic.apps.flattening.layout import fit_unit_square, place_in_row
-from quasiharmonic.energies.deformation import positive_weights
+from quasiharmonic.energies.deformation import positive_weights, signed_areas
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.curves.boundary_curves import sliding_curves
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.objects import MeshLike, seamed_mesh
+from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult
@@ -80,7 +81,7 @@ def polish(
     ValueError
         If an island is not injective or not a surface; the message names its first triangle.
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     check_bool("free", free)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     if free and fixed is not None:
@@ -118,7 +119,7 @@ def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **
     -------
     MappedAtlas
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     checked = _check_fixed(mesh, fixed)
     return each_island(
         mesh, lambda island: harmonise_map(_domain(island, checked), island.uv, HarmoniseOptions(**rest))
@@ -149,7 +150,7 @@ def injective_map(
     MappedAtlas
         If an island has no injective map, its result reports it.
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     checked = _check_fixed(mesh, fixed)
 
     def find(island: Island) -> MapResult:
@@ -195,7 +196,7 @@ def flatten(
         In the surface's unit of length, or in the unit square. After Ctrl-C the remaining islands keep their positions,
         and the others keep their centre, direction and area.
     """
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     check_bool("start", start)
     check_bool("unit_square", unit_square)
     check_non_negative("gap", gap)
@@ -312,7 +313,7 @@ def pack(
     # Packing needs scipy.spatial, which takes longer to load than most maps take.
     from quasiharmonic.apps.atlas.packing.pack import pack_charts
 
-    mesh = seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh)
     islands = mesh.islands
     charts = _scale_to_surface(islands, _surface_areas(mesh))
     packing = pack_charts(charts, resolution=resolution, padding=padding, rotate=rotate, stack=stack)
@@ -338,16 +339,11 @@ def _scale_to_surface(islands: Sequence[Island], surface: FloatArray) -> list[tu
         island.F[:, ::-1] if is_mirrored(island.F, uv) else island.F
         for island, uv in zip(islands, positions, strict=True)
     ]
-    plane = np.array([np.abs(_doubled_areas(uv, rows)).sum() / 2 for uv, rows in zip(positions, F, strict=True)])
+    plane = np.array([np.abs(signed_areas(rows, in_units(uv, 0))).sum() for uv, rows in zip(positions, F, strict=True)])
     known = (plane > 0) & (surface > 0)
     mean = surface[known].sum() / plane[known].sum() if known.any() else 1.0
     scales = np.sqrt(np.divide(surface, plane, out=np.full(len(plane), mean), where=known))
     return [(uv * scale, rows) for uv, scale, rows in zip(positions, scales.tolist(), F, strict=True)]
-
-
-def _doubled_areas(uv: FloatArray, F: IntArray) -> FloatArray:
-    a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def _surface_areas(mesh: SeamedMesh) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, AtlasVerdict, certify, mirrored_islands
+from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, AtlasVerdict, IslandReport, certify, mirrored_islands
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import is_injective
@@ -18,24 +18,12 @@ from quasiharmonic.geometry.mesh.surface_checks import manifold_edges
 from quasiharmonic.io import MeshData, refined_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
+from quasiharmonic.util.arrays import FloatArray, names_of
 from quasiharmonic.util.outcome import Outcome
-
-# The status of an atlas is the first of these that one of its islands has; without any, that of the first island.
-_FURTHEST_LAST = (
-    Status.INTERRUPTED,
-    Status.IMPOSSIBLE,
-    Status.TOO_MANY_SPLITS,
-    Status.PRECISION_LIMIT,
-    Status.OUT_OF_ITERATIONS,
-    Status.COLLAPSED,
-    Status.STILL_FALLING,
-    Status.EXHAUSTED,
-)
 
 
 @dataclass(frozen=True, eq=False)
-class MappedIsland:
+class MappedIsland(IslandReport):
     """The result for one island.
 
     Attributes
@@ -48,18 +36,11 @@ class MappedIsland:
         The result, in the island's own numbering.
     """
 
-    triangles: IntArray
-    mirrored: bool
     result: MapResult
 
     def to_dict(self) -> dict[str, Any]:
         """The result for JSON."""
-        return {
-            "first_triangle": int(self.triangles[0]),
-            "triangles": len(self.triangles),
-            "mirrored": self.mirrored,
-            **self.result.to_dict(),
-        }
+        return {**super().to_dict(), **self.result.to_dict()}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,8 +77,7 @@ class MappedAtlas(Outcome):
     @property
     def status(self) -> Status:
         """The status of the island that made the least progress."""
-        found = [island.result.status for island in self.islands]
-        return next((status for status in _FURTHEST_LAST if status in found), found[0])
+        return Status.most_severe(island.result.status for island in self.islands)
 
     def places(self) -> list[FloatArray]:
         """Return the vertex positions of every island, in the order of its result."""

@@ -1,4 +1,4 @@
 """Displacement fields on pixel grids: folds, the nearest field without folds, and inverses.
 
-The package builds on `energies` and `geometry.exact`. Start reading in `grid`, then `nearest`.
+The package builds on `energies`, `geometry.exact` and `apps.tetrahedra`. Start reading in `grid`, then `nearest`.
 """

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.displacement_fields.grid import Grid, check_field, check_grid, name_pixels
-from quasiharmonic.apps.displacement_fields.nearest import fold_free
-from quasiharmonic.apps.tetrahedra.voxel_fields import InverseVolume, inverse_volume
+from quasiharmonic.apps.displacement_fields.grid import PixelGrid, check_field, check_unfolded
+from quasiharmonic.apps.displacement_fields.nearest import is_fold_free
+from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, inverse_volume
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
@@ -85,14 +85,9 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
     if np.ndim(field) == 4:
         return inverse_volume(field, spacing)
     given = check_field(field)
-    grid = check_grid(given.shape, spacing)
-    wrong = ~fold_free(given, spacing=spacing)
-    if wrong.any():
-        raise ValueError(
-            f"the field folds, so it has no inverse: at the cells whose first pixels are {name_pixels(wrong)}. "
-            "use `nearest_invertible` to get the nearest invertible field"
-        )
-    positions, F = (grid.points + given).reshape(-1, 2), grid.triangles()
+    grid = PixelGrid(given.shape[:2], spacing)
+    check_unfolded(~is_fold_free(grid, given))
+    positions, F = grid.positions(given).reshape(-1, 2), grid.triangles()
     certificate = certify(F, positions)
     if not certificate.bijective:
         raise ValueError(f"the field has no inverse. {certificate.summary()}")
@@ -110,7 +105,7 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
 class _Images:
     """The images of cells (m,), ``first + s along + t down + s t twist`` for s and t from 0 to 1."""
 
-    def __init__(self, grid: Grid, positions: FloatArray, cell: IntArray) -> None:
+    def __init__(self, grid: PixelGrid, positions: FloatArray, cell: IntArray) -> None:
         row, column = np.divmod(cell, grid.shape[1] - 1)
         self.corner, self.spacing = np.stack([column, row], axis=1), np.array(grid.spacing)
         self.first, right, below, last = (positions[vertex] for vertex in grid.cells(row, column).T)

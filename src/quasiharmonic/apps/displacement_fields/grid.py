@@ -1,4 +1,4 @@
-"""Displacement fields on a grid of pixels, and the condition under which a field folds.
+"""Displacement fields on a grid of pixels or voxels, and the condition under which a field of pixels folds.
 
 A field maps the pixel in row y and column x, at the position ``p = (x · spacing_x, y · spacing_y)``, to
 ``p + field[y, x]``. Between pixels, displacements are interpolated bilinearly, as in registration software. A cell is
@@ -24,23 +24,110 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, real_array
+from quasiharmonic.util.outcome import SummarisedOutcome
 
 # Corner triangles of a cell whose vertices are numbered along x and then along y.
 _TRIANGLES = np.array([[0, 1, 2], [1, 3, 0], [2, 0, 3], [3, 2, 1]])
 
 
-@dataclass(frozen=True)
-class Grid:
-    """A grid of pixels."""
+class _Words(NamedTuple):
+    """Words for the points of a grid, in messages."""
 
-    shape: tuple[int, int]  # Numbers of rows and columns, at least two each
-    # Distances between columns, along x, and between rows, along y
-    spacing: tuple[float, float] = (1.0, 1.0)
+    one: str
+    many: str
+    indices: str
+    sides: str
+    field: str
+
+
+# By the number of dimensions.
+_WORDS = {
+    2: _Words(
+        "pixel",
+        "pixels",
+        "row and column",
+        "two (along x and along y)",
+        "(height, width, 2), displacements along x and y for at least 2 × 2 pixels",
+    ),
+    3: _Words(
+        "voxel",
+        "voxels",
+        "slice, row and column",
+        "three (along x, y and z)",
+        "(depth, height, width, 3), displacements along x, y and z for at least 2 × 2 × 2 voxels",
+    ),
+}
+
+
+class Grid:
+    """A grid of pixels of a shape (h, w) or voxels (d, h, w), at least two along each axis.
+
+    ``spacing`` are the distances between neighbours along x, along y, and along z; one number stands for all. Raises
+    ValueError if they are not positive.
+    """
+
+    def __init__(self, shape: tuple[int, ...], spacing: ArrayLike = 1.0) -> None:
+        sides = real_array("spacing", spacing)
+        if sides.shape not in ((), (len(shape),)) or not (np.isfinite(sides) & (sides > 0)).all():
+            raise ValueError(f"spacing must be a positive number, or {_WORDS[len(shape)].sides}, not {spacing!r}")
+        self.shape = shape
+        self.spacing: FloatArray = np.broadcast_to(sides, len(shape)).copy()
+
+    @property
+    def cell_shape(self) -> tuple[int, ...]:
+        """The shape of an array with one entry per cell."""
+        return tuple(count - 1 for count in self.shape)
+
+    def positions(self, field: FloatArray, begin: int = 0, stop: int | None = None) -> FloatArray:
+        """Return the positions of the mapped points, those of rows or slices ``begin`` to ``stop``."""
+        p = field[begin:stop].copy()
+        last = len(self.shape) - 1
+        for axis, (count, side) in enumerate(zip(self.shape[::-1], self.spacing, strict=True)):
+            along = np.arange(count) * side
+            p[..., axis] += (along if axis < last else along[begin:stop]).reshape(-1, *(1,) * axis)
+        return p
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """Positions of the pixels or voxels; (h, w, 2) or (d, h, w, 3)."""
+        return self.positions(np.zeros((*self.shape, len(self.shape))))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NearestField(SummarisedOutcome):
+    """The nearest displacement field without folds that was found, and its distance from the given one.
+
+    Attributes
+    ----------
+    field : (h, w, 2) or (d, h, w, 3) float64
+        The new field.
+    moved_mask : (h, w) or (d, h, w) bool
+        Pixels or voxels whose displacement changed; the others are bitwise unchanged.
+    folds : int
+        Number of cells that the given field folds: a determinant is not above ``min_jacobian``.
+    patches : int
+        Number of separate regions of the grid in which the field changed.
+    distance : float
+        Root mean square distance from the given field, over all pixels or voxels, in the field's unit.
+    seconds : float
+    """
+
+    field: FloatArray
+    moved_mask: BoolArray
+    folds: int
+    patches: int
+    distance: float
+    seconds: float
+
+
+class PixelGrid(Grid):
+    """A grid of pixels."""
 
     @property
     def unit(self) -> float:
@@ -48,21 +135,22 @@ class Grid:
         return float(np.sqrt(self.spacing[0]) * np.sqrt(self.spacing[1]))
 
     @cached_property
-    def points(self) -> FloatArray:
-        """Positions of the pixels; (h, w, 2)."""
-        rows, columns = self.shape
-        x, y = np.arange(columns) * self.spacing[0], np.arange(rows) * self.spacing[1]
-        return np.stack(np.meshgrid(x, y), axis=-1)
-
-    @cached_property
     def rest(self) -> ComplexArray:
         """Positions of the pixels in the grid's unit, as complex numbers; (h, w)."""
-        return np.ascontiguousarray(self.points / self.unit).view(np.complex128)[..., 0]
+        return self.in_unit(self.points)
+
+    def in_unit(self, positions: FloatArray) -> ComplexArray:
+        """Return positions (h, w, 2) in the grid's unit, as complex numbers; (h, w)."""
+        return np.ascontiguousarray(positions / self.unit).view(np.complex128)[..., 0]
 
     def cells(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Return the four vertices of cells, pixels counted row by row; (k, 4) int64."""
         first = rows * self.shape[1] + columns
         return np.stack([first, first + 1, first + self.shape[1], first + self.shape[1] + 1], axis=1)
+
+    def all_cells(self) -> IntArray:
+        """Return the vertices of all cells, row by row; (k, 4) int64."""
+        return self.cells(*np.indices(self.cell_shape).reshape(2, -1))
 
     def corner_triangles(self, cells: IntArray) -> IntArray:
         """Return all corner triangles of cells (k, 4); (4 k, 3) int64."""
@@ -70,8 +158,7 @@ class Grid:
 
     def triangles(self) -> IntArray:
         """Return the grid as a mesh; each cell's diagonal joins its second and third vertex; (f, 3)."""
-        rows, columns = np.indices((self.shape[0] - 1, self.shape[1] - 1)).reshape(2, -1)
-        return self.cells(rows, columns)[:, [[0, 1, 2], [3, 2, 1]]].reshape(-1, 3)
+        return self.all_cells()[:, [[0, 1, 2], [3, 2, 1]]].reshape(-1, 3)
 
     def jacobians(self, w: ComplexArray) -> FloatArray:
         """Return the determinants at all cell corners of a map (h, w) in the grid's unit; (h − 1, w − 1, 4)."""
@@ -83,37 +170,89 @@ class Grid:
             return np.stack([x.real * y.imag - x.imag * y.real for x, y in sides], axis=-1)
 
 
-def check_grid(shape: tuple[int, ...], spacing: ArrayLike) -> Grid:
-    """Return the grid of a field with a given shape; ValueError if the spacing is not one or two positive numbers."""
-    sides = real_array("spacing", spacing)
-    if sides.shape not in ((), (2,)) or not (np.isfinite(sides) & (sides > 0)).all():
-        raise ValueError(f"spacing must be a positive number, or two (along x and along y), not {spacing!r}")
-    x, y = np.broadcast_to(sides, 2).tolist()
-    return Grid((shape[0], shape[1]), (x, y))
-
-
 def check_field(field: ArrayLike) -> FloatArray:
-    """Check a displacement field, and return a copy as (h, w, 2) float64; a ValueError names the first bad pixels."""
+    """Check a displacement field, and return a copy as (h, w, 2) or (d, h, w, 3) float64.
+
+    A ValueError names the first bad pixels or voxels.
+    """
     array = real_array("field", field)
-    if array.ndim != 3 or array.shape[2] != 2 or min(array.shape[:2]) < 2:
+    dimension = 3 if array.ndim == 4 else 2
+    if array.ndim != dimension + 1 or array.shape[-1] != dimension or min(array.shape[:-1]) < 2:
         advice = ""
-        if array.ndim == 3 and array.shape[0] == 2:
+        if array.ndim == dimension + 1 and array.shape[0] == dimension:
             advice = ": pass numpy.moveaxis(field, 0, -1)"
-        elif array.ndim == 4 or (array.ndim == 3 and array.shape[2] == 3):
+        elif array.ndim == 3 and array.shape[2] == 3:
             advice = "; fields on volumes have shape (depth, height, width, 3)"
-        raise ValueError(
-            "field must have shape (height, width, 2), displacements along x and y for at least 2 × 2 "
-            f"pixels, not {array.shape}{advice}"
-        )
-    bad = np.asarray(~np.isfinite(array).all(axis=2))
+        raise ValueError(f"field must have shape {_WORDS[dimension].field}, not {array.shape}{advice}")
+    bad = np.asarray(~np.isfinite(array).all(axis=-1))
     if bad.any():
-        raise ValueError(f"field is not finite at {name_pixels(bad)}")
+        raise ValueError(f"field is not finite at {name_points(bad)}")
     return array
 
 
-def name_pixels(mask: BoolArray, most: int = 5) -> str:
-    """Name the first pixels of a mask (h, w): ``pixels (0, 3), (2, 7), … (17 in all), row and column``."""
-    where = np.argwhere(mask)
-    listed = ", ".join(f"({y}, {x})" for y, x in where[:most].tolist())
+def check_fixed(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
+    """Return the mask of the fixed points; ValueError if it has another shape or dtype."""
+    if fixed is None:
+        return np.zeros(grid.shape, dtype=bool)
+    mask = np.asarray(fixed)
+    if mask.shape != grid.shape or mask.dtype != bool:
+        raise ValueError(f"fixed must be a bool array of shape {grid.shape}, not {mask.dtype} of shape {mask.shape}")
+    return mask
+
+
+def check_unfolded(wrong: BoolArray) -> None:
+    """Raise ValueError for the cells in which a field without inverse folds."""
+    if wrong.any():
+        raise ValueError(
+            f"the field folds, so it has no inverse: at the cells whose first {_WORDS[wrong.ndim].many} are "
+            f"{name_points(wrong)}. use `nearest_invertible` to get the nearest invertible field"
+        )
+
+
+def name_points(mask: BoolArray, most: int = 5) -> str:
+    """Name the first points of a mask: ``pixels (0, 3), (2, 7), … (17 in all), row and column``."""
+    words, where = _WORDS[mask.ndim], np.argwhere(mask)
+    listed = ", ".join(str(tuple(index)) for index in where[:most].tolist())
     rest = f", … ({len(where)} in all)" if len(where) > most else ""
-    return f"{'pixel' if len(where) == 1 else 'pixels'} {listed}{rest}, row and column"
+    return f"{words.one if len(where) == 1 else words.many} {listed}{rest}, {words.indices}"
+
+
+def cell_corners(points: BoolArray) -> list[BoolArray]:
+    """Return views of a mask of points, one for each corner of the cells, each of the shape of the cells."""
+    return [
+        points[tuple(slice(at, at + count - 1) for at, count in zip(corner, points.shape, strict=True))]
+        for corner in np.ndindex((2,) * points.ndim)
+    ]
+
+
+def find_points(cells: BoolArray) -> BoolArray:
+    """Return the points of cells."""
+    points = np.zeros(tuple(count + 1 for count in cells.shape), dtype=bool)
+    for corner in cell_corners(points):
+        corner |= cells
+    return points
+
+
+def find_cells(points: BoolArray) -> BoolArray:
+    """Return the cells that have at least one of the points."""
+    return np.asarray(np.logical_or.reduce(cell_corners(points)))
+
+
+def find_fixed_cells(cells: BoolArray, fixed: BoolArray) -> BoolArray:
+    """Return those of the cells whose points are all fixed."""
+    return np.asarray(cells & np.logical_and.reduce(cell_corners(fixed)))
+
+
+def label_patches(free: BoolArray) -> IntArray:
+    """Number the patches of free points from 1 on; no cell has points of two patches."""
+    from scipy.ndimage import label
+
+    return np.asarray(label(free, structure=np.ones((3,) * free.ndim))[0], dtype=np.int64)
+
+
+def grow(points: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
+    """Add all points within a number of steps, each along any of the axes, except fixed ones."""
+    from scipy.ndimage import maximum_filter
+
+    around: BoolArray = maximum_filter(points, 2 * steps + 1, mode="constant") & ~fixed
+    return around

@@ -9,19 +9,21 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.displacement_fields.grid import Grid, check_field, check_grid, name_pixels
-from quasiharmonic.apps.displacement_fields.patch_descent import descend_patches
-from quasiharmonic.apps.displacement_fields.patches import (
-    FixedPixelsError,
-    fill_patches,
-    find_folds,
+from quasiharmonic.apps.displacement_fields.grid import (
+    NearestField,
+    PixelGrid,
+    check_field,
+    check_fixed,
+    find_fixed_cells,
     grow,
     label_patches,
+    name_points,
 )
-from quasiharmonic.apps.tetrahedra.trilinear import trilinear_fold_free
-from quasiharmonic.apps.tetrahedra.voxel_fields import (
+from quasiharmonic.apps.displacement_fields.patch_descent import descend_patches
+from quasiharmonic.apps.displacement_fields.patches import FixedPixelsError, fill_patches, find_folds
+from quasiharmonic.apps.displacement_fields.trilinear import trilinear_fold_free
+from quasiharmonic.apps.displacement_fields.voxels import (
     InvertibleVolume,
-    check_volume_field,
     find_folded_cells,
     in_units,
     nearest_invertible_volume,
@@ -29,7 +31,6 @@ from quasiharmonic.apps.tetrahedra.voxel_fields import (
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, check_choice, count_of
-from quasiharmonic.util.outcome import Outcome
 
 #: How a field on voxels is sampled between them.
 INTERPOLATIONS = "linear", "trilinear"
@@ -42,7 +43,7 @@ _MAX_ROUNDS = 12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class InvertibleField(Outcome):
+class InvertibleField(NearestField):
     """A displacement field without folds, and its distance from the given one.
 
     Attributes
@@ -63,23 +64,12 @@ class InvertibleField(Outcome):
     seconds : float
     """
 
-    field: FloatArray
-    moved_mask: BoolArray
     certificate: Certificate
-    folds: int
-    patches: int
-    distance: float
-    seconds: float
 
     @property
     def success(self) -> bool:
         """Whether the field is injective (certified)."""
         return self.certificate.injective
-
-    @property
-    def message(self) -> str:
-        """The text of `summary`."""
-        return self.summary()
 
     def summary(self) -> str:
         """Describe the field in one or two sentences."""
@@ -137,9 +127,9 @@ def nearest_invertible(
     Notes
     -----
     Fields on voxels (d, h, w, 3) have displacements along x, y and z in slice z, row y and column x. Each cell between
-    eight voxels is divided into six tetrahedra (`quasiharmonic.apps.tetrahedra.voxel_fields`), which must be positive.
-    The search can fail, also because of fixed pixels: no error is raised then, and the result lists the cells that
-    still fold.
+    eight voxels is divided into six tetrahedra (`quasiharmonic.apps.displacement_fields.voxels`), which must be
+    positive. The search can fail, also because of fixed pixels: no error is raised then, and the result lists the cells
+    that still fold.
 
     With deep folds the distance has many local minima. The result depends on the start, a harmonic fill of patches
     around the folds (`quasiharmonic.apps.displacement_fields.patches`). If the field's border overlaps itself, which is
@@ -160,21 +150,25 @@ def nearest_invertible(
     if np.ndim(field) == 4:
         return nearest_invertible_volume(field, spacing, min_jacobian, fixed)
     given = check_field(field)
-    grid = check_grid(given.shape, spacing)
-    mask = _check_mask(fixed, grid)
-    w = _map(grid, given)
+    grid = PixelGrid(given.shape[:2], spacing)
+    mask = check_fixed(fixed, grid)
+    w = grid.in_unit(grid.positions(given))
     min_jacobian = max(min_jacobian, _bound_rounding(w))
     wrong = find_folds(grid, w, min_jacobian)
     repaired = given.copy()
     if wrong.any():
-        _check_fixed(wrong, mask)
+        unrepairable = find_fixed_cells(wrong, mask)
+        if unrepairable.any():
+            raise ValueError(
+                f"fixed: cells fold whose four pixels are all fixed; the first of each is {name_points(unrepairable)}"
+            )
         here = _descend(grid, w, mask, min_jacobian)
         moved = here != w
         positions = np.stack([here.real, here.imag], axis=-1) * grid.unit
         repaired[moved] = (positions - grid.points)[moved]
-        if not _is_fold_free(grid, repaired).all():
+        if not is_fold_free(grid, repaired).all():
             raise RuntimeError("rounding folds the new field: its displacements are too large for its spacing")
-    certificate = certify(grid.triangles(), (grid.points + repaired).reshape(-1, 2))
+    certificate = certify(grid.triangles(), grid.positions(repaired).reshape(-1, 2))
     moved = (repaired != given).any(axis=2)
     away = np.hypot(*np.moveaxis(repaired - given, 2, 0))
     farthest = float(away.max())
@@ -200,27 +194,21 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0, interpolation: str 
     """
     check_choice("interpolation", interpolation, INTERPOLATIONS)
     if np.ndim(field) == 4:
-        volume, scaled, _ = in_units(check_volume_field(field), spacing)
+        volume, scaled, _ = in_units(check_field(field), spacing)
         if interpolation == "trilinear":
             return trilinear_fold_free(volume, scaled)
         return ~find_folded_cells(volume, scaled, None)
     if interpolation != "linear":
         raise ValueError("trilinear interpolation is that of volumes: omit interpolation")
     given = check_field(field)
-    return _is_fold_free(check_grid(given.shape, spacing), given)
+    return is_fold_free(PixelGrid(given.shape[:2], spacing), given)
 
 
-def _is_fold_free(grid: Grid, field: FloatArray) -> BoolArray:
-    positions = (grid.points + field).reshape(-1, 2)
-    rows, columns = np.indices((grid.shape[0] - 1, grid.shape[1] - 1)).reshape(2, -1)
-    a, b, c = positions[grid.corner_triangles(grid.cells(rows, columns))].swapaxes(0, 1)
-    positive = (orientation(a, b, c) > 0).reshape(grid.shape[0] - 1, grid.shape[1] - 1, 4)
-    return np.asarray(positive.all(axis=2))
-
-
-def _map(grid: Grid, field: FloatArray) -> ComplexArray:
-    """Positions of the mapped pixels, in the grid's unit; (h, w)."""
-    return np.ascontiguousarray((grid.points + field) / grid.unit).view(np.complex128)[..., 0]
+def is_fold_free(grid: PixelGrid, field: FloatArray) -> BoolArray:
+    """Decide for each cell of a checked field of pixels whether it does not fold; (h − 1, w − 1) bool."""
+    positions = grid.positions(field).reshape(-1, 2)
+    a, b, c = positions[grid.corner_triangles(grid.all_cells())].swapaxes(0, 1)
+    return np.asarray((orientation(a, b, c) > 0).reshape(*grid.cell_shape, 4).all(axis=2))
 
 
 def _bound_rounding(w: ComplexArray) -> float:
@@ -229,32 +217,14 @@ def _bound_rounding(w: ComplexArray) -> float:
     return 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))) * max(side, 1)
 
 
-def _check_mask(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
-    if fixed is None:
-        return np.zeros(grid.shape, dtype=bool)
-    mask = np.asarray(fixed)
-    if mask.shape != grid.shape or mask.dtype != bool:
-        raise ValueError(f"fixed must be a bool array of shape {grid.shape}, not {mask.dtype} of shape {mask.shape}")
-    return mask
-
-
-def _check_fixed(wrong: BoolArray, fixed: BoolArray) -> None:
-    """Raise ValueError for folds whose pixels are all fixed."""
-    unrepairable = wrong & fixed[:-1, :-1] & fixed[1:, :-1] & fixed[:-1, 1:] & fixed[1:, 1:]
-    if unrepairable.any():
-        raise ValueError(
-            f"fixed: cells fold whose four pixels are all fixed; the first of each is {name_pixels(unrepairable)}"
-        )
-
-
-def _descend(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> ComplexArray:
+def _descend(grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> ComplexArray:
     """Find the nearest map, starting from one without folds; patches grow until nothing moves at their borders."""
     try:
         w, patch = fill_patches(grid, given, fixed, min_jacobian)
     except FixedPixelsError as none:
         raise RuntimeError(
             "no field without folds was found that keeps the fixed pixels; folds remain at "
-            f"{name_pixels(none.mask)}. Fix fewer pixels around these"
+            f"{name_points(none.mask)}. Fix fewer pixels around these"
         ) from none
     moving = patch
     for _ in range(_MAX_ROUNDS):
@@ -270,7 +240,7 @@ def _descend(grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: fl
     return w
 
 
-def _return_near_pixels(grid: Grid, w: ComplexArray, given: ComplexArray, min_jacobian: float) -> None:
+def _return_near_pixels(grid: PixelGrid, w: ComplexArray, given: ComplexArray, min_jacobian: float) -> None:
     """Return pixels that are nearly at their original positions to them, unless this makes a fold."""
     close = (w != given) & (np.abs(w - given) < _RETURN_DISTANCE)
     before = w[close]

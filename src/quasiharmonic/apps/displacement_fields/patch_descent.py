@@ -20,10 +20,11 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.displacement_fields.grid import Grid
+from quasiharmonic.apps.displacement_fields.grid import PixelGrid, find_cells
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, Isotropic
 from quasiharmonic.energies.newton.line_search import backtrack_each
@@ -87,7 +88,9 @@ class ThinBarrier(Isotropic):
         return np.where(s > 0, s, 1)
 
 
-def descend_patches(grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float) -> None:
+def descend_patches(
+    grid: PixelGrid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float
+) -> None:
     """Move the free pixels as near to their positions under a given field as possible.
 
     ``w`` (h, w) complex128 is changed in place. It is a map in the grid's unit whose determinants are above
@@ -102,37 +105,39 @@ def descend_patches(grid: Grid, w: ComplexArray, given: ComplexArray, patch: Int
         for number in range(int(batch[-1]) + 1):
             todo = np.flatnonzero((batch == number) & (size > 0))
             for weight in _WEIGHTS:
-                _descend(grid, w, given, patch, todo, min_jacobian, weight)
+                _descend(_Patches(grid, w, given, patch, min_jacobian), todo, weight)
 
 
-def _descend(
-    grid: Grid,
-    w: ComplexArray,
-    given: ComplexArray,
-    patch: IntArray,
-    todo: IntArray,
-    min_jacobian: float,
-    weight: float,
-) -> None:
+class _Patches(NamedTuple):
+    """The arguments of `descend_patches`."""
+
+    grid: PixelGrid
+    w: ComplexArray
+    given: ComplexArray
+    patch: IntArray
+    min_jacobian: float
+
+
+def _descend(patches: _Patches, todo: IntArray, weight: float) -> None:
     """Converge the patches ``todo`` for one weight of the barrier; the matrix only has patches that still move."""
     steps = _MAX_STEPS
     while todo.size and steps:
-        batch = _Batch(grid, w, given, np.where(np.isin(patch, todo), patch, 0), min_jacobian, weight)
+        batch = _Batch(patches, todo, weight)
         moving = np.ones(todo.size, dtype=bool)
         while steps and 2 * np.count_nonzero(moving) > todo.size:
             heartbeat()
             moving &= batch.step(moving)
             steps -= 1
-        batch.enter(w)
+        batch.enter(patches.w)
         todo = todo[moving]
 
 
 class _Batch:
     """Patches that share one matrix."""
 
-    def __init__(
-        self, grid: Grid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float, weight: float
-    ) -> None:
+    def __init__(self, patches: _Patches, todo: IntArray, weight: float) -> None:
+        grid, w, given, patch, min_jacobian = patches
+        patch = np.where(np.isin(patch, todo), patch, 0)
         touched = find_cells(patch > 0)
         cells = grid.cells(*np.nonzero(touched))
         pixels, local = np.unique(cells, return_inverse=True)
@@ -200,10 +205,3 @@ class _Batch:
         t, value = backtrack_each(values, before, expected_decrease, longest, tries=_MAX_HALVINGS)
         self.here = trial
         return np.where(t > 0, before - value, 0)
-
-
-def find_cells(pixels: BoolArray) -> BoolArray:
-    """The cells (h − 1, w − 1) that have at least one of the pixels (h, w)."""
-    rows = pixels[:-1] | pixels[1:]
-    touched: BoolArray = rows[:, :-1] | rows[:, 1:]
-    return touched

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from quasiharmonic.apps.displacement_fields.grid import Grid
+from quasiharmonic.apps.displacement_fields.grid import PixelGrid, find_points, grow, label_patches
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
 
@@ -24,7 +24,6 @@ _MARGIN = 2
 _GROWTH = 2
 # Growth factor of the smoothing's standard deviation in pixels.
 _SMOOTHER = 1.2
-_EIGHT = np.ones((3, 3), dtype=bool)
 
 
 class FixedPixelsError(Exception):
@@ -35,37 +34,13 @@ class FixedPixelsError(Exception):
         self.mask = mask
 
 
-def find_folds(grid: Grid, w: ComplexArray, min_jacobian: float) -> BoolArray:
+def find_folds(grid: PixelGrid, w: ComplexArray, min_jacobian: float) -> BoolArray:
     """The cells (h − 1, w − 1) with a corner whose determinant is not above ``min_jacobian``."""
     return np.asarray(~(grid.jacobians(w) > min_jacobian).all(axis=2))
 
 
-def find_pixels(cells: BoolArray) -> BoolArray:
-    """The pixels (h, w) of cells (h − 1, w − 1)."""
-    pixels = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=bool)
-    for y in (0, 1):
-        for x in (0, 1):
-            pixels[y : y + cells.shape[0], x : x + cells.shape[1]] |= cells
-    return pixels
-
-
-def label_patches(free: BoolArray) -> IntArray:
-    """Number the patches of free pixels (h, w) from 1 on; no cell has pixels of two patches."""
-    from scipy.ndimage import label
-
-    return np.asarray(label(free, structure=_EIGHT)[0], dtype=np.int64)
-
-
-def grow(pixels: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
-    """Add all pixels within a number of steps, by rows, columns or both, except fixed ones."""
-    from scipy.ndimage import maximum_filter
-
-    around: BoolArray = maximum_filter(pixels, 2 * steps + 1, mode="constant") & ~fixed
-    return around
-
-
 def fill_patches(
-    grid: Grid, given: ComplexArray, fixed: BoolArray, min_jacobian: float
+    grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobian: float
 ) -> tuple[ComplexArray, IntArray]:
     """Find a map without folds that agrees with the given one (h, w), in the grid's unit, outside some patches.
 
@@ -73,7 +48,7 @@ def fill_patches(
     such map was found, which can only happen with fixed pixels.
     """
     w, steps = given.copy(), _MARGIN
-    free = grow(find_pixels(find_folds(grid, given, min_jacobian)), steps, fixed)
+    free = grow(find_points(find_folds(grid, given, min_jacobian)), steps, fixed)
     while not free.all():
         patch = label_patches(free)
         _fill(grid, w, given, free)
@@ -81,15 +56,15 @@ def fill_patches(
         if not wrong.any():
             return w, patch
         steps *= _GROWTH
-        failed = np.unique(patch[find_pixels(wrong)])
-        larger = grow(np.isin(patch, failed[failed > 0]) | find_pixels(wrong), steps, fixed) | free
+        failed = np.unique(patch[find_points(wrong)])
+        larger = grow(np.isin(patch, failed[failed > 0]) | find_points(wrong), steps, fixed) | free
         if np.array_equal(larger, free):
-            raise FixedPixelsError(find_pixels(wrong))
+            raise FixedPixelsError(find_points(wrong))
         free = larger
     return _smooth(grid, given, min_jacobian), label_patches(free)
 
 
-def _fill(grid: Grid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
+def _fill(grid: PixelGrid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
     """Make the displacements of free pixels harmonic, given the others; natural conditions at the grid's border."""
     from scipy.sparse import csr_array, dia_array, kron, triu
 
@@ -118,7 +93,7 @@ def _path(count: int) -> dia_array:
     return dia_array((bands, [-1, 0, 1]), shape=(count, count))
 
 
-def _smooth(grid: Grid, given: ComplexArray, min_jacobian: float) -> ComplexArray:
+def _smooth(grid: PixelGrid, given: ComplexArray, min_jacobian: float) -> ComplexArray:
     """Smooth the displacements by the smallest tried Gaussian that leaves no fold."""
     from scipy.ndimage import gaussian_filter
 

@@ -161,8 +161,12 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
     >>> bool(result.certificate.bijective), result.history[-1].energy < 1e-2
     (True, True)
     """
+    return flatten_surface(V, F, FlattenOptions(**options))
+
+
+def flatten_surface(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
+    """Map a surface into the plane bijectively with a free boundary; see `flatten`."""
     began = time.perf_counter()
-    checked = FlattenOptions(**options)
     _check_combination(checked)
     V, F = vertex_array(V), triangle_rows(F)
     weights = None if checked.weights is None else positive_weights(checked.weights, len(F))

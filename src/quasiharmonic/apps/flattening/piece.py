@@ -27,7 +27,7 @@ from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import FloatArray, count_of, find_exponent, scale_to_unit, to_space
+from quasiharmonic.util.arrays import FloatArray, count_of, find_exponent, pad_to_space, scale_to_unit
 from quasiharmonic.util.options import FlattenOptions
 
 #: Surfaces with at least this number of triangles are flattened with coarse meshes.
@@ -85,7 +85,7 @@ class Piece:
                 "cut it open first (cut_open; --cut of qhm map and qhm flatten)"
             )
         self.exponent = find_exponent(domain.V)
-        self.V = to_space(np.ldexp(domain.V, -self.exponent))
+        self.V = pad_to_space(np.ldexp(domain.V, -self.exponent))
 
         corners = self.V[self.F]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -173,37 +173,30 @@ class Pairs(Protocol):
         """Solve with the factored system and the entries that it lacks."""
 
 
-class SurfaceModel:
-    """The model of a map with a free boundary, with or without a guard; see `NewtonModel` and `SurfaceDescent`."""
+class SurfaceModel(MapModel):
+    """The model of a map with a free boundary, with or without a guard; see `SurfaceDescent`."""
 
     def __init__(
         self,
         energy: NewtonObjective,
         uv: FloatArray,
         linear_solver: str,
-        fixed: Sequence[int] | IntArray,
+        fixed: IntArray,
         rim: Rim | None,
         pairs: Pairs | None,
     ) -> None:
         self.surface, self.guard, self._pairs = energy, None if rim is None else Guard(rim, energy), pairs
-        coordinates = Coordinates.of(uv, np.asarray(fixed, dtype=np.int64), 0)
-        system = NewtonSystem(energy.F, energy.g, len(uv), coordinates.fixed, linear_solver)
-        self.map = MapModel(energy if self.guard is None else self.guard.energy, coordinates, system)
-        self._n, self._linear_solver = len(uv), linear_solver
-
-    @property
-    def system(self) -> NewtonSystem:
-        """See `NewtonModel`."""
-        return self.map.system
-
-    @property
-    def slack(self) -> float:
-        """See `NewtonModel`."""
-        return 1.0 if self.guard is None else self.guard.slack
+        self._of_map = len(uv), fixed, linear_solver
+        super().__init__(
+            energy if self.guard is None else self.guard.energy,
+            Coordinates.of(uv, fixed, 0),
+            NewtonSystem(energy.F, energy.g, *self._of_map),
+        )
+        self.slack = 1.0 if self.guard is None else self.guard.slack
 
     def start(self, uv: FloatArray) -> NewtonState:
         """Return the state of a map (n, 2)."""
-        state = self.map.evaluate(in_units(uv, 0))
+        state = self.evaluate(in_units(uv, 0))
         near = Contacts.none() if self.guard is None else self.guard.contacts(state.w)
         return state._replace(extra=_StepRecord(np.inf, np.inf, 0, near, near.smallest_gap(state.w)))
 
@@ -211,20 +204,26 @@ class SurfaceModel:
         """The value of the surface's energy, without contacts."""
         return state.value if self.guard is None else self.surface.value_of(state.derivatives.surface)
 
+    def relax_barrier(self) -> bool:
+        """Lower the weight of the barrier that guards the map; return False if there is none or it is the last."""
+        if self.guard is None or not self.guard.relax():
+            return False
+        self.slack = self.guard.slack
+        return True
+
     def prepare(self, state: NewtonState) -> NewtonState:
         """See `NewtonModel`."""
-        return state if self.guard is None else self.guard.prepare(state, self._rebuild)
+        if self.guard is None:
+            return state
 
-    def _rebuild(self, F: IntArray, g: ComplexArray) -> None:
-        self.map.system = NewtonSystem(F, g, self._n, self.map.coordinates.fixed, self._linear_solver)
+        def rebuild(F: IntArray, g: ComplexArray) -> None:
+            self.system = NewtonSystem(F, g, *self._of_map)
 
-    def gradient(self, state: NewtonState) -> ComplexArray:
-        """See `NewtonModel`."""
-        return self.map.gradient(state)
+        return self.guard.prepare(state, rebuild)
 
     def assemble(self, state: NewtonState, negative: float) -> None:
         """See `NewtonModel`."""
-        self.map.assemble(state, negative)
+        super().assemble(state, negative)
         if self.guard is not None:
             self.guard.add_to(self.system, state.w)
         if self._pairs is not None:
@@ -232,13 +231,7 @@ class SurfaceModel:
 
     def solve(self, load: ComplexArray) -> ComplexArray:
         """See `NewtonModel`."""
-        return self.system.solve(load) if self._pairs is None else self._pairs.solve(self.system, load)
-
-    def restrict(
-        self, state: NewtonState, gradient: ComplexArray, direction: ComplexArray, expected_decrease: float
-    ) -> tuple[ComplexArray, float]:
-        """See `NewtonModel`."""
-        return direction, expected_decrease
+        return super().solve(load) if self._pairs is None else self._pairs.solve(self.system, load)
 
     def check_numbers(self, state: NewtonState) -> None:
         """See `NewtonModel`."""
@@ -253,21 +246,20 @@ class SurfaceModel:
         less = expected_decrease > _SLOW_DECREMENT * course.decrease and state.value > _SLOW_ENERGY * course.value
         slow = course.slow + 1 if less and not shortened else 0
         state = state._replace(extra=course._replace(decrease=expected_decrease, value=state.value, slow=slow))
-        full = self.map.displacement(direction, state.w.size)
+        full = self.displacement(direction, state.w.size)
         if slow >= _SLOW_STEPS:
             rotated = self._search_rotating(state, full, expected_decrease)
             if rotated is not None:
                 return rotated, False
 
         def trial(t: float, bound: float) -> tuple[float, NewtonState | None]:
-            return self._evaluate_trial(state, state.w + t * full, bound)
+            return self._evaluate_step(state, state.w + t * full, bound)
 
-        return self.map.search_straight(state, full, expected_decrease, trial)
+        return self.search_straight(state, full, expected_decrease, trial)
 
     @cached_property
     def _rotation_path(self) -> RotationPath | None:
-        surface, fixed = self.surface, self.map.coordinates.fixed
-        return RotationPath.of(surface.F, surface.g, self._n, fixed, self._linear_solver)
+        return RotationPath.of(self.surface.F, self.surface.g, *self._of_map)
 
     def _search_rotating(self, state: NewtonState, full: ComplexArray, expected_decrease: float) -> NewtonState | None:
         """Take a full or longer step along a rotating path; None if the energy does not decrease enough."""
@@ -283,31 +275,33 @@ class SurfaceModel:
             except NotPositiveDefinite:
                 # With very thin rest triangles, the path's own system can be numerically singular.
                 return np.inf, None
-            return self._evaluate_trial(state, there, bound)
+            return self._evaluate_step(state, there, bound)
 
         taken = backtrack(trial, state.value, expected_decrease, tries=1)
         return None if taken is None else extend(trial, taken).state
 
-    def _evaluate_trial(self, state: NewtonState, w: ComplexArray, bound: float) -> tuple[float, NewtonState | None]:
+    def _evaluate_step(self, state: NewtonState, w: ComplexArray, bound: float) -> tuple[float, NewtonState | None]:
         """Return the objective at a map reached from ``state``, and its state if it is accepted."""
-        value, there = self.map.evaluate_trial(w, bound)
+        value, there = self.evaluate_trial(w, bound)
         if there is None:
             return value, None
         if self.guard is None:
             return value, there._replace(extra=state.extra)
-        found = self.guard.accept(state, w, self.map.positions(w))
+        found = self.guard.accept(state, w, self.positions(w))
         if found is None:
             return value, None
         near, gap = found
         return value, there._replace(extra=state.extra._replace(near=near, gap=gap))
 
 
-class SurfaceDescent:
+class SurfaceDescent(NewtonDescent):
     """Newton steps of a map with a free boundary, from an injective map ``uv`` (n, 2) of about unit size.
 
     ``fixed`` has at least one vertex, to prevent drift; usually exactly one. With the surface's boundary as ``rim`` the
     map stays bijective. ``pairs`` are further second derivatives of the energy.
     """
+
+    model: SurfaceModel
 
     def __init__(
         self,
@@ -319,46 +313,36 @@ class SurfaceDescent:
         rim: Rim | None = None,
         pairs: Pairs | None = None,
     ) -> None:
-        self.model = SurfaceModel(energy, uv, linear_solver, fixed, rim, pairs)
-        self.newton = NewtonDescent(self.model, self.model.start(uv))
-
-    @property
-    def w(self) -> ComplexArray:
-        """The current map; (n,) complex128."""
-        return self.newton.w
+        model = SurfaceModel(energy, uv, linear_solver, np.asarray(fixed, dtype=np.int64), rim, pairs)
+        super().__init__(model, model.start(uv))
 
     @property
     def uv(self) -> FloatArray:
         """The current map; (n, 2) float64."""
-        return self.model.map.positions(self.newton.w)
+        return self.model.positions(self.w)
 
     @property
     def distortion(self) -> float:
         """The value of the surface's energy, without contacts."""
-        return self.model.distortion(self.newton.state)
+        return self.model.distortion(self.state)
 
     @property
     def linear_solver(self) -> str:
         """Name of the linear solver."""
         return self.model.system.solver.name
 
-    def step(self, tol: float) -> Status | None:
-        """Take one step; return a status if no further step is possible."""
-        return self.newton.step(tol)
-
     def use_density(self, density: Energy) -> None:
         """Continue with another density on the same triangles; the energy must be a `DeformationEnergy`."""
         assert isinstance(self.model.surface, DeformationEnergy)
         self.model.surface.energy = density
-        state = self.newton.state
-        self.newton.state = state._replace(value=self.model.map.energy.value_of(state.derivatives))
-        self.newton.memory = replace(self.newton.memory, shortened=True, idle=0)
+        self.state = self.state._replace(value=self.model.energy.value_of(self.state.derivatives))
+        self.memory = replace(self.memory, shortened=True, idle=0)
 
     def relax_barrier(self) -> bool:
         """Lower the weight of the barrier that guards the map; return False if there is none or it is the last."""
-        if self.model.guard is None or not self.model.guard.relax():
+        if not self.model.relax_barrier():
             return False
-        self.newton.memory = replace(self.newton.memory, idle=0)
+        self.memory = replace(self.memory, idle=0)
         return True
 
 

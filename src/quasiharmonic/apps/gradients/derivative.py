@@ -13,8 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property, partial
-from typing import Protocol
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,12 +22,12 @@ from quasiharmonic.apps.gradients.forces import Forces, TensorForces, TriangleRe
 from quasiharmonic.apps.gradients.gauge import Gauge
 from quasiharmonic.apps.gradients.strain import Strain
 from quasiharmonic.util.arrays import (
+    BoolArray,
     ComplexArray,
     FloatArray,
     IntArray,
     check_finite,
     map_array,
-    names_of,
     real_array,
     target_positions,
     work,
@@ -56,50 +55,6 @@ class Doubt(Enum):
     CLIPPED = "Tensors have the largest anisotropy that double precision allows, and no longer depend on μ."
 
 
-class Gradients:
-    """The gradients of a scalar function of a map, each computed at first access.
-
-    Attributes
-    ----------
-    target : (k, 2) float64
-        With respect to the target positions of the fixed vertices, in the order of ``fixed``.
-    rest : (n, d) float64
-        With respect to the rest positions.
-    mu : (f,) complex128 or None
-        With respect to the Beltrami coefficients, ``∂/∂Re μ + i ∂/∂Im μ``; None for maps without them.
-    """
-
-    def __init__(
-        self,
-        target: Callable[[], FloatArray],
-        rest: Callable[[], FloatArray],
-        mu: Callable[[], ComplexArray | None],
-    ) -> None:
-        self._target, self._rest, self._mu = target, rest, mu
-
-    @cached_property
-    def target(self) -> FloatArray:
-        """The gradient with respect to the target positions of the fixed vertices."""
-        return self._target()
-
-    @cached_property
-    def rest(self) -> FloatArray:
-        """The gradient with respect to the rest positions."""
-        return self._rest()
-
-    @cached_property
-    def mu(self) -> ComplexArray | None:
-        """The gradient with respect to the Beltrami coefficients."""
-        return self._mu()
-
-
-class Inverse(Protocol):
-    """The inverse of the derivative of the forces by the free positions; symmetric."""
-
-    def solve(self, load: ComplexArray) -> ComplexArray:
-        """Return the displacement (n,) of all vertices under a load (n,); zero at fixed vertices."""
-
-
 @dataclass(frozen=True, eq=False)
 class Scale:
     """A factor s between the scales of a map and its surface.
@@ -113,6 +68,92 @@ class Scale:
     def change(self, dw: ComplexArray, dV: FloatArray) -> float:
         """Return the change of log s."""
         return work(self.by_places, dw) + float(np.sum(self.by_rest * dV))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Equilibrium:
+    """The forces at a map, all that they depend on, and the inverse of their derivative.
+
+    ``fixed`` (k,) are the fixed vertices, and ``on_curves`` those of them whose positions curves determine. ``inverse``
+    returns the displacement (n,) of all vertices under a load (n,), zero at fixed vertices; it is symmetric.
+    ``strain`` makes the strain of the rest triangles when it is first used. ``unit`` is the unit of the forces' map,
+    and ``rest_shape`` the shape of the rest positions.
+    """
+
+    fixed: IntArray
+    forces: Forces
+    inverse: Callable[[ComplexArray], ComplexArray]
+    strain: Callable[[], Strain] | None
+    rest_shape: tuple[int, ...]
+    unit: float = 1.0
+    on_curves: IntArray | None = None
+    scale: Scale | None = None
+    gauge: Gauge | None = None
+    tensors: TensorForces | None = None
+
+    @cached_property
+    def follows(self) -> BoolArray:
+        """Which fixed vertices move with their target positions; (k,) bool."""
+        return np.ones(self.fixed.size, dtype=bool) if self.on_curves is None else ~np.isin(self.fixed, self.on_curves)
+
+    @cached_property
+    def made_strain(self) -> Strain | None:
+        """The strain of the rest triangles; None if the map does not depend on them."""
+        return None if self.strain is None else self.strain()
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the forces depend on the scale between map and surface."""
+        return self.scale is not None and self.gauge is None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Gradients:
+    """The gradients of a scalar function of a map, each computed at first access.
+
+    Attributes
+    ----------
+    target : (k, 2) float64
+        With respect to the target positions of the fixed vertices, in the order of ``fixed``.
+    rest : (n, d) float64
+        With respect to the rest positions.
+    mu : (f,) complex128 or None
+        With respect to the Beltrami coefficients, ``∂/∂Re μ + i ∂/∂Im μ``; None for maps without them.
+    """
+
+    _of: Equilibrium
+    _pull: ComplexArray
+    _response: TriangleResponse
+    _on_pin: complex
+    _on_scale: float
+
+    @cached_property
+    def target(self) -> FloatArray:
+        """The gradient with respect to the target positions of the fixed vertices."""
+        of = self._of
+        by_places = self._pull - of.forces.gather(self._response.hp, self._response.hq)
+        if of.scale is not None:
+            by_places += self._on_scale * of.scale.by_places
+        if of.gauge is not None and of.gauge.pin is not None:
+            by_places[of.gauge.pin] += self._on_pin
+        by_held = by_places[of.fixed] / of.unit
+        by_held[~of.follows] = 0
+        return to_rows(by_held)
+
+    @cached_property
+    def rest(self) -> FloatArray:
+        """The gradient with respect to the rest positions."""
+        out = np.zeros(self._of.rest_shape)
+        if self._of.made_strain is not None:
+            out -= self._of.made_strain.pull(*self._of.forces.pull_strain(self._response))
+        if self._of.scale is not None:
+            out += self._on_scale * self._of.scale.by_rest
+        return out
+
+    @cached_property
+    def mu(self) -> ComplexArray | None:
+        """The gradient with respect to the Beltrami coefficients."""
+        return None if self._of.tensors is None else -self._of.tensors.of(self._of.forces, self._response)
 
 
 class Derivative:
@@ -130,33 +171,11 @@ class Derivative:
         Reasons not to rely on the derivative; usually empty.
     """
 
-    def __init__(
-        self,
-        uv: FloatArray,
-        *,
-        fixed: IntArray,
-        forces: Forces,
-        inverse: Inverse,
-        strain: Callable[[], Strain] | None,
-        rest_shape: tuple[int, ...],
-        doubts: Iterable[Doubt] = (),
-        unit: float = 1.0,
-        on_curves: IntArray | None = None,
-        scale: Scale | None = None,
-        gauge: Gauge | None = None,
-        tensors: TensorForces | None = None,
-    ) -> None:
+    def __init__(self, uv: FloatArray, equilibrium: Equilibrium, doubts: Iterable[Doubt] = ()) -> None:
         self.uv = uv
         self.uv.flags.writeable = False
         self.doubts = tuple(doubts)
-        self._fixed, self._forces, self._inverse = fixed, forces, inverse
-        self._make_strain, self._rest_shape, self._unit = strain, rest_shape, unit
-        self._follows = np.ones(fixed.size, dtype=bool) if on_curves is None else ~np.isin(fixed, on_curves)
-        self._scale, self._gauge, self._tensors = scale, gauge, tensors
-
-    @cached_property
-    def _strain(self) -> Strain | None:
-        return None if self._make_strain is None else self._make_strain()
+        self._of = equilibrium
 
     @property
     def reliable(self) -> bool:
@@ -187,29 +206,29 @@ class Derivative:
         ValueError
             If an argument has the wrong shape or is not finite, or ``mu`` is given for a map without tensors.
         """
-        n, forces = len(self.uv), self._forces
+        n, of = len(self.uv), self._of
         held = np.zeros(n, dtype=np.complex128)
         load = np.zeros(n, dtype=np.complex128)
-        moved = np.zeros(self._rest_shape)
+        moved = np.zeros(of.rest_shape)
         if target is not None:
-            positions = to_complex(target_positions(target, self._fixed.size)) / self._unit
-            held[self._fixed[self._follows]] = positions[self._follows]
-            load += forces.by_places(held)
+            positions = to_complex(target_positions(target, of.fixed.size)) / of.unit
+            held[of.fixed[of.follows]] = positions[of.follows]
+            load += of.forces.by_places(held)
         if rest is not None:
-            moved = self._rest_positions(rest)
-            if self._strain is not None:
-                load += forces.by_strain(*self._strain.of(moved))
+            moved = _check_rest(rest, of.rest_shape)
+            if of.made_strain is not None:
+                load += of.forces.by_strain(*of.made_strain.of(moved))
         if mu is not None:
-            if self._tensors is None:
+            if of.tensors is None:
                 raise ValueError("mu is supported only for quasi-harmonic maps")
-            load += self._tensors.by_mu(forces, self._checked_mu(mu))
-        more = 0.0 if self._scale is None else self._scale.change(held, moved)
-        if self._scaled:
-            load += more * forces.by_scale
-        dw = held - self._inverse.solve(load)
-        if self._gauge is not None:
-            dw = self._gauge.select(dw, held, more)
-        return to_rows(self._unit * dw)
+            load += of.tensors.by_mu(of.forces, _check_mu(mu, of.forces.share.size))
+        more = 0.0 if of.scale is None else of.scale.change(held, moved)
+        if of.scaled:
+            load += more * of.forces.by_scale
+        dw = held - of.inverse(load)
+        if of.gauge is not None:
+            dw = of.gauge.select(dw, held, more)
+        return to_rows(of.unit * dw)
 
     def vjp(self, cotangent: ArrayLike) -> Gradients:
         """Return the gradients of a function of the map with respect to the map's inputs.
@@ -228,66 +247,33 @@ class Derivative:
         ValueError
             If the cotangent has the wrong shape or is not finite.
         """
-        pull = self._unit * to_complex(map_array("cotangent", cotangent, len(self.uv)))
+        of = self._of
+        pull = of.unit * to_complex(map_array("cotangent", cotangent, len(self.uv)))
         on_pin, on_scale = 0j, 0.0
-        if self._gauge is not None:
-            pull, on_pin, on_scale = self._gauge.pull_back(pull)
-        adjoint = self._inverse.solve(pull)
-        response = self._forces.respond(adjoint)
-        if self._scaled:
-            on_scale -= work(self._forces.by_scale, adjoint)
-        return Gradients(
-            partial(self._by_target, pull, response, on_pin, on_scale),
-            partial(self._by_rest, response, on_scale),
-            partial(self._by_mu, response),
+        if of.gauge is not None:
+            pull, on_pin, on_scale = of.gauge.pull_back(pull)
+        adjoint = of.inverse(pull)
+        if of.scaled:
+            on_scale -= work(of.forces.by_scale, adjoint)
+        return Gradients(of, pull, of.forces.respond(adjoint), on_pin, on_scale)
+
+
+def _check_rest(rest: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    moved = real_array("rest", rest)
+    if moved.shape != shape:
+        raise ValueError(f"rest must have the shape of the rest positions, {shape}, not {moved.shape}")
+    check_finite("rest", "vertex", "vertices", moved)
+    return moved
+
+
+def _check_mu(mu: ArrayLike, f: int) -> ComplexArray:
+    array = np.asarray(mu)
+    if array.shape != (f,) or array.dtype.kind not in "iufc":
+        raise ValueError(
+            f"mu must contain {f} numbers, one for each triangle, not {array.dtype} of shape {array.shape}"
         )
-
-    @property
-    def _scaled(self) -> bool:
-        """Whether the forces depend on the scale between map and surface."""
-        return self._scale is not None and self._gauge is None
-
-    def _by_target(
-        self, pull: ComplexArray, response: TriangleResponse, on_pin: complex, on_scale: float
-    ) -> FloatArray:
-        by_places = pull - self._forces.gather(response.hp, response.hq)
-        if self._scale is not None:
-            by_places += on_scale * self._scale.by_places
-        if self._gauge is not None and self._gauge.pin is not None:
-            by_places[self._gauge.pin] += on_pin
-        by_held = by_places[self._fixed] / self._unit
-        by_held[~self._follows] = 0
-        return to_rows(by_held)
-
-    def _by_rest(self, response: TriangleResponse, on_scale: float) -> FloatArray:
-        out = np.zeros(self._rest_shape)
-        if self._strain is not None:
-            out -= self._strain.pull(*self._forces.pull_strain(response))
-        if self._scale is not None:
-            out += on_scale * self._scale.by_rest
-        return out
-
-    def _by_mu(self, response: TriangleResponse) -> ComplexArray | None:
-        return None if self._tensors is None else -self._tensors.of(self._forces, response)
-
-    def _rest_positions(self, rest: ArrayLike) -> FloatArray:
-        moved = real_array("rest", rest)
-        if moved.shape != self._rest_shape:
-            raise ValueError(f"rest must have the shape of the rest positions, {self._rest_shape}, not {moved.shape}")
-        check_finite("rest", "vertex", "vertices", moved)
-        return moved
-
-    def _checked_mu(self, mu: ArrayLike) -> ComplexArray:
-        array, f = np.asarray(mu), self._forces.share.size
-        if array.shape != (f,) or array.dtype.kind not in "iufc":
-            raise ValueError(
-                f"mu must contain {f} numbers, one for each triangle, not {array.dtype} of shape {array.shape}"
-            )
-        if not np.isfinite(array).all():
-            raise ValueError(
-                f"mu is not finite at {names_of('triangle', 'triangles', np.flatnonzero(~np.isfinite(array)))}"
-            )
-        return array.astype(np.complex128)
+    check_finite("mu", "triangle", "triangles", array[:, None])
+    return array.astype(np.complex128)
 
 
 def to_complex(rows: FloatArray) -> ComplexArray:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Scale, to_rows
+from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, Scale, to_rows
 from quasiharmonic.apps.gradients.freedom import Freedom
 from quasiharmonic.apps.gradients.gauge import Gauge
 from quasiharmonic.apps.gradients.minimum import Minimum
@@ -19,22 +20,26 @@ from quasiharmonic.energies.polishing import check_injective, find_energy
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
-from quasiharmonic.util.arrays import ComplexArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray
+from quasiharmonic.util.options import FlattenOptions, takes
 
 # Energies with a relative difference of at most this are equal, as in `flattening.piece`.
 _EQUAL_ENERGY = 1e-6
 
 
+class FlattenDerivativeKeywords(TypedDict, total=False):
+    """Types of the options of `flatten_derivative`."""
+
+    fixed: ArrayLike | None
+    energy: str | Energy
+    weights: ArrayLike | None
+    linear_solver: str
+
+
 @accepts_mesh
+@takes(FlattenOptions, FlattenDerivativeKeywords)
 def flatten_derivative(
-    V: ArrayLike,
-    F: ArrayLike,
-    uv: ArrayLike,
-    *,
-    fixed: ArrayLike = (),
-    energy: str | Energy = "symmetric-dirichlet",
-    weights: ArrayLike | None = None,
-    linear_solver: str = "auto",
+    V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[FlattenDerivativeKeywords]
 ) -> Derivative:
     """Converge a flattened map to rounding, and differentiate it by target and rest positions.
 
@@ -76,8 +81,13 @@ def flatten_derivative(
     >>> bool(abs(change - 2e-6) < 1e-9)
     True
     """
-    domain = Domain(V, F, fixed)
-    chosen = find_energy(energy)
+    return differentiate_flattened(V, F, uv, FlattenOptions(**options))
+
+
+def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: FlattenOptions) -> Derivative:
+    """Converge a flattened map to rounding, and differentiate it; see `flatten_derivative`."""
+    domain = Domain(V, F, () if options.fixed is None else options.fixed)
+    chosen = find_energy(options.energy)
     start = check_injective(domain, uv, NOT_FOUND)
     strain = make_strain(domain)
     exponent = int(np.frexp(np.abs(domain.V).max())[1])
@@ -86,32 +96,40 @@ def flatten_derivative(
         np.ldexp(domain.V, -exponent),
         domain.F,
         chosen,
-        weights=None if weights is None else positive_weights(weights, len(domain.F)),
+        weights=None if options.weights is None else positive_weights(options.weights, len(domain.F)),
     )
     gauge = _gauge(measure, w, domain)
+
+    def find_minimum(w: ComplexArray, *, converge: bool = True) -> Minimum:
+        fixed, sliding, tangent = domain.fixed, None, None
+        if gauge is not None:
+            fixed, sliding, tangent = replace(gauge, w=w).constraints()
+        freedom = Freedom(measure, w.size, fixed, options.linear_solver, sliding, tangent)
+        return Minimum(measure, w, freedom, converge=converge)
+
     if gauge is not None and gauge.keeps_area:
         # First converge at any scale, then scale to the surface's area.
-        w = _minimum(measure, w, gauge, domain.fixed, linear_solver).w
+        w = find_minimum(w).w
         size = float(np.ldexp(strain.m, -2 * exponent).sum())
         w = (w - w.mean()) * np.sqrt(size / signed_areas(domain.F, w).sum()) + w.mean()
-    minimum, doubts = _minimum(measure, w, gauge, domain.fixed, linear_solver), []
+    minimum, doubts = find_minimum(w), []
     if _overlaps(domain, minimum.w) and not _overlaps(domain, w):
-        minimum, doubts = _minimum(measure, w, gauge, domain.fixed, linear_solver, converge=False), [Doubt.CONTACT]
+        minimum, doubts = find_minimum(w, converge=False), [Doubt.CONTACT]
     scale = None
     if gauge is not None and gauge.keeps_area:
         scale = Scale(np.zeros_like(w), differentiate_surface_size(strain))
-    return Derivative(
-        place_map(minimum.w, exponent, domain.fixed, start),
+    equilibrium = Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
-        inverse=minimum,
+        inverse=minimum.solve,
         strain=lambda: strain,
         rest_shape=domain.V.shape,
-        doubts=[*doubts, *minimum.doubts],
         unit=2.0**exponent,
         scale=scale,
         gauge=None if gauge is None else replace(gauge, w=minimum.w),
     )
+    uv = place_map(minimum.w, exponent, domain.fixed, start)
+    return Derivative(uv, equilibrium, [*doubts, *minimum.doubts])
 
 
 def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge | None:
@@ -123,21 +141,6 @@ def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge
         here, doubled = measure.value(w), measure.value(2 * w)
     pin = int(domain.fixed[0]) if domain.fixed.size else None
     return Gauge(w, pin, abs(doubled - here) <= _EQUAL_ENERGY * here, domain.loops)
-
-
-def _minimum(
-    measure: DeformationEnergy,
-    w: ComplexArray,
-    gauge: Gauge | None,
-    fixed: IntArray,
-    linear_solver: str,
-    *,
-    converge: bool = True,
-) -> Minimum:
-    sliding, tangent = None, None
-    if gauge is not None:
-        fixed, sliding, tangent = replace(gauge, w=w).constraints()
-    return Minimum(measure, w, Freedom(measure, w.size, fixed, linear_solver, sliding, tangent), converge=converge)
 
 
 def _overlaps(domain: Domain, w: ComplexArray) -> bool:

@@ -8,26 +8,28 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.apps.flattening.free_boundary import flatten
+from quasiharmonic.apps.flattening.free_boundary import flatten_surface
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.flatten_gradient import flatten_derivative
-from quasiharmonic.apps.gradients.polish_gradient import polish_derivative
+from quasiharmonic.apps.gradients.flatten_gradient import FlattenDerivativeKeywords, differentiate_flattened
+from quasiharmonic.apps.gradients.polish_gradient import differentiate_polish
 from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
 from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.polishing import polish_options
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
-from quasiharmonic.solver.mapping import solve
+from quasiharmonic.solver.mapping import solve_problem
 from quasiharmonic.util.arrays import FloatArray, IntArray, index_array, real_array
+from quasiharmonic.util.options import FlattenOptions, MapOptions, Options, option
 
 #: An argument, converted to NumPy.
 Array = NDArray[Any]
@@ -45,6 +47,28 @@ class DoubtfulDerivative(UserWarning):
     """Warns that a gradient's derivative has a `Doubt`."""
 
 
+class SolvedKeywords(TypedDict, total=False):
+    """Types of the options of a solved layer."""
+
+    polish: str | Energy
+    slide: bool | BoundaryCurves
+    start: ArrayLike | None
+    linear_solver: str
+
+
+class FlattenedKeywords(FlattenDerivativeKeywords, total=False):
+    """Types of the options of a flattened layer."""
+
+    start: ArrayLike | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolvedOptions(MapOptions):
+    """Options of `quasiharmonic.solve` with a polish."""
+
+    polish: Any = option("symmetric-dirichlet")
+
+
 @dataclass(frozen=True, eq=False)
 class Layer(ABC):
     """A map as a function of arrays. Layers with equal settings are equal, so programs are compiled once for them."""
@@ -58,14 +82,7 @@ class Layer(ABC):
     @cached_property
     def _settings(self) -> tuple[Any, ...]:
         """The layer's settings for comparison: arrays and plain values by content, other objects by identity."""
-        found: list[Any] = []
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                found.append((value.shape, value.tobytes()))
-            else:
-                found.append(value if isinstance(value, str | bool | tuple | None) else id(value))
-        return tuple(found)
+        return tuple(_to_comparable(getattr(self, field.name)) for field in fields(self))
 
     @property
     @abstractmethod
@@ -126,31 +143,24 @@ class PolishLayer(Layer):
     """`quasiharmonic.solve` with a polish, as a function of ``target`` and ``rest``."""
 
     problem: Problem
-    polish: str | Energy
-    slide: bool | BoundaryCurves
-    start: FloatArray | None
-    linear_solver: str
+    options: SolvedOptions
+
+    @classmethod
+    def of(cls, problem: Problem, options: SolvedKeywords) -> PolishLayer:
+        """Make a layer from a call's arguments."""
+        checked = SolvedOptions(**options)
+        start = None if checked.start is None else np.asarray(checked.start, dtype=np.float64)
+        return cls(problem, replace(checked, start=start))
 
     @cached_property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         return {"target": self.problem.target.shape, "rest": self.problem.V.shape}
 
     def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        problem = pose_problem(self.problem, arrays)
+        problem, options = pose_problem(self.problem, arrays), self.options
         if uv is None:
-            found = solve(
-                problem, polish=self.polish, slide=self.slide, start=self.start, linear_solver=self.linear_solver
-            )
-            uv = _check_found(found)
-        return polish_derivative(
-            problem.V,
-            problem.F,
-            uv,
-            fixed=problem.fixed,
-            energy=self.polish,
-            slide=self.slide,
-            linear_solver=self.linear_solver,
-        )
+            uv = _check_found(solve_problem(problem, options))
+        return differentiate_polish(problem.domain, uv, polish_options(options))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,56 +169,36 @@ class FlattenLayer(Layer):
 
     F: IntArray
     vertices: tuple[int, int]
-    fixed: IntArray | None
-    energy: str | Energy
-    weights: FloatArray | None
-    start: FloatArray | None
-    linear_solver: str
+    options: FlattenOptions
 
     @classmethod
-    def of(
-        cls,
-        rest: Any,
-        F: ArrayLike,
-        fixed: ArrayLike | None,
-        target: Any,
-        *,
-        energy: str | Energy,
-        weights: ArrayLike | None,
-        start: ArrayLike | None,
-        solver: str,
-    ) -> FlattenLayer:
+    def of(cls, rest: Any, F: ArrayLike, target: Any, options: FlattenedKeywords) -> FlattenLayer:
         """Make a layer from a call's arguments; only the shape of ``rest`` is read, as it may be a traced array."""
+        checked = FlattenOptions(**options)
+        fixed, weights, start = checked.fixed, checked.weights, checked.start
         if (fixed is None) != (target is None):
             raise ValueError("give fixed and target together: fixed vertices and their target positions")
         shape = tuple(getattr(rest, "shape", ()))
         if len(shape) < 2 or shape[-1] not in (2, 3):
             raise ValueError(f"rest must have shape (n, 2) or (n, 3), or batch axes before these, not {shape}")
-        return cls(
-            index_array("F", F),
-            (shape[-2], shape[-1]),
-            None if fixed is None else index_array("fixed", fixed),
-            energy,
-            None if weights is None else real_array("weights", weights),
-            None if start is None else real_array("start", start),
-            solver,
+        checked = replace(
+            checked,
+            fixed=None if fixed is None else index_array("fixed", fixed),
+            weights=None if weights is None else real_array("weights", weights),
+            start=None if start is None else real_array("start", start),
         )
+        return cls(index_array("F", F), (shape[-2], shape[-1]), checked)
 
     @cached_property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        target = {} if self.fixed is None else {"target": (self.fixed.size, 2)}
+        target = {} if self.options.fixed is None else {"target": (self.options.fixed.size, 2)}
         return {"rest": self.vertices, **target}
 
     def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        options: dict[str, Any] = {
-            "energy": self.energy,
-            "weights": self.weights,
-            "linear_solver": self.linear_solver,
-        }
-        V, target = arrays["rest"], arrays.get("target")
+        V, options = arrays["rest"], self.options
         if uv is None:
-            uv = _check_found(flatten(V, self.F, fixed=self.fixed, target=target, start=self.start, **options))
-        return flatten_derivative(V, self.F, uv, fixed=() if self.fixed is None else self.fixed, **options)
+            uv = _check_found(flatten_surface(V, self.F, replace(options, target=arrays.get("target"))))
+        return differentiate_flattened(V, self.F, uv, options)
 
 
 def pose_problem(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
@@ -273,10 +263,21 @@ def sum_to_shape(gradient: Any, shape: tuple[int, ...]) -> Any:
     return gradient.sum(axis=short, keepdims=True) if short else gradient
 
 
-def check_shape(name: str, shape: tuple[int, ...], one: tuple[int, ...]) -> None:
-    """Raise ValueError if an argument has neither one problem's shape nor that with batch axes in front."""
-    if len(shape) < len(one) or shape[len(shape) - len(one) :] != one:
-        raise ValueError(f"{name} must have shape {one}, or batch axes before it, not {tuple(shape)}")
+def select_arguments(
+    layer: Layer, arguments: Mapping[str, Any], check: Callable[[str, Any], None]
+) -> tuple[tuple[str, ...], list[Any]]:
+    """Return the names and values of a layer's arguments without those that are None, with checked types and shapes.
+
+    ``check`` raises an error for the name and a wrong value. ValueError if an argument has neither one problem's shape
+    nor that with batch axes in front.
+    """
+    given = {name: array for name, array in arguments.items() if array is not None}
+    for name, array in given.items():
+        check(name, array)
+        shape, one = tuple(array.shape), layer.shapes[name]
+        if len(shape) < len(one) or shape[len(shape) - len(one) :] != one:
+            raise ValueError(f"{name} must have shape {one}, or batch axes before it, not {shape}")
+    return tuple(given), list(given.values())
 
 
 def _check_found(result: MapResult) -> FloatArray:
@@ -289,3 +290,12 @@ def _warn(derivative: Derivative, item: tuple[int, ...]) -> None:
     for doubt in derivative.doubts:
         which = f"item {', '.join(map(str, item))}: " if item else ""
         warnings.warn(f"{which}{doubt.value}", DoubtfulDerivative, stacklevel=4)
+
+
+def _to_comparable(value: Any) -> Any:
+    """Return arrays and plain values by content, options by their fields, and other objects by identity."""
+    if isinstance(value, Options):
+        return tuple(_to_comparable(getattr(value, field.name)) for field in fields(value))
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    return value if isinstance(value, str | bool | int | float | tuple | None) else id(value)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TypedDict, Unpack
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.derivative import Derivative, Scale, to_rows
+from quasiharmonic.apps.gradients.derivative import Derivative, Equilibrium, Scale, to_rows
 from quasiharmonic.apps.gradients.freedom import Freedom, OnCurves
 from quasiharmonic.apps.gradients.gauge import differentiate_map_size
 from quasiharmonic.apps.gradients.minimum import Minimum
@@ -19,22 +21,30 @@ from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves, Track
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.options import PolishOptions, takes
 
 #: Error message for maps that are not injective.
 NOT_FOUND = "no map was found, so there is no derivative"
 
 
+class PolishDerivativeKeywords(TypedDict, total=False):
+    """Types of the options of `polish_derivative`."""
+
+    energy: str | Energy
+    weights: ArrayLike | None
+    linear_solver: str
+    slide: bool | BoundaryCurves
+
+
 @accepts_mesh
+@takes(PolishOptions, PolishDerivativeKeywords)
 def polish_derivative(
     V: ArrayLike,
     F: ArrayLike,
     uv: ArrayLike,
     *,
     fixed: ArrayLike | None = None,
-    energy: str | Energy = "symmetric-dirichlet",
-    weights: ArrayLike | None = None,
-    linear_solver: str = "auto",
-    slide: bool | BoundaryCurves = False,
+    **options: Unpack[PolishDerivativeKeywords],
 ) -> Derivative:
     """Converge a polished map to rounding, and differentiate it by target and rest positions.
 
@@ -78,37 +88,41 @@ def polish_derivative(
     >>> gradients.target.shape, gradients.rest.shape, derivative.reliable
     ((36, 2), (127, 2), True)
     """
-    domain = Domain(V, F, fixed)
+    return differentiate_polish(Domain(V, F, fixed), uv, PolishOptions(**options))
+
+
+def differentiate_polish(domain: Domain, uv: ArrayLike, options: PolishOptions) -> Derivative:
+    """Converge a polished map to rounding, and differentiate it; see `polish_derivative`."""
     domain.check_boundary_fixed()
-    chosen = find_energy(energy)
+    chosen = find_energy(options.energy)
     start = check_injective(domain, uv, NOT_FOUND)
-    track = move_boundary(slide, domain, start) if slide is not False else None
+    track = move_boundary(options.slide, domain, start) if options.slide is not False else None
     if track is not None:
         start = track.uv
-    counts = None if weights is None else positive_weights(weights, len(domain.F))
+    counts = None if options.weights is None else positive_weights(options.weights, len(domain.F))
     measure, exponent = scale_energy(domain, start, chosen, counts)
     w = in_units(start, exponent)
     strain = make_strain(domain)
     by_rest = differentiate_surface_size(strain)
     if track is None:
-        freedom = Freedom(measure, domain.n, domain.fixed, linear_solver)
+        freedom = Freedom(measure, domain.n, domain.fixed, options.linear_solver)
         scale = Scale(-differentiate_map_size(w, domain.loops), by_rest)
     else:
-        freedom = OnCurves(measure, track, domain.fixed, domain.loops, exponent, linear_solver)
+        freedom = OnCurves(measure, track, domain.fixed, domain.loops, exponent, options.linear_solver)
         scale = Scale(np.zeros_like(w), by_rest)
     minimum = Minimum(measure, w, freedom)
-    return Derivative(
-        place_map(minimum.w, exponent, np.setdiff1d(domain.fixed, freedom.sliding), start),
+    equilibrium = Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
-        inverse=minimum,
+        inverse=minimum.solve,
         strain=lambda: strain,
         rest_shape=domain.V.shape,
-        doubts=minimum.doubts,
         unit=2.0**exponent,
         on_curves=None if track is None else find_curve_vertices(track),
         scale=scale,
     )
+    held = np.setdiff1d(domain.fixed, freedom.sliding)
+    return Derivative(place_map(minimum.w, exponent, held, start), equilibrium, minimum.doubts)
 
 
 def make_strain(domain: Domain) -> RestStrain:

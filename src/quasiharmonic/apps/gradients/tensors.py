@@ -15,26 +15,15 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, to_complex
+from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, to_complex
 from quasiharmonic.apps.gradients.forces import Forces, TensorForces
 from quasiharmonic.apps.gradients.strain import CorrectedStrain, RestStrain, Strain
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.linsolve.laplacian import FactoredLaplacian
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH, beltrami_coefficients
 from quasiharmonic.util.arrays import ComplexArray, check_choice
-
-
-class _Response:
-    """The inverse that `Derivative` needs, from a factored Laplacian."""
-
-    def __init__(self, operator: FactoredLaplacian) -> None:
-        self._operator = operator
-
-    def solve(self, load: ComplexArray) -> ComplexArray:
-        return self._operator.respond(load)
 
 
 def quasi_harmonic_derivative(
@@ -101,13 +90,12 @@ def quasi_harmonic_derivative(
     by_p, by_q = form.apply(dw.p, dw.q)
     corners = np.ascontiguousarray(problem.F.T)
     clipped = np.abs(field.mu - coefficients) > 1e-12
-    return Derivative(
-        uv,
+    equilibrium = Equilibrium(
         fixed=problem.fixed,
         forces=Forces(corners, problem.n, half, mesh.m, dw.p, dw.q, by_p, by_q, form),
-        inverse=_Response(operator),
+        inverse=operator.respond,
         strain=strain,
         rest_shape=problem.V.shape,
-        doubts=[Doubt.CLIPPED] if clipped.any() else [],
         tensors=TensorForces(field),
     )
+    return Derivative(uv, equilibrium, [Doubt.CLIPPED] if clipped.any() else [])

@@ -11,26 +11,29 @@ The package builds on `apps.gradients.layers`. Start reading here, then `callbac
 
 from __future__ import annotations
 
-try:
-    import jax
-except ImportError as error:
-    raise ImportError("quasiharmonic.jax needs JAX: pip install 'quasiharmonic[jax]'") from error
+from typing import Unpack
 
-import numpy as np
+from quasiharmonic.util.optional import explain_missing
+
+with explain_missing("quasiharmonic.jax needs JAX", "'quasiharmonic[jax]'"):
+    import jax
+
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.layers import (
     DoubtfulDerivative,
+    FlattenedKeywords,
     FlattenLayer,
     MapNotFound,
     PolishLayer,
+    SolvedKeywords,
+    SolvedOptions,
     TensorLayer,
 )
 from quasiharmonic.apps.jax.callbacks import apply_layer
-from quasiharmonic.energies.energies import Energy
-from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
+from quasiharmonic.util.options import FlattenOptions, takes
 
 __all__ = ["DoubtfulDerivative", "MapNotFound", "flatten", "injective_map", "quasi_harmonic_map"]
 
@@ -51,32 +54,21 @@ def quasi_harmonic_map(
     return apply_layer(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
 
 
+@takes(SolvedOptions, SolvedKeywords)
 def injective_map(
     problem: Problem,
     *,
     target: jax.Array | None = None,
     rest: jax.Array | None = None,
-    polish: str | Energy = "symmetric-dirichlet",
-    slide: bool | BoundaryCurves = False,
-    start: ArrayLike | None = None,
-    linear_solver: str = "auto",
+    **options: Unpack[SolvedKeywords],
 ) -> jax.Array:
     """Return polished injective maps (…, n, 2) float64 of arrays, as `quasiharmonic.torch.injective_map`."""
-    first = None if start is None else np.asarray(start, dtype=np.float64)
-    return apply_layer(PolishLayer(problem, polish, slide, first, linear_solver), {"target": target, "rest": rest})
+    return apply_layer(PolishLayer.of(problem, options), {"target": target, "rest": rest})
 
 
+@takes(FlattenOptions, FlattenedKeywords)
 def flatten(
-    rest: jax.Array,
-    F: ArrayLike,
-    *,
-    fixed: ArrayLike | None = None,
-    target: jax.Array | None = None,
-    energy: str | Energy = "symmetric-dirichlet",
-    weights: ArrayLike | None = None,
-    start: ArrayLike | None = None,
-    linear_solver: str = "auto",
+    rest: jax.Array, F: ArrayLike, *, target: jax.Array | None = None, **options: Unpack[FlattenedKeywords]
 ) -> jax.Array:
     """Return maps (…, n, 2) float64 with a free boundary, as `quasiharmonic.torch.flatten`."""
-    layer = FlattenLayer.of(rest, F, fixed, target, energy=energy, weights=weights, start=start, solver=linear_solver)
-    return apply_layer(layer, {"rest": rest, "target": target})
+    return apply_layer(FlattenLayer.of(rest, F, target, options), {"rest": rest, "target": target})

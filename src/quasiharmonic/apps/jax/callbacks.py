@@ -15,7 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.layers import Array, Layer, check_shape, compute_gradients, compute_maps, sum_to_shape
+from quasiharmonic.apps.gradients.layers import (
+    Array,
+    Layer,
+    compute_gradients,
+    compute_maps,
+    select_arguments,
+    sum_to_shape,
+)
 from quasiharmonic.util.arrays import FloatArray
 
 # JAX passes only arrays from the forward to the backward pass. This cache keeps the last derivatives; older ones are
@@ -27,14 +34,12 @@ _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 
 def apply_layer(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
     """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes."""
-    given = {name: array for name, array in arguments.items() if array is not None}
-    for name, array in given.items():
-        _check(name, array, layer.shapes[name])
+    names, given = select_arguments(layer, arguments, _check)
     # All arrays get the same number of leading axes, so that the axis that `jax.vmap` adds is the first of each.
-    axes = {name: np.ndim(array) - len(layer.shapes[name]) for name, array in given.items()}
-    most = max(axes.values(), default=0)
-    arrays = (jnp.expand_dims(array, tuple(range(most - axes[name]))) for name, array in given.items())
-    maps: jax.Array = _map(layer, tuple(given), *arrays)
+    axes = [np.ndim(array) - len(layer.shapes[name]) for name, array in zip(names, given, strict=True)]
+    most = max(axes, default=0)
+    arrays = (jnp.expand_dims(array, tuple(range(most - own))) for array, own in zip(given, axes, strict=True))
+    maps: jax.Array = _map(layer, names, *arrays)
     return maps
 
 
@@ -124,7 +129,7 @@ def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer,
     return layer, digest.digest()
 
 
-def _check(name: str, array: Any, one: tuple[int, ...]) -> None:
+def _check(name: str, array: Any) -> None:
     if not jax.config.read("jax_enable_x64"):
         raise TypeError(
             "maps need double precision, but JAX uses single: jax.config.update('jax_enable_x64', True) before the "
@@ -142,4 +147,3 @@ def _check(name: str, array: Any, one: tuple[int, ...]) -> None:
                 f"{name} is on {elsewhere[0]}, but maps are computed on the CPU: "
                 f"jax.device_put({name}, jax.devices('cpu')[0])"
             )
-    check_shape(name, array.shape, one)

@@ -116,14 +116,12 @@ def _move_nodes(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
     if not free.size:
         return points
     near = F[np.isin(F, free).any(axis=1)]
-    unit = np.abs(jacobian_coefficients(*_chords(near, points))[:, 0])
-    size = np.sqrt(unit.mean())
-    number = invert_indices(len(points), free)
+    objective = _Displacement(near, points, free)
     now = points.copy()
     weight = _DISPLACEMENT_WEIGHT
     for _ in range(_MAX_TRIES):
         for _ in range(_STEPS):
-            step = _step(near, now, points, number, unit, size, weight)
+            step = objective.find_step(now, weight)
             if step is None:
                 break
             now = now.copy()
@@ -141,55 +139,57 @@ def _chords(F: IntArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return nodes[..., 0], nodes[..., 1]
 
 
-def _find_deficits(F: IntArray, points: FloatArray, unit: FloatArray) -> FloatArray:
-    """Return how far control values are below the margin; (f, 6)."""
-    x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)
-    return np.maximum(_MARGIN - jacobian_coefficients(x, y) / unit[:, None], 0.0)
+class _Displacement:
+    """The weighted displacement of the nodes ``free`` (k,) from ``first`` (n, 2), and what control values lack."""
 
+    def __init__(self, F: IntArray, first: FloatArray, free: IntArray) -> None:
+        self._F, self._first, self._free = F, first, free
+        self._unit = np.abs(jacobian_coefficients(*_chords(F, first))[:, 0])
+        self._size = np.sqrt(self._unit.mean())
+        self._number = invert_indices(len(first), free)
 
-def _step(
-    F: IntArray,
-    now: FloatArray,
-    first: FloatArray,
-    number: IntArray,
-    unit: FloatArray,
-    size: float,
-    weight: float,
-) -> FloatArray | None:
-    """Return one Levenberg–Marquardt step (k, 2), or None if no step lowers the objective."""
-    from scipy.sparse import csr_array, dia_array
-    from scipy.sparse.linalg import splu
+    def _find_displacement(self, now: FloatArray) -> FloatArray:
+        """Return the displacements (k, 2) of the free nodes, relative to the size of elements."""
+        return np.asarray((now[self._free] - self._first[self._free]) / self._size)
 
-    free = np.flatnonzero(number >= 0)
-    gone = (now[free] - first[free]) / size
-    deficits = _find_deficits(F, now, unit)
-    value = weight * (gone**2).sum() + (deficits**2).sum()
-    element, which = np.nonzero(deficits)
-    if not element.size:
+    def _find_deficits(self, now: FloatArray) -> FloatArray:
+        """Return how far control values are below the margin; (f, 6)."""
+        x, y = (now[self._F] - now[self._F[:, :1]]).transpose(2, 0, 1)
+        return np.maximum(_MARGIN - jacobian_coefficients(x, y) / self._unit[:, None], 0.0)
+
+    def _value(self, now: FloatArray, weight: float) -> float:
+        return float(weight * (self._find_displacement(now) ** 2).sum() + (self._find_deficits(now) ** 2).sum())
+
+    def find_step(self, now: FloatArray, weight: float) -> FloatArray | None:
+        """Return one Levenberg–Marquardt step (k, 2), or None if no step lowers the objective."""
+        from scipy.sparse import csr_array, dia_array
+        from scipy.sparse.linalg import splu
+
+        number, unknowns = self._number, 2 * self._free.size
+        deficits = self._find_deficits(now)
+        element, which = np.nonzero(deficits)
+        if not element.size:
+            return None
+        nodes = self._F[element]
+        x, y = (now[nodes] - now[nodes[:, :1]]).transpose(2, 0, 1)
+        forms = FORMS[which].astype(np.float64)
+        scale = self._size / self._unit[element][:, None]
+        by_nodes = np.einsum("mab,mb->ma", forms, y), -np.einsum("mab,mb->ma", forms, x)
+        slopes = np.stack(by_nodes, axis=2) * scale[..., None]
+        column = 2 * number[nodes][..., None] + np.array([0, 1])
+        row = np.broadcast_to(np.arange(len(element))[:, None, None], column.shape)
+        known = np.broadcast_to(number[nodes][..., None] >= 0, column.shape)
+        jacobian = csr_array((slopes[known], (row[known], column[known])), shape=(len(element), unknowns))
+        load = jacobian.T @ deficits[element, which] - weight * self._find_displacement(now).ravel()
+        matrix = jacobian.T @ jacobian + dia_array((np.full((1, unknowns), weight), [0]), shape=(unknowns, unknowns))
+        try:
+            direction = splu(matrix.tocsc()).solve(load).reshape(-1, 2)
+        except RuntimeError:  # singular: in very bad elements the weight is lost to rounding
+            return None
+        there, before = now.copy(), self._value(now, weight)
+        for halving in range(6):
+            step = 0.5**halving * self._size * direction
+            there[self._free] = now[self._free] + step
+            if self._value(there, weight) < before:
+                return np.asarray(step)
         return None
-    nodes = F[element]
-    x, y = (now[nodes] - now[nodes[:, :1]]).transpose(2, 0, 1)
-    forms = FORMS[which].astype(np.float64)
-    scale = size / unit[element][:, None]
-    slopes = (
-        np.stack([np.einsum("mab,mb->ma", forms, y), -np.einsum("mab,mb->ma", forms, x)], axis=2) * scale[..., None]
-    )
-    column = 2 * number[nodes][..., None] + np.array([0, 1])
-    row = np.broadcast_to(np.arange(len(element))[:, None, None], column.shape)
-    known = np.broadcast_to(number[nodes][..., None] >= 0, column.shape)
-    jacobian = csr_array((slopes[known], (row[known], column[known])), shape=(len(element), 2 * free.size))
-    load = jacobian.T @ deficits[element, which] - weight * gone.ravel()
-    unknowns = 2 * free.size
-    matrix = jacobian.T @ jacobian + dia_array((np.full((1, unknowns), weight), [0]), shape=(unknowns, unknowns))
-    try:
-        direction = splu(matrix.tocsc()).solve(load).reshape(-1, 2)
-    except RuntimeError:  # singular: in very bad elements the weight is lost to rounding
-        return None
-    there = now.copy()
-    for halving in range(6):
-        t = 0.5**halving
-        there[free] = now[free] + t * size * direction
-        further = (there[free] - first[free]) / size
-        if weight * (further**2).sum() + (_find_deficits(F, there, unit) ** 2).sum() < value:
-            return t * size * direction
-    return None

@@ -8,20 +8,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quasiharmonic.apps.tetrahedra.result import summarise_qualities
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import corner_triangles, name_elements
 from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
 from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import SummarisedOutcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MorphResult(Outcome, Displayable):
+class MorphResult(SummarisedOutcome, Displayable):
     """A planar mesh after its boundary has moved.
 
     Attributes
@@ -71,11 +72,6 @@ class MorphResult(Outcome, Displayable):
     def status(self) -> Status:
         """The status of the search."""
         return self.result.status
-
-    @property
-    def message(self) -> str:
-        """The first line of `summary`."""
-        return self.summary().partition("\n")[0]
 
     def drift(self) -> float:
         """Return the maximum distance of a node from its position after one step from the rest mesh.
@@ -130,7 +126,6 @@ class MorphResult(Outcome, Displayable):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""
-        both = (("quality_before", self.quality_before), ("quality_after", self.quality_after))
         return {
             **self.result.to_dict(),
             "success": self.success,
@@ -138,10 +133,7 @@ class MorphResult(Outcome, Displayable):
             "valid": self.valid,
             "inverted": self.inverted.tolist(),
             "forbidden": self.forbidden.tolist(),
-            **{
-                name: {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())}
-                for name, quality in both
-            },
+            **summarise_qualities(self.quality_before, self.quality_after),
         }
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import NamedTuple, TypedDict, Unpack
+from dataclasses import dataclass, replace
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +20,7 @@ from quasiharmonic.apps.mesh_motion.morph_result import MorphResult, find_forbid
 from quasiharmonic.apps.mesh_motion.quadrilaterals import make_convex
 from quasiharmonic.apps.mesh_motion.quality import element_quality
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
-from quasiharmonic.apps.tetrahedra.tetrahedral_maps import morph_tetrahedra
+from quasiharmonic.apps.tetrahedra.tetrahedral_maps import is_volume, morph_tetrahedra
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
 from quasiharmonic.energies.polishing import find_energy, polish_result
@@ -55,6 +55,9 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.options import MorphOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
+
+#: Curves of the boundary, and the nodes that do not slide.
+_Slide = tuple[bool | BoundaryCurves, IntArray]
 
 
 class MorphKeywords(TypedDict, total=False):
@@ -159,7 +162,7 @@ def morph(
     """
     checked = MorphOptions(**options)
     slide, rest, start = checked.slide, checked.rest, checked.start
-    if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
+    if is_volume(points, F):
         if isinstance(slide, BoundaryCurves):
             raise ValueError("slide must be a bool or an array of planes for tetrahedra, not BoundaryCurves")
         if checked.energy is not None:
@@ -178,13 +181,13 @@ def morph(
     F = _counterclockwise(F, first)
     check_spread(F, len(points))
     fixed, goal = _find_fixed(points, F, moved_vertices, target)
-    given = _MorphProblem(F, first, fixed, nets_of(F))
-    after, result = _place_nodes(given, points, goal, begin, (curves, np.asarray(moved_vertices)), checked)
+    search = _NodeSearch(F, first, fixed, nets_of(F), checked)
+    after, result = search.place(points, goal, begin, (curves, np.asarray(moved_vertices)))
 
     def one_step() -> FloatArray:
         # Fix the boundary at the positions to which it has slid.
-        alone = replace(checked, callback=None)
-        whole, _ = _place_nodes(given, first, after[fixed], None, (False, fixed), alone)
+        alone = replace(search, options=replace(checked, callback=None))
+        whole, _ = alone.place(first, after[fixed], None, (False, fixed))
         return np.full_like(whole, np.nan) if inverted_elements(F, whole).size else whole
 
     inverted = inverted_elements(F, after)
@@ -193,99 +196,86 @@ def morph(
     return MorphResult(after, F, inverted, forbidden, result, before, now, points.copy(), one_step)
 
 
-class _MorphProblem(NamedTuple):
-    """A rest mesh, the nodes with given positions, and sets of triangles to search on, in order."""
+@dataclass(frozen=True)
+class _NodeSearch:
+    """The search for the positions of all nodes: a rest mesh, the nodes with given positions, and triangles.
+
+    The triangles are sets ``nets`` to search on, in order.
+    """
 
     F: IntArray
     rest: FloatArray
     fixed: IntArray
     nets: list[IntArray]
+    options: MorphOptions
 
+    def place(
+        self, points: FloatArray, target: FloatArray, begin: FloatArray | None, slide: _Slide
+    ) -> tuple[FloatArray, MapResult]:
+        """Place all nodes by the first set of triangles that leaves no element inverted, or by the best one.
 
-def _place_nodes(
-    given: _MorphProblem,
-    points: FloatArray,
-    target: FloatArray,
-    begin: FloatArray | None,
-    slide: tuple[bool | BoundaryCurves, IntArray],
-    options: MorphOptions,
-) -> tuple[FloatArray, MapResult]:
-    """Place all nodes by the first set of triangles that leaves no element inverted, or by the best one.
+        Nodes in no element, and mid-side nodes on a sliding boundary, are at ``points`` (n, 2). ``target`` (k, 2) has
+        the positions of the fixed nodes, and ``begin`` is the initial mesh. ``slide`` has the curves of the boundary,
+        and the nodes that do not slide.
+        """
+        F, fixed, nets = self.F, self.fixed, self.nets
+        if F.shape[1] == 6 and slide[0] is not False:
+            # Mid-side nodes slide as other nodes do. They are then moved to the middle of their sides and fixed there.
+            there, slid = self._search(nets[-1], points, target, begin, slide)
+            has_slid = fixed[(there[fixed] != target).any(axis=1)]
+            before = points.copy()
+            before[fixed] = target
+            there = centre_midsides(F, there, has_slid, _list_curves(slide[0], nets[-1], before))
+            after, result = self.place(points, there[fixed], there, (False, fixed))
+            return after, result.after(slid)
+        best, least = None, np.inf
+        for triangles in nets:
+            after, result = self._search(triangles, points, target, begin, slide)
+            if F.shape[1] == 6:
+                # Mid-side nodes outside these triangles have not moved yet.
+                inside = ~np.isin(F[:, MIDDLES], triangles).any()
+                straight = restore_midsides(F, self.rest, after, fixed)
+                after = untangle_elements(F, straight, straight if inside else after, fixed)
+            left = inverted_elements(F, after).size
+            if left < least:
+                best, least = (after, result), left
+            if not left:
+                break
+        assert best is not None
+        return best
 
-    Nodes in no element, and mid-side nodes on a sliding boundary, are at ``points`` (n, 2). ``target`` (k, 2) has the
-    positions of the fixed nodes, and ``begin`` is the initial mesh. ``slide`` has the curves of the boundary, and the
-    nodes that do not slide.
-    """
-    F, rest, fixed, nets = given
-    if F.shape[1] == 6 and slide[0] is not False:
-        # Mid-side nodes slide as other nodes do. They are then moved to the middle of their sides and fixed there.
-        there, slid = _search(given, nets[-1], points, target, begin, slide, options)
-        has_slid = fixed[(there[fixed] != target).any(axis=1)]
-        before = points.copy()
-        before[fixed] = target
-        there = centre_midsides(F, there, has_slid, _list_curves(slide[0], nets[-1], before))
-        after, result = _place_nodes(given, points, there[fixed], there, (False, fixed), options)
-        return after, result.after(slid)
-    best, least = None, np.inf
-    for triangles in nets:
-        after, result = _search(given, triangles, points, target, begin, slide, options)
-        if F.shape[1] == 6:
-            # Mid-side nodes outside these triangles have not moved yet.
-            inside = ~np.isin(F[:, MIDDLES], triangles).any()
-            straight = restore_midsides(F, rest, after, fixed)
-            after = untangle_elements(F, straight, straight if inside else after, fixed)
-        left = inverted_elements(F, after).size
-        if left < least:
-            best, least = (after, result), left
-        if not left:
-            break
-    assert best is not None
-    return best
-
-
-def _search(
-    given: _MorphProblem,
-    triangles: IntArray,
-    points: FloatArray,
-    target: FloatArray,
-    begin: FloatArray | None,
-    slide: tuple[bool | BoundaryCurves, IntArray],
-    options: MorphOptions,
-) -> tuple[FloatArray, MapResult]:
-    """Search a map of some triangles, untangle those at quadrilaterals' corners, and return the moved mesh."""
-    F, rest, fixed, _ = given
-    energy, linear_solver, callback = options.energy, options.linear_solver, options.callback
-    used = np.unique(triangles)
-    known = np.isin(fixed, used)
-    own, own_fixed = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
-    # With the mesh's own reference triangles, the search starts from the harmonic extension of the displacement.
-    problem = Problem(rest[used], own, own_fixed, target[known], reference="corrected")
-    curves = _select_curves(slide[0], problem, used, slide[1])
-    corners = np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None
-    if energy is not None:
-        find_energy(energy)
-    elif curves is not False:
-        raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
-    if curves is not False:
-        problem = move_onto(curves, problem)
-    result = solve(
-        problem,
-        start=None if begin is None else begin[used],
-        max_iterations=options.max_iterations,
-        linear_solver=linear_solver,
-        callback=callback,
-    )
-    if corners is not None and result.status is not Status.INTERRUPTED:
-        result = make_convex(problem, result, corners, linear_solver=linear_solver)
-    if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
-        polishing = PolishOptions(
-            energy=energy, tol=options.tol, linear_solver=linear_solver, callback=callback, slide=curves
-        )
-        result = polish_result(problem, result, polishing, triangles=corners)
-    after = points.copy()
-    after[fixed] = target
-    after[used] = result.uv
-    return after, result
+    def _search(
+        self, triangles: IntArray, points: FloatArray, target: FloatArray, begin: FloatArray | None, slide: _Slide
+    ) -> tuple[FloatArray, MapResult]:
+        """Search a map of some triangles, untangle those at quadrilaterals' corners, and return the moved mesh."""
+        F, fixed = self.F, self.fixed
+        energy, linear_solver, callback = self.options.energy, self.options.linear_solver, self.options.callback
+        used = np.unique(triangles)
+        known = np.isin(fixed, used)
+        own, own_fixed = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
+        # With the mesh's own reference triangles, the search starts from the harmonic extension of the displacement.
+        problem = Problem(self.rest[used], own, own_fixed, target[known], reference="corrected")
+        curves = _select_curves(slide[0], problem, used, slide[1])
+        corners = np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None
+        if energy is not None:
+            find_energy(energy)
+        elif curves is not False:
+            raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
+        if curves is not False:
+            problem = move_onto(curves, problem)
+        start, iterations = None if begin is None else begin[used], self.options.max_iterations
+        result = solve(problem, start=start, max_iterations=iterations, linear_solver=linear_solver, callback=callback)
+        if corners is not None and result.status is not Status.INTERRUPTED:
+            result = make_convex(problem, result, corners, linear_solver=linear_solver)
+        if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
+            polishing = PolishOptions(
+                energy=energy, tol=self.options.tol, linear_solver=linear_solver, callback=callback, slide=curves
+            )
+            result = polish_result(problem, result, polishing, triangles=corners)
+        after = points.copy()
+        after[fixed] = target
+        after[used] = result.uv
+        return after, result
 
 
 def _check_positions(name: str, mesh: ArrayLike, points: FloatArray, used: IntArray) -> FloatArray:

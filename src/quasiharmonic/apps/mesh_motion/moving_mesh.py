@@ -7,12 +7,13 @@ The energy compares with the first mesh and does not depend on the path to the p
 
 from __future__ import annotations
 
-from typing import overload
+from typing import TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.moving import MovingTetrahedra
+from quasiharmonic.apps.tetrahedra.tetrahedral_maps import is_volume
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.energies.newton.boundary_continuation import MovingDescent
@@ -37,11 +38,21 @@ from quasiharmonic.util.arrays import (
     triangle_array,
     vertex_indices,
 )
+from quasiharmonic.util.options import MovingOptions, takes
 
 # Minimum decrease, relative to the energy, that a step must predict.
 _TOLERANCE = 1e-4
 # Maximum number of steps that move the boundary.
 _MAX_STEPS = 25
+
+
+class MovingKeywords(TypedDict, total=False):
+    """Types of the options of `MovingMesh`."""
+
+    energy: str | Energy
+    settle: int
+    slide: bool | ArrayLike
+    linear_solver: str
 
 
 class MovingMesh:
@@ -102,45 +113,22 @@ class MovingMesh:
 
     @overload
     def __init__(
-        self,
-        points: ArrayLike,
-        F: ArrayLike,
-        moved_vertices: ArrayLike,
-        *,
-        energy: str | Energy = "blend",
-        settle: int = 1,
-        slide: bool | ArrayLike = False,
-        linear_solver: str = "auto",
+        self, points: ArrayLike, F: ArrayLike, moved_vertices: ArrayLike, **options: Unpack[MovingKeywords]
     ) -> None: ...
     @overload
-    def __init__(
-        self,
-        points: MeshLike,
-        moved_vertices: ArrayLike,
-        *,
-        energy: str | Energy = "blend",
-        settle: int = 1,
-        slide: bool | ArrayLike = False,
-        linear_solver: str = "auto",
-    ) -> None: ...
+    def __init__(self, points: MeshLike, moved_vertices: ArrayLike, **options: Unpack[MovingKeywords]) -> None: ...
     @init_accepts_planar_mesh
+    @takes(MovingOptions, MovingKeywords)
     def __init__(
-        self,
-        points: ArrayLike,
-        F: ArrayLike,
-        moved_vertices: ArrayLike,
-        *,
-        energy: str | Energy = "blend",
-        settle: int = 1,
-        slide: bool | ArrayLike = False,
-        linear_solver: str = "auto",
+        self, points: ArrayLike, F: ArrayLike, moved_vertices: ArrayLike, **options: Unpack[MovingKeywords]
     ) -> None:
+        checked = MovingOptions(**options)
+        slide, self._settle, self._linear_solver = checked.slide, checked.settle, checked.linear_solver
+        self._energy = find_energy(checked.energy)
         self._volume: MovingTetrahedra | None = None
-        if np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(F) == 2 and np.shape(F)[1] != 3:
-            find_energy(energy)
-            check_name(linear_solver)
-            check_integer("settle", settle, minimum=0)
-            self._volume = MovingTetrahedra(points, F, moved_vertices, settle, slide)
+        if is_volume(points, F):
+            check_name(self._linear_solver)
+            self._volume = MovingTetrahedra(points, F, moved_vertices, self._settle, slide)
             return
         self._points = map_array("points", points)
         F = triangle_array(F, len(self._points))
@@ -152,12 +140,10 @@ class MovingMesh:
         check_spread(F, len(self._points))
         self._moved = vertex_indices("moved_vertices", moved_vertices, len(self._points))
         check_bool("slide", slide)
-        self._energy, self._slide = find_energy(energy), bool(slide)
-        check_integer("settle", settle, minimum=1 if slide else 0)
-        self._settle = settle
+        self._slide = bool(slide)
+        check_integer("settle", self._settle, minimum=1 if slide else 0)
         rest = np.setdiff1d(boundary_edges(F, len(self._points)), self._moved)
         self._domain = Domain(self._points, F, np.concatenate([self._moved, rest]))
-        self._linear_solver = linear_solver
         still = [loop for loop in self._domain.loops if not np.isin(loop, self._moved).any()]
         # Walls without moved vertices keep the curves of the first mesh, so that sliding vertices do not cut corners.
         self._walls = BoundaryCurves.around(still, self._points, fixed=self._moved) if slide and still else None
@@ -169,7 +155,7 @@ class MovingMesh:
         # area.
         self._weights = area.mean() / area
         deformation, exponent = scale_energy(self._domain, self._points, self._energy, self._weights)
-        self._descent = MovingDescent(deformation, self._points, self._domain.fixed, exponent, linear_solver)
+        self._descent = MovingDescent(deformation, self._points, self._domain.fixed, exponent, self._linear_solver)
         self._system: SlidingSystem | None = None
 
     @property

@@ -11,11 +11,12 @@ last patch is the whole island.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from quasiharmonic.apps.flattening.pins.obstructions import renumber_obstruction
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
@@ -26,10 +27,10 @@ from quasiharmonic.io.seamed_mesh import Island
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 from quasiharmonic.problem.diagnosis.obstruction import Obstruction
-from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.solver.mapping import solve
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.solver.mapping import solve_problem
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, edge_names, names_of
-from quasiharmonic.util.options import PolishOptions
+from quasiharmonic.util.options import MapOptions, PolishOptions, RepairOptions
 
 # Numbers of rings of free vertices around inverted triangles, tried in turn.
 _RINGS = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32
@@ -52,16 +53,7 @@ class IslandRepair:
         The obstruction to a map, in the mesh's numbering.
     """
 
-    def __init__(
-        self,
-        V: FloatArray,
-        island: Island,
-        *,
-        fixed: IntArray,
-        max_iterations: int,
-        linear_solver: str,
-        callback: Callable[[Step], object] | None,
-    ) -> None:
+    def __init__(self, V: FloatArray, island: Island, fixed: IntArray, options: RepairOptions) -> None:
         self.island = island
         self.uv = island.uv.copy()
         self.reason = ""
@@ -70,9 +62,7 @@ class IslandRepair:
         self._fixed = np.zeros(len(self.uv), dtype=np.bool_)
         self._fixed[boundary_edges(self._F, len(self.uv))] = True
         self._fixed |= np.isin(island.vertices, fixed)
-        self._max_iterations = max_iterations
-        self._linear_solver = linear_solver
-        self._callback = callback
+        self._options = options
         # Vertices with more inverted triangles are more likely to be misplaced, and return to their positions last.
         suspicion = np.bincount(self._F[self.inverted].ravel(), minlength=len(self.uv))
         self._innocence = np.argsort(np.argsort(-suspicion, kind="stable"))
@@ -87,9 +77,10 @@ class IslandRepair:
         """Which of the island's vertices have moved; (m,) bool."""
         return np.asarray((self.uv != self.island.uv).any(axis=1) & ~(np.isnan(self.uv).any(axis=1)))
 
-    def run(self, whole: bool) -> None:
-        """Repair the island: first by patches, unless ``whole``, then as a whole."""
+    def run(self) -> None:
+        """Repair the island: first by patches, unless it is to be mapped as a whole, then as a whole."""
         tried: set[bytes] = set()
+        whole = self._options.whole
         for rings in () if whole else _RINGS:
             free = self._around(self._repairable(), rings)
             if not 0 < np.count_nonzero(free) <= _MAX_SHARE * np.count_nonzero(~self._fixed):
@@ -101,7 +92,7 @@ class IslandRepair:
         if self._repairable().size:
             for part in self._components(~self._fixed):
                 if inverted_triangles(self._F[part[self._F].any(axis=1)], self.uv).size:
-                    self._attempt(part, self._max_iterations, keep=not whole)
+                    self._attempt(part, self._options.max_iterations, keep=not whole)
         if self.inverted.size:
             self._explain()
 
@@ -153,7 +144,10 @@ class IslandRepair:
             return
         # Tutte's embedding suffices for most patches. If it fails, the diagnosis shows whether a map can exist.
         for allowed in (1, iterations):
-            result = solve(problem, max_iterations=allowed, linear_solver=self._linear_solver, callback=self._callback)
+            options = MapOptions(
+                max_iterations=allowed, linear_solver=self._options.linear_solver, callback=self._options.callback
+            )
+            result = solve_problem(problem, options)
             if _check_interrupt(result).injective:
                 self._use_map(free, vertices, result.uv, keep)
                 return
@@ -198,11 +192,8 @@ class IslandRepair:
         for part in self._components(free):
             problem, vertices, _ = self._patch(part)
             if not rest_shapes(problem.V, problem.F).flat.size:
-                polished = polish_map(
-                    problem.domain,
-                    self.uv[vertices],
-                    PolishOptions(linear_solver=self._linear_solver, callback=self._callback),
-                )
+                options = PolishOptions(linear_solver=self._options.linear_solver, callback=self._options.callback)
+                polished = polish_map(problem.domain, self.uv[vertices], options)
                 self.uv[vertices] = _check_interrupt(polished).uv
 
     def _is_multiply_wound(self, free: BoolArray) -> bool:
@@ -254,13 +245,7 @@ def _check_interrupt(result: MapResult) -> MapResult:
 
 def _renumber(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obstruction:
     """Renumber the elements of an obstruction; its message then names the new numbers."""
-    there = replace(
-        found,
-        vertices=vertices[found.vertices],
-        edges=vertices[found.edges],
-        triangles=triangles[found.triangles],
-        split=vertices[found.split],
-    )
+    there = renumber_obstruction(found, vertices, triangles)
     if np.array_equal(vertices, np.arange(len(vertices))) and np.array_equal(triangles, np.arange(len(triangles))):
         return there
     elements = (

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.atlas.atlas_verdict import mirrored_islands
+from quasiharmonic.apps.atlas.atlas_verdict import IslandReport, mirrored_islands
 from quasiharmonic.apps.repair.island_repair import IslandRepair
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
@@ -22,20 +22,17 @@ from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    check_bool,
-    check_callback,
-    check_integer,
     count_of,
     names_of,
     vertex_indices,
 )
-from quasiharmonic.util.options import MAX_ITERATIONS
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.options import RepairOptions, takes
+from quasiharmonic.util.outcome import SummarisedOutcome
 from quasiharmonic.util.progress import reports_progress
 
 
 @dataclass(frozen=True, eq=False)
-class RepairedIsland:
+class RepairedIsland(IslandReport):
     """The repair report of one island; indices are the mesh's, from 0.
 
     Attributes
@@ -57,11 +54,9 @@ class RepairedIsland:
         The obstruction to a map with this boundary, computed if triangles are still inverted.
     """
 
-    triangles: IntArray
     inverted_before: IntArray
     inverted: IntArray
     moved_vertices: IntArray
-    mirrored: bool
     bijective: bool
     reason: str = ""
     diagnosis: Diagnosis | None = None
@@ -90,9 +85,7 @@ class RepairedIsland:
     def to_dict(self) -> dict[str, Any]:
         """The report for JSON, with the first triangle and the number of triangles."""
         return {
-            "first_triangle": int(self.triangles[0]),
-            "triangles": len(self.triangles),
-            "mirrored": self.mirrored,
+            **super().to_dict(),
             "injective": self.injective,
             "bijective": self.bijective,
             "inverted_before": self.inverted_before.tolist(),
@@ -104,7 +97,7 @@ class RepairedIsland:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RepairResult(Outcome):
+class RepairResult(SummarisedOutcome):
     """A repaired map with a report for every island.
 
     Attributes
@@ -128,11 +121,6 @@ class RepairResult(Outcome):
         return self.injective
 
     @property
-    def message(self) -> str:
-        """The first line of `summary`."""
-        return self.summary().partition("\n")[0]
-
-    @property
     def injective(self) -> bool:
         """Whether there is an island, and every triangle of every island is strictly positive."""
         return bool(self.islands) and all(island.injective for island in self.islands)
@@ -146,7 +134,7 @@ class RepairResult(Outcome):
 
     def summary(self) -> str:
         """Describe the repair, in total and for every island that needed it."""
-        before, now = (sum(len(getattr(i, name)) for i in self.islands) for name in ("inverted_before", "inverted"))
+        before, now = self._count_inverted()
         lines = [
             f"{count_of('island', 'islands', len(self.islands))}: "
             f"{count_of('triangle', 'triangles', before)} inverted before, {now} now; "
@@ -154,33 +142,40 @@ class RepairResult(Outcome):
         ]
         return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
 
+    def _count_inverted(self) -> tuple[int, int]:
+        """Numbers of inverted triangles before and after the repair."""
+        return sum(len(i.inverted_before) for i in self.islands), sum(len(i.inverted) for i in self.islands)
+
     def to_dict(self) -> dict[str, Any]:
         """The report for JSON, without the map."""
+        before, now = self._count_inverted()
         return {
             "success": self.success,
             "message": self.message,
             "injective": self.injective,
-            "inverted_before": sum(len(island.inverted_before) for island in self.islands),
-            "inverted": sum(len(island.inverted) for island in self.islands),
+            "inverted_before": before,
+            "inverted": now,
             "moved_vertices": len(self.moved_vertices),
             "islands": [island.to_dict() for island in self.islands],
         }
 
 
+class RepairKeywords(TypedDict, total=False):
+    """Types of the options of `repair`."""
+
+    fixed: ArrayLike | None
+    whole: bool
+    unmirror: bool
+    max_iterations: int
+    linear_solver: str
+    callback: Callable[[Step], object] | None
+
+
 @accepts_mesh
 @reports_progress
+@takes(RepairOptions, RepairKeywords)
 def repair(
-    V: ArrayLike,
-    F: ArrayLike,
-    uv: ArrayLike,
-    *,
-    FT: ArrayLike | None = None,
-    fixed: ArrayLike | None = None,
-    whole: bool = False,
-    unmirror: bool = False,
-    max_iterations: int = MAX_ITERATIONS,
-    linear_solver: str = "auto",
-    callback: Callable[[Step], object] | None = None,
+    V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, FT: ArrayLike | None = None, **options: Unpack[RepairKeywords]
 ) -> RepairResult:
     """Repair the inverted triangles of a map, keeping its boundary and as much of its interior as possible.
 
@@ -237,47 +232,37 @@ def repair(
     >>> len(result.islands[0].inverted_before), result.injective, result.moved_vertices.tolist()
     (2, True, [0])
     """
-    check_integer("max_iterations", max_iterations, minimum=1)
-    check_bool("whole", whole)
-    check_bool("unmirror", unmirror)
-    check_callback(callback)
+    checked = RepairOptions(**options)
     mesh = SeamedMesh(V, F, FT, uv)
-    held = vertex_indices("fixed", () if fixed is None else fixed, len(mesh.V))
-    done = []
-    for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
-        if mirrored:
-            done.append(_report_mirrored(island, unmirror))
-            continue
-        one = IslandRepair(
-            mesh.V,
-            island,
-            fixed=held,
-            max_iterations=max_iterations,
-            linear_solver=linear_solver,
-            callback=callback,
-        )
-        before = island.triangles[one.inverted]
-        if before.size:
-            one.run(whole)
-        certificate = certify(island.F, one.uv)
-        done.append(
-            (
-                one.uv,
-                RepairedIsland(
-                    triangles=island.triangles,
-                    inverted_before=before,
-                    inverted=island.triangles[one.inverted],
-                    moved_vertices=np.unique(island.vertices[one.moved_mask]),
-                    mirrored=False,
-                    bijective=bool(certificate.bijective),
-                    reason="" if certificate.injective else one.reason,
-                    diagnosis=None if certificate.injective else one.diagnosis,
-                ),
-            )
-        )
+    fixed = vertex_indices("fixed", () if checked.fixed is None else checked.fixed, len(mesh.V))
+    done = [
+        _report_mirrored(island, checked.unmirror) if mirrored else _repair_island(mesh.V, island, fixed, checked)
+        for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True)
+    ]
     repaired = mesh.with_places([new for new, _ in done])
     assert repaired.uv is not None
     return RepairResult(repaired.uv, repaired.FT, tuple(report for _, report in done))
+
+
+def _repair_island(
+    V: FloatArray, island: Island, fixed: IntArray, options: RepairOptions
+) -> tuple[FloatArray, RepairedIsland]:
+    """Repair an island that is not mirrored; return its new positions and the report."""
+    one = IslandRepair(V, island, fixed, options)
+    before = island.triangles[one.inverted]
+    if before.size:
+        one.run()
+    certificate = certify(island.F, one.uv)
+    return one.uv, RepairedIsland(
+        triangles=island.triangles,
+        inverted_before=before,
+        inverted=island.triangles[one.inverted],
+        moved_vertices=np.unique(island.vertices[one.moved_mask]),
+        mirrored=False,
+        bijective=bool(certificate.bijective),
+        reason="" if certificate.injective else one.reason,
+        diagnosis=None if certificate.injective else one.diagnosis,
+    )
 
 
 def _report_mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIsland]:

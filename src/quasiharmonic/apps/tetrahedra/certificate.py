@@ -39,6 +39,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     ReadOnly,
     check_bool,
+    check_finite,
     check_range,
     count_of,
     index_array,
@@ -270,9 +271,8 @@ def space_array(name: str, X: ArrayLike, n: int | None = None, *, finite: bool =
     array = real_array(name, X)
     if array.ndim != 2 or array.shape[1] != 3 or (n is not None and len(array) != n):
         raise ValueError(f"{name} must have shape ({'n' if n is None else n}, 3), not {array.shape}")
-    if finite and not np.isfinite(array).all():
-        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-        raise ValueError(f"{name} is not finite at {names_of('row', 'rows', bad)}")
+    if finite:
+        check_finite(name, "row", "rows", array)
     return array
 
 

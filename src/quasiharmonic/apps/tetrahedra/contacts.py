@@ -206,11 +206,11 @@ def _meet_in_plane(F: IntArray, G: IntArray, count: int, X: FloatArray) -> BoolA
     """`_meet_aligned` for triangles in common planes."""
     axes, turn = _project(F, X)
     f, g = _flatten(F, axes, X), _flatten(G, axes, X)
-    if count == 2:
-        return orientation(g[:, 0], g[:, 1], g[:, 2]) == turn
-    f[turn < 0] = f[turn < 0][:, (0, 2, 1)]
     other_turn = orientation(g[:, 0], g[:, 1], g[:, 2])
-    g[other_turn < 0] = g[other_turn < 0][:, (0, 2, 1)]
+    if count == 2:
+        return other_turn == turn
+    for one, sign in ((f, turn), (g, other_turn)):
+        one[sign < 0] = one[sign < 0][:, (0, 2, 1)]
     if count == 0:
         return ~(_is_separated(f, g) | _is_separated(g, f))
     inside = np.zeros(len(F), dtype=np.bool_)

@@ -68,6 +68,17 @@ class Descent:
             if ratio > 1.0 - _QUICK_DECREASE or repeated > _MAX_REPEATED:
                 epsilon, repeated = max(reduce_epsilon(epsilon, least, ratio), _MIN_EPSILON), 0
 
+    def make_valid(self, max_steps: int) -> bool:
+        """Untangle the mesh if necessary; return whether all determinants are above the floor."""
+        if not self.is_valid():
+            for _ in self.untangle(max_steps):
+                pass
+        return self.is_valid()
+
+    def is_valid(self) -> bool:
+        """Return whether all determinants are above the floor."""
+        return bool(self.energy.determinants(self.X).min() > self.energy.floor)
+
     def polish(self, max_steps: int, tol: float) -> Iterator[float]:
         """Lower the energy of positive tetrahedra; yield it after each step, and end when it has converged."""
         before = self._value(self.X, 0.0)

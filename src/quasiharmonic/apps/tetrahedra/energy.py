@@ -77,9 +77,9 @@ class ShapeEnergy:
     def __init__(self, T: IntArray, rest: FloatArray, floor: float = 0.0) -> None:
         self.T, self.n, self.floor = T, len(rest), floor
         u, v, w = (np.ascontiguousarray((rest[T[:, k]] - rest[T[:, 0]]).T) for k in (1, 2, 3))
-        volume = _dot(u, _cross(v, w))
+        volume = dot(u, cross(v, w))
         # Gradients of the four linear basis functions.
-        one, two, three = _cross(v, w) / volume, _cross(w, u) / volume, _cross(u, v) / volume
+        one, two, three = cross(v, w) / volume, cross(w, u) / volume, cross(u, v) / volume
         self.gradients = np.stack([-(one + two + three), one, two, three])
         # Six times the volumes at rest.
         self.volumes = volume
@@ -100,12 +100,12 @@ class ShapeEnergy:
     def determinants(self, X: FloatArray) -> FloatArray:
         """Return the determinants (t,) of the Jacobian matrices."""
         J = self.jacobians(X)
-        return _dot(J[0], _cross(J[1], J[2]))
+        return dot(J[0], cross(J[1], J[2]))
 
     def value(self, X: FloatArray, epsilon: float) -> float:
         """Return the energy per tetrahedron; infinite if ε is 0 and a tetrahedron is not positive."""
         J = self.jacobians(X)
-        D = _dot(J[0], _cross(J[1], J[2]))
+        D = dot(J[0], cross(J[1], J[2]))
         if epsilon == 0 and not D.min() > self.floor:
             return np.inf
         chi = regularised(D - self.floor, epsilon)
@@ -117,7 +117,7 @@ class ShapeEnergy:
     def densities(self, X: FloatArray) -> FloatArray:
         """Return the density of every tetrahedron, (t,), with ε = 0; infinite if it is not positive."""
         J = self.jacobians(X)
-        D = _dot(J[0], _cross(J[1], J[2]))
+        D = dot(J[0], cross(J[1], J[2]))
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(D > 0, self._density(J, D, 0.0).value, np.inf)
 
@@ -163,7 +163,7 @@ class ShapeEnergy:
         blocks = np.empty((len(_PAIRS), 3, 3, count))
         mixed = 2 * d.by_t_d / count * along + 0.5 * d.by_d_d / count * across
         for k, (i, j) in enumerate(_PAIRS):
-            diagonal = 2 * d.by_t / count * _dot(G[i], G[j])
+            diagonal = 2 * d.by_t / count * dot(G[i], G[j])
             for a in range(3):
                 for b in range(3):
                     np.multiply(mixed[i, a], across[j, b], out=blocks[k, a, b])
@@ -174,8 +174,8 @@ class ShapeEnergy:
     def _parts(self, X: FloatArray, epsilon: float) -> tuple[_Density, FloatArray, FloatArray]:
         """The density with its derivatives, and the products of J and its cofactors with the gradients, (4, 3, t)."""
         J = self.jacobians(X)
-        C = np.stack([_cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])])
-        d = self._density(J, _dot(J[0], C[0]), epsilon)
+        C = np.stack([cross(J[1], J[2]), cross(J[2], J[0]), cross(J[0], J[1])])
+        d = self._density(J, dot(J[0], C[0]), epsilon)
         return d, np.einsum("abt,ibt->iat", J, self.gradients), np.einsum("abt,ibt->iat", C, self.gradients)
 
     def _sum_forces(self, d: _Density, along: FloatArray, across: FloatArray) -> FloatArray:
@@ -228,10 +228,11 @@ class BlockMatrix:
         return bsr_array((data, self._indices, self._indptr), shape=(size, size))
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of vectors (3, t)."""
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products of vectors (3, …)."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Inner products of vectors (3, …)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

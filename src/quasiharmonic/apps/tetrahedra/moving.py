@@ -56,10 +56,7 @@ class MovingTetrahedra:
         with np.errstate(all="ignore"):
             descent.X = extend_harmonically(self._energy, before, self._fixed, places, self._projections)
             descent.X[self._fixed] = places
-            if not self._energy.determinants(descent.X).min() > 0:
-                for _ in descent.untangle(_MAX_STEPS):
-                    pass
-            if self._energy.determinants(descent.X).min() > 0:
+            if descent.make_valid(_MAX_STEPS):
                 for _ in descent.polish(self._settle, 1e-8):
                     pass
         points = self.points.copy()

@@ -189,21 +189,16 @@ def extend_harmonically(
 
     ``projections`` (m, 3, 3), if given, restrict the displacements of the other vertices of the mesh, ascending.
     """
-    from scipy.sparse import coo_array
+    from scipy.sparse import coo_array, dia_array
     from scipy.sparse.linalg import LinearOperator, cg
 
     T, G = energy.T, energy.gradients
     n = len(X)
     displacement = np.zeros_like(X)
     displacement[fixed] = target - X[fixed]
-    rows, columns, values = [], [], []
-    for i in range(4):
-        for j in range(4):
-            rows.append(T[:, i])
-            columns.append(T[:, j])
-            values.append((G[i] * G[j]).sum(axis=0) * energy.volumes)
-    where = (np.concatenate(rows), np.concatenate(columns))
-    matrix = coo_array((np.concatenate(values), where), shape=(n, n)).tocsr()
+    stiffness = (G[:, None] * G[None]).sum(axis=2) * energy.volumes
+    rows, columns = np.broadcast_arrays(T.T[:, None], T.T[None])
+    matrix = coo_array((stiffness.ravel(), (rows.ravel(), columns.ravel())), shape=(n, n)).tocsr()
     free = np.setdiff1d(np.unique(T), fixed)
     own = matrix[free][:, free]
     load = -(matrix[free] @ displacement)
@@ -213,19 +208,12 @@ def extend_harmonically(
     def apply(x: FloatArray) -> FloatArray:
         return project(projections, own @ x.reshape(-1, 3)).ravel()
 
-    def precondition(x: FloatArray) -> FloatArray:
-        return np.asarray(inverse[:, None] * x.reshape(-1, 3)).ravel()
-
     load = project(projections, load).ravel()
     if load.any():
         size = (load.size, load.size)
-        solved = cg(
-            LinearOperator(size, matvec=apply, dtype=np.float64),
-            load,
-            rtol=1e-6,
-            maxiter=2000,
-            M=LinearOperator(size, matvec=precondition, dtype=np.float64),
-        )[0]
+        operator = LinearOperator(size, matvec=apply, dtype=np.float64)
+        preconditioner = dia_array((np.repeat(inverse, 3)[None], [0]), shape=size)
+        solved = cg(operator, load, rtol=1e-6, maxiter=2000, M=preconditioner)[0]
         displacement[free] = project(projections, solved.reshape(-1, 3))
     there = X + displacement
     return there if np.isfinite(there).all() else X
@@ -251,8 +239,7 @@ def _search(descent: Descent, options: TetrahedraOptions) -> tuple[FloatArray, T
             return best[-1][1], status, descent.iterations
         status = _polish(descent, options, run)
         return descent.X, status, descent.iterations
-    positive = bool(energy.determinants(descent.X).min() > 0)
-    return descent.X if positive else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
+    return descent.X if descent.is_valid() else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
 
 
 def _untangle(descent: Descent, options: TetrahedraOptions, run: Run, best: list[tuple[int, FloatArray]]) -> int:

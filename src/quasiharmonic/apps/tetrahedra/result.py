@@ -130,11 +130,16 @@ class TetrahedraResult(Outcome):
             "iterations": self.iterations,
             "seconds": self.seconds,
             "energy": self.energy if np.isfinite(self.energy) else None,
-            **{
-                name: {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())}
-                for name, quality in (("quality_before", self.quality_before), ("quality_after", self.quality_after))
-            },
+            **summarise_qualities(self.quality_before, self.quality_after),
         }
+
+
+def summarise_qualities(before: FloatArray, after: FloatArray) -> dict[str, dict[str, float]]:
+    """Return the minimum, the mean and the worst element of qualities before and after, for JSON."""
+    return {
+        name: {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())}
+        for name, quality in (("quality_before", before), ("quality_after", after))
+    }
 
 
 def tetrahedron_quality(T: IntArray, X: FloatArray) -> FloatArray:

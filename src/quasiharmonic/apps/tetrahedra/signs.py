@@ -16,6 +16,8 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,7 +58,7 @@ class ExactSigns:
             for start in range(0, len(corners), _CHUNK):
                 heartbeat()
                 block = slice(start, start + _CHUNK)
-                sign[block] = _sign_if_certain(*self._edges(corners[block].T))
+                sign[block] = _sign_if_certain(self._edges(corners[block].T))
             undecided = np.flatnonzero(sign == 0)
             if not self.finite.all():
                 undecided = undecided[np.asarray(self.finite[corners[undecided]].all(axis=1))]
@@ -83,18 +85,12 @@ def tetrahedron_signs(T: IntArray, X: FloatArray) -> tuple[SignArray, IntArray]:
     return sign, nonfinite
 
 
-def _sign_if_certain(
-    ux: FloatArray,
-    uy: FloatArray,
-    uz: FloatArray,
-    vx: FloatArray,
-    vy: FloatArray,
-    vz: FloatArray,
-    wx: FloatArray,
-    wy: FloatArray,
-    wz: FloatArray,
-) -> SignArray:
-    """Sign of the determinant of rounded differences of magnitude at most two, where it is certain; 0 elsewhere."""
+def _sign_if_certain(edges: Sequence[FloatArray]) -> SignArray:
+    """Sign of the determinant of rounded differences of magnitude at most two, where it is certain; 0 elsewhere.
+
+    ``edges`` are the nine coordinates of three vectors, vector by vector.
+    """
+    ux, uy, uz, vx, vy, vz, wx, wy, wz = edges
     det, permanent = np.zeros_like(ux), np.zeros_like(ux)
     for a, (b, c), (d, e) in ((ux, (vy, wz), (vz, wy)), (uy, (vz, wx), (vx, wz)), (uz, (vx, wy), (vy, wx))):
         left, right = b * c, d * e
@@ -116,7 +112,7 @@ def _decide(p: FloatArray) -> SignArray:
     scaled = np.ldexp(p, -exponent[:, None, None])
     exact = (np.ldexp(scaled, exponent[:, None, None]) == p).all(axis=(1, 2))  # scaling has not rounded
     difference, tail = two_sum(scaled[:, 1:], -scaled[:, :1])
-    sign = _sign_if_certain(*difference.reshape(-1, 9).T)
+    sign = _sign_if_certain(list(difference.reshape(-1, 9).T))
     # A component that is the same at all four corners makes the determinant zero, as do two equal corners.
     same = (p[:, 1:] == p[:, :1]).all(axis=1).any(axis=1)
     for i in range(4):

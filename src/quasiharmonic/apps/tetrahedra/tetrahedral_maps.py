@@ -93,6 +93,11 @@ def injective_tetrahedra(
     return place_vertices(mesh, X, held, goal, begin, checked)
 
 
+def is_volume(points: ArrayLike, cells: ArrayLike) -> bool:
+    """Whether points are in space, and cells are not triangles."""
+    return np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(cells) == 2 and np.shape(cells)[1] != 3
+
+
 def morph_tetrahedra(
     points: ArrayLike,
     T: ArrayLike,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +30,7 @@ def outer_winding(F: IntArray, X: FloatArray, patches: IntArray) -> IntArray:
     count = int(patches.max(initial=-1)) + 1
     result = np.zeros(count, dtype=np.int64)
     known = np.zeros(count, dtype=np.bool_)
-    corners = X[F]
-    lo, hi = corners.min(axis=1), corners.max(axis=1)
+    boxes = _Boxes(X[F], X[F].min(axis=1), X[F].max(axis=1))
     order = np.argsort(patches, kind="stable")
     starts = np.searchsorted(patches[order], np.arange(count))
     for patch in range(count):
@@ -38,39 +38,49 @@ def outer_winding(F: IntArray, X: FloatArray, patches: IntArray) -> IntArray:
         if known[patch]:
             continue
         stop = starts[patch + 1] if patch + 1 < count else len(order)
-        for triangle, outside in _first_line(corners, lo, hi, order[starts[patch] : stop]):
+        for triangle, outside in _first_line(boxes, order[starts[patch] : stop]):
             own = patches[triangle]
             result[own], known[own] = outside, True
     return result
 
 
-def _first_line(corners: FloatArray, lo: FloatArray, hi: FloatArray, triangles: IntArray) -> list[tuple[int, int]]:
+class _Boxes(NamedTuple):
+    """Triangles (f, 3, 3) and the corners (f, 3) of their boxes."""
+
+    corners: FloatArray
+    lo: FloatArray
+    hi: FloatArray
+
+
+class _Line(NamedTuple):
+    """A line along ``axes[2]`` through the point of a triangle that weights of its corners define."""
+
+    triangle: int
+    weights: tuple[int, int, int]
+    axes: tuple[int, int, int]
+
+
+def _first_line(boxes: _Boxes, triangles: IntArray) -> list[tuple[int, int]]:
     """Return the crossings of a line through one of some triangles: the triangle, and the winding number outside."""
-    for triangle, weights, axes in _choices(triangles):
-        found = _crossings(corners, lo, hi, triangle, weights, axes)
+    for line in _choices(triangles):
+        found = _crossings(boxes, line)
         if found is not None:
             return found
     raise AssertionError("every line through the surface meets an edge")
 
 
-def _choices(triangles: IntArray) -> Iterator[tuple[int, tuple[int, int, int], tuple[int, int, int]]]:
+def _choices(triangles: IntArray) -> Iterator[_Line]:
     for weights in _WEIGHTS:
         for triangle in triangles[:: max(len(triangles) // 20, 1)].tolist():
             for axes in _AXES:
-                yield triangle, weights, axes
+                yield _Line(triangle, weights, axes)
     for k in range(1, 10000):
-        yield int(triangles[k % len(triangles)]), (k * k + 1, 7 * k + 3, 5 * k + 2), _AXES[k % 3]
+        yield _Line(int(triangles[k % len(triangles)]), (k * k + 1, 7 * k + 3, 5 * k + 2), _AXES[k % 3])
 
 
-def _crossings(
-    corners: FloatArray,
-    lo: FloatArray,
-    hi: FloatArray,
-    triangle: int,
-    weights: tuple[int, int, int],
-    axes: tuple[int, int, int],
-) -> list[tuple[int, int]] | None:
-    """Crossings of a line along ``axes[2]``; None if it meets an edge of a triangle."""
+def _crossings(boxes: _Boxes, line: _Line) -> list[tuple[int, int]] | None:
+    """Crossings of a line; None if it meets an edge of a triangle."""
+    (corners, lo, hi), (triangle, weights, axes) = boxes, line
     total = sum(weights)
     own = _rational(corners[triangle])
     q = [sum(w * p[a] for w, p in zip(weights, own, strict=True)) / total for a in axes[:2]]

@@ -9,26 +9,29 @@ The package builds on `apps.gradients.layers`. Start reading here, then `functio
 
 from __future__ import annotations
 
-try:
-    import torch
-except ImportError as error:
-    raise ImportError("quasiharmonic.torch needs PyTorch: pip install 'quasiharmonic[torch]'") from error
+from typing import Unpack
 
-import numpy as np
+from quasiharmonic.util.optional import explain_missing
+
+with explain_missing("quasiharmonic.torch needs PyTorch", "'quasiharmonic[torch]'"):
+    import torch
+
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.layers import (
     DoubtfulDerivative,
+    FlattenedKeywords,
     FlattenLayer,
     MapNotFound,
     PolishLayer,
+    SolvedKeywords,
+    SolvedOptions,
     TensorLayer,
 )
 from quasiharmonic.apps.torch.function import apply_layer
-from quasiharmonic.energies.energies import Energy
-from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
+from quasiharmonic.util.options import FlattenOptions, takes
 
 __all__ = ["DoubtfulDerivative", "MapNotFound", "flatten", "injective_map", "quasi_harmonic_map"]
 
@@ -72,15 +75,13 @@ def quasi_harmonic_map(
     return apply_layer(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
 
 
+@takes(SolvedOptions, SolvedKeywords)
 def injective_map(
     problem: Problem,
     *,
     target: torch.Tensor | None = None,
     rest: torch.Tensor | None = None,
-    polish: str | Energy = "symmetric-dirichlet",
-    slide: bool | BoundaryCurves = False,
-    start: ArrayLike | None = None,
-    linear_solver: str = "auto",
+    **options: Unpack[SolvedKeywords],
 ) -> torch.Tensor:
     """Return polished injective maps of tensors, as `quasiharmonic.solve`, converged to rounding.
 
@@ -103,20 +104,12 @@ def injective_map(
     MapNotFound
         If no injective map was found for one item of the batch.
     """
-    first = None if start is None else np.asarray(start, dtype=np.float64)
-    return apply_layer(PolishLayer(problem, polish, slide, first, linear_solver), {"target": target, "rest": rest})
+    return apply_layer(PolishLayer.of(problem, options), {"target": target, "rest": rest})
 
 
+@takes(FlattenOptions, FlattenedKeywords)
 def flatten(
-    rest: torch.Tensor,
-    F: ArrayLike,
-    *,
-    fixed: ArrayLike | None = None,
-    target: torch.Tensor | None = None,
-    energy: str | Energy = "symmetric-dirichlet",
-    weights: ArrayLike | None = None,
-    start: ArrayLike | None = None,
-    linear_solver: str = "auto",
+    rest: torch.Tensor, F: ArrayLike, *, target: torch.Tensor | None = None, **options: Unpack[FlattenedKeywords]
 ) -> torch.Tensor:
     """Return maps with a free boundary, as `quasiharmonic.flatten`, converged to rounding.
 
@@ -146,5 +139,4 @@ def flatten(
     MapNotFound
         If no injective map was found for one item of the batch.
     """
-    layer = FlattenLayer.of(rest, F, fixed, target, energy=energy, weights=weights, start=start, solver=linear_solver)
-    return apply_layer(layer, {"rest": rest, "target": target})
+    return apply_layer(FlattenLayer.of(rest, F, target, options), {"rest": rest, "target": target})

@@ -12,10 +12,10 @@ from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.gradients.layers import (
     Array,
     Layer,
-    check_shape,
     compute_changes,
     compute_gradients,
     compute_maps,
+    select_arguments,
     sum_to_shape,
 )
 
@@ -25,10 +25,8 @@ _COMPILED = "maps are computed by NumPy and SciPy, so torch.compile breaks the g
 @torch.compiler.disable(reason=_COMPILED)  # type: ignore[untyped-decorator]
 def apply_layer(layer: Layer, arguments: Mapping[str, torch.Tensor | None]) -> torch.Tensor:
     """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes."""
-    given = {name: tensor for name, tensor in arguments.items() if tensor is not None}
-    for name, tensor in given.items():
-        _check(name, tensor, layer.shapes[name])
-    maps: torch.Tensor = _Map.apply(layer, tuple(given), *given.values())[0]
+    names, tensors = select_arguments(layer, arguments, _check)
+    maps: torch.Tensor = _Map.apply(layer, names, *tensors)[0]
     return maps
 
 
@@ -96,7 +94,7 @@ def _numpy(tensor: torch.Tensor) -> Array:
         ) from error
 
 
-def _check(name: str, tensor: Any, one: tuple[int, ...]) -> None:
+def _check(name: str, tensor: Any) -> None:
     wanted = torch.complex128 if name == "mu" else torch.float64
     if not isinstance(tensor, torch.Tensor):
         raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}")
@@ -104,4 +102,3 @@ def _check(name: str, tensor: Any, one: tuple[int, ...]) -> None:
         raise TypeError(f"{name} must be of {wanted}, not {tensor.dtype}: {name}.to({wanted})")
     if tensor.device.type != "cpu":
         raise ValueError(f"{name} is on {tensor.device}, but maps are computed on the CPU: {name}.cpu()")
-    check_shape(name, tuple(tensor.shape), one)

@@ -9,15 +9,13 @@ from quasiharmonic.geometry.mesh.polygons import Polygons
 from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 
 
-def find_concave(polygons: Polygons | None, F: IntArray, uv: FloatArray) -> IntArray:
+def find_concave(polygons: Polygons, F: IntArray, uv: FloatArray) -> IntArray:
     """Find polygons that are not strictly convex or not counterclockwise, (k,) int64 ascending.
 
     A polygon is strictly convex and winds once if and only if two conditions hold. It turns left at every corner, and
     every edge lies to the left as seen from the first corner. The second condition excludes polygons that wind several
     times. Then all triangulations of the polygon have only positive triangles.
     """
-    if polygons is None:
-        polygons = Polygons(np.arange(F.size), 3 * np.arange(len(F) + 1))
     ring = F.ravel()[polygons.corners]
     face = repeat_each(np.arange(len(polygons)), polygons.sizes)
     first, last = polygons.starts[:-1][face], polygons.starts[1:][face] - 1

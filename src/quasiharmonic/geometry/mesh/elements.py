@@ -114,6 +114,12 @@ def _join_rows(blocks: Sequence[IntArray], shortest: int) -> IntArray:
     return np.concatenate([np.empty((0, width), dtype=np.int64), *padded])
 
 
+def split_solids(F: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the tetrahedra (t, 4) and the hexahedra (h, 8) of rows of `join_solids`, each in order."""
+    tetrahedra = np.full(len(F), F.shape[1] == 4) | (F[:, 3] == F[:, -1])
+    return F[tetrahedra, :4], F[~tetrahedra].reshape(-1, 8)
+
+
 def name_elements(F: IntArray, which: IntArray) -> str:
     """Name the first few of the given elements: ``quadrilaterals 3, 8``."""
     if F.shape[1] == 4:

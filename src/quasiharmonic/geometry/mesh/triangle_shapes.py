@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.reference import rest_frames
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, find_exponent, names_of, to_space, vertex_array
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, find_exponent, names_of, pad_to_space, vertex_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ def rest_shapes(V: ArrayLike, F: NDArray[np.integer], *, lowest: float = 0.0) ->
     """
     positions = vertex_array(V, finite=False)
     exponent = find_exponent(positions) - 1
-    z1, z2 = rest_frames(to_space(np.ldexp(positions, -exponent)), F)
+    z1, z2 = rest_frames(pad_to_space(np.ldexp(positions, -exponent)), F)
     if lowest:
         longest = np.maximum(np.maximum(z1, np.abs(z2)), np.abs(z2 - z1))
         z1 = np.where(z1 > 0, z1, longest)

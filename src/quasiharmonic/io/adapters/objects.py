@@ -12,9 +12,13 @@ from os import PathLike
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
+from quasiharmonic.io.fem.vtk_cells import find_counts
+from quasiharmonic.io.mesh_files import read_mesh, write_mapped
+from quasiharmonic.io.models.cut_seams import seamed
+from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -22,76 +26,64 @@ from quasiharmonic.util.arrays import (
     check_range,
     describe,
     index_array,
+    pad_to_space,
     repeat_each,
     triangle_rows,
     vertex_array,
 )
 
 
-class _VerticesFaces(Protocol):
+class _HasVertices(Protocol):
     @property
     def vertices(self) -> Any: ...
-    @property
-    def faces(self) -> Any: ...
 
 
-class _VerticesTriangles(Protocol):
-    @property
-    def vertices(self) -> Any: ...
-    @property
-    def triangles(self) -> Any: ...
-
-
-class _PointsFaces(Protocol):
+class _HasPoints(Protocol):
     @property
     def points(self) -> Any: ...
-    @property
-    def faces(self) -> Any: ...
 
 
-class _PointsCells(Protocol):
-    @property
-    def points(self) -> Any: ...
-    @property
-    def cells(self) -> Any: ...
-
-
-class _VF(Protocol):
+class _HasV(Protocol):
     @property
     def V(self) -> Any: ...
+
+
+class _HasCoordinates(Protocol):
     @property
-    def F(self) -> Any: ...
+    def coordinates(self) -> Any: ...
 
 
-class _DoflocsT(Protocol):
+class _HasVerts(Protocol):
+    @property
+    def verts(self) -> Any: ...
+
+
+class _HasDoflocs(Protocol):
     @property
     def doflocs(self) -> Any: ...
-    @property
-    def t(self) -> Any: ...
 
 
-class _Geometry(Protocol):
+class _HasGeometry(Protocol):
     @property
     def geometry(self) -> Any: ...
 
 
-class _Gifti(Protocol):
+class _HasDarrays(Protocol):
     @property
     def darrays(self) -> Any: ...
-    def agg_data(self) -> Any: ...
 
 
 #: A mesh: an object with vertices and faces, a mapping with these keys, a surface of nibabel (a ``GiftiImage``, or a
 #: tuple of an array of points and an array of triangles), or the path of a file.
 MeshLike = (
-    _VerticesFaces
-    | _VerticesTriangles
-    | _PointsFaces
-    | _PointsCells
-    | _VF
-    | _DoflocsT
-    | _Geometry
-    | _Gifti
+    _HasVertices
+    | _HasPoints
+    | _HasV
+    | _HasCoordinates
+    | _HasVerts
+    | _HasDoflocs
+    | _HasGeometry
+    | _HasDarrays
     | tuple[NDArray[Any], NDArray[Any]]
     | tuple[NDArray[Any], NDArray[Any], Any]
     | tuple[NDArray[Any], NDArray[Any], Any, Any]
@@ -177,8 +169,6 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
         If the file cannot be read.
     """
     if isinstance(mesh, str | PathLike):
-        from quasiharmonic.io import read_mesh
-
         read = read_mesh(mesh)
         return read.V, read.F
     what = describe(mesh)
@@ -211,22 +201,71 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
 def planar_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     """Return the arrays of `mesh_arrays`, with positions (n, 2) if the third coordinate is constant."""
     V, F = mesh_arrays(mesh)
-    return (V[:, :2] if V.shape[1] == 3 and len(V) and not np.ptp(V[:, 2]) else V), F
+    return without_constant_z(V), F
 
 
-def seamed_mesh(mesh: MeshLike) -> SeamedMesh:
-    """Return a `SeamedMesh` of a mesh; seams and map come from a `SeamedMesh`, `MeshData` or file only."""
-    from quasiharmonic import io
+def without_constant_z(V: FloatArray) -> FloatArray:
+    """Return positions (n, 2) if the third coordinate is constant; otherwise ``V``."""
+    return V[:, :2].copy() if V.shape[1] == 3 and len(V) and not np.ptp(V[:, 2]) else V
 
+
+def as_seamed_mesh(mesh: MeshLike) -> SeamedMesh:
+    """Return a mesh as a `SeamedMesh`, with its seams and its map.
+
+    Parameters
+    ----------
+    mesh : SeamedMesh, MeshData, path or mesh object
+        A path is read. Of a mesh object of another library, positions and triangles are used, without seams and map.
+
+    Returns
+    -------
+    SeamedMesh
+        A `SeamedMesh` is returned unchanged.
+
+    Raises
+    ------
+    TypeError
+        If the argument is not a mesh.
+    ValueError
+        If positions or faces are missing.
+    quasiharmonic.io.MeshFileError
+        If the file cannot be read.
+    """
     if isinstance(mesh, SeamedMesh):
         return mesh
     if isinstance(mesh, str | PathLike):
-        return io.seamed(io.read_mesh(mesh))
-    if isinstance(mesh, io.MeshData):
-        return io.seamed(mesh)
+        mesh = read_mesh(mesh)
+    if isinstance(mesh, MeshData):
+        return seamed(mesh)
     if not stands_for_mesh(mesh):
         raise TypeError(f"{describe(mesh)} is not a mesh: pass a SeamedMesh, or the path of a file")
     return SeamedMesh(*mesh_arrays(mesh))
+
+
+def write_map(path: str | PathLike[str], mesh: MeshLike, uv: ArrayLike) -> None:
+    """Write a mesh with one position per vertex as its map; see `write_mapped`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file to write.
+    mesh : MeshData, path or mesh object
+        A path is read. Of a mesh object of another library, positions and triangles are written.
+    uv : (n, 2) float
+        Position of every vertex in the plane.
+
+    Raises
+    ------
+    MeshFileError, OutputError
+        As `write_mapped`.
+    ValueError
+        If ``uv`` has another shape or is not finite.
+    """
+    if isinstance(mesh, str | PathLike):
+        mesh = read_mesh(mesh)
+    elif not isinstance(mesh, MeshData):
+        mesh = MeshData(*mesh_arrays(mesh))
+    write_mapped(path, mesh.with_map(getattr(uv, "uv", uv)))
 
 
 def mesh_triangles(F: Any) -> Any:
@@ -280,11 +319,9 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
 
     ``kinds`` are the kinds of the cells; None if all cells are faces.
     """
-    step = int(numbers[0]) + 1
-    if step > 1 and len(numbers) % step == 0 and (numbers[::step] == step - 1).all():
-        heads = np.arange(0, len(numbers), step)
-    else:
-        heads = np.array(_heads(name, numbers.tolist()))
+    heads = find_counts(numbers)
+    if heads is None or not numbers[heads].all():
+        raise ValueError(f"{name} must have one row of corners per face, or the flat form (count, corners, count, …)")
     sizes = numbers[heads]
     faces = np.ones(len(heads), dtype=np.bool_)
     if kinds is not None:
@@ -297,22 +334,8 @@ def _vtk(name: str, numbers: IntArray, kinds: Any) -> tuple[IntArray, IntArray]:
     return numbers[corner], sizes[faces]
 
 
-def _heads(name: str, numbers: list[int]) -> list[int]:
-    """Return the indices of the counts in VTK's list."""
-    heads, at = [], 0
-    while at < len(numbers):
-        if numbers[at] < 1 or at + numbers[at] >= len(numbers):
-            raise ValueError(
-                f"{name} must have one row of corners per face, or the flat form (count, corners, count, …)"
-            )
-        heads.append(at)
-        at += 1 + numbers[at]
-    return heads
-
-
 def _cut(V: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
     """Cut faces of any number of corners into triangles (f, 3)."""
     check_range("the faces", corners, len(V))
-    space = V if V.shape[1] == 3 else np.column_stack([V, np.zeros(len(V))])
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    return corners[triangulate_polygons(space, corners, starts)[0]]
+    return corners[triangulate_polygons(pad_to_space(V), corners, starts)[0]]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, pad_to_space
+from quasiharmonic.util.optional import explain_missing
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -17,11 +16,8 @@ def make_trimesh(V: FloatArray, F: IntArray, uv: FloatArray) -> Trimesh:
 
     A planar mesh is placed at z = 0. ImportError if trimesh is not installed.
     """
-    try:
+    with explain_missing("to_trimesh needs trimesh", "trimesh"):
         import trimesh
-    except ImportError as error:
-        raise ImportError(f"to_trimesh needs trimesh ({error}): pip install trimesh") from error
-    points = np.pad(V, [(0, 0), (0, 3 - V.shape[1])])
-    made = trimesh.Trimesh(vertices=points, faces=F, process=False)
+    made = trimesh.Trimesh(vertices=pad_to_space(V), faces=F, process=False)
     made.visual = trimesh.visual.TextureVisuals(uv=uv.copy())  # type: ignore[no-untyped-call]
     return made

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.untrusted import check_end
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +69,12 @@ class TableReader:
         if self._order is None:
             if not count:
                 return
-            last = int(np.searchsorted(self._starts, self.position)) + count - 1
-            if last >= len(self._ends):
-                raise ValueError("it ends too early")
-            self.position = int(self._ends[last])
+            end = int(np.searchsorted(self._starts, self.position)) + count
+            check_end(end, len(self._ends))
+            self.position = int(self._ends[end - 1])
         else:
             self.position += count * np.dtype(kind).itemsize
-            if self.position > self._end:
-                raise ValueError("it ends too early")
+            check_end(self.position, self._end)
 
     def tables(self, rows: int, *columns: tuple[str, int]) -> list[Table]:
         """Return the next rows as a table for each group of columns, given by its type code and number of columns.
@@ -87,8 +86,7 @@ class TableReader:
         if self._order is None:
             return self._words(rows, columns)
         row = np.dtype([(str(i), self._order + kind, (count,)) for i, (kind, count) in enumerate(columns)])
-        if self.position + rows * row.itemsize > self._end:
-            raise ValueError("it ends too early")
+        check_end(self.position + rows * row.itemsize, self._end)
         block = np.frombuffer(self.data, row, rows, self.position)
         begin = self.position + row.itemsize * np.arange(rows, dtype=np.int64)[:, None]
         self.position += rows * row.itemsize
@@ -104,8 +102,7 @@ class TableReader:
         width = sum(count for _, count in columns)
         first = int(np.searchsorted(self._starts, self.position))
         last = first + rows * width
-        if last > len(self._starts):
-            raise ValueError("it ends too early")
+        check_end(last, len(self._starts))
         starts, ends = (every[first:last].reshape(rows, width) for every in (self._starts, self._ends))
         if last > first:
             text = np.array(self.data[starts[0, 0] : ends[-1, -1]].split(), dtype=np.bytes_).reshape(rows, width)

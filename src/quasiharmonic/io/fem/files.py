@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.fem.meshparts import MeshParts
 from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
+from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import is_planar
-from quasiharmonic.io.registry import find_format, suffixes
-from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, names_of
+from quasiharmonic.io.registry import find_function, suffixes
+from quasiharmonic.util.arrays import FloatArray, IntArray, names_of, vertex_array
 
 # Errors that readers may raise on damaged files.
 _DAMAGE = (ValueError, IndexError, KeyError, OverflowError)
@@ -26,75 +27,49 @@ _DAMAGE = (ValueError, IndexError, KeyError, OverflowError)
 
 @dataclass(frozen=True, eq=False)
 class FemMesh:
-    """A planar mesh and all other data of its file."""
+    """A mesh of finite elements, in the plane or in space, and all other data of its file."""
 
-    points: FloatArray  # (n, 2): every point of the file, in its order
+    points: FloatArray  # (n, 2) or, in space, (n, 3): every point of the file, in its order
     # (f, 3), (f, 4) or (f, 6): triangles and quadrilaterals of all blocks of the file, in order, in the format of
-    # `geometry.mesh.elements`
+    # `geometry.mesh.elements`. Of a mesh in space (t, 4) or (t, 8): tetrahedra and hexahedra, as from `join_solids`
     F: IntArray
     source: Path  # The file
     parts: MeshParts  # The parsed file
 
     def point_field(self, name: str, vertices: ArrayLike) -> FloatArray:
-        """Return vectors at some points, (k, 2) float64, from the file's point data at the last time.
+        """Return vectors at some points, (k, 2) or (k, 3) float64, from the file's point data at the last time.
 
-        MeshFileError if the data do not exist, are not vectors in the plane, or a value at these points is not finite.
+        MeshFileError if the data do not exist, are not vectors in the plane or in space, or a value at these points is
+        not finite.
         """
-        values = _point_field(self.source, self.parts, name, vertices)
-        if values.shape[1] not in (2, 3):
+        values, axes = self._finite_values(name, vertices), self.points.shape[1]
+        if values.shape[1] not in (axes, 3):
+            vectors = "plane vectors" if axes == 2 else "vectors in space"
             raise MeshFileError(
                 self.source,
-                f"the point data {name!r} are not plane vectors: they have {values.shape[1]} numbers for each point",
+                f"the point data {name!r} are not {vectors}: they have {values.shape[1]} numbers for each point",
             )
-        if values[:, 2:].any():
+        if values[:, axes:].any():
             raise MeshFileError(self.source, f"the point data {name!r} have displacements out of the plane")
-        return values[:, :2].copy()
+        return values[:, :axes].copy()
 
-
-@dataclass(frozen=True, eq=False)
-class VolumeMesh:
-    """A mesh of tetrahedra and hexahedra and all other data of its file."""
-
-    points: FloatArray  # (n, 3): every point of the file, in its order
-    T: IntArray  # (t, 4): tetrahedra of all blocks of the file, in order
-    H: IntArray  # (h, 8): hexahedra
-    source: Path  # The file
-    parts: MeshParts  # The parsed file
-
-    def point_field(self, name: str, vertices: ArrayLike) -> FloatArray:
-        """Return vectors at some points, (k, 3) float64, from the file's point data at the last time.
-
-        MeshFileError if the data do not exist, are not vectors in space, or a value at these points is not finite.
-        """
-        values = _point_field(self.source, self.parts, name, vertices)
-        if values.shape[1] != 3:
+    def _finite_values(self, name: str, vertices: ArrayLike) -> FloatArray:
+        """Return finite values at some points, (k, m) float64."""
+        which, fields = np.asarray(vertices, dtype=np.int64), self.parts.fields
+        if name not in fields:
+            there = ", ".join(map(repr, sorted(fields))) or "none"
+            raise MeshFileError(self.source, f"there is no point data {name!r}", remedy=f"available: {there}")
+        # Converting a signalling NaN to double raises a warning.
+        with reading(self.source, f"the point data {name!r} cannot be read: ", _DAMAGE), np.errstate(invalid="ignore"):
+            values = fields[name]()[which]
+        lost = which[~np.isfinite(values).all(axis=1)]
+        if lost.size:
             raise MeshFileError(
                 self.source,
-                f"the point data {name!r} are not vectors in space: they have {values.shape[1]} numbers for each point",
+                f"{name!r} has no finite value at {names_of('boundary point', 'boundary points', lost)} (0-based)",
+                remedy="give every boundary point a value, 0 for points that do not move",
             )
         return values
-
-
-def _point_field(source: Path, parts: MeshParts, name: str, vertices: ArrayLike) -> FloatArray:
-    """Return finite values at some points, (k, m) float64."""
-    which, fields = np.asarray(vertices, dtype=np.int64), parts.fields
-    if name not in fields:
-        there = ", ".join(map(repr, sorted(fields))) or "none"
-        raise MeshFileError(source, f"there is no point data {name!r}", remedy=f"available: {there}")
-    try:
-        # Converting a signalling NaN to double raises a warning.
-        with np.errstate(invalid="ignore"):
-            values = fields[name]()[which]
-    except _DAMAGE as error:
-        raise MeshFileError(source, f"the point data {name!r} cannot be read: {error}") from error
-    lost = which[~np.isfinite(values).all(axis=1)]
-    if lost.size:
-        raise MeshFileError(
-            source,
-            f"{name!r} has no finite value at {names_of('boundary point', 'boundary points', lost)} (0-based)",
-            remedy="give every boundary point a value, 0 for points that do not move",
-        )
-    return values
 
 
 def read_fem(path: str | os.PathLike[str]) -> FemMesh:
@@ -104,24 +79,30 @@ def read_fem(path: str | os.PathLike[str]) -> FemMesh:
     has no triangles or quadrilaterals, or cells with area other than triangles of three or six nodes and quadrilaterals
     of four.
     """
-    source = Path(path)
-    return _mesh(source, _read_bytes(source))
+    parts = _parse(path, read_bytes(path), solid=False)
+    points, F = parts.points, parts.F
+    if not F.size:
+        raise MeshFileError(path, "has no triangles")
+    lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if lost.size:
+        raise MeshFileError(path, f"not finite at {names_of('point', 'points', lost)} (0-based)")
+    used = points[np.unique(F)]
+    if not is_planar(used):
+        raise MeshFileError(
+            path,
+            f"is not planar: z goes from {used[:, 2].min():.6g} to {used[:, 2].max():.6g}",
+            remedy="only meshes in a plane z = constant are supported",
+        )
+    return FemMesh(points[:, :2].copy(), F, Path(path), parts)
 
 
-def read_volume(path: str | os.PathLike[str]) -> VolumeMesh:
+def read_volume(path: str | os.PathLike[str]) -> FemMesh:
     """Read the tetrahedra and hexahedra of a file as for `read_fem`; cells without volume are allowed.
 
     MeshFileError if the format is not supported, the file cannot be read, or it has other cells with volume.
     """
-    source = Path(path)
-    return _volume(source, _read_bytes(source))
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
+    parts = _parse(path, read_bytes(path), solid=True)
+    return FemMesh(parts.points, parts.F, Path(path), parts)
 
 
 def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str]) -> None:
@@ -142,84 +123,39 @@ def check_fem_output(path: str | os.PathLike[str], source: str | os.PathLike[str
 
 
 def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) -> None:
-    """Write a mesh with new positions (n, 2) in the plane; every other byte of its file is unchanged.
+    """Write a mesh with new positions, (n, 2) or (n, 3) as before; every other byte of its file is unchanged.
 
     Positions are rounded to single precision if the file has single precision. ValueError if they have the wrong shape
     or are not finite; MeshFileError if they are too large for the file's precision. Other errors as `check_fem_output`.
     """
-    points = map_array("points", points, len(mesh.points))
+    points = vertex_array(points, "points")
+    if points.shape != mesh.points.shape:
+        shape = f"{mesh.points.shape}, one position for each vertex"
+        raise ValueError(f"points must have shape {shape}, not {points.shape}")
     check_fem_output(path, mesh.source)
-    data = _replace_points(path, mesh.parts, points)
-    written = _mesh(mesh.source, data)
-    _check_written(path, mesh.parts, written.parts, points)
-    write_whole(path, data)
-
-
-def write_volume(path: str | os.PathLike[str], mesh: VolumeMesh, points: FloatArray) -> None:
-    """Write a mesh with new positions (n, 3), finite; as `write_fem`."""
-    check_fem_output(path, mesh.source)
-    data = _replace_points(path, mesh.parts, points)
-    _check_written(path, mesh.parts, _volume(mesh.source, data).parts, points)
-    write_whole(path, data)
-
-
-def _replace_points(path: str | os.PathLike[str], parts: MeshParts, points: FloatArray) -> bytes:
-    if not np.isfinite(_rounded(parts, points)).all():
-        raise MeshFileError(path, "positions are too large for the file's single precision")
-    return parts.replace_points(points)
-
-
-def _rounded(parts: MeshParts, points: FloatArray) -> FloatArray:
+    axes, parts = points.shape[1], mesh.parts
     with np.errstate(over="ignore"):
-        return points.astype(parts.precision).astype(np.float64)
-
-
-def _check_written(path: str | os.PathLike[str], parts: MeshParts, written: MeshParts, points: FloatArray) -> None:
-    """Raise a MeshFileError unless a new file has the new positions and the old cells."""
-    axes = points.shape[1]
+        rounded = points.astype(parts.precision).astype(np.float64)
+    if not np.isfinite(rounded).all():
+        raise MeshFileError(path, "positions are too large for the file's single precision")
+    data = parts.replace_points(points)
+    written = _parse(mesh.source, data, solid=axes == 3)
     if not (
-        np.array_equal(written.points[:, :axes], _rounded(parts, points))
+        np.array_equal(written.points[:, :axes], rounded)
         and np.array_equal(written.F, parts.F)
         and np.array_equal(written.points[:, axes:], parts.points[:, axes:])
     ):
         raise MeshFileError(path, "nothing was written, because the new file would not read back correctly")
+    write_whole(path, data)
 
 
-def _parse(source: Path, data: bytes, solid: bool) -> MeshParts:
+def _parse(source: str | os.PathLike[str], data: bytes, *, solid: bool) -> MeshParts:
     """Parse a file, with its tetrahedra and hexahedra if ``solid``."""
-    reader = find_format(source, "read_elements").read_elements
-    assert reader is not None
-    try:
-        with np.errstate(invalid="ignore"):
-            parts = reader(data, solid)
-    except _DAMAGE as error:
-        what = str(error) if isinstance(error, ValueError) else f"an entry is missing ({error})"
-        raise MeshFileError(source, f"cannot be read: {what}") from error
+    parse = find_function(source, "read_elements")
+    with reading(source, "cannot be read: ", _DAMAGE, describe=_describe_damage), np.errstate(invalid="ignore"):
+        parts: MeshParts = parse(data, solid)
     return parts
 
 
-def _volume(source: Path, data: bytes) -> VolumeMesh:
-    """Parse a mesh in space."""
-    parts = _parse(source, data, True)
-    tetrahedra = np.full(len(parts.F), parts.F.shape[1] == 4) | (parts.F[:, 3] == parts.F[:, -1])
-    H = parts.F[~tetrahedra] if parts.F.shape[1] == 8 else np.empty((0, 8), dtype=np.int64)
-    return VolumeMesh(parts.points, parts.F[tetrahedra, :4], H, source, parts)
-
-
-def _mesh(source: Path, data: bytes) -> FemMesh:
-    """Parse a file and check it."""
-    parts = _parse(source, data, False)
-    points, F = parts.points, parts.F
-    if not F.size:
-        raise MeshFileError(source, "has no triangles")
-    lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if lost.size:
-        raise MeshFileError(source, f"not finite at {names_of('point', 'points', lost)} (0-based)")
-    used = points[np.unique(F)]
-    if not is_planar(used):
-        raise MeshFileError(
-            source,
-            f"is not planar: z goes from {used[:, 2].min():.6g} to {used[:, 2].max():.6g}",
-            remedy="only meshes in a plane z = constant are supported",
-        )
-    return FemMesh(points[:, :2].copy(), F, source, parts)
+def _describe_damage(error: Exception) -> str:
+    return str(error) if isinstance(error, ValueError) else f"an entry is missing ({error})"

@@ -13,6 +13,7 @@ from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers
 from quasiharmonic.io.fem.meshparts import MeshParts
 from quasiharmonic.io.fem.vtk_cells import SUPPORTED
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.untrusted import check_end
 
 # Number of nodes of each kind of element that is read, and of the kinds that are skipped: lines and points.
 _ELEMENTS = {2: 3, 3: 4, 9: 6}
@@ -158,20 +159,20 @@ def _elements(data: bytes, begin: int, end: int, version: str, order: str | None
         if order is None:
             return join(_element_lines(list(map(int, data[head.position : end].split())), count, solid))
         reader = TableReader(data, head.position, end, order)
-        while count > 0:
+    else:
+        reader = TableReader(data, begin, end, order)
+        count = int(reader.take("u8", 2 if version == "4.0" else 4)[0])
+    while count > 0:
+        # In version 2, tags of the element follow its number; it counts the elements, version 4 their blocks.
+        if version == "2":
             kind, size, tags = reader.take("i4", 3).tolist()
-            table = reader.tables(size, ("i4", 1 + tags + _nodes_of(kind, solid)))[0].values
-            if kind in wanted:
-                found.append(table[:, -_nodes_of(kind, solid) :].astype(np.int64))
-            count -= max(size, 1)
-        return join(found)
-    reader = TableReader(data, begin, end, order)
-    for _ in range(int(reader.take("u8", 2 if version == "4.0" else 4)[0])):
-        kind = int(reader.take("i4", 3)[2])
-        size = int(reader.take("u8", 1)[0])
-        table = reader.tables(size, ("i4" if version == "4.0" else "u8", 1 + _nodes_of(kind, solid)))[0].values
+        else:
+            kind, size, tags = int(reader.take("i4", 3)[2]), int(reader.take("u8", 1)[0]), 0
+        nodes = _nodes_of(kind, solid)
+        table = reader.tables(size, ("u8" if version == "4.1" else "i4", 1 + tags + nodes))[0].values
         if kind in wanted:
-            found.append(table[:, 1:].astype(np.int64))
+            found.append(table[:, 1 + tags :].astype(np.int64))
+        count -= max(size, 1) if version == "2" else 1
     return join(found)
 
 
@@ -180,14 +181,12 @@ def _element_lines(numbers: list[int], count: int, solid: bool) -> list[IntArray
     found: list[list[int]] = []
     at = 0
     for _ in range(count):
-        if at + 3 > len(numbers):
-            raise ValueError("it ends too early")
+        check_end(at + 3, len(numbers))
         kind, stop = numbers[at + 1], at + 3 + numbers[at + 2] + _nodes_of(numbers[at + 1], solid)
         if kind in (_SOLIDS if solid else _ELEMENTS):
             found.append(numbers[stop - _nodes_of(kind, solid) : stop])
         at = stop
-    if at > len(numbers):
-        raise ValueError("it ends too early")
+    check_end(at, len(numbers))
     return [np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers
 from quasiharmonic.io.fem.meshparts import MeshParts
-from quasiharmonic.io.fem.vtk_cells import elements
+from quasiharmonic.io.fem.vtk_cells import elements, find_counts
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 _KINDS = {
@@ -131,21 +131,11 @@ class _LegacyReader:
             return
         reader.position = begin
         mixed = reader.take("i4", size).astype(np.int64)
-        if not 0 <= count <= size:
+        counts = find_counts(mixed)
+        if counts is None or len(counts) != count:
             raise ValueError("its lists of cells contradict each other")
-        starts = np.empty(count + 1, dtype=np.int64)
-        if count and size % count == 0 and (mixed[:: size // count] == size // count - 1).all():
-            starts[:] = np.arange(count + 1) * (size // count)
-        else:
-            values, at = mixed.tolist(), 0
-            for cell in range(count):
-                starts[cell] = at
-                at += 1 + values[at] if at < size else 0
-            starts[count] = at
-        if starts[-1] != size:
-            raise ValueError("its lists of cells contradict each other")
-        corners = np.delete(mixed, starts[:-1])
-        self._lists.append((starts - np.arange(count + 1), corners, kind))
+        starts = np.append(counts, size) - np.arange(count + 1)
+        self._lists.append((starts, np.delete(mixed, counts), kind))
 
     def _field(self) -> None:
         """Read an array of a field: name, components, tuples, kind."""

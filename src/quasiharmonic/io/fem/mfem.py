@@ -11,6 +11,7 @@ from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers
 from quasiharmonic.io.fem.meshparts import MeshParts
 from quasiharmonic.io.fem.vtk_cells import elements
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.untrusted import check_end
 
 _SECTION = re.compile(rb"^[ \t]*([a-z_]+)[ \t\r]*$", re.MULTILINE)
 # Number of vertices, and VTK's kind, of MFEM's geometries: point, segment, triangle, square, tetrahedron, cube, prism,
@@ -72,8 +73,7 @@ def _cells(numbers: list[int]) -> tuple[IntArray, IntArray, IntArray]:
             raise ValueError(f"an element has the unknown geometry {geometry}")
         size = _SIZES[geometry]
         corners = numbers[at + 2 : at + 2 + size]
-        if len(corners) < size:
-            raise ValueError("it ends too early")
+        check_end(size, len(corners))
         connectivity += corners
         starts.append(len(connectivity))
         kinds.append(_KINDS[geometry])

@@ -31,6 +31,20 @@ _NAMES = {
 }
 
 
+def find_counts(numbers: IntArray) -> IntArray | None:
+    """Return the indices of the counts in a list (count, points, count, …); None for other numbers."""
+    step = int(numbers[0]) + 1 if len(numbers) else 0
+    if step > 0 and len(numbers) % step == 0 and (numbers[::step] == step - 1).all():
+        return np.arange(0, len(numbers), step)
+    found, at, values = [], 0, numbers.tolist()
+    while at < len(values):
+        if values[at] < 0:
+            return None
+        found.append(at)
+        at += 1 + values[at]
+    return np.array(found, dtype=np.int64) if at == len(values) else None
+
+
 def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: int, solid: bool = False) -> IntArray:
     """Return the triangles and quadrilaterals; (f, 3), (f, 4) or (f, 6) int64, as in `geometry.mesh.elements`.
 

@@ -27,6 +27,7 @@ from quasiharmonic.io.fem.byte_tables import TableReader, replace_numbers
 from quasiharmonic.io.fem.meshparts import MeshParts
 from quasiharmonic.io.fem.vtk_cells import elements
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.untrusted import check_end
 
 _KINDS = {
     **{f"Int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},
@@ -256,8 +257,7 @@ class _VtuFile:
 
 def _take_raw(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
     """Return a number of bytes, and the position after them."""
-    if begin + length > len(data):
-        raise ValueError("it ends too early")
+    check_end(begin + length, len(data))
     return data[begin : begin + length], begin + length
 
 
@@ -268,8 +268,7 @@ def _take_base64(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
         found = base64.b64decode(data[begin:end], validate=True)[:length]
     except binascii.Error as error:
         raise ValueError(f"base64 data are damaged: {error}") from error
-    if len(found) < length:
-        raise ValueError("it ends too early")
+    check_end(length, len(found))
     return found, end
 
 

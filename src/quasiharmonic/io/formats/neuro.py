@@ -11,19 +11,22 @@ import gzip
 import os
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
+from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import check_gifti, unpack_gzip
 
 # The intents that the standard has for points and triangles.
@@ -47,10 +50,8 @@ def read_gifti(path: str | os.PathLike[str]) -> MeshData:
         If nibabel is not installed.
     """
     image = _read_gifti(path)
-    try:
+    with reading(path, damage=(TypeError, ValueError)):
         return MeshData(*gifti_arrays(image), source=os.fspath(path))
-    except (TypeError, ValueError) as error:
-        raise MeshFileError(path, str(error)) from error
 
 
 def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray:
@@ -74,18 +75,13 @@ def _read_gifti(path: str | os.PathLike[str]) -> Any:
     """Return the ``GiftiImage`` of a file; MeshFileError if it is not valid."""
     nibabel, data = _nibabel(), read_bytes(path)
     if os.fspath(path).lower().endswith(".gz"):
-        try:
+        with reading(path, "is not a complete gzip file: "):
             data = unpack_gzip(data)
-        except ValueError as error:
-            raise MeshFileError(path, f"is not a complete gzip file: {error}") from error
-    with warnings.catch_warnings():
+    # The parser raises errors of many types for damaged files.
+    with reading(path, "is not valid GIFTI: ", Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        try:
-            check_gifti(data)
-            # The parser raises errors of many types for damaged files.
-            return nibabel.gifti.GiftiImage.from_bytes(data)
-        except Exception as error:
-            raise MeshFileError(path, f"is not valid GIFTI: {error}") from error
+        check_gifti(data)
+        return nibabel.gifti.GiftiImage.from_bytes(data)
 
 
 def gifti_arrays(image: Any) -> tuple[Any, Any]:
@@ -143,26 +139,21 @@ def read_freesurfer(path: str | os.PathLike[str]) -> MeshData:
     nibabel, data = _nibabel(), read_bytes(path)
     if data.startswith(b"#!ascii"):
         raise MeshFileError(path, "is a text file of FreeSurfer", remedy="convert it: mris_convert IN OUT.gii")
-    with warnings.catch_warnings():
+    # A damaged file also gives MemoryError, and errors of other types.
+    with reading(path, "is not a binary surface of FreeSurfer: ", Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        try:
-            # A damaged file also gives MemoryError, and errors of other types.
-            V, F = nibabel.freesurfer.read_geometry(os.fspath(path))
-            return MeshData(V, F, source=os.fspath(path))
-        except Exception as error:
-            raise MeshFileError(path, f"is not a binary surface of FreeSurfer: {error}") from error
+        V, F = nibabel.freesurfer.read_geometry(os.fspath(path))
+        return MeshData(V, F, source=os.fspath(path))
 
 
 def write_freesurfer(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """Write the map of a mesh as a flat binary surface of FreeSurfer; see `write_gifti`."""
     write_geometry = _nibabel().freesurfer.write_geometry
     flat = flat_surface(path, mesh)
-    with TemporaryDirectory() as folder:
-        part = Path(folder, "surface")
-        # The default stamp contains the user's name and the time.
-        write_geometry(str(part), single_precision(path, flat.V), flat.F, create_stamp="created by quasiharmonic")
-        data = part.read_bytes()
-    write_whole(path, data)
+    places = single_precision(path, flat.V)
+    # The default stamp contains the user's name and the time.
+    stamp = "created by quasiharmonic"
+    write_whole(path, encode_by("surface", lambda part: write_geometry(part, places, flat.F, create_stamp=stamp)))
 
 
 def flat_surface(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
@@ -219,25 +210,28 @@ def single_precision(path: str | os.PathLike[str], V: FloatArray) -> NDArray[np.
 _KINDS = "inflated", "smoothwm", "white", "pial", "midthickness", "fiducial", "orig", "sphere", "surf"
 _ENDINGS = "", ".surf.gii", ".gii", ".gii.gz"
 _ROWS = np.dtype([("vertex", ">i4"), ("place", ">f4", 3)])
-# The surface of all patches that are read, where it is not found beside the patch.
-_parent: Path | None = None
+_given_surface: ContextVar[Path | None] = ContextVar("given_surface", default=None)
 
 
-def set_parent_surface(path: str | os.PathLike[str] | None) -> None:
-    """Set the surface that `read_patch` uses by default; None for the one beside the patch."""
-    global _parent
-    _parent = None if path is None else Path(path)
+@contextmanager
+def use_parent_surface(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Read patches in the block with the triangles of a surface in place of the one beside the patch."""
+    token = _given_surface.set(Path(path))
+    try:
+        yield
+    finally:
+        _given_surface.reset(token)
 
 
 def find_parent_surface(path: str | os.PathLike[str]) -> Path | None:
-    """Return the surface of a patch: the one that was set, or one beside the patch with the same hemisphere.
+    """Return the surface of a patch: that of `use_parent_surface`, or one beside the patch with the same hemisphere.
 
     For ``lh.cortex.patch.3d`` this is the first that exists of ``lh.inflated``, ``lh.smoothwm``, ``lh.white``,
     ``lh.pial``, ``lh.midthickness``, ``lh.fiducial``, ``lh.orig``, ``lh.sphere`` and ``lh.surf``, or one of these names
     followed by ``.surf.gii``, ``.gii`` or ``.gii.gz``. None if there is none.
     """
-    if _parent is not None:
-        return _parent
+    if (given := _given_surface.get()) is not None:
+        return given
     folder, side = Path(path).parent, Path(path).name.split(".")[0]
     candidates = (folder / f"{side}.{kind}{ending}" for ending in _ENDINGS for kind in _KINDS)
     return next((candidate for candidate in candidates if candidate.is_file()), None)
@@ -288,17 +282,20 @@ def read_patch(path: str | os.PathLike[str], surface: str | os.PathLike[str] | N
         n, F = len(whole.V), whole.F
         if number.size and number.max() >= n:
             raise MeshFileError(path, f"has vertex {number.max()}, but {parent} has {n} vertices")
+    V, F = _patch_of(number, places, n, F)
+    if not len(F):
+        raise MeshFileError(path, "has no triangle whose corners all belong to the patch")
+    with reading(path):
+        return MeshData(V, F, source=os.fspath(path))
+
+
+def _patch_of(number: IntArray, places: FloatArray, n: int, F: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return positions of all ``n`` vertices of a surface, zero outside a patch, and the triangles inside it."""
     inside = np.zeros(n, dtype=np.bool_)
     inside[number] = True
     V = np.zeros((n, 3))
     V[number] = places
-    F = F[inside[F].all(axis=1)]
-    if not len(F):
-        raise MeshFileError(path, "has no triangle whose corners all belong to the patch")
-    try:
-        return MeshData(V, F, source=os.fspath(path))
-    except ValueError as error:
-        raise MeshFileError(path, str(error)) from error
+    return V, F[inside[F].all(axis=1)]
 
 
 def read_written_patch(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
@@ -306,12 +303,8 @@ def read_written_patch(path: str | os.PathLike[str], mesh: MeshData) -> MeshData
     parent = find_parent_surface(path)
     if parent is not None:
         return read_patch(path, parent)
-    number, places = _binary_patch(path, read_bytes(path))
-    inside = np.zeros(len(mesh.V), dtype=np.bool_)
-    inside[number] = True
-    V = np.zeros((len(mesh.V), 3))
-    V[number] = places
-    return replace(mesh, V=V, F=mesh.F[inside[mesh.F].all(axis=1)], vt=None, FT=None, polygons=None)
+    V, F = _patch_of(*_binary_patch(path, read_bytes(path)), len(mesh.V), mesh.F)
+    return replace(mesh, V=V, F=F, vt=None, FT=None, polygons=None)
 
 
 def write_patch(path: str | os.PathLike[str], mesh: MeshData) -> None:
@@ -354,7 +347,7 @@ def _binary_patch(path: str | os.PathLike[str], data: bytes) -> tuple[IntArray, 
 
 def _text_patch(path: str | os.PathLike[str], data: bytes) -> tuple[IntArray, FloatArray, IntArray]:
     """Return numbers and positions of the vertices of a text patch, and its triangles."""
-    try:
+    with reading(path, "is not a text patch of FreeSurfer: ", (ValueError, IndexError, OverflowError)):
         _, text = data.split(b"\n", 1)
         # The number from zero follows as "vno=…".
         words = re.sub(rb"vno=\S*", b"", text).split()
@@ -369,8 +362,6 @@ def _text_patch(path: str | os.PathLike[str], data: bytes) -> tuple[IntArray, Fl
         F = np.array(words[2 + 4 * n :]).reshape(-1, 4)[:, 1:].astype(np.int64)
         if F.min() < 0 or not np.isin(F, number).all():
             raise ValueError("a triangle has a corner outside the patch")
-    except (ValueError, IndexError, OverflowError) as error:
-        raise MeshFileError(path, f"is not a text patch of FreeSurfer: {error}") from error
     _check_patch(path, number, places)
     return number, places, F
 
@@ -383,12 +374,8 @@ def _check_patch(path: str | os.PathLike[str], number: IntArray, places: FloatAr
 
 
 def _nibabel() -> Any:
-    try:
+    with explain_missing("GIFTI and FreeSurfer surfaces need nibabel", "quasiharmonic[neuro]"):
         import nibabel
         import nibabel.freesurfer
         import nibabel.gifti
-    except ImportError as error:
-        raise ImportError(
-            f"GIFTI and FreeSurfer surfaces need nibabel ({error}): pip install quasiharmonic[neuro]"
-        ) from error
     return nibabel

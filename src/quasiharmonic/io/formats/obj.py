@@ -207,7 +207,7 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
         yield from _lines("vt", mesh.map_lines, mesh.vt)
     yield mesh.normals
     corners = _corner_texts(mesh)
-    starts = 3 * np.arange(len(mesh.F) + 1) if mesh.polygons is None else mesh.polygons.starts
+    starts = mesh.rings.starts
     begin = 0
     for end, line in zip(at[head:].tolist(), [*statements[head:-1], b""], strict=True):
         for first in range(begin, end, _CHUNK):
@@ -250,7 +250,7 @@ def _number_lines(keyword: str, rows: NDArray[np.float64]) -> Iterator[bytes]:
 
 def _corner_texts(mesh: MeshData) -> list[str]:
     """Return the text of every corner of every face, one after another."""
-    ring = slice(None) if mesh.polygons is None else mesh.polygons.corners
+    ring = mesh.rings.corners
     parts = [None if part is None else part.ravel()[ring] for part in (mesh.F, mesh.FT, mesh.FN)]
     F, FT, FN = parts
     assert F is not None

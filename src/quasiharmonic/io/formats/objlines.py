@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.lowlevel.textual import integer, number, shown
 from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
+from quasiharmonic.util.arrays import count_of
 
 # Statements that are refused: reading would lose their geometry.
 REFUSED = {b"curv", b"curv2", b"surf", b"bsp", b"bzp", b"cdc", b"cdp", b"fo", b"call"}
@@ -57,16 +58,14 @@ class _Reader:
                     take[keyword](line, text)
                 else:
                     self.statement(keyword, text)
-            except _FaultError as fault:
-                raise MeshFileError(self.path, fault.what, line, fault.remedy) from None
             except ValueError as error:
-                raise MeshFileError(self.path, str(error), line) from None
+                raise MeshFileError(self.path, str(error), line, getattr(error, "remedy", "")) from None
         return self.result()
 
     def vertex(self, line: int, text: bytes) -> None:
         row = _numbers(text, 3 + _MAX_EXTRA)
         if len(row) < 3:
-            raise _FaultError(f"a vertex with {_count(row, 'coordinate')}", "give three")
+            raise _FaultError(f"a vertex with {count_of('coordinate', 'coordinates', len(row))}", "give three")
         self.coordinates.extend(row)
         self.width.append(len(row))
         self.positions += text + b"\n"
@@ -74,7 +73,7 @@ class _Reader:
     def texture(self, line: int, text: bytes) -> None:
         row = _numbers(text, 3)
         if len(row) < 2:
-            raise _FaultError(f"a texture coordinate with {_count(row, 'number')}", "give two")
+            raise _FaultError(f"a texture coordinate with {count_of('number', 'numbers', len(row))}", "give two")
         self.vt.extend(row[:2])
         self.places += text + b"\n"
 
@@ -86,7 +85,7 @@ class _Reader:
         # Split only as many corners as the error message needs, because a line may be very long.
         corners = _strip_comment(text).split(None, _MAX_CORNERS + 1)[1:]
         if len(corners) < 3:
-            raise _FaultError(f"face with {_count(corners, 'corner')}", "a triangle has 3")
+            raise _FaultError(f"face with {count_of('corner', 'corners', len(corners))}", "a triangle has 3")
         if len(corners) > _MAX_CORNERS:
             raise _FaultError(f"face with more than {_MAX_CORNERS} corners", "triangulate it first")
         counts = (len(self.width), len(self.vt) // 2, self.normal_count)
@@ -149,11 +148,11 @@ class _Reader:
         return np.ascontiguousarray(rows[:, :3]), extra
 
 
-class _FaultError(Exception):
+class _FaultError(ValueError):
     """A fault on the current line, with the remedy for the user."""
 
     def __init__(self, what: str, remedy: str) -> None:
-        self.what = what
+        super().__init__(what)
         self.remedy = remedy
 
 
@@ -208,7 +207,3 @@ def _corner(text: bytes, counts: tuple[int, int, int]) -> list[int]:
         else:
             references[i] = counts[i] + index
     return references
-
-
-def _count(items: list[bytes] | list[float], what: str) -> str:
-    return f"{len(items)} {what}{'' if len(items) == 1 else 's'}"

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.lowlevel.textual import integer, integer_table, number, number_table, read_text, shown
 from quasiharmonic.io.models.meshdata import MeshData, in_plane, polygon_mesh
@@ -51,10 +51,8 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
         counts = text.split(None, 2)
     if len(counts) < 2:
         raise MeshFileError(path, "no counts of vertices and faces", line)
-    try:
+    with reading(path, "no counts of vertices and faces: ", line=line):
         vertices, faces = integer(counts[0]), integer(counts[1])
-    except ValueError as error:
-        raise MeshFileError(path, f"no counts of vertices and faces: {error}", line) from None
     if vertices < 1 or faces < 1:
         what = f"has {vertices} vertices and {faces} faces"
         raise MeshFileError(path, what, line, "give a mesh with vertices and faces")
@@ -81,11 +79,9 @@ def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """
     head = f"OFF\n{len(mesh.V)} {mesh.faces} 0\n"
     points = "%r %r %r\n" * len(mesh.V) % tuple(mesh.V.ravel().tolist())
-    if mesh.polygons is None:
-        faces = "3 %d %d %d\n" * len(mesh.F) % tuple(mesh.F.ravel().tolist())
-    else:
-        forms = [f"{size}" + " %d" * size + "\n" for size in mesh.polygons.sizes.tolist()]
-        faces = "".join(forms) % tuple(mesh.F.ravel()[mesh.polygons.corners].tolist())
+    forms = {size: f"{size}" + " %d" * size + "\n" for size in np.unique(mesh.rings.sizes).tolist()}
+    faces = "".join(map(forms.__getitem__, mesh.rings.sizes.tolist()))
+    faces %= tuple(mesh.F.ravel()[mesh.rings.corners].tolist())
     write_whole(path, (head + points + faces).encode())
 
 

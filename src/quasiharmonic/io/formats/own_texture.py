@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import os
 from collections.abc import Iterator
 from pathlib import Path, PureWindowsPath
@@ -14,6 +12,7 @@ from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.formats.gltf import document as gltf
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf
 from quasiharmonic.io.lowlevel.textual import read_bytes
+from quasiharmonic.io.models.materials import library_names
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.models.textures import Texture, read_texture, texture_of
 from quasiharmonic.util.untrusted import beside
@@ -51,7 +50,7 @@ def texture_names(mesh: MeshData) -> list[str]:
         tree = mesh.carried.document.tree if isinstance(mesh.carried, CarriedGltf) else {}
         try:
             return list(dict.fromkeys(_names_in_gltf(tree)))
-        except (*gltf.DAMAGE, RecursionError):
+        except gltf.DAMAGE:
             # A damaged description of a material does not prevent other work.
             return []
     textures = (name for keyword, _, name in _images_of_libraries(mesh) if _shows_image(keyword.lower()))
@@ -70,12 +69,8 @@ def _images_of_libraries(mesh: MeshData) -> Iterator[tuple[bytes, Path, str]]:
     """
     folder = Path(mesh.source).parent
     for line in mesh.statements.split(b"\n"):
-        keyword, _, rest = line.partition(b" ")
-        if keyword != b"mtllib":
-            continue
-        name = os.fsdecode(rest.strip())
-        names = [name] if (folder / name).is_file() else name.split()
-        for library in (folder / name for name in names if _is_beside(folder, name) and (folder / name).is_file()):
+        names = [name for name in library_names(line, folder) if _is_beside(folder, name)]
+        for library in (folder / name for name in names if (folder / name).is_file()):
             within = library.parent.relative_to(folder)
             for entry in read_bytes(library).splitlines():
                 words = entry.split()
@@ -131,11 +126,8 @@ def _of_gltf(path: Path) -> Texture | None:
             image = tree["images"][tree["textures"][colour["index"]]["source"]]
             if "bufferView" in image:
                 return texture_of(bytes(document.views[image["bufferView"]]))
-            uri = image["uri"]
-            if uri.startswith("data:"):
-                return texture_of(base64.b64decode(uri.partition(",")[2], validate=True))
-            return texture_of(read_bytes(beside(path.parent, uri)))
-    except (*gltf.DAMAGE, binascii.Error):
+            return texture_of(gltf.read_uri(path.parent, image["uri"]))
+    except gltf.DAMAGE:
         # A damaged description of a material does not prevent drawing.
         return None
     return None

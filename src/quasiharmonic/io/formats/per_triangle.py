@@ -9,9 +9,18 @@ from io import BytesIO
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables
 from quasiharmonic.io.lowlevel.atomic import write_whole
-from quasiharmonic.io.registry import find_format
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_instance, map_array, triangle_rows, vertex_array
+from quasiharmonic.io.registry import find_function
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_instance,
+    map_array,
+    pad_to_space,
+    triangle_rows,
+    vertex_array,
+)
 
 # Names that a format or its writer reserves.
 _RESERVED = {"triangle", "F", "uv", "file", "args", "kwds", "allow_pickle", "vertex_indices", "quality"}
@@ -57,8 +66,7 @@ def write_per_triangle(
         If the file cannot be written.
     """
     check_instance("values", values, Mapping)
-    encode = find_format(path, "encode_values").encode_values
-    assert encode is not None
+    encode = find_function(path, "encode_values")
     V, F = vertex_array(V, finite=False), triangle_rows(F)
     uv = map_array("uv", uv, len(V), finite=False)
     columns = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
@@ -88,23 +96,11 @@ def encode_npz(V: FloatArray, F: IntArray, uv: FloatArray, columns: Mapping[str,
 
 def encode_ply(V: FloatArray, F: IntArray, uv: FloatArray, columns: Mapping[str, FloatArray]) -> bytes:
     """Return a binary PLY file of the surface, the map and the columns."""
-    if V.shape[1] == 2:
-        V = np.column_stack([V, np.zeros(len(V))])
     # MeshLab colours by "quality": write the first value under this name.
     properties = {"quality": next(iter(columns.values())), **columns} if columns else {}
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(V)}",
-        *(f"property double {name}" for name in ("x", "y", "z", "s", "t")),
-        f"element face {len(F)}",
-        "property list uchar int vertex_indices",
-        *(f"property double {name}" for name in properties),
-        "end_header\n",
-    ]
-    faces = np.empty(len(F), dtype=[("n", "u1"), ("corners", "<i4", 3), *((name, "<f8") for name in properties)])
-    faces["n"], faces["corners"] = 3, F
-    for name, column in properties.items():
-        faces[name] = column
-    vertices = np.column_stack([V, uv]).astype("<f8")
-    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    places = np.column_stack([pad_to_space(V), uv]).T
+    vertices = [Column(name, values) for name, values in zip(("x", "y", "z", "s", "t"), places, strict=True)]
+    corners = Column("vertex_indices", F.ravel().astype(np.int32), np.full(len(F), 3))
+    faces = [corners, *(Column(name, values) for name, values in properties.items())]
+    elements = Element("vertex", len(V), tuple(vertices)), Element("face", len(F), tuple(faces))
+    return encode_tables(PlyTables(elements))

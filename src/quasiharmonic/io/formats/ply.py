@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.formats.normals import normal_lines, normal_rows
+from quasiharmonic.io.errors import reading
 from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables, parse_tables
+from quasiharmonic.io.formats.vertex_data import colours_of, normal_lines, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import Carried, MeshData, polygon_mesh, vertex_places
@@ -25,12 +25,11 @@ _COLOUR = "red", "green", "blue", "alpha"
 _NORMAL = "nx", "ny", "nz"
 
 
+@dataclass(frozen=True, eq=False)
 class CarriedPly(Carried):
     """The tables of a PLY file, and its mesh."""
 
-    def __init__(self, tables: PlyTables, V: FloatArray, F: IntArray) -> None:
-        super().__init__(V, F)
-        self.tables = tables
+    tables: PlyTables
 
     def further(self) -> list[str]:
         read = {
@@ -66,12 +65,9 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
         If the file is not PLY, is damaged, or has no faces.
     """
     data = read_bytes(path)
-    try:
-        # Converting a signalling NaN is invalid; it is reported later as not finite.
-        with np.errstate(invalid="ignore"):
-            return _mesh(parse_tables(data), os.fspath(path))
-    except ValueError as error:
-        raise MeshFileError(path, str(error), remedy="" if data else "it is empty") from error
+    # Converting a signalling NaN is invalid; it is reported later as not finite.
+    with reading(path, remedy="" if data else "it is empty"), np.errstate(invalid="ignore"):
+        return _mesh(parse_tables(data), os.fspath(path))
 
 
 def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
@@ -134,7 +130,7 @@ def _mesh(tables: PlyTables, source: str) -> MeshData:
         normal_lines=None if normals is None else corners,
         source=source,
     )
-    return replace(mesh, carried=CarriedPly(tables, mesh.V, mesh.F))
+    return replace(mesh, carried=CarriedPly(mesh.V, mesh.F, tables))
 
 
 def _table(element: Element, *names: str) -> FloatArray | None:
@@ -202,23 +198,12 @@ def _with_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
 
 def _corner_places(mesh: MeshData) -> Column:
     """Return a pair for each corner of the faces that have texture coordinates."""
-    assert mesh.FT is not None
-    assert mesh.vt is not None
-    ring, sizes = _rings(mesh)
-    at = mesh.FT.ravel()[ring]
+    pairs, sizes = mesh.corner_uv.reshape(-1, 2)[mesh.rings.corners], mesh.rings.sizes
     face = repeat_each(np.arange(len(sizes)), sizes)
-    bare = np.unique(face[at < 0])
-    given = ~np.isin(face, bare)
+    bare = np.unique(face[np.isnan(pairs[:, 0])])
     count = 2 * sizes
     count[bare] = 0
-    return Column(_CORNER_PLACES, mesh.vt[at[given]].ravel(), count)
-
-
-def _rings(mesh: MeshData) -> tuple[IntArray, IntArray]:
-    """Return the corners of faces, as indices into the flattened triangles, and the number of corners of each face."""
-    if mesh.polygons is None:
-        return np.arange(mesh.F.size), np.full(len(mesh.F), 3)
-    return mesh.polygons.corners, mesh.polygons.sizes
+    return Column(_CORNER_PLACES, pairs[~np.isin(face, bare)].ravel(), count)
 
 
 def _vertices(mesh: MeshData) -> Element:
@@ -238,22 +223,22 @@ def _vertices(mesh: MeshData) -> Element:
 
 def _faces(mesh: MeshData) -> Element:
     """Return the face table of a mesh that was not read from a PLY file."""
-    ring, sizes = _rings(mesh)
-    return Element("face", len(sizes), (Column(_RINGS[0], mesh.F.ravel()[ring].astype(np.int32), sizes),))
+    ring = mesh.F.ravel()[mesh.rings.corners].astype(np.int32)
+    return Element("face", mesh.faces, (Column(_RINGS[0], ring, mesh.rings.sizes),))
 
 
 def _colours(mesh: MeshData) -> NDArray[Any] | None:
     """Return colours of vertices, as bytes if they are multiples of 1/255; None unless all vertices have one."""
-    extra = mesh.extra
-    if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
+    colours = colours_of(mesh)
+    if colours is None:
         return None
-    in_bytes = np.rint(255 * extra)
-    return in_bytes.astype(np.uint8) if (in_bytes / 255 == extra).all() else extra.astype(np.float32)
+    in_bytes = np.rint(255 * colours)
+    return in_bytes.astype(np.uint8) if (in_bytes / 255 == colours).all() else colours.astype(np.float32)
 
 
 def _normals(mesh: MeshData) -> FloatArray | None:
     """Return the normal of every vertex; None if a vertex has several normals or a corner has none."""
-    rows = None if mesh.FN is None or (mesh.FN < 0).any() else normal_rows(mesh.normals)
+    rows = normals_of(mesh)
     if rows is None or mesh.FN is None:
         return None
     own = np.zeros((len(mesh.V), 3))

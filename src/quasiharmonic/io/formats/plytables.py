@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.lowlevel.textual import shown
 from quasiharmonic.util.arrays import IntArray, repeat_each
+from quasiharmonic.util.untrusted import check_end
 
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -132,15 +134,50 @@ def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Propert
     return order, declared, tuple(remarks)
 
 
-class _BinaryReader:
-    """Reads the tables of a binary file."""
-
-    def __init__(self, data: bytes, at: int, order: str) -> None:
-        self._data, self._at, self._order = data, at, order
+class _Reader(ABC):
+    """Reads the tables of a file one after another."""
 
     def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
         """Return the next table."""
         return self._alike(rows, properties) or self._one_by_one(rows, properties)
+
+    @abstractmethod
+    def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
+        """Return the next table if it can be read at once, else None."""
+
+    @abstractmethod
+    def _size(self, of: _Property) -> int:
+        """Return how many numbers of a property come next, 1 if it is no list, and go to the first of them."""
+
+    @abstractmethod
+    def _take(self, kind: str, count: int) -> Any:
+        """Return the next numbers as they are in the file."""
+
+    @abstractmethod
+    def _join(self, parts: list[Any], kind: str) -> NDArray[Any]:
+        """Return the numbers of several results of `_take`."""
+
+    def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
+        """Return the next table, read row by row."""
+        parts: list[list[Any]] = [[] for _ in properties]
+        sizes: list[list[int]] = [[] for _ in properties]
+        for _ in range(rows):
+            for of, numbers, lengths in zip(properties, parts, sizes, strict=True):
+                lengths.append(self._size(of))
+                numbers.append(self._take(of.kind, lengths[-1]))
+        return tuple(
+            Column(
+                of.name, self._join(numbers, of.kind), None if of.count is None else np.array(lengths, dtype=np.int64)
+            )
+            for of, numbers, lengths in zip(properties, parts, sizes, strict=True)
+        )
+
+
+class _BinaryReader(_Reader):
+    """Reads the tables of a binary file."""
+
+    def __init__(self, data: bytes, at: int, order: str) -> None:
+        self._data, self._at, self._order = data, at, order
 
     def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
         """Return the next table if all its lists are as long as those of its first row, else None."""
@@ -152,9 +189,7 @@ class _BinaryReader:
             fields.append((f"v{i}", self._order + of.kind, () if of.count is None else (size,)))
         dtype = np.dtype(fields)
         if rows * dtype.itemsize > len(self._data) - self._at:
-            if any(of.count is not None for of in properties):
-                return None
-            raise ValueError("it ends too early")
+            return None
         table = np.frombuffer(self._data, dtype, count=rows, offset=self._at)
         columns = []
         for i, (of, size) in enumerate(zip(properties, sizes, strict=True)):
@@ -166,54 +201,33 @@ class _BinaryReader:
         return tuple(columns)
 
     def _first_sizes(self, properties: list[_Property]) -> list[int]:
-        """Return the length of each list of the next row."""
-        at, sizes = self._at, []
+        """Return how many numbers of each property are in the next row, without reading past it."""
+        begin, sizes = self._at, []
         for of in properties:
-            size, at = self._size(of, at)
-            at += (1 if of.count is None else size) * np.dtype(of.kind).itemsize
-            sizes.append(size)
+            sizes.append(self._size(of))
+            self._at += sizes[-1] * np.dtype(of.kind).itemsize
+        self._at = begin
         return sizes
 
-    def _size(self, of: _Property, at: int) -> tuple[int, int]:
-        """Return the length of the list at a byte, and the byte at which its numbers start."""
+    def _size(self, of: _Property) -> int:
         if of.count is None:
-            return 0, at
-        width = np.dtype(of.count).itemsize
-        if at + width > len(self._data):
-            raise ValueError("it ends too early")
-        size = int.from_bytes(
-            self._data[at : at + width], "little" if self._order == "<" else "big", signed=of.count[0] == "i"
-        )
+            return 1
+        count = self._take(of.count, 1)
+        size = int.from_bytes(count, "little" if self._order == "<" else "big", signed=of.count[0] == "i")
         if size < 0 or size > len(self._data):
             raise ValueError(f"it has a list of {size} numbers")
-        return size, at + width
+        return size
 
-    def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
-        """Return the next table, read row by row."""
-        parts: list[list[bytes]] = [[] for _ in properties]
-        sizes: list[list[int]] = [[] for _ in properties]
-        widths = [np.dtype(of.kind).itemsize for of in properties]
-        at, end = self._at, len(self._data)
-        for _ in range(rows):
-            for i, of in enumerate(properties):
-                size, at = self._size(of, at)
-                begin, at = at, at + (1 if of.count is None else size) * widths[i]
-                if at > end:
-                    raise ValueError("it ends too early")
-                parts[i].append(self._data[begin:at])
-                sizes[i].append(size)
-        self._at = at
-        return tuple(
-            Column(
-                of.name,
-                np.frombuffer(b"".join(parts[i]), self._order + of.kind).astype(of.kind),
-                None if of.count is None else np.array(sizes[i], dtype=np.int64),
-            )
-            for i, of in enumerate(properties)
-        )
+    def _take(self, kind: str, count: int) -> bytes:
+        begin, self._at = self._at, self._at + count * np.dtype(kind).itemsize
+        check_end(self._at, len(self._data))
+        return self._data[begin : self._at]
+
+    def _join(self, parts: list[bytes], kind: str) -> NDArray[Any]:
+        return np.frombuffer(b"".join(parts), self._order + kind).astype(kind)
 
 
-class _TextReader:
+class _TextReader(_Reader):
     """Reads the tables of a text file."""
 
     def __init__(self, text: bytes) -> None:
@@ -222,15 +236,11 @@ class _TextReader:
         self._numbers = np.array(list(map(float, text.split())), dtype=np.float64)
         self._at = 0
 
-    def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
-        """Return the next table."""
-        if all(of.count is None for of in properties):
-            table = self._take(rows * len(properties)).reshape(rows, -1)
-            return tuple(Column(of.name, _convert(table[:, i], of.kind)) for i, of in enumerate(properties))
-        return self._alike(rows, properties) or self._one_by_one(rows, properties)
-
     def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
-        """Return the next table if it has a single column of lists that are all as long as the first, else None."""
+        """Return the next table if it has no lists, or a single column of lists that are all as long as the first."""
+        if all(of.count is None for of in properties):
+            numbers = self._take("f8", rows * len(properties)).reshape(rows, -1)
+            return tuple(Column(of.name, _convert(numbers[:, i], of.kind)) for i, of in enumerate(properties))
         if not rows or len(properties) > 1 or self._at == len(self._numbers):
             return None
         (of,), size = properties, self._numbers[self._at]
@@ -241,34 +251,19 @@ class _TextReader:
         lists = table.reshape(rows, -1)
         return (Column(of.name, _convert(lists[:, 1:].ravel(), of.kind), _convert(lists[:, 0], "i4").astype(np.int64)),)
 
-    def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
-        """Return the next table, read row by row."""
-        parts: list[list[NDArray[np.float64]]] = [[] for _ in properties]
-        sizes: list[list[int]] = [[] for _ in properties]
-        for _ in range(rows):
-            for i, of in enumerate(properties):
-                size = 1
-                if of.count is not None:
-                    size = int(_convert(self._take(1), of.count)[0])
-                    if size < 0:
-                        raise ValueError(f"it has a list of {size} numbers")
-                parts[i].append(self._take(size))
-                sizes[i].append(size)
-        return tuple(
-            Column(
-                of.name,
-                _convert(np.concatenate([np.empty(0), *parts[i]]), of.kind),
-                None if of.count is None else np.array(sizes[i], dtype=np.int64),
-            )
-            for i, of in enumerate(properties)
-        )
+    def _size(self, of: _Property) -> int:
+        size = 1 if of.count is None else int(_convert(self._take(of.count, 1), of.count)[0])
+        if size < 0:
+            raise ValueError(f"it has a list of {size} numbers")
+        return size
 
-    def _take(self, count: int) -> NDArray[np.float64]:
-        """Return the next numbers."""
-        if self._at + count > len(self._numbers):
-            raise ValueError("it ends too early")
+    def _take(self, kind: str, count: int) -> NDArray[np.float64]:
+        check_end(self._at + count, len(self._numbers))
         self._at += count
         return self._numbers[self._at - count : self._at]
+
+    def _join(self, parts: list[NDArray[np.float64]], kind: str) -> NDArray[Any]:
+        return _convert(np.concatenate([np.empty(0), *parts]), kind)
 
 
 def _convert(numbers: NDArray[np.float64], kind: str) -> NDArray[Any]:

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.formats.welding import weld
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData
@@ -47,10 +47,8 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
     if not len(corners):
         raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
     V, F = weld(corners.reshape(-1, 3))
-    try:
+    with reading(path):
         return MeshData(V, F.reshape(-1, 3), source=os.fspath(path))
-    except ValueError as error:
-        raise MeshFileError(path, str(error)) from error
 
 
 def _binary(data: bytes) -> FloatArray | None:

@@ -8,6 +8,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 from quasiharmonic.io.errors import FileInUseError, OutputError, check_path, printable
@@ -108,6 +109,25 @@ def write_whole(
         if isinstance(error, OSError):
             raise OutputError(f"cannot write {path}: {_reason(error)}") from error
         raise
+
+
+@contextlib.contextmanager
+def writing(place: str | Path) -> Iterator[None]:
+    """Raise errors of the system as `OutputError`, which names the place: a file, or "to" and a folder."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"cannot write {place}: {_reason(error)}") from error
+
+
+def encode_by(name: str, write: Callable[[str], object]) -> bytes:
+    """Return the bytes that ``write``, a function of another library, writes to a file of this name."""
+    with TemporaryDirectory() as folder:
+        part = Path(folder, name)
+        write(str(part))
+        return part.read_bytes()
 
 
 def retry_in_use(action: Callable[..., object], *paths: Path) -> None:

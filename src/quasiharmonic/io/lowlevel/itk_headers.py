@@ -15,7 +15,7 @@ def check_header(data: bytes, suffix: str) -> None:
 
     ITK's readers follow the name of a data file to any place.
     """
-    entries = _meta_image(data) if suffix == ".mha" else _nrrd(data)
+    entries = _entries(data, suffix)
     other = next((entries[key] for key in ("elementdatafile", "data file", "datafile") if key in entries), "LOCAL")
     if other.upper() != "LOCAL":
         raise ValueError(f"refers to the data file {ascii(other)[:80]}: save the data in the file itself")
@@ -26,23 +26,12 @@ def check_header(data: bytes, suffix: str) -> None:
         check_size(8 * count, "the header announces")
 
 
-def _meta_image(data: bytes) -> dict[str, str]:
-    """Return the entries of a MetaImage header, which ends with the entry ElementDataFile."""
-    entries = {}
+def _entries(data: bytes, suffix: str) -> dict[str, str]:
+    """Return the entries of a header: MetaImage's ends with the entry ElementDataFile, NRRD's with an empty line."""
+    entries: dict[str, str] = {}
     for line in data[:_LONGEST].split(b"\n"):
-        key, _, value = line.decode("latin-1").partition("=")
-        entries[key.strip().lower()] = value.strip()
-        if key.strip().lower() == "elementdatafile":
+        if "elementdatafile" in entries or (suffix != ".mha" and not line.strip()):
             break
-    return entries
-
-
-def _nrrd(data: bytes) -> dict[str, str]:
-    """Return the fields of an NRRD header, which ends with an empty line."""
-    entries = {}
-    for line in data[:_LONGEST].split(b"\n"):
-        if not line.strip():
-            break
-        key, _, value = line.decode("latin-1").partition(":")
+        key, _, value = line.decode("latin-1").partition("=" if suffix == ".mha" else ":")
         entries[key.strip().lower()] = value.strip()
     return entries

@@ -6,12 +6,14 @@ import math
 import os
 import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.util.arrays import count_of
 
 # First bytes of common files that are not plain text.
 _FOREIGN = {
@@ -31,21 +33,18 @@ _INTEGER = re.compile(rb"[+-]?[0-9]+")
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """Read the bytes of a file; MeshFileError if it does not exist or cannot be read."""
     check_path("path", path)
-    try:
-        mode = os.stat(path).st_mode
-        if stat.S_ISDIR(mode):
-            raise MeshFileError(path, "is a directory", remedy="name a file")
-        if not stat.S_ISREG(mode):
-            raise MeshFileError(path, "is not a regular file")
-        return Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise MeshFileError(path, "there is no such file") from error
-    except OSError as error:
-        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
-    except MeshFileError:
-        raise
-    except ValueError as error:
-        raise MeshFileError(path, f"is not a file name: {error}") from error
+    with reading(path, "is not a file name: "):
+        try:
+            mode = os.stat(path).st_mode
+            if stat.S_ISDIR(mode):
+                raise MeshFileError(path, "is a directory", remedy="name a file")
+            if not stat.S_ISREG(mode):
+                raise MeshFileError(path, "is not a regular file")
+            return Path(path).read_bytes()
+        except FileNotFoundError as error:
+            raise MeshFileError(path, "there is no such file") from error
+        except OSError as error:
+            raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
 
 
 def read_text(path: str | os.PathLike[str]) -> bytes:
@@ -163,6 +162,24 @@ def _collapse_blanks(block: bytes) -> bytes:
     return block.replace(b" \n", b"\n")
 
 
+def read_pairs(path: str | os.PathLike[str], what: str) -> Iterator[tuple[int, list[int]]]:
+    """Read lines of two whole numbers each; yield line numbers, counted from 1, and numbers.
+
+    Blanks, tabs, commas and colons separate the numbers. A comment starts with ``#``. MeshFileError if the file cannot
+    be read, or for any other line; ``what`` says what each line must be.
+    """
+    for at, line in enumerate(read_text(path).split(b"\n"), 1):
+        words = line.partition(b"#")[0].replace(b",", b" ").replace(b":", b" ").split()
+        if not words:
+            continue
+        if len(words) != 2 or not all(word.isdigit() for word in words):
+            shown_line = line[:60].decode("utf-8", "replace")
+            raise MeshFileError(path, f"is not {what}, two whole numbers from 0 on: {shown_line!r}", at)
+        with reading(path, line=at, remedy="indices count from 0"):
+            numbers = list(map(integer, words))
+        yield at, numbers
+
+
 def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, list[float]]]:
     """Read lines with ``columns`` numbers each; return line numbers, counted from 1, and numbers.
 
@@ -183,8 +200,7 @@ def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, lis
         if at == 1 and not any(is_number(word) for word in words):
             continue
         if len(words) != columns:
-            plural = "number" if columns == 1 else "numbers"
-            raise MeshFileError(path, f"not {columns} {plural}: {shown(text)}", at)
+            raise MeshFileError(path, f"not {count_of('number', 'numbers', columns)}: {shown(text)}", at)
         try:
             rows.append((at, [number(word) for word in words]))
         except ValueError as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,8 +20,9 @@ def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
 
     A name is unchanged if the library also exists beside the new file, or does not exist beside the source.
     """
+    here, there = Path(mesh.source).parent, Path(path).parent
 
-    def rename(name: str, here: Path, there: Path) -> str:
+    def rename(name: str) -> str:
         if (there / name).is_file() or not (here / name).is_file():
             return name
         try:
@@ -31,10 +31,23 @@ def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
             return (here / name).resolve().as_posix()
 
     lines = mesh.statements.split(b"\n")
-    if not any(map(_names_library, lines)):
-        return mesh
-    new = [_with_names(line, path, mesh, rename) if _names_library(line) else line for line in lines]
-    return replace(mesh, statements=b"\n".join(new))
+    for at, line in enumerate(lines):
+        names = library_names(line, here, there)
+        if (new := [rename(name) for name in names]) != names:
+            lines[at] = os.fsencode("mtllib " + " ".join(new))
+    statements = b"\n".join(lines)
+    return mesh if statements == mesh.statements else replace(mesh, statements=statements)
+
+
+def library_names(line: bytes, *folders: Path) -> list[str]:
+    """Return the names in an ``mtllib`` line: several names, or one with blanks if it is a file of one of the folders.
+
+    The list is empty for other lines.
+    """
+    if not _names_library(line):
+        return []
+    name = os.fsdecode(b"".join(line.split(None, 1)[1:]).strip())
+    return [name] if any((folder / name).is_file() for folder in folders) else name.split()
 
 
 def companions(path: str | os.PathLike[str], texture: Texture) -> tuple[Path, Path]:
@@ -74,15 +87,3 @@ def write_material(path: str | os.PathLike[str], mesh: MeshData, *, durable: boo
 
 def _names_library(line: bytes) -> bool:
     return line.split(None, 1)[:1] == [b"mtllib"]
-
-
-def _with_names(
-    line: bytes, path: str | os.PathLike[str], mesh: MeshData, change: Callable[[str, Path, Path], str]
-) -> bytes:
-    """Return a ``mtllib`` line with its names changed: several names, or a single name with blanks."""
-    here, there = Path(mesh.source).parent, Path(path).parent
-    rest = os.fsdecode(line.split(None, 1)[1].strip()) if len(line.split(None, 1)) > 1 else ""
-    whole = (here / rest).is_file() or (there / rest).is_file()
-    names = [rest] if whole else rest.split()
-    new = [change(name, here, there) for name in names]
-    return line if new == names else os.fsencode("mtllib " + " ".join(new))

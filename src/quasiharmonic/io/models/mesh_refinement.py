@@ -66,9 +66,7 @@ def _refine_polygons(mesh: MeshData, parent: IntArray) -> tuple[Polygons | None,
     ``parent`` (f,) is the given triangle that contains each new triangle, ascending. The second result is the first new
     face of each given face, then the number of new faces.
     """
-    if mesh.polygons is None:
-        return None, np.searchsorted(parent, np.arange(len(mesh.F) + 1))
-    old = mesh.polygons
+    old = mesh.rings
     face = old.of_triangle[parent]
     count = np.bincount(face, minlength=len(old))
     unsplit = count == old.sizes - 2

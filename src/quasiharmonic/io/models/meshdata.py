@@ -17,18 +17,21 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_finite,
     check_range,
+    corner_rows,
     map_array,
     names_of,
+    pad_to_space,
     triangle_rows,
     vertex_array,
 )
 
 
+@dataclass(frozen=True, eq=False)
 class Carried:
     """The contents of a file besides its mesh ``V, F``, for a writer of the same format."""
 
-    def __init__(self, V: FloatArray, F: IntArray) -> None:
-        self.V, self.F = V, F
+    V: FloatArray
+    F: IntArray
 
     def further(self) -> list[str]:
         """Return descriptions of the data besides the mesh, which only a writer of the same format keeps."""
@@ -116,9 +119,7 @@ class MeshData:
 
     def __post_init__(self) -> None:
         """Convert the arrays to the types and shapes above; raise `ValueError` for invalid ones."""
-        V = vertex_array(self.V)
-        if V.shape[1] == 2:
-            V = np.column_stack([V, np.zeros(len(V))])
+        V = pad_to_space(vertex_array(self.V))
         object.__setattr__(self, "V", V)
         F = triangle_rows(self.F, copy=False)
         check_range("F", F, len(V))
@@ -128,14 +129,28 @@ class MeshData:
             check_finite("vt", "row", "rows", vt)
             object.__setattr__(self, "vt", vt)
         if self.FT is not None:
-            object.__setattr__(self, "FT", self._corners("FT", self.FT, 0 if self.vt is None else len(self.vt)))
+            object.__setattr__(self, "FT", corner_rows("FT", self.FT, F, 0 if self.vt is None else len(self.vt)))
         if self.FN is not None:
-            object.__setattr__(self, "FN", self._corners("FN", self.FN, self.normals.count(b"\n")))
+            object.__setattr__(self, "FN", corner_rows("FN", self.FN, F, self.normals.count(b"\n")))
 
     @property
     def faces(self) -> int:
         """Number of faces in the file."""
         return len(self.F) if self.polygons is None else len(self.polygons)
+
+    @property
+    def rings(self) -> Polygons:
+        """The file's faces as rings of corners of the triangles, also if all are triangles."""
+        if self.polygons is not None:
+            return self.polygons
+        return Polygons(np.arange(self.F.size), 3 * np.arange(len(self.F) + 1))
+
+    @property
+    def corner_uv(self) -> FloatArray:
+        """Texture coordinates at every corner, (f, 3, 2) float64; NaN where there are none."""
+        if self.vt is None or self.FT is None:
+            return np.full((*self.F.shape, 2), np.nan)
+        return np.where(self.FT[:, :, None] >= 0, self.vt[self.FT], np.nan)
 
     def with_map(self, uv: ArrayLike) -> MeshData:
         """Return the same mesh with one texture coordinate for each vertex.
@@ -160,14 +175,6 @@ class MeshData:
             If ``uv`` does not have shape (n, 2), or a position is not finite.
         """
         return MeshData(map_array("uv", uv, len(self.V)), self.F, polygons=self.polygons, source=self.source)
-
-    def _corners(self, name: str, values: ArrayLike, rows: int) -> IntArray:
-        """Check a table of row indices or -1 for every corner; return it as (f, 3) int64."""
-        table = triangle_rows(values, name, copy=False)
-        if len(table) != len(self.F):
-            raise ValueError(f"{name} must have as many rows as F, {len(self.F)}, not {len(table)}")
-        check_range(name, table, rows, "row", "rows", minimum=-1)
-        return table
 
 
 def polygon_mesh(
@@ -213,11 +220,11 @@ def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
     """
     uv = np.full((len(mesh.V), 2), np.nan)
     seam = np.zeros(len(mesh.V), dtype=np.bool_)
-    if mesh.vt is not None and mesh.FT is not None:
-        given = mesh.FT >= 0
-        vertex, place = mesh.F[given], mesh.vt[mesh.FT[given]]
-        uv[vertex] = place
-        seam[vertex[(uv[vertex] != place).any(axis=1)]] = True
+    places = mesh.corner_uv
+    given = ~np.isnan(places[:, :, 0])
+    vertex, place = mesh.F[given], places[given]
+    uv[vertex] = place
+    seam[vertex[(uv[vertex] != place).any(axis=1)]] = True
     return uv, seam
 
 

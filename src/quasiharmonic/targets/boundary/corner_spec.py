@@ -15,7 +15,7 @@ from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.lowlevel.textual import integer
 from quasiharmonic.targets.boundary.corner_pins import Corners
-from quasiharmonic.util.arrays import IntArray, scale_to_unit, to_space, triangle_array, vertex_array
+from quasiharmonic.util.arrays import IntArray, pad_to_space, scale_to_unit, triangle_array, vertex_array
 
 FORMS = "V, V:K and V:X:Y, where near:x,y,z may stand for the vertex V"
 _NEAR = "near:"
@@ -137,7 +137,7 @@ def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArr
     if not loops:
         raise ValueError("the surface is closed: it has no boundary vertices")
     border = np.sort(np.concatenate(loops))
-    both = scale_to_unit(np.concatenate([to_space(points[border]), to_space(wanted)]))
+    both = scale_to_unit(np.concatenate([pad_to_space(points[border]), pad_to_space(wanted)]))
     here, there = both[: len(border)], both[len(border) :]
     return np.array([border[np.argmin(((here - place) ** 2).sum(axis=1))] for place in there], dtype=np.int64)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.lowlevel.textual import read_pairs
 from quasiharmonic.targets.outlines.outline_curves import outline_curves
 
 
@@ -36,17 +37,7 @@ def read_pieces(path: Path, sides: int) -> dict[int, int]:
     Blanks, commas or colons separate the indices; ``#`` starts a comment.
     """
     sides_of: dict[int, int] = {}
-    try:
-        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    except OSError as error:
-        raise MeshFileError(path, f"cannot be read: {error.strerror or error}") from error
-    for number, line in enumerate(lines, 1):
-        words = line.partition("#")[0].replace(",", " ").replace(":", " ").split()
-        if not words:
-            continue
-        if len(words) != 2 or not all(word.isascii() and word.isdigit() for word in words):
-            raise MeshFileError(path, f"is not 'vertex side', two whole numbers from 0 on: {line[:60]!r}", number)
-        vertex, side = map(int, words)
+    for number, (vertex, side) in read_pairs(path, "'vertex side'"):
         if side >= sides:
             there = f"only sides 0 … {sides - 1}" if sides > 1 else "only one side, 0"
             raise MeshFileError(path, f"says side {side}, but the outline has {there}", number)

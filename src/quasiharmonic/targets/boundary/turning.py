@@ -30,8 +30,8 @@ from quasiharmonic.util.arrays import (
     check_integer,
     find_exponent,
     mark,
+    pad_to_space,
     scale_to_unit,
-    to_space,
     triangle_array,
     vertex_array,
 )
@@ -203,7 +203,7 @@ def outermost(loops: Sequence[IntArray], space: FloatArray) -> int:
 
 def in_space(V: FloatArray) -> FloatArray:
     """Return positions (n, 3), centred and scaled to about unit size to avoid overflow."""
-    V = to_space(scale_to_unit(V))
+    V = pad_to_space(scale_to_unit(V))
     return np.asarray(V - V.mean(axis=0))
 
 

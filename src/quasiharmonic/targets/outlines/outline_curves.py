@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.geometry.curves.arcs import Arc
 from quasiharmonic.geometry.curves.curve import Curve
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import reading
 from quasiharmonic.targets.outlines.contours import Pieces
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths
 from quasiharmonic.targets.outlines.svg import svg_paths
@@ -59,10 +59,8 @@ def outline_curves(specification: str | PathLike[str], *, font: Font | None = No
         a, b = map(float, argument.lower().split("x"))
         return [Curve([Arc((0.0, 0.0), (a, 0.0), (0.0, b), 0.0, 2 * np.pi)])]
     if Path(text).suffix.lower() == ".svg":
-        try:
+        with reading(text):
             return _contours(svg_paths(text, arcs=True))
-        except ValueError as error:
-            raise MeshFileError(text, str(error)) from error
     return [Curve.polygon(contour) for contour in contours]
 
 

@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from quasiharmonic.geometry.exact.loops import join_items
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.lowlevel.textual import is_number, number, read_text
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, distinct
 from quasiharmonic.targets.outlines.nesting import arrange, collinear
@@ -73,8 +73,6 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
         begins.append(start)
     if not contours:
         raise MeshFileError(path, "has no points")
-    try:
+    plural = "contour begins at line" if len(begins) == 1 else "contours begin at lines"
+    with reading(path, describe=lambda error: f"{error} (the {plural} {join_items(begins)})"):
         return [one.points for one in arrange(contours)]
-    except ValueError as error:
-        plural = "contour begins at line" if len(begins) == 1 else "contours begin at lines"
-        raise MeshFileError(path, f"{error} (the {plural} {join_items(begins)})") from None

@@ -16,7 +16,7 @@ from xml.parsers import expat
 import numpy as np
 
 from quasiharmonic.geometry.curves.arcs import Arc
-from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.errors import MeshFileError, check_path, reading
 from quasiharmonic.io.lowlevel.textual import read_text
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces, flatten
 from quasiharmonic.targets.outlines.nesting import arrange
@@ -90,19 +90,15 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
         raise MeshFileError(path, "has coordinates that are too large")
     size = float(np.ptp(every, axis=0).max())
     contours = []
-    try:
+    with reading(path):
         for pieces in subpaths if size > 1 / _LARGEST else []:
             contour = flatten(pieces, tolerance * size)
             if len(contour) > 2 and _breadth(contour) > (tolerance * size) ** 2:
                 contours.append(contour)
-    except ValueError as error:
-        raise MeshFileError(path, str(error)) from None
     if not contours:
         raise MeshFileError(path, "has no path or shape that encloses an area")
-    try:
+    with reading(path, describe=lambda error: f"{error} (in units of the drawing, the y-axis upwards)"):
         return [one.points for one in arrange(contours)]
-    except ValueError as error:
-        raise MeshFileError(path, f"{error} (in units of the drawing, the y-axis upwards)") from None
 
 
 def svg_paths(path: str | os.PathLike[str], *, arcs: bool = False) -> list[Pieces]:
@@ -150,14 +146,12 @@ class _Drawing:
         drawn: list[tuple[list[Any], FloatArray]] = []
         count = 0
         for tag, line, d, transform in self.shapes:
-            try:
+            with reading(self.path, f"<{tag}>: ", line=line):
                 for pieces in parse_path(d, arcs=self.arcs):
                     count += len(pieces)
                     if count > MAX_POINTS:
                         raise ValueError(_TOO_MANY)
                     drawn.append((pieces, transform))
-            except ValueError as error:
-                raise MeshFileError(self.path, f"<{tag}>: {error}", line) from None
         return [_apply_transform(pieces, transform) for pieces, transform in drawn]
 
     def _error(self, what: str, remedy: str = "") -> MeshFileError:
@@ -199,7 +193,7 @@ class _Drawing:
         self._check_style(tag, attributes.get("style", ""))
         if "transform" in attributes and "transform-origin" in attributes:
             raise self._error(f"<{tag}>: transform-origin is not supported", "apply the transform in a drawing program")
-        try:
+        with reading(self.path, f"<{tag}>: ", line=self.parser.CurrentLineNumber):
             transform = self.transforms[-1]
             if "transform" in attributes:
                 transform = transform @ _transform(attributes["transform"])
@@ -213,8 +207,6 @@ class _Drawing:
                 self.skipped = self.depth
             else:
                 self.transforms.append(transform)
-        except ValueError as error:
-            raise self._error(f"<{tag}>: {error}") from None
 
     def _end(self, name: str) -> None:
         if self.sheet is not None:

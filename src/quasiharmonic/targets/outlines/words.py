@@ -11,6 +11,7 @@ from quasiharmonic.targets.outlines.contours import distinct, signed_area
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter
 from quasiharmonic.targets.outlines.nesting import filled, nested
 from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive
+from quasiharmonic.util.optional import explain_missing
 
 #: Overlap of each letter with the one before, in units of the font size, by default.
 OVERLAP = 0.03
@@ -172,12 +173,8 @@ def _leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
 
 def _unite(shapes: list[list[FloatArray]]) -> list[FloatArray]:
     """Outline of the union of shapes, each of them an outline oriented as in `nested`."""
-    try:
+    with explain_missing("joining the letters of a word needs Shapely", "'quasiharmonic[shapes]'"):
         import shapely
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "joining the letters of a word needs Shapely: pip install 'quasiharmonic[shapes]'"
-        ) from error
 
     covered = [
         shapely.difference(

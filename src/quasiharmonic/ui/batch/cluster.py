@@ -11,6 +11,7 @@ from typing import Any
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.supervisor import Finished, Supervisor, record_crash
+from quasiharmonic.util.optional import explain_missing
 
 # Problems submitted per thread of the cluster: enough to keep threads busy, few to lose if the driver dies.
 _PER_THREAD = 3
@@ -25,7 +26,7 @@ _CONNECTION_LOST = (
 _mine = threading.local()
 
 
-def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> Generator[Finished | None]:
+def solve_on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> Generator[Finished | None]:
     """Solve problems on a cluster; yield None regularly while no problem is finished.
 
     The scheduler is an address, or a client or a cluster. If a worker is lost, its problem goes to another worker. The
@@ -34,11 +35,9 @@ def on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: Any) -> 
     ImportError if ``distributed`` is not installed, ValueError if the address is malformed, ConnectionError if the
     connection fails, and errors of a `Supervisor` on a worker.
     """
-    try:
+    with explain_missing("a Dask cluster needs distributed", "'quasiharmonic[dask]'"):
         from distributed import Client
         from distributed.comm import resolve_address
-    except ImportError as error:
-        raise ImportError("a Dask cluster needs distributed: pip install 'quasiharmonic[dask]'") from error
     if isinstance(scheduler, Client):
         yield from _through(scheduler, todo, orders)
         return

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from quasiharmonic import __version__
 from quasiharmonic.io.errors import OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole
+from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole, writing
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives import places
 from quasiharmonic.ui.batch.archives.archived import ArchivedProblems
@@ -23,12 +23,13 @@ from quasiharmonic.ui.batch.archives.outputs import Outputs
 from quasiharmonic.ui.batch.archives.scratch import scratch_folder
 from quasiharmonic.ui.batch.lock import lock_folder, lock_name
 from quasiharmonic.ui.batch.loose import LooseProblems
-from quasiharmonic.ui.batch.pool import core_count, on_this_machine
+from quasiharmonic.ui.batch.pool import solve_in_processes
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, group_small
-from quasiharmonic.ui.batch.settings import Orders, Settings
+from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
 from quasiharmonic.ui.batch.shards import WHOLE, Shard, read_shard, shard_of, table_name
 from quasiharmonic.ui.batch.supervisor import Finished, resident
-from quasiharmonic.util.arrays import check_bool, check_callback, check_instance, check_integer, check_positive
+from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
+from quasiharmonic.util.threads import count_cores
 
 
 class DataSet(Protocol):
@@ -44,10 +45,7 @@ class DataSet(Protocol):
         """Yield the problems."""
 
     def collect(self, item: Finished | None) -> Iterable[Finished]:
-        """Keep the results of an item of the pool; return the problems that are finished."""
-
-    def finish(self) -> Iterable[Finished]:
-        """Complete the results; return the problems that this finishes."""
+        """Keep the results of an item of the pool, if there is one; return the problems that are finished."""
 
     def records(self) -> Iterator[records.Record]:
         """Yield the records of the finished problems."""
@@ -178,11 +176,11 @@ def run(
     check_callback(callback)
     check_path("source", source)
     check_path("output", output)
-    check_bool("retry", retry)
     settings = Settings() if settings is None else settings
     check_instance("settings", settings, Settings)
     settings = _check_files(settings)
-    _check(jobs, threads, time_limit, memory_limit, scheduler)
+    orders = Orders(Path(os.path.abspath(output)), settings, threads, time_limit, memory_limit, retry)
+    _check(jobs, memory_limit, scheduler)
     part = read_shard(shard)
     url = os.fspath(output) if places.is_url(output) else None
     archives = find_archives(source, plain=settings.plain)
@@ -190,10 +188,11 @@ def run(
         raise ValueError("results are sent to a URL only if the problems are in archives and solved on this machine")
     began = time.perf_counter()
     with ExitStack() as stack:
-        folder = Path(os.path.abspath(output) if url is None else stack.enter_context(TemporaryDirectory()))
+        if url is not None:
+            orders = replace(orders, output=Path(stack.enter_context(TemporaryDirectory())))
+        folder = orders.output
         table_path = folder / table_name(part, table)
         records.check_table(table_path)
-        orders = Orders(folder, settings, threads, time_limit, memory_limit, retry)
         loose = None if archives else LooseProblems(source, orders, part)
         _check_folder(folder)
         lock = lock_name(part)
@@ -221,11 +220,13 @@ def _solve(
     todo = data.problems()
     if scheduler is None:
         groups = group_small(todo) if data.orders.settings.together else ([files] for files in todo)
-        finished = on_this_machine(groups, data.orders, _workers(jobs, data.total))
+        jobs = jobs or count_cores()
+        # Not more workers than problems, if their number is known.
+        finished = solve_in_processes(groups, data.orders, min(jobs, data.total or jobs))
     else:
-        from quasiharmonic.ui.batch.cluster import on_cluster
+        from quasiharmonic.ui.batch.cluster import solve_on_cluster
 
-        finished = on_cluster(todo, data.orders, scheduler)
+        finished = solve_on_cluster(todo, data.orders, scheduler)
 
     def count(some: Iterable[Finished]) -> None:
         for one in some:
@@ -238,14 +239,8 @@ def _solve(
     with closing(finished):
         for item in finished:
             count(data.collect(item))
-        count(data.finish())
+        count(data.collect(None))
     return progress
-
-
-def _workers(jobs: int | None, total: int) -> int:
-    """Return the number of worker processes; not more than problems, if their number is known."""
-    jobs = jobs or core_count()
-    return min(jobs, total or jobs)
 
 
 def _check_files(settings: Settings) -> Settings:
@@ -258,30 +253,16 @@ def _check_files(settings: Settings) -> Settings:
     outline(settings.to, font=settings.font)
     if settings.corners is not None:
         read_corners(settings.corners)
-    return replace(
-        settings,
-        to=_anywhere(settings.to),
-        font=_anywhere(settings.font),
-        corners=_anywhere(settings.corners),
-        pieces=_anywhere(settings.pieces),
-    )
+    named = {setting: getattr(settings, setting) for setting in NAMING_FILES}
+    paths = {setting: os.path.abspath(name) for setting, name in named.items() if name and os.path.isfile(name)}
+    return replace(settings, **paths)
 
 
-def _anywhere(name: str | None) -> str | None:
-    """Return the absolute path if the name is that of a file, else the name."""
-    return os.path.abspath(name) if name is not None and os.path.isfile(name) else name
-
-
-def _check(jobs: int | None, threads: int, time_limit: float | None, memory_limit: int | None, scheduler: Any) -> None:
+def _check(jobs: int | None, memory_limit: int | None, scheduler: Any) -> None:
     if scheduler is not None and jobs is not None:
         raise ValueError("jobs applies only to processes on this machine, not to a Dask cluster: omit one of them")
     if jobs is not None:
         check_integer("jobs", jobs, minimum=1)
-    check_integer("threads", threads, minimum=1)
-    if time_limit is not None:
-        check_positive(time_limit=time_limit)
-    if memory_limit is not None:
-        check_positive(memory_limit=memory_limit)
     if memory_limit is not None and scheduler is None and resident(os.getpid()) is None:
         raise ValueError("a limit of memory needs psutil on this system: pip install 'quasiharmonic[batch]'")
 
@@ -290,10 +271,8 @@ def _check_folder(folder: Path) -> None:
     """Raise OutputError if the path exists but is not a run's folder."""
     if os.path.lexists(folder) and not folder.is_dir():
         raise OutputError(f"cannot write to {folder}: it is not a folder")
-    try:
+    with writing(f"to {folder}"):
         tables = [name for name in records.TABLES if (folder / name).exists()]
-    except OSError as error:
-        raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     if tables and not (folder / MARKER).exists():
         raise OutputError(f"{folder} has a {tables[0]} that belongs to no run: choose another folder for the results")
 
@@ -304,15 +283,13 @@ def _absolute(source: str | os.PathLike[str]) -> str:
 
 def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, part: Shard) -> None:
     """Write the marker file with source, settings and version into the run's folder, and delete old tables."""
-    try:
+    with writing(f"to {folder}"):
         for path in folder.glob("records*"):
             # The table of the last run must not be taken for that of this run, nor the tables of other shards.
             if path.name in records.TABLES or (
                 shard_of(path.name) is not None and part in (WHOLE, shard_of(path.name))
             ):
                 remove_file(path)
-    except OSError as error:
-        raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     about = {"source": _absolute(source), "settings": settings.to_dict(), "version": __version__}
     contents = json.dumps(about, indent=2).encode() + b"\n"
     marker = folder / MARKER

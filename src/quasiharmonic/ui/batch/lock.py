@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.lowlevel.atomic import writing
 from quasiharmonic.ui.batch.shards import WHOLE, Shard
 
 
@@ -25,10 +26,8 @@ def lock_folder(folder: Path, name: str) -> Iterator[None]:
     If the system or the file system has no such locks, the folder is not locked. OutputError if another run has locked
     the folder, or the folder cannot be written to.
     """
-    try:
+    with writing(f"to {folder}"):
         file = open(folder / name, "ab")  # noqa: SIM115
-    except OSError as error:
-        raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     with file:
         try:
             _lock(file.fileno())

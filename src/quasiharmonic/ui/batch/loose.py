@@ -45,10 +45,6 @@ class LooseProblems:
         """Return the problems that are finished with an item of the pool."""
         return () if item is None else (item,)
 
-    def finish(self) -> Iterable[Finished]:
-        """Complete the results; return the problems that this finishes."""
-        return ()
-
     def records(self) -> Iterator[records.Record]:
         """Yield the records of the finished problems."""
         for files in self.problems():

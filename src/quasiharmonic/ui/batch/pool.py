@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import deque
 from collections.abc import Generator, Iterator
@@ -19,15 +18,7 @@ _POLL_INTERVAL = 0.2
 _MANY = 16
 
 
-def core_count() -> int:
-    """Return the number of cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
-
-
-def on_this_machine(groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> Generator[Finished | None]:
+def solve_in_processes(groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> Generator[Finished | None]:
     """Solve problems, several at a time; yield None regularly while no problem is finished.
 
     The problems of a group may be solved together. A problem whose process ran out of memory is solved again in a new
@@ -116,5 +107,5 @@ class _Workers:
                     files = self._starved.popleft()
                 except IndexError:
                     return
-                self._answers.put(supervisor.attend_again(files))
+                self._answers.put(supervisor.attend(files, again=True))
                 supervisor.rest()

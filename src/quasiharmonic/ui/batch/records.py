@@ -14,8 +14,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.io.errors import FileInUseError, MeshFileError, OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole
+from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole, writing
+from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import parse_json
 
 Record = dict[str, Any]
@@ -99,6 +100,7 @@ TABLES = "records.csv", "records.parquet"
 FILE = "record.json"
 _MAP = "map.obj"
 _ROWS = 1000
+_NO_TABLE = "cannot be read as a table: "
 
 
 def map_path(folder: Path) -> Path:
@@ -143,13 +145,9 @@ def clear(folder: Path) -> None:
 
     OutputError if the folder cannot be created or emptied, FileInUseError if another program has one of its files open.
     """
-    try:
+    with writing(f"results to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         remove_results(folder)
-    except FileInUseError:
-        raise
-    except OSError as error:
-        raise OutputError(f"cannot write results to {folder}: {error.strerror or error}") from error
 
 
 def remove_results(folder: Path) -> None:
@@ -190,8 +188,8 @@ def write_table(path: str | os.PathLike[str], records: Iterable[Record]) -> None
     if _suffix(path) == ".csv":
         write_whole(path, lambda file: _write_csv(file, records))
     else:
-        parquet = load_pyarrow()
-        write_whole(path, lambda file: _write_parquet(parquet, file, records))
+        load_pyarrow()
+        write_whole(path, lambda file: write_parquet(file, table_schema(), map(table_row, records), _ROWS))
 
 
 def check_table(path: str | os.PathLike[str]) -> None:
@@ -239,10 +237,8 @@ def _suffix(path: str | os.PathLike[str]) -> str:
 
 def load_pyarrow() -> Any:
     """Return the module `pyarrow.parquet`; ImportError with the install command if it is missing."""
-    try:
+    with explain_missing("Parquet needs pyarrow", "'quasiharmonic[batch]', or choose .csv"):
         import pyarrow.parquet
-    except ImportError as error:
-        raise ImportError("Parquet needs pyarrow: pip install 'quasiharmonic[batch]', or choose .csv") from error
     return pyarrow.parquet
 
 
@@ -272,35 +268,31 @@ def table_row(record: Record) -> Record:
     return {column: _plain(record.get(column)) for column in COLUMNS}
 
 
-def _write_parquet(parquet: Any, file: BinaryIO, records: Iterable[Record]) -> None:
+def write_parquet(file: BinaryIO, schema: Any, rows: Iterable[Record], together: int) -> None:
+    """Write rows with a pyarrow schema, some together, so that memory use is constant."""
     import pyarrow
 
-    schema, rest = table_schema(), iter(records)
-    with parquet.ParquetWriter(file, schema) as writer:
-        while rows := [table_row(record) for record in islice(rest, _ROWS)]:
-            writer.write_table(pyarrow.Table.from_pylist(rows, schema=schema))
+    rest = iter(rows)
+    with load_pyarrow().ParquetWriter(file, schema) as writer:
+        while some := list(islice(rest, together)):
+            writer.write_table(pyarrow.Table.from_pylist(some, schema=schema))
 
 
 def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            for row in csv.DictReader(file):
-                row.pop(None, None)  # values after the last column
-                yield row
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MeshFileError(path, f"cannot be read as a table: {error}") from error
+    damage = OSError, UnicodeDecodeError, csv.Error
+    with reading(path, _NO_TABLE, damage), open(path, encoding="utf-8-sig", newline="") as file:
+        for row in csv.DictReader(file):
+            row.pop(None, None)  # values after the last column
+            yield row
 
 
 def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
     parquet = load_pyarrow()
     import pyarrow
 
-    try:
-        with parquet.ParquetFile(path) as file:
-            for batch in file.iter_batches(_ROWS):
-                yield from batch.to_pylist()
-    except (OSError, pyarrow.ArrowException) as error:
-        raise MeshFileError(path, f"cannot be read as a table: {error}") from error
+    with reading(path, _NO_TABLE, (OSError, pyarrow.ArrowException)), parquet.ParquetFile(path) as file:
+        for batch in file.iter_batches(_ROWS):
+            yield from batch.to_pylist()
 
 
 def _convert(path: str | os.PathLike[str], number: int, column: str, value: Any) -> Any:

@@ -5,32 +5,59 @@ from __future__ import annotations
 import json
 import os
 import stat
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from quasiharmonic import __version__
-from quasiharmonic.energies.polishing import ENERGIES
 from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
-from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.linsolve import available
-from quasiharmonic.solver.search.stages import STRATEGIES
 from quasiharmonic.ui.batch.problems import ProblemFiles
-from quasiharmonic.util.arrays import check_bool, check_choice, check_integer, describe
-from quasiharmonic.util.options import MAX_ITERATIONS
+from quasiharmonic.util.arrays import check_choice, describe
+from quasiharmonic.util.options import (
+    ENERGIES,
+    FLATTENED,
+    MAX_ITERATIONS,
+    REFERENCES,
+    STRATEGIES,
+    Options,
+    option,
+    positive,
+    positive_number,
+    switch,
+)
 
-_CHOICES: dict[str, tuple[str | None, ...]] = {
-    "strategy": tuple(STRATEGIES),
-    "energy": (None, *ENERGIES, "distances"),
-    "polish": (None, *ENERGIES),
-    "reference": (None, *get_args(Reference)),
-}
+#: The settings that may name files.
+NAMING_FILES = "to", "font", "corners", "pieces"
+
+
+def _one_of(*words: str | None) -> Callable[[str, Any], None]:
+    """Return a check of a setting with one of several values."""
+
+    def check(name: str, value: Any) -> None:
+        if not isinstance(value, str | None) or value not in words:
+            raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {value!r}")
+
+    return check
+
+
+def _text(name: str, value: Any) -> None:
+    """Check a text or None."""
+    if not isinstance(value, str | None):
+        raise ValueError(f"{name} must be a text or None, not {describe(value)}")
+
+
+def _limit(name: str, value: Any) -> None:
+    """Check a positive number or None."""
+    if value is not None:
+        positive_number(name, value)
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(Options):
     """Settings that determine the result of a problem, together with its files.
 
     Attributes
@@ -80,38 +107,27 @@ class Settings:
         If a setting has an invalid value, or two settings contradict each other.
     """
 
-    to: str | None = None
-    font: str | None = None
-    corner_angle: float = 20.0
-    flatten: bool = False
-    energy: str | None = None
-    start: bool = False
-    pack: bool = False
-    cut: bool = False
-    corners: str | None = None
-    refine: bool = False
-    strategy: str = "speed"
-    polish: str | None = None
-    slide: bool = False
-    pieces: str | None = None
-    reference: str | None = None
-    max_iterations: int = MAX_ITERATIONS
-    linear_solver: str = "auto"
+    to: str | None = option(None, check=_text)
+    font: str | None = option(None, check=_text)
+    corner_angle: float = option(20.0, check=lambda _, angle: check_corner_angle(angle))
+    flatten: bool = option(False, check=switch)
+    energy: str | None = option(None, check=_one_of(None, *FLATTENED))
+    start: bool = option(False, check=switch)
+    pack: bool = option(False, check=switch)
+    cut: bool = option(False, check=switch)
+    corners: str | None = option(None, check=_text)
+    refine: bool = option(False, check=switch)
+    strategy: str = option("speed", check=_one_of(*STRATEGIES))
+    polish: str | None = option(None, check=_one_of(None, *ENERGIES))
+    slide: bool = option(False, check=switch)
+    pieces: str | None = option(None, check=_text)
+    reference: str | None = option(None, check=_one_of(None, *REFERENCES))
+    max_iterations: int = option(MAX_ITERATIONS, check=positive)
+    linear_solver: str = option("auto", check=lambda name, value: check_choice(name, value, ("auto", *available())))
 
     def __post_init__(self) -> None:
         """Check the values, without reading files."""
-        for name, words in _CHOICES.items():
-            given = getattr(self, name)
-            if not isinstance(given, str | None) or given not in words:
-                raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {given!r}")
-        for name in ("flatten", "start", "pack", "cut", "refine", "slide"):
-            check_bool(name, getattr(self, name))
-        for name in ("to", "font", "corners", "pieces"):
-            if not isinstance(getattr(self, name), str | None):
-                raise ValueError(f"{name} must be a text or None, not {describe(getattr(self, name))}")
-        check_corner_angle(self.corner_angle)
-        check_integer("max_iterations", self.max_iterations, minimum=1)
-        check_choice("linear_solver", self.linear_solver, ("auto", *available()))
+        super().__post_init__()
         self._check_combination()
 
     def _check_combination(self) -> None:
@@ -151,10 +167,6 @@ class Settings:
         by_qdldl = self.linear_solver in ("auto", "qdldl") and "qdldl" in available()
         return by_qdldl and not alone and self.reference in (None, "equilateral")
 
-    def _names(self) -> tuple[str | None, ...]:
-        """Return the settings that may name files."""
-        return self.to, self.font, self.corners, self.pieces
-
     def key(self, files: ProblemFiles) -> str:
         """Return a digest of a problem's contents, these settings, the version, and the package's sources.
 
@@ -180,7 +192,8 @@ class Settings:
     def key_of(self, mesh: bytes, fixed: bytes) -> str:
         """Return the `key` of a problem whose files have these contents."""
         digest = blake2b(digest_size=16)
-        named = [_contents(Path(name)) if name is not None and os.path.isfile(name) else b"" for name in self._names()]
+        names = (getattr(self, setting) for setting in NAMING_FILES)
+        named = [_contents(Path(name)) if name is not None and os.path.isfile(name) else b"" for name in names]
         for contents in (mesh, fixed, *named):
             digest.update(len(contents).to_bytes(8, "little"))
             digest.update(contents)
@@ -225,15 +238,15 @@ def sources_digest() -> str:
 
 
 @dataclass(frozen=True)
-class Orders:
+class Orders(Options):
     """Parameters of a run that all its workers need."""
 
     output: Path  # Absolute path of the run's folder, the same on all machines
     settings: Settings
-    threads: int = 1  # Threads of the linear solver
-    time_limit: float | None = None  # Seconds of wall time per problem
-    memory_limit: int | None = None  # Bytes of resident memory of the process that solves a problem
-    retry: bool = False  # Whether to try again problems that failed for other reasons than their input
+    threads: int = option(1, check=positive)  # Threads of the linear solver
+    time_limit: float | None = option(None, check=_limit)  # Seconds of wall time per problem
+    memory_limit: int | None = option(None, check=_limit)  # Bytes of resident memory of the process for a problem
+    retry: bool = option(False, check=switch)  # Whether to retry failures that the input did not cause
 
     def folder(self, files: ProblemFiles) -> Path:
         """Return the folder of a problem's map and record."""

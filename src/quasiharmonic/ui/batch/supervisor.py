@@ -61,19 +61,15 @@ class Supervisor:
         self._closed = False
         self._lock = threading.Lock()
 
-    def attend(self, files: ProblemFiles) -> Finished:
+    def attend(self, files: ProblemFiles, *, again: bool = False) -> Finished:
         """Ensure that a problem has a record of this input and these settings; solve it if necessary.
 
-        OutputError if results cannot be written, WorkerError if no process can be started, ClosedError if `close` was
-        called in the meantime.
+        With ``again``, solve it in a new process, and replace its record. OutputError if results cannot be written,
+        WorkerError if no process can be started, ClosedError if `close` was called in the meantime.
         """
-        job = self._job(files)
-        return job if isinstance(job, Finished) else self._solve_one(job)
-
-    def attend_again(self, files: ProblemFiles) -> Finished:
-        """Solve a problem in a new process, and replace its record."""
-        self.rest()
-        job = self._job(files, again=True)
+        if again:
+            self.rest()
+        job = self._job(files, again=again)
         return job if isinstance(job, Finished) else self._solve_one(job)
 
     def attend_all(self, some: Sequence[ProblemFiles]) -> Iterator[Finished]:

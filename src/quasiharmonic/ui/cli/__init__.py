@@ -56,22 +56,6 @@ GROUPS = {
 }
 COMMANDS = tuple(name for group in GROUPS.values() for name in group)
 
-# The commands that read surfaces, and so patches of FreeSurfer.
-SURFACE_COMMANDS = (
-    "map",
-    "flatten",
-    "unwrap",
-    "polish",
-    "harmonise",
-    "repair",
-    "animate",
-    "transfer",
-    "check",
-    "measure",
-    "plot",
-    "view",
-)
-
 _INTERRUPTED = "interrupted, nothing was written"
 
 
@@ -117,7 +101,7 @@ def _parent_surface(options: argparse.Namespace) -> Iterator[None]:
     if path is None:
         yield
         return
-    from quasiharmonic.io.formats.neuro import set_parent_surface
+    from quasiharmonic.io.formats.neuro import use_parent_surface
     from quasiharmonic.io.registry import format_of
 
     given = [value if isinstance(value, list) else [value] for value in vars(options).values() if value is not path]
@@ -126,12 +110,8 @@ def _parent_surface(options: argparse.Namespace) -> Iterator[None]:
         raise ValueError("--surface gives the triangles of FreeSurfer's patches, but no file is a patch: omit it")
     if not path.is_file():
         raise ValueError(f"--surface {path}: there is no such file")
-
-    set_parent_surface(path)
-    try:
+    with use_parent_surface(path):
         yield
-    finally:
-        set_parent_surface(None)
 
 
 def _fail(command: str, why: str | Exception, status: int) -> int:
@@ -192,13 +172,4 @@ def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
     )
     for name in names:
         import_module(f"{__name__}.commands.{name}").add_parser(commands)
-        if name in SURFACE_COMMANDS:
-            commands.choices[name].add_argument(
-                "--surface",
-                dest="parent_surface",
-                type=Path,
-                metavar="FILE",
-                help="the surface with the triangles of a FreeSurfer patch (default: beside the patch, such as "
-                "lh.inflated for lh.cortex.patch.3d)",
-            )
     return parser

@@ -1,18 +1,22 @@
-"""Arguments that several commands share."""
+"""The options that several commands share, and how options are declared and checked."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
+from dataclasses import Field, fields
+from inspect import cleandoc
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from quasiharmonic.util import options
+from quasiharmonic.util.options import Options
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Option: TypeAlias = dict[str, Any]  # Keywords of `add_argument`
 
-# Copies of names in energies.polishing, solver.search.harmonising, energies.measures, solver.search.stages and
-# linsolve, so that the parser does not import these modules.
-ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
-FLATTENED = *ENERGIES, "distances"
-HARMONISED = "arap", "arap-unsigned", "area", "springs", *ENERGIES
+# Copies of names in energies.measures, so that the parser does not import this module.
 MEASURES = (
     "sigma1",
     "sigma2",
@@ -24,39 +28,79 @@ MEASURES = (
     "area_ratio",
     "shear",
 )
-STRATEGIES = "speed", "paper"
-LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
+# Defaults for packing, in texels.
+RESOLUTION, PADDING = 1024, 4
 
 
-def add_report(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``."""
-    parser.add_argument("--json", metavar="FILE", help="write the report as JSON; - for standard output")
+def add_command(
+    commands: Commands, name: str, text: str | None, run: Callable[[argparse.Namespace], int]
+) -> argparse.ArgumentParser:
+    """Declare a command, and return its parser.
+
+    ``text`` is the docstring of the command's module. It has four paragraphs: a title, which the help leaves out, what
+    the command does, the exit status, and examples.
+    """
+    _, description, epilog, examples = [*cleandoc(text or "").split("\n\n"), *[""] * 4][:4]
+    lines = tuple(line.strip() for line in examples.splitlines())
+    parser = commands.add_parser(name, description=description, epilog=epilog, examples=lines)
+    parser.set_defaults(run=run)
+    return parser
 
 
-def add_linear_solver(parser: argparse._ActionsContainer) -> None:
-    """Add ``--linear-solver``."""
-    parser.add_argument(
-        "--linear-solver", default="auto", choices=LINEAR_SOLVERS, help="(default: the fastest one installed)"
-    )
+def flag(words: str) -> Option:
+    """Return an option without a value; ``words`` are its help, as for the other kinds."""
+    return {"action": "store_true", "help": words}
 
 
-def add_strategy(parser: argparse._ActionsContainer) -> None:
-    """Add ``--strategy``."""
-    parser.add_argument(
-        "--strategy",
-        choices=STRATEGIES,
-        help="the fastest method, or the paper's pipeline, which starts with si-log (default: speed)",
-    )
+def file(words: str, **rest: Any) -> Option:
+    """Return an option that names a file."""
+    return {"type": Path, "metavar": "FILE", "help": words} | rest
 
 
-def add_rings(parser: argparse._ActionsContainer) -> None:
-    """Add ``--rings``."""
-    parser.add_argument(
-        "--rings",
-        type=count,
-        metavar="N",
-        help="for distances: largest number of edges between two vertices (default: 20)",
-    )
+def text(metavar: str, words: str, **rest: Any) -> Option:
+    """Return an option with any text."""
+    return {"metavar": metavar, "help": words, **rest}
+
+
+def choice(choices: Sequence[str], words: str, **rest: Any) -> Option:
+    """Return an option with one of several words."""
+    return {"choices": choices, "help": words, **rest}
+
+
+def number(kind: Callable[[str], Any], words: str, *, metavar: str = "N", **rest: Any) -> Option:
+    """Return an option with a number that ``kind`` converts."""
+    return {"type": kind, "metavar": metavar, "help": words, **rest}
+
+
+def declared(operation: type[Options]) -> dict[str, Option]:
+    """Return the options of an operation: the fields of its class that have a help text."""
+    return {one.name: _declare(one) for one in fields(operation) if one.metadata["help"]}
+
+
+def _declare(one: Field[Any]) -> Option:
+    words, choices, check = (one.metadata[name] for name in ("help", "choices", "check"))
+    if one.default is False:
+        return flag(words)
+    if choices:
+        return choice(choices, words, default=one.default)
+    return number({options.positive: count, options.count: steps}.get(check, float), words, default=one.default)
+
+
+def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option) -> None:
+    """Add options of `SHARED`, then options with these names and keywords; underscores stand for hyphens."""
+    for name, option in [*((name, SHARED[name]) for name in shared), *own.items()]:
+        parser.add_argument("--" + name.replace("_", "-"), **option)
+
+
+def add_files(parser: argparse.ArgumentParser, source: str, output: str, metavar: str = "INPUT") -> None:
+    """Add the input, and ``--output``, with these help texts."""
+    parser.add_argument("input", type=Path, metavar=metavar, help=source)
+    parser.add_argument("-o", "--output", type=Path, required=True, help=output)
+
+
+def pick(given: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the values of options as keyword arguments of the same names."""
+    return {name: getattr(given, name) for name in names}
 
 
 def set_default(options: argparse.Namespace, name: str, default: object, *, asked: bool, belongs: str) -> None:
@@ -97,3 +141,75 @@ def byte_count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a size such as 800M or 4G")
     return int(value)
+
+
+def degrees(text: str) -> float:
+    """Convert text to an angle in degrees, 0 to 180; for argparse."""
+    angle = float(text)
+    if not 0 <= angle <= 180:
+        raise argparse.ArgumentTypeError(f"{text} degrees: an angle from 0 to 180 is needed")
+    return angle
+
+
+def _island_list(text: str) -> list[int]:
+    """Convert a list of indices separated by commas; for argparse."""
+    words = text.split(",")
+    if not all(word.isascii() and word.isdigit() and len(word) < 10 for word in words):
+        raise argparse.ArgumentTypeError(f"{text} is not a list of islands such as 0,2")
+    return sorted({int(word) for word in words})
+
+
+#: The options that several commands take with the same meaning.
+SHARED: dict[str, Option] = {
+    **declared(options.MapOptions),
+    "fixed": file("file of fixed vertices, 0-based, one per line (default: the boundary)"),
+    "font": text("FONT", "for letters and words: a font file or the name of a font"),
+    "corners": text(
+        "V,V,…",
+        "boundary vertices, 0-based, that go to the outline's corners in the order it has them in (qhm check "
+        "--boundary numbers them), near:x,y,z for the one nearest to a place; or V:K for its corner K (from 0), V:X:Y "
+        "for its point (X, Y); or a file of these, one a line; or auto, by angle",
+    ),
+    "corner_angle": number(
+        degrees,
+        "how far an outline turns at a corner; with 0 all its points are corners, and its sides are matched edge "
+        "by edge (default: %(default)g)",
+        metavar="DEG",
+        default=20.0,
+    ),
+    "slide": flag("let boundary vertices slide along the outline while distortion is lowered; corners stay fixed"),
+    "pieces": file(
+        "file that assigns boundary vertices to sides of --to's outline, 'vertex side' on each line, 0-based; "
+        "a side ends at the next corner, and sides count along one contour after another"
+    ),
+    "cut": flag("cut surfaces that cannot be flattened, along seams; vertices and faces of the model are unchanged"),
+    "seams": text(
+        "WHICH",
+        "where seams are: file, where the input's vt have them (default); none; or a file of edges, two vertices, "
+        "0-based, on each line",
+        default="file",
+    ),
+    "islands": number(
+        _island_list,
+        "change only these islands, from 0 in the order of their first triangles; the others keep their positions",
+        metavar="K,K,…",
+    ),
+    "pack": flag("pack the islands into the unit square by their shapes, all at one texel density"),
+    "resolution": number(
+        int, f"for --pack: texels along a side of the texture (default: {RESOLUTION})", metavar="TEXELS"
+    ),
+    "padding": number(
+        float, f"for --pack: minimum distance between islands in texels (default: {PADDING})", metavar="TEXELS"
+    ),
+    "texture": text(
+        "IMAGE", "add a texture, a PNG or JPEG file or checkerboard: beside an OBJ as .mtl and image, within a GLB"
+    ),
+    "reference": choice(options.REFERENCES, "reference triangles"),
+    "rings": number(count, "for distances: largest number of edges between two vertices (default: 20)"),
+    "surface": file(
+        "the surface with the triangles of a FreeSurfer patch (default: beside the patch, such as "
+        "lh.inflated for lh.cortex.patch.3d)",
+        dest="parent_surface",
+    ),
+    "json": text("FILE", "write the report as JSON; - for standard output"),
+}

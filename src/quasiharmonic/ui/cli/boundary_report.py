@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.ui.cli import pipeline, report
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -27,7 +29,6 @@ def run(options: argparse.Namespace) -> int:
 
     from quasiharmonic import io
     from quasiharmonic.targets import boundary_turning
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.ui.plot import save_boundary_figure
     from quasiharmonic.util.arrays import count_of
 
@@ -55,8 +56,10 @@ def run(options: argparse.Namespace) -> int:
         marked = [corner["vertex"] for loop in described for corner in loop["corners"]]
         save_boundary_figure(options.plot, mesh.V, mesh.F, [loop.vertices for loop in loops], np.array(marked))
         text.append(f"wrote {options.plot}")
-    (report.emit_verdict if options.plot is None else report.emit)(facts, options.json, "\n".join(text))
-    return 0
+    account = pipeline.Account(facts, text)
+    if options.plot is None:
+        return pipeline.conclude(options, account)
+    return pipeline.finish(options, lambda: account, options.plot)
 
 
 def _describe_loop(loop: BoundaryLoop, V: NDArray[np.float64]) -> dict[str, Any]:

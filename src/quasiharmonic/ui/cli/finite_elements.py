@@ -6,11 +6,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.ui.cli import pipeline, report
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.io.fem.files import FemMesh, VolumeMesh
+    from quasiharmonic.io.fem.files import FemMesh
 
 
 def has_elements(path: Path) -> bool:
@@ -25,12 +27,11 @@ def check(options: argparse.Namespace) -> int:
     from quasiharmonic.geometry.mesh.elements import name_elements
     from quasiharmonic.io.fem.files import read_fem, read_volume
     from quasiharmonic.problem.inspection import inspect_mesh
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.util.arrays import count_of
 
     _reject(options, ("precision", "--as"), ("any_triangulation", "--any-triangulation"), ("fixed", "--fixed"))
     volume = read_volume(options.input)
-    if len(volume.parts.F):
+    if len(volume.F):
         return _check_volume(options, volume)
     mesh = read_fem(options.input)
     triangles, _, inverted = _split(mesh)
@@ -45,46 +46,44 @@ def check(options: argparse.Namespace) -> int:
         "injective": not inverted.size,
         "inverted": inverted.tolist(),
     }
-    text = f"{options.input}: {elements}, split into triangles: {found.summary()}\n{verdict}"
-    report.emit_verdict(facts, options.json, text)
-    return 1 if inverted.size else 0
+    first = f"{options.input}: {elements}, split into triangles: {found.summary()}"
+    return pipeline.conclude(options, pipeline.Account(facts, [first, verdict], not inverted.size))
 
 
-def _check_volume(options: argparse.Namespace, mesh: VolumeMesh) -> int:
+def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     """Certify tetrahedra as they are in the file; report hexahedra with a corner that is not positive."""
     from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
     from quasiharmonic.apps.tetrahedra.hexahedra import find_bad_corners
-    from quasiharmonic.ui.cli import report
+    from quasiharmonic.geometry.mesh.elements import split_solids
     from quasiharmonic.util.arrays import count_of, names_of
 
-    facts: dict[str, Any] = {"input": str(options.input), "elements": len(mesh.parts.F)}
+    T, H = split_solids(mesh.F)
+    facts: dict[str, Any] = {"input": str(options.input), "elements": len(mesh.F)}
     lines, good = [], True
-    if len(mesh.T):
+    if len(T):
         # Faces to hexahedra would count as boundary, so with hexahedra the boundary is not checked.
-        certificate = certify_arrays(mesh.T, mesh.points, boundary=not len(mesh.H))
-        good = certificate.positive if len(mesh.H) else bool(certificate.injective)
+        certificate = certify_arrays(T, mesh.points, boundary=not len(H))
+        good = certificate.positive if len(H) else bool(certificate.injective)
         facts |= certificate.to_dict()
         lines.append(certificate.summary())
-    if len(mesh.H):
-        bad = find_bad_corners(mesh.H, mesh.points)
+    if len(H):
+        bad = find_bad_corners(H, mesh.points)
         good = good and not bad.size
-        facts |= {"hexahedra": len(mesh.H), "corners_not_positive": bad.tolist(), "injective": None if good else False}
-        hexahedra = count_of("hexahedron", "hexahedra", len(mesh.H))
+        facts |= {"hexahedra": len(H), "corners_not_positive": bad.tolist(), "injective": None if good else False}
+        hexahedra = count_of("hexahedron", "hexahedra", len(H))
         lines.append(
             f"Of {hexahedra}, these have a corner that is not positive: {names_of('hexahedron', 'hexahedra', bad)}."
             if bad.size
             else f"All corners of {hexahedra} are positive. This does not certify them: a hexahedron with positive "
             "corners can be inverted inside."
         )
-    report.emit_verdict(facts, options.json, f"{options.input}: {' '.join(lines)}")
-    return 0 if good else 1
+    return pipeline.conclude(options, pipeline.Account(facts, [f"{options.input}: {' '.join(lines)}"], good))
 
 
 def measure(options: argparse.Namespace) -> int:
     """Report the quality of the elements; return the exit status of ``qhm measure``."""
     from quasiharmonic.apps.mesh_motion.quality import element_quality
     from quasiharmonic.io.fem.files import read_fem
-    from quasiharmonic.ui.cli import report
 
     _reject(options, ("export", "--export"), ("distances", "--distances"))
     mesh = read_fem(options.input)
@@ -98,8 +97,7 @@ def measure(options: argparse.Namespace) -> int:
         f"quality of {len(mesh.F)} elements (1: equilateral or square, 0: no area, negative: inverted): "
         f"mean {quality.mean():.4g}, minimum {quality.min():.4g} at element {quality.argmin()}"
     )
-    report.emit_verdict(facts, options.json, text)
-    return 0
+    return pipeline.conclude(options, pipeline.Account(facts, [text]))
 
 
 def plot(options: argparse.Namespace) -> int:
@@ -108,7 +106,6 @@ def plot(options: argparse.Namespace) -> int:
 
     from quasiharmonic import io
     from quasiharmonic.io.fem.files import read_fem
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.ui.plot import save_map_figure
 
     if options.kind not in (None, "map"):
@@ -118,9 +115,7 @@ def plot(options: argparse.Namespace) -> int:
     triangles, of, inverted = _split(mesh)
     V, F, uv = io.without_idle(mesh.points, triangles, mesh.points)
     save_map_figure(options.output, V, F, uv, inverted=np.flatnonzero(np.isin(of, inverted)))
-    with report.after_writing(options.output):
-        print(f"wrote {options.output}", flush=True)
-    return 0
+    return report.tell_written(options.output)
 
 
 def _split(mesh: FemMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -1,4 +1,4 @@
-"""Options that add a texture to the written surface."""
+"""The texture that ``--texture`` adds to the written surface."""
 
 from __future__ import annotations
 
@@ -12,15 +12,6 @@ if TYPE_CHECKING:
 
 # The value of --texture that needs no file.
 CHECKERBOARD = "checkerboard"
-
-
-def add_options(parser: argparse._ActionsContainer) -> None:
-    """Add ``--texture``."""
-    parser.add_argument(
-        "--texture",
-        metavar="IMAGE",
-        help="add a texture, a PNG or JPEG file or checkerboard: beside an OBJ as .mtl and image, within a GLB",
-    )
 
 
 def read_mesh(options: argparse.Namespace, path: Path) -> MeshData:

@@ -1,4 +1,4 @@
-"""Show progress on one terminal line that is overwritten; silent if standard error is not a terminal."""
+"""Show progress on one terminal line that is overwritten, or in a log."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.ui.cli.streams import tell
+
 if TYPE_CHECKING:
     from quasiharmonic.problem.result import Step
 
 _INTERVAL = 0.1
 
 
-def _of_search(step: Step) -> str:
+def describe_step(step: Step) -> str:
+    """Return a sentence about a step of a search."""
     return f"iteration {step.iteration}   inverted {step.inverted}   energy/area {step.energy:.3g}"
 
 
@@ -27,22 +30,30 @@ def overwrite(text: str) -> None:
 
 
 @contextmanager
-def line(words: Callable[[Any], str] = _of_search) -> Iterator[Callable[[Any], None] | None]:
-    """Yield a callback that shows steps, or None if standard error is not a terminal."""
-    if sys.stderr is None or not sys.stderr.isatty():
+def line(
+    words: Callable[[Any], str] = describe_step, *, live: float = _INTERVAL, log: float | None = None
+) -> Iterator[Callable[[Any], None] | None]:
+    """Yield a callback that shows steps every ``live`` seconds.
+
+    If standard error is not a terminal, the callback prints a line every ``log`` seconds; without this it is None.
+    """
+    terminal = sys.stderr is not None and sys.stderr.isatty()
+    interval = live if terminal else log
+    if sys.stderr is None or interval is None:
         yield None
         return
-    shown = 0.0
+    # The first step is shown at once on a terminal only.
+    shown = time.monotonic() - (interval if terminal else 0.0)
 
     def show(step: Any) -> None:
         nonlocal shown
         now = time.monotonic()
-        if now - shown < _INTERVAL:
-            return
-        shown = now
-        overwrite(words(step))
+        if now - shown >= interval:
+            shown = now
+            (overwrite if terminal else tell)(words(step))
 
     try:
         yield show
     finally:
-        overwrite("")
+        if terminal:
+            overwrite("")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -68,27 +69,21 @@ def emit_verdict(facts: dict[str, Any], destination: str | None, text: str) -> N
     emit(facts, destination, text)
 
 
-def check_outputs(
-    map_path: Path,
-    plot: Path | None,
-    json_path: str | None,
-    inputs: Sequence[Path | None],
-    *,
-    pattern: Path | None = None,
-) -> None:
+def check_outputs(options: argparse.Namespace, inputs: Sequence[Path | None]) -> None:
     """Check before any work that outputs can be written and do not replace other files.
 
-    ValueError or OSError if a path cannot be written, two outputs are the same file, or a picture or a report would
-    replace an input. The map may replace an input, because it is written after reading.
+    The outputs are the map, and the files of ``--plot``, ``--pattern`` and ``--json``. ValueError or OSError if a path
+    cannot be written, two outputs are the same file, or a picture or a report would replace an input. The map may
+    replace an input, because it is written after reading.
     """
     from quasiharmonic import io
 
-    io.check_output(map_path)
+    io.check_output(options.output)
+    plot, pattern = getattr(options, "plot", None), getattr(options, "pattern", None)
     if plot is not None:
         check_picture("--plot", plot, inputs)
-    taken = {map_path.resolve(): "the map (-o)"}
-    json_file = None if json_path in (None, "-") else Path(str(json_path))
-    for option, path in (("--plot", plot), ("--pattern", pattern), ("--json", json_file)):
+    taken = {options.output.resolve(): "the map (-o)"}
+    for option, path in (("--plot", plot), ("--pattern", pattern), ("--json", _json_file(options.json))):
         if path is None:
             continue
         _check_replaces_nothing(option, path, inputs)
@@ -97,22 +92,26 @@ def check_outputs(
         taken[path.resolve()] = option
 
 
-def check_json(json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for a command that writes only a report."""
-    if json_path not in (None, "-"):
-        _check_replaces_nothing("--json", Path(str(json_path)), inputs)
+def _json_file(json_path: str | None) -> Path | None:
+    """Return the file of ``--json``, if it names one."""
+    return None if json_path in (None, "-") else Path(str(json_path))
 
 
 def check_moved(output: Path, json_path: str | None, inputs: Sequence[Path | None]) -> None:
     """Like `check_outputs`, for a mesh in a format whose suffix another library checks."""
     _check_replaces_nothing("-o", output, inputs)
-    check_json(json_path, (*inputs, output))
+    check_new({}, json_path, (*inputs, output))
 
 
-def check_new(outputs: Mapping[str, Path], json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for files that must not replace any input; ``outputs`` maps descriptions to paths."""
+def check_new(outputs: Mapping[str, Path | None], json_path: str | None, inputs: Sequence[Path | None]) -> None:
+    """Like `check_outputs`, for files that must not replace any input.
+
+    ``outputs`` maps descriptions to paths, or to None.
+    """
     taken: list[Path] = []
-    for what, path in {**outputs, **({} if json_path in (None, "-") else {"--json": Path(str(json_path))})}.items():
+    for what, path in {**outputs, "--json": _json_file(json_path)}.items():
+        if path is None:
+            continue
         _check_replaces_nothing(what, path, inputs)
         if any(_same(path, other) for other in taken):
             raise ValueError(f"{what} {path} is also another output")
@@ -190,6 +189,13 @@ def describe_error(error: Exception) -> str:
         return str(error)
     named = isinstance(error.filename, str | bytes)
     return f"{printable(error.filename)}: {error.strerror}" if named else error.strerror
+
+
+def tell_written(path: Path) -> int:
+    """Print that a picture is written; return the exit status."""
+    with after_writing(path):
+        print(f"wrote {path}", flush=True)
+    return 0
 
 
 class ReportError(Exception):

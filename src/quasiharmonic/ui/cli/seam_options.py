@@ -1,4 +1,4 @@
-"""Options for seams, and the surface with its seams."""
+"""The surface of a file with the seams that the options request."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
     from quasiharmonic.io.seamed_mesh import SeamedMesh
 
-# Defaults for packing, in texels.
-_RESOLUTION, _PADDING = 1024, 4
-
 
 @dataclass
 class SeamedSurface:
@@ -25,61 +22,6 @@ class SeamedSurface:
     mesh: SeamedMesh
     facts: dict[str, Any] = field(default_factory=dict)  # Entries for the JSON report
     notes: list[str] = field(default_factory=list)  # Sentences for the text report
-
-
-def add_options(parser: argparse._ActionsContainer) -> None:
-    """Add ``--cut`` and ``--seams``."""
-    parser.add_argument(
-        "--cut",
-        action="store_true",
-        help="cut surfaces that cannot be flattened, along seams; vertices and faces of the model are unchanged",
-    )
-    parser.add_argument(
-        "--seams",
-        metavar="WHICH",
-        default="file",
-        help="where seams are: file, where the input's vt have them (default); none; or a file of edges, two vertices, "
-        "0-based, on each line",
-    )
-
-
-def add_islands(parser: argparse._ActionsContainer) -> None:
-    """Add ``--islands``."""
-    parser.add_argument(
-        "--islands",
-        type=_island_list,
-        metavar="K,K,…",
-        help="change only these islands, from 0 in the order of their first triangles; the others keep their positions",
-    )
-
-
-def _island_list(text: str) -> list[int]:
-    """Convert a list of indices separated by commas; for argparse."""
-    words = text.split(",")
-    if not all(word.isascii() and word.isdigit() and len(word) < 10 for word in words):
-        raise argparse.ArgumentTypeError(f"{text} is not a list of islands such as 0,2")
-    return sorted({int(word) for word in words})
-
-
-def add_packing(parser: argparse._ActionsContainer) -> None:
-    """Add ``--pack``, ``--resolution`` and ``--padding``."""
-    parser.add_argument(
-        "--pack",
-        action="store_true",
-        help="pack the islands into the unit square by their shapes, all at one texel density",
-    )
-    parser.add_argument(
-        "--resolution",
-        type=int,
-        metavar="TEXELS",
-        help=f"for --pack: texels along a side of the texture (default: {_RESOLUTION})",
-    )
-    parser.add_argument(
-        "--padding",
-        type=float,
-        metavar="TEXELS",
-        help=f"for --pack: minimum distance between islands in texels (default: {_PADDING})",
-    )
 
 
 def pack_islands(options: argparse.Namespace, mesh: SeamedMesh) -> SeamedMesh:
@@ -93,8 +35,8 @@ def check_packing(options: argparse.Namespace) -> None:
     """Raise ValueError if ``--resolution`` or ``--padding`` is given without ``--pack``."""
     from quasiharmonic.ui.cli import arguments
 
-    arguments.set_default(options, "resolution", _RESOLUTION, asked=options.pack, belongs="--pack")
-    arguments.set_default(options, "padding", _PADDING, asked=options.pack, belongs="--pack")
+    arguments.set_default(options, "resolution", arguments.RESOLUTION, asked=options.pack, belongs="--pack")
+    arguments.set_default(options, "padding", arguments.PADDING, asked=options.pack, belongs="--pack")
 
 
 def check_options(options: argparse.Namespace) -> None:
@@ -158,19 +100,10 @@ def read_edges(path: Path, n: int) -> NDArray[np.int64]:
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.lowlevel.textual import integer
+    from quasiharmonic.io.lowlevel.textual import read_pairs
 
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
-        words = line.partition("#")[0].replace(",", " ").replace(":", " ").split()
-        if not words:
-            continue
-        if len(words) != 2 or not all(word.isascii() and word.isdigit() for word in words):
-            raise MeshFileError(path, f"is not an edge, two whole numbers from 0 on: {line[:60]!r}", number)
-        try:
-            ends = [integer(word.encode()) for word in words]
-        except ValueError as error:
-            raise MeshFileError(path, str(error), number, "indices count from 0") from None
+    for number, ends in read_pairs(path, "an edge"):
         if max(ends) >= n:
             raise MeshFileError(path, f"vertex {max(ends)} of a mesh with {n}", number, "indices count from 0")
         rows.append(ends)

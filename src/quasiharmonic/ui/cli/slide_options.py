@@ -1,30 +1,13 @@
-"""Options for sliding boundaries, and the curves that they slide along."""
+"""Check the options of sliding boundaries, and describe vertices that cannot slide."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from quasiharmonic.geometry.curves import BoundaryCurves
     from quasiharmonic.io.seamed_mesh import Island
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--slide`` and ``--pieces``."""
-    parser.add_argument(
-        "--slide",
-        action="store_true",
-        help="let boundary vertices slide along the outline while distortion is lowered; corners stay fixed",
-    )
-    parser.add_argument(
-        "--pieces",
-        type=Path,
-        metavar="FILE",
-        help="file that assigns boundary vertices to sides of --to's outline, 'vertex side' on each line, 0-based; "
-        "a side ends at the next corner, and sides count along one contour after another",
-    )
 
 
 def check_options(options: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import seam_options
+from quasiharmonic.ui.cli import arguments, seam_options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,8 +30,6 @@ class IslandProblem:
     """Problem of an island as defined by the options."""
 
     fitted: FittedProblem  # If the boundary slides, its target positions lie on the curves
-    # Entries for the JSON report; those of several islands are added
-    facts: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # Sentences for the text report
     slide: bool | BoundaryCurves = False  # Whether the boundary slides, and along which curves
 
@@ -41,36 +39,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "targets of the boundary", "By default the targets are the texture coordinates (vt) of the input."
     )
-    where = group.add_mutually_exclusive_group()
-    where.add_argument(
-        "--fixed",
-        type=Path,
-        metavar="FILE",
-        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
-    )
-    where.add_argument("--to", metavar="OUTLINE", help=FORMS)
-    group.add_argument("--font", metavar="FONT", help="for letters and words: a font file or the name of a font")
-    group.add_argument(
-        "--corners",
-        metavar="V,V,…",
-        help="boundary vertices, 0-based, that go to the outline's corners in the order it has them in (qhm check "
-        "--boundary numbers them), near:x,y,z for the one nearest to a place; or V:K for its corner K (from 0), V:X:Y "
-        "for its point (X, Y); or a file of these, one a line; or auto, by angle",
-    )
-    group.add_argument(
-        "--corner-angle",
-        type=degrees,
-        default=20.0,
-        metavar="DEG",
-        help="how far an outline turns at a corner; with 0 all its points are corners, and its sides are matched edge "
-        "by edge (default: %(default)g)",
-    )
-    seam_options.add_options(group)
-    group.add_argument(
-        "--refine",
-        action="store_true",
-        help="if no map exists, split as few inner edges as necessary (adds vertices at the end)",
-    )
+    arguments.add_options(group.add_mutually_exclusive_group(), "fixed", to=arguments.text("OUTLINE", FORMS))
+    arguments.add_options(group, "font", "corners", "corner_angle", "cut", "seams")
 
 
 def files(options: argparse.Namespace) -> tuple[Path | None, ...]:
@@ -153,7 +123,7 @@ def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> I
         found = ",".join(map(str, island.vertices[fitted.corner_vertices].tolist()))
         posed.notes.append(f"corners by angle, in the outline's order: --corners {found}")
     if fitted.filled_holes:
-        posed.facts["filled_holes"] = holes = fitted.filled_holes
+        holes = fitted.filled_holes
         which = "the hole" if holes == 1 else f"the {holes} holes"
         posed.notes.append(
             f"the surface has no hole, so {which} of {options.to} {'is' if holes == 1 else 'are'} filled"
@@ -178,7 +148,6 @@ def _slide(options: argparse.Namespace, posed: IslandProblem) -> None:
             pieces=options.pieces,
         )
     posed.fitted = replace(posed.fitted, problem=move_onto(posed.slide, posed.fitted.problem))
-    posed.facts["slide"] = True
 
 
 def _check_room(problem: Problem, to: str) -> None:
@@ -203,11 +172,3 @@ def read_corners(text: str) -> CornerSpec:
         return asked_corners.read_corners(text)
     except ValueError as error:
         raise ValueError(f"--corners {text}: {error}") from None
-
-
-def degrees(text: str) -> float:
-    """Convert text to an angle in degrees, 0 to 180; for argparse."""
-    angle = float(text)
-    if not 0 <= angle <= 180:
-        raise argparse.ArgumentTypeError(f"{text} degrees: an angle from 0 to 180 is needed")
-    return angle

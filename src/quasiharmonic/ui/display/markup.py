@@ -14,6 +14,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.display.pictures import draw
+from quasiharmonic.ui.plot.canvas import png_bytes
 from quasiharmonic.util.display import Displayable
 
 if TYPE_CHECKING:
@@ -52,9 +53,9 @@ def _png(figure: Figure) -> bytes:
     """Return a PNG with few colours, a third of the size, because notebooks store every picture."""
     from PIL import Image
 
-    file = BytesIO()
-    figure.savefig(file, format="png", dpi=80)
-    Image.open(file).convert("RGB").quantize(_COLORS).save(small := BytesIO(), format="png", optimize=True)
+    Image.open(BytesIO(png_bytes(figure, dpi=80))).convert("RGB").quantize(_COLORS).save(
+        small := BytesIO(), format="png", optimize=True
+    )
     return small.getvalue()
 
 

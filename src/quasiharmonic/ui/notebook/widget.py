@@ -23,12 +23,11 @@ from quasiharmonic.ui.studio.session.exports import mapped_model, write_model
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.surface import Sheet, make_sheet, read_sheet
 from quasiharmonic.util.arrays import IntArray, describe
+from quasiharmonic.util.optional import explain_missing
 
-try:
+with explain_missing("the widget needs anywidget", "'quasiharmonic[notebook]'"):
     import anywidget
     import traitlets
-except ImportError as error:
-    raise ImportError(f"the widget needs anywidget ({error}): pip install 'quasiharmonic[notebook]'") from error
 
 # Messages to repeat to a new view, in this order.
 _REPEATED = "surface", "seams", "map", "obstructions", "image"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 import zlib
 from collections.abc import Iterable
 from io import BytesIO
@@ -20,6 +19,7 @@ from quasiharmonic.io.errors import check_path
 from quasiharmonic.ui.plot.canvas import AS_DRAWN, as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.ui.plot.shading import view
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_sequence, map_array
+from quasiharmonic.util.optional import explain_missing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -188,18 +188,16 @@ def _ffmpeg() -> str:
     """Return the path of the program ffmpeg, from PATH or from the extra ``video``."""
     if (found := shutil.which("ffmpeg")) is not None:
         return found
-    try:
+    with explain_missing("an .mp4 needs the program ffmpeg", "'quasiharmonic[video]' brings it, or write a .gif"):
         from imageio_ffmpeg import get_ffmpeg_exe
-    except ImportError:
-        raise ImportError(
-            "an .mp4 needs the program ffmpeg: pip install 'quasiharmonic[video]' brings it, or write a .gif"
-        ) from None
     return str(get_ffmpeg_exe())
 
 
 def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     from matplotlib import rc_context
     from matplotlib.animation import FFMpegWriter
+
+    from quasiharmonic.io.lowlevel.atomic import encode_by
 
     pictures = iter(pictures)
     first = next(pictures, None)
@@ -210,12 +208,13 @@ def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     image = figure.add_axes((0, 0, 1, 1))
     image.set_axis_off()
     shown = image.imshow(first, interpolation="none")
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "animation.mp4"
+
+    def write(target: str) -> None:
         # Browsers and phones play yuv420p.
         writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p"])
-        with rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(figure, str(target), dpi=100):
+        with rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(figure, target, dpi=100):
             for picture in chain([first], pictures):
                 shown.set_data(picture)
                 writer.grab_frame()
-        return target.read_bytes()
+
+    return encode_by("animation.mp4", write)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,7 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.ui.plot.shading import View, drawable, edge_style, min_heights
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, triangle_rows, vertex_array
+from quasiharmonic.util.optional import explain_missing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,20 +31,19 @@ _MAX_SHAPES = 10_000
 #: Settings of matplotlib with which a figure is saved in its own size, whatever the user's settings are.
 AS_DRAWN: dict[Any, Any] = {"savefig.dpi": "figure", "savefig.bbox": "standard"}
 
-RED = (0.89, 0.07, 0.17)
-INK = (0.06, 0.12, 0.29)
+Color: TypeAlias = tuple[float, float, float]
+RED: Color = (0.89, 0.07, 0.17)
+INK: Color = (0.06, 0.12, 0.29)
 BORDER = 1.2  # width in points
 _INSIDE = np.array((0.80, 0.82, 0.86))
 
 
 def new_figure(inches: tuple[float, float]) -> Figure:
     """Return a white figure of 100 pixels per inch that is not registered with pyplot; notebooks display it."""
-    try:
+    with explain_missing("pictures need matplotlib", "'matplotlib>=3.8'"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         from quasiharmonic.ui.plot.notebook_figures import NotebookFigure
-    except ImportError as error:
-        raise ImportError(f"pictures need matplotlib ({error}): pip install 'matplotlib>=3.8'") from error
 
     figure = NotebookFigure(figsize=inches, dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
@@ -80,7 +81,7 @@ def panels(figure: Figure, count: int) -> list[Axes]:
     return [figure.add_axes((i * width + 0.005, 0.02, width - 0.01, 0.88)) for i in range(count)]
 
 
-def caption(ax: Axes, text: str, color: tuple[float, float, float] = INK) -> None:
+def caption(ax: Axes, text: str, color: Color = INK) -> None:
     """Write a caption above a panel, at the same height for all panels."""
     left, right = ax.get_position(original=True).intervalx
     ax.figure.text((left + right) / 2, 0.93, text, ha="center", size=12.5, color=color)
@@ -116,7 +117,7 @@ def paint_surface(ax: Axes, seen: View, F: IntArray, color: FloatArray) -> None:
     corners = np.concatenate([F, border])
     near = np.concatenate([seen.depth[F].mean(axis=1), seen.depth[border].max(axis=1)])
     order = np.argsort(near, kind="stable")
-    _fill(
+    fill(
         ax,
         seen.points[corners[order]],
         np.concatenate([color, ink])[order],
@@ -147,24 +148,45 @@ def paint_map(
     edges, width = edge_style(color, height)
     # Inverted triangles are painted last, on top of the triangles they overlap.
     order = np.concatenate([np.delete(np.arange(len(F)), inverted), inverted])
-    _fill(ax, uv[F[order]], color[order], edges[order], width[order])
+    fill(ax, uv[F[order]], color[order], edges[order], width[order])
     tiny = inverted[height[inverted] < 0.7]
     ax.plot(*uv[F[tiny]].mean(axis=1).T, ".", markersize=3, markeredgewidth=0, color=RED, zorder=3)
-    outline(ax, F, uv)
+    border = boundary_edges(F, len(uv))
+    draw_edges(ax, uv, border)
     if fixed is not None:
         held = index_array("fixed", fixed)
         check_range("fixed", held, len(uv))
-        pins = np.setdiff1d(held, boundary_edges(F, len(uv)))
-        ax.plot(*uv[pins].T, "o", markersize=5, color="white", mec=INK, mew=1.4, zorder=5)
+        draw_pins(ax, uv[np.setdiff1d(held, border)])
 
 
-def outline(ax: Axes, F: IntArray, uv: FloatArray) -> None:
-    """Draw the boundary of a map."""
+def draw_edges(
+    ax: Axes, points: FloatArray, edges: IntArray, color: Color = INK, width: float = BORDER, zorder: float = 4
+) -> None:
+    """Draw edges (k, 2), by default as those of a boundary; edges with an end at NaN are left out."""
     from matplotlib.collections import LineCollection
 
-    border = uv[boundary_edges(F, len(uv))]
-    lines = LineCollection(_polygons(border), colors=[INK], linewidths=BORDER, capstyle="round", zorder=4)
+    ends = _polygons(points[edges])
+    lines = LineCollection(ends, colors=[color], linewidths=width, capstyle="round", zorder=zorder)
     ax.add_collection(lines, autolim=False)
+
+
+def draw_pins(ax: Axes, points: FloatArray) -> None:
+    """Mark fixed interior vertices."""
+    ax.plot(*points.T, "o", markersize=5, color="white", mec=INK, mew=1.4, zorder=5)
+
+
+def name_axes(ax: Axes, x: str, y: str) -> None:
+    """Label the axes of a chart, which has no frame at the top and at the right."""
+    ax.set_xlabel(x, color=INK)
+    ax.set_ylabel(y, color=INK)
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def png_bytes(figure: Figure, **options: Any) -> bytes:
+    """Return a figure as the bytes of a PNG file; ``options`` are those of matplotlib's ``savefig``."""
+    file = BytesIO()
+    figure.savefig(file, format="png", **options)
+    return file.getvalue()
 
 
 def not_positive(F: IntArray, uv: FloatArray) -> IntArray:
@@ -184,8 +206,8 @@ def as_mesh(V: ArrayLike, F: ArrayLike) -> tuple[FloatArray, IntArray]:
     return rest, triangles
 
 
-def _fill(ax: Axes, corners: FloatArray, color: FloatArray, edges: FloatArray, width: FloatArray) -> None:
-    """Paint triangles in the given order; corners (f, 3, 2), colours (f, 3)."""
+def fill(ax: Axes, corners: FloatArray, color: FloatArray, edges: ArrayLike, width: ArrayLike) -> None:
+    """Paint polygons in the given order; corners (f, m, 2), colours (f, 3), colours and widths of their edges."""
     from matplotlib.collections import PolyCollection
 
     triangles = PolyCollection(

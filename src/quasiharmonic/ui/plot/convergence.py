@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from quasiharmonic.problem.result import MapResult, Step
-from quasiharmonic.ui.plot.canvas import INK, RED, new_figure
+from quasiharmonic.ui.plot.canvas import RED, name_axes, new_figure
 from quasiharmonic.util.arrays import check_instance
 
 if TYPE_CHECKING:
@@ -58,11 +58,9 @@ def plot_convergence(result: MapResult) -> Figure:
         energy.set_yscale("log")
     flips.set_yscale("symlog", linthresh=1)
     flips.set_ylim(0, 2 * max(1, max(step.inverted for step in result.history)))
-    for ax, label in ((energy, "energy"), (flips, "inverted")):
-        ax.set_ylabel(label, color=INK)
+    for ax, x, y in ((energy, "", "energy"), (flips, "iterations", "inverted")):
+        name_axes(ax, x, y)
         ax.set_xlim(0, max(1, begin))
-        ax.spines[["top", "right"]].set_visible(False)
-    flips.set_xlabel("iterations", color=INK)
     energy.tick_params(labelbottom=False)
     flips.xaxis.set_major_locator(MaxNLocator(integer=True))
     energy.legend(frameon=False, fontsize=9)

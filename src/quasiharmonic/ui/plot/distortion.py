@@ -11,7 +11,17 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.measures import Distortion, distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
-from quasiharmonic.ui.plot.canvas import INK, RED, as_mesh, caption, new_figure, paint_map, paint_surface, save_picture
+from quasiharmonic.ui.plot.canvas import (
+    INK,
+    RED,
+    as_mesh,
+    caption,
+    name_axes,
+    new_figure,
+    paint_map,
+    paint_surface,
+    save_picture,
+)
 from quasiharmonic.ui.plot.shading import lit, view
 from quasiharmonic.util.arrays import FloatArray, check_choice, map_array
 
@@ -194,8 +204,6 @@ def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, sc
     ax.bar(steps[:-1], shares, width=1 / 40, align="edge", color=matplotlib.colormaps[scale.colormap](middle))
     _, names = scale.ticks
     ax.set_xticks(np.linspace(0, 1, len(names)), names, size=9)
-    ax.set_xlabel(scale.label, color=INK)
-    ax.set_ylabel("% of the surface's area", color=INK)
-    ax.spines[["top", "right"]].set_visible(False)
+    name_axes(ax, scale.label, "% of the surface's area")
     summed = found.statistics(measure)
     caption(ax, f"median {summed.median:.3g}, 95 % < {summed.p95:.3g}, max {summed.maximum:.3g}")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quasiharmonic.ui.plot.canvas import INK, RED, caption, fit, new_figure
+from quasiharmonic.ui.plot.canvas import INK, RED, caption, fill, fit, name_axes, new_figure
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
 
 if TYPE_CHECKING:
@@ -44,15 +44,12 @@ def elements_figure(
     for k, name in enumerate(("before", "after")):
         style: dict[str, Any] = {"histtype": ("step", "stepfilled")[k], "color": (INK, colors(0.6))[k], "label": name}
         ax.hist(np.clip(quality[k], bins[0], 1), list(bins), **style)
-    ax.set_xlabel("quality (1: best)")
-    ax.set_ylabel("elements")
+    name_axes(ax, "quality (1: best)", "elements")
     ax.legend(frameon=False)
     return figure
 
 
 def _draw_elements(ax: Axes, F: IntArray, points: FloatArray, colors: FloatArray, inverted: IntArray) -> None:
-    from matplotlib.collections import PolyCollection
-
     used = points[np.unique(F)]
     scale = fit(ax, used)
     outline = _outlines(F, points)
@@ -62,14 +59,7 @@ def _draw_elements(ax: Axes, F: IntArray, points: FloatArray, colors: FloatArray
     size = scale * np.sqrt(np.ptp(used, axis=0).prod() / len(F))
     width = float(np.clip(size / 30, 0.05, 0.6))
     order = np.argsort(np.isin(np.arange(len(F)), inverted), kind="stable")
-    shapes = PolyCollection(
-        list(outline[order]),
-        facecolors=colors[order],
-        edgecolors=[(*INK, 0.8)],
-        linewidths=width,
-        rasterized=len(F) > 10_000,
-    )
-    ax.add_collection(shapes)
+    fill(ax, outline[order], colors[order], [(*INK, 0.8)], width)
 
 
 def _outlines(F: IntArray, points: FloatArray) -> FloatArray:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.ui.plot.canvas import RED, as_mesh
 from quasiharmonic.util.arrays import FloatArray, map_array
+from quasiharmonic.util.optional import explain_missing
 
 #: Measures of distortion that the window offers as colours.
 SHOWN = ("isometric", "conformal", "area_ratio", "mips")
@@ -29,6 +28,8 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
     written as a PNG, which needs no display. ImportError if polyscope is not installed, RuntimeError if no window can
     be opened, and ValueError as `quasiharmonic.distortion`.
     """
+    from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
+
     polyscope = _polyscope()
     polyscope.set_verbosity(0)
     polyscope.set_use_prefs_file(False)
@@ -41,19 +42,10 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
         if screenshot is None:
             polyscope.show()
         else:
-            _photograph(polyscope, screenshot)
+            picture = encode_by("view.png", lambda path: polyscope.screenshot(path, transparent_bg=False))
+            write_whole(screenshot, picture)
     finally:
         polyscope.remove_all_structures()
-
-
-def _photograph(polyscope: Any, path: str | PathLike[str]) -> None:
-    """Write the view as a PNG; the file is replaced only when it is complete."""
-    from quasiharmonic.io.lowlevel.atomic import write_whole
-
-    with tempfile.TemporaryDirectory() as folder:
-        picture = Path(folder) / "view.png"
-        polyscope.screenshot(str(picture), transparent_bg=False)
-        write_whole(path, picture.read_bytes())
 
 
 def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
@@ -125,8 +117,6 @@ def view_of(points: FloatArray, aspect: float, angle: float) -> tuple[FloatArray
 
 
 def _polyscope() -> Any:
-    try:
+    with explain_missing("a window needs polyscope", "'quasiharmonic[view]'"):
         import polyscope
-    except ImportError as error:
-        raise ImportError("a window needs polyscope: pip install 'quasiharmonic[view]'") from error
     return polyscope

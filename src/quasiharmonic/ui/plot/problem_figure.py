@@ -9,12 +9,22 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.ui.plot.canvas import BORDER, INK, RED, as_mesh, caption, fit, new_figure, paint_surface, panels
+from quasiharmonic.ui.plot.canvas import (
+    BORDER,
+    RED,
+    as_mesh,
+    caption,
+    draw_edges,
+    draw_pins,
+    fit,
+    new_figure,
+    paint_surface,
+    panels,
+)
 from quasiharmonic.ui.plot.shading import drawable, view
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, fixed_vertices, index_array, target_positions
+from quasiharmonic.util.arrays import check_range, fixed_vertices, index_array, target_positions
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -64,19 +74,10 @@ def plot_problem(
     paint_surface(surface, seen, F, seen.color)
     caption(surface, f"surface: {len(F):,} triangles")
     fit(plane, places[held])
-    _lines(plane, places, border, INK, BORDER)
-    pins = np.setdiff1d(held, border)
-    plane.plot(*places[pins].T, "o", markersize=5, color="white", mec=INK, mew=1.4, zorder=5)
+    draw_edges(plane, places, border, zorder=6)
+    draw_pins(plane, places[np.setdiff1d(held, border)])
     caption(plane, f"where {len(held):,} vertices go")
     for ax, points in ((surface, seen.points), (plane, places)):
-        _lines(ax, points, pairs, RED, 2 * BORDER)
+        draw_edges(ax, points, pairs, RED, 2 * BORDER, zorder=6)
         ax.plot(*points[marked].T, "o", markersize=5, color=RED, zorder=7)
     return figure
-
-
-def _lines(ax: Axes, points: FloatArray, edges: IntArray, color: tuple[float, float, float], width: float) -> None:
-    """Draw the edges whose two ends have positions."""
-    ends = points[edges].reshape(-1, 2, 2)
-    gap = np.full((len(ends), 1, 2), np.nan)
-    x, y = np.concatenate([ends, gap], axis=1).reshape(-1, 2).T
-    ax.plot(x, y, color=color, linewidth=width, solid_capstyle="round", zorder=6)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.targets.boundary.correspondence import viewer_axes
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, pad_to_space
 
 # Colours at the four corners of the view; all differ clearly from the red of inverted triangles.
 _CORNERS = np.array([[(40, 96, 190), (16, 160, 140)], [(140, 110, 230), (255, 200, 60)]]) / 255
@@ -34,9 +34,7 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
     """Project a surface: a planar one from above, an open one from the direction that shows most of it."""
     if not len(F):
         raise ValueError("the mesh has no triangles to draw")
-    V = drawable(V)
-    if V.shape[1] == 2:
-        V = np.column_stack([V, np.zeros(len(V))])
+    V = pad_to_space(drawable(V))
     normals = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
     sizes = np.linalg.norm(normals, axis=1)
     frame = _frame(normals.sum(axis=0), sizes.sum())

@@ -10,22 +10,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
-from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.errors import check_path, reading
 from quasiharmonic.io.models.textures import Texture, read_texture
 from quasiharmonic.ui.plot.canvas import (
     RED,
     as_mesh,
     caption,
+    draw_edges,
     new_figure,
     not_positive,
-    outline,
     panels,
     save_picture,
     verdict,
 )
 from quasiharmonic.ui.plot.shading import drawable, lit, view
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, enumerate_each, map_array
+from quasiharmonic.util.optional import explain_missing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,7 +95,7 @@ def plot_texture(
     _show(surface, seen.points, _render(seen.points, seen.depth, F, board, color, inverted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
     _show(plane, board, _render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
-    outline(plane, F, board)
+    draw_edges(plane, board, boundary_edges(F, len(board)))
     verdict(plane, "map", len(inverted))
     return figure
 
@@ -192,20 +194,16 @@ def _checkerboard_color(coordinates: FloatArray) -> FloatArray:
 
 def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[FloatArray], FloatArray]:
     """Return a function from texture coordinates (k, 2) to colours (k, 3) of an image that repeats with period 1."""
-    try:
+    with explain_missing("pictures need Pillow", "pillow"):
         from PIL import Image
-    except ImportError as error:
-        raise ImportError(f"pictures need Pillow ({error}): pip install pillow") from error
     if not isinstance(texture, Texture):
         check_path("texture", texture)
     path, image_file = ("", texture) if isinstance(texture, Texture) else (texture, read_texture(texture))
-    try:
-        with Image.open(BytesIO(image_file.data)) as image:
-            # Details finer than the panel's samples would alias.
-            image.thumbnail((_SIDE * _SAMPLES, _SIDE * _SAMPLES))
-            glass = image.convert("RGBA")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise MeshFileError(path, f"is a damaged image: {error}") from error
+    damage = OSError, ValueError, SyntaxError, Image.DecompressionBombError
+    with reading(path, "is a damaged image: ", damage), Image.open(BytesIO(image_file.data)) as image:
+        # Details finer than the panel's samples would alias.
+        image.thumbnail((_SIDE * _SAMPLES, _SIDE * _SAMPLES))
+        glass = image.convert("RGBA")
     white = Image.new("RGBA", glass.size, "white")
     # Rows from bottom to top, as v increases.
     pixels = np.asarray(Image.alpha_composite(white, glass).convert("RGB"), dtype=np.float64)[::-1] / 255

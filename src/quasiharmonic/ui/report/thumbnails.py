@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -34,7 +33,7 @@ def thumbnail(record: Record, results: Path | None) -> str:
     if mesh is None or not len(mesh.F) or len(mesh.F) > _MAX_TRIANGLES:
         return ""
     from quasiharmonic.ui.plot import plot_map, plot_surface
-    from quasiharmonic.ui.plot.canvas import new_figure, panels
+    from quasiharmonic.ui.plot.canvas import new_figure, panels, png_bytes
 
     figure = new_figure((3.2, 1.6) if mapped else (1.6, 1.6))
     axes = panels(figure, 2 if mapped else 1)
@@ -45,9 +44,7 @@ def thumbnail(record: Record, results: Path | None) -> str:
     if mapped:
         opened, F, uv = io.without_idle(*io.cut_at_seams(mesh))
         plot_map(_center(opened), F, _center(uv), ax=axes[1])
-    file = BytesIO()
-    figure.savefig(file, format="png")
-    return "data:image/png;base64," + b64encode(file.getvalue()).decode()
+    return "data:image/png;base64," + b64encode(png_bytes(figure)).decode()
 
 
 def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:

@@ -23,6 +23,7 @@ from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy, PairF
 from quasiharmonic.apps.flattening.layout import to_given_unit
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.distances import Sampling, SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
@@ -144,22 +145,37 @@ def lower_distance_error(piece: Piece, uv: FloatArray, options: DistanceOptions,
     """
     run = Run(options.callback, options.record_every, first=first)
     distances = sample_distances(piece.V, piece.F, choose_sampling(options.rings))
-    start = fit_scale(uv, distances, piece.F, piece.loops)
-    with np.errstate(all="ignore"):
-        energy = DistanceEnergy(distances, piece.energy(SymmetricDirichlet(), None), len(piece.V))
-        descent = SurfaceDescent(
-            energy, start, options.linear_solver, rim=Rim(piece.loops), pairs=DistancePairs(energy)
-        )
-    status = Status.INTERRUPTED
-    with run.until_interrupted():
-        steps = islice(descend(descent, SymmetricDirichlet(), options.tol), options.max_iterations)
-        status = run.descend(
-            "guarded descent, distances",
-            steps,
-            lambda: descent.distortion,
-            lambda: to_given_unit(descent.uv, piece.exponent),
-        )
+    barrier = piece.energy(SymmetricDirichlet(), None)
+    descent = make_descent(distances, barrier, uv, piece.loops, options.linear_solver)
+    status = lower_errors(run, "guarded descent, distances", descent, options, piece.exponent)
     return run.result(descent.uv, piece.F, status, loops=piece.loops, linear_solver=descent.linear_solver)
+
+
+def make_descent(
+    distances: SurfaceDistances, barrier: DeformationEnergy, uv: FloatArray, loops: list[IntArray], linear_solver: str
+) -> SurfaceDescent:
+    """Return the guarded descent of the error of distances from a bijective map (n, 2) of any size."""
+    start = fit_scale(uv, distances, barrier.F, loops)
+    with np.errstate(all="ignore"):
+        energy = DistanceEnergy(distances, barrier, len(uv))
+        return SurfaceDescent(energy, start, linear_solver, rim=Rim(loops), pairs=DistancePairs(energy))
+
+
+def lower_errors(
+    run: Run, name: str, descent: SurfaceDescent, options: DistanceOptions, exponent: int | None = None
+) -> Status:
+    """Run a descent of `make_descent` as a stage, and return its status; maps are recorded if ``exponent`` is given.
+
+    The map is in units of ``2 ** exponent``.
+    """
+    with run.until_interrupted():
+        return run.descend(
+            name,
+            islice(descend(descent, SymmetricDirichlet(), options.tol), options.max_iterations),
+            lambda: descent.distortion,
+            None if exponent is None else lambda: to_given_unit(descent.uv, exponent),
+        )
+    return Status.INTERRUPTED
 
 
 def choose_sampling(rings: int) -> Sampling:

@@ -12,17 +12,13 @@ meshes have errors of 1 to 2 %. If a map can nearly keep distances, a descent on
 
 from __future__ import annotations
 
-from itertools import islice
-
 import numpy as np
 
-from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.distances.distance_descent import (
-    DistancePairs,
     choose_sampling,
-    fit_scale,
+    lower_errors,
+    make_descent,
 )
-from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy
 from quasiharmonic.apps.flattening.layout import to_given_unit
 from quasiharmonic.apps.flattening.multilevel.coarse_flattening import (
     COARSEST,
@@ -35,11 +31,10 @@ from quasiharmonic.apps.flattening.multilevel.coarse_flattening import (
 from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
 from quasiharmonic.apps.flattening.multilevel.local_smoothing import smooth_map, thick_energy
 from quasiharmonic.apps.flattening.piece import Piece
-from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.distances import SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.problem.result import MapResult, Snapshot, Status
+from quasiharmonic.problem.result import MapResult, Snapshot
 from quasiharmonic.problem.run import Run
 from quasiharmonic.util.options import DistanceOptions
 
@@ -75,14 +70,8 @@ def lower_coarse_distance_error(piece: Piece, options: DistanceOptions, *, least
     run.add_stage("start, coarse", energy=(value, value))
 
     distances = _measure_distances(hierarchy, level, rings)
-    with np.errstate(all="ignore"):
-        energy = DistanceEnergy(distances, barrier, len(V))
-        start = fit_scale(uv, distances, level.F, level.loops)
-        descent = SurfaceDescent(energy, start, solver, rim=Rim(level.loops), pairs=DistancePairs(energy))
-    status = Status.INTERRUPTED
-    with run.until_interrupted():
-        steps = islice(descend(descent, SymmetricDirichlet(), options.tol), options.max_iterations)
-        status = run.descend("guarded descent, distances, coarse", steps, lambda: descent.distortion)
+    descent = make_descent(distances, barrier, uv, level.loops, solver)
+    status = lower_errors(run, "guarded descent, distances, coarse", descent, options)
     found = prolong_map(hierarchy, level, hierarchy.level(0), descent.uv, solver)
     if found is None:
         return None

@@ -103,14 +103,14 @@ def descend_level(
     """Lower the symmetric Dirichlet energy of a level's bijective map; return it and whether a guard was needed."""
     rim = Rim(level.loops)
     energy = thick_energy(V, level.F)
-    if not guarded:
-        free = SurfaceDescent(energy, uv, linear_solver)
-        for _ in islice(descend(free, SymmetricDirichlet(), _TOLERANCE), steps):
+
+    def lower(rim: Rim | None) -> FloatArray:
+        descent = SurfaceDescent(energy, uv, linear_solver, rim=rim)
+        for _ in islice(descend(descent, SymmetricDirichlet(), _TOLERANCE), steps):
             pass
-        if not rim.meets_itself(free.uv):
-            return free.uv, False
+        return descent.uv
+
+    if not guarded and not rim.meets_itself(free := lower(None)):
+        return free, False
     energy.energy = SymmetricDirichlet()
-    descent = SurfaceDescent(energy, uv, linear_solver, rim=rim)
-    for _ in islice(descend(descent, SymmetricDirichlet(), _TOLERANCE), steps):
-        pass
-    return descent.uv, True
+    return lower(rim), True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,17 @@ def pin_obstructions(F: IntArray, n: int, found: Edges, fixed: IntArray, target:
         *_find_covered(F, is_fixed, where, fixed),
     ]
     return Diagnosis(tuple(obstructions), ("the boundary, because it is free",))
+
+
+def renumber_obstruction(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obstruction:
+    """Return an obstruction of a part in the numbering of the mesh; ``vertices`` and ``triangles`` are the mesh's."""
+    return replace(
+        found,
+        vertices=vertices[found.vertices],
+        edges=vertices[found.edges],
+        triangles=triangles[found.triangles],
+        split=vertices[found.split],
+    )
 
 
 def _find_shared_positions(fixed: IntArray, target: FloatArray) -> Iterator[Obstruction]:

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from quasiharmonic.apps.flattening.connected_parts import Part, name_part, unite_parts
-from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
+from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions, renumber_obstruction
 from quasiharmonic.apps.flattening.pins.pin_search import PinSearch
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.loops import check_loops, winding
@@ -174,17 +174,9 @@ def _distances(points: FloatArray, tails: FloatArray, heads: FloatArray) -> Floa
 
 def _renumber_diagnosis(diagnosis: Diagnosis, part: Part) -> Diagnosis:
     """Convert a part's diagnosis to the mesh's numbering; messages keep the part's numbering, and say so."""
+    where = name_part(part.vertices)
+    renumbered = (renumber_obstruction(one, part.vertices, part.triangles) for one in diagnosis.obstructions)
     return Diagnosis(
-        tuple(
-            replace(
-                one,
-                message=f"In {name_part(part.vertices)}: {one.message}",
-                vertices=part.vertices[one.vertices],
-                edges=part.vertices[one.edges],
-                triangles=part.triangles[one.triangles],
-                split=part.vertices[one.split],
-            )
-            for one in diagnosis.obstructions
-        ),
+        tuple(replace(one, message=f"In {where}: {one.message}") for one in renumbered),
         diagnosis.unchecked,
     )

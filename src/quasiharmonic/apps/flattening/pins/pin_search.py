@@ -78,9 +78,7 @@ def flatten_pinned(
     area.
     """
     search = PinSearch(piece, fixed, target, options, weights)
-    # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never accepted.
-    with np.errstate(all="ignore"):
-        search.run(start)
+    search.run(start)
     return search.result()
 
 
@@ -172,11 +170,13 @@ class PinSearch:
 
     def run(self, start: FloatArray | None) -> None:
         """Find a bijective map with the vertices at their target positions, and lower its distortion."""
-        moved = self.flatten_freely(start)
-        if not self.certificate.bijective and self.status is not Status.INTERRUPTED:
-            self.find_bijective(moved)
-        if self.certificate.bijective and self.status is not Status.INTERRUPTED:
-            self.lower_distortion()
+        # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never accepted.
+        with np.errstate(all="ignore"):
+            moved = self.flatten_freely(start)
+            if not self.certificate.bijective and self.status is not Status.INTERRUPTED:
+                self.find_bijective(moved)
+            if self.certificate.bijective and self.status is not Status.INTERRUPTED:
+                self.lower_distortion()
 
     def flatten_freely(self, start: FloatArray | None) -> FloatArray:
         """Flatten freely, optionally from a start in the surface's unit, and move the map onto the pins; (n, 2)."""

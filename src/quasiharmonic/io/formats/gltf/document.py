@@ -10,15 +10,17 @@ import base64
 import binascii
 import json
 import os
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError, printable
+from quasiharmonic.io.errors import MeshFileError, printable, reading
 from quasiharmonic.io.lowlevel.textual import read_bytes
-from quasiharmonic.util.untrusted import beside
+from quasiharmonic.util.untrusted import beside, check_end
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}
@@ -32,15 +34,15 @@ _LISTS = (
 )
 _PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX 20": "image/ktx2"}
 # Errors that reading a damaged document may raise.
-DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError)
 
 
+@dataclass(frozen=True, eq=False)
 class Document:
     """A glTF file: its JSON, and the bytes of each of ``tree["bufferViews"]``."""
 
-    def __init__(self, tree: dict[str, Any], views: list[bytes | memoryview]) -> None:
-        self.tree = tree
-        self.views = views
+    tree: dict[str, Any]
+    views: list[bytes | memoryview]
 
     @property
     def size(self) -> int:
@@ -161,26 +163,19 @@ def load(path: str | os.PathLike[str]) -> Document:
     MeshFileError if the file is not glTF, is damaged or compressed, or refers to bytes outside its own folder.
     """
     data = read_bytes(path)
-    try:
+    with reading(path, "is not a glTF file: ", DAMAGE, describe=fault):
         text, chunk = _chunks(data) if data[:4] == b"glTF" else (data, None)
         tree = json.loads(text, parse_constant=_no_number)
         version = str(tree["asset"]["version"])
         _check_lists(tree)
-    except (*DAMAGE, RecursionError) as error:
-        raise MeshFileError(path, f"is not a glTF file: {fault(error)}") from error
     if not version.startswith("2."):
         raise MeshFileError(path, f"is glTF {version[:20]}", remedy="save it as glTF 2.0")
     compressed = [name for name in _COMPRESSIONS if f'"{name}"' in json.dumps(tree.get("extensionsUsed", []))]
     if compressed:
         raise MeshFileError(path, f"is compressed by {compressed[0]}", remedy="save it without compression")
-    try:
+    with reading(path, "is damaged: ", DAMAGE, describe=fault):
         buffers = [_buffer(path, buffer, chunk) for buffer in tree.get("buffers", [])]
         views = [_view(view, buffers) for view in tree.get("bufferViews", [])]
-    except MeshFileError:
-        # An error in a file that this one refers to.
-        raise
-    except DAMAGE as error:
-        raise MeshFileError(path, f"is damaged: {fault(error)}") from error
     return Document(tree, views)
 
 
@@ -210,18 +205,28 @@ def embed_pictures(document: Document, folder: Path) -> list[str]:
         uri = image.get("uri")
         if not isinstance(uri, str) or uri.startswith("data:"):
             continue
-        try:
-            data = read_bytes(beside(folder, uri))
-        except ValueError:
-            missing.append(uri)
-            continue
-        kind = picture_type(data)
-        if kind is None:
+        data = b""
+        with suppress(ValueError):
+            data = read_uri(folder, uri)
+        if (kind := picture_type(data)) is None:
             missing.append(uri)
             continue
         del image["uri"]
         image |= {"bufferView": document.add_bytes(data), "mimeType": kind}
     return missing
+
+
+def read_uri(folder: Path, uri: str) -> bytes:
+    """Return the bytes in a data URI, or those of a file in the folder of the document; ValueError if it is damaged."""
+    if not uri.startswith("data:"):
+        return read_bytes(beside(folder, uri))
+    head, _, text = uri.partition(",")
+    if not head.endswith(";base64"):
+        raise ValueError("a buffer is not base64")
+    try:
+        return base64.b64decode(text, validate=True)
+    except binascii.Error as error:
+        raise ValueError(f"a buffer is not base64: {error}") from error
 
 
 def whole(value: object) -> int:
@@ -260,8 +265,7 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     at = 12
     while at + 8 <= len(data):
         size, name = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
-        if at + 8 + size > len(data):
-            raise ValueError("it ends too early")
+        check_end(at + 8 + size, len(data))
         found.setdefault(name, data[at + 8 : at + 8 + size])
         at += 8 + size
     return found[b"JSON"], found.get(b"BIN\0")
@@ -270,18 +274,7 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
 def _buffer(path: str | os.PathLike[str], buffer: dict[str, Any], chunk: bytes | None) -> bytes:
     """Return the bytes of a buffer."""
     size, uri = whole(buffer["byteLength"]), buffer.get("uri")
-    if uri is None:
-        data = chunk
-    elif uri.startswith("data:"):
-        head, _, text = uri.partition(",")
-        if not head.endswith(";base64"):
-            raise ValueError("a buffer is not base64")
-        try:
-            data = base64.b64decode(text, validate=True)
-        except binascii.Error as error:
-            raise ValueError(f"a buffer is not base64: {error}") from error
-    else:
-        data = read_bytes(beside(Path(path).parent, uri))
+    data = chunk if uri is None else read_uri(Path(path).parent, uri)
     if data is None or len(data) < size:
         raise ValueError("a buffer is shorter than its length states")
     return data[:size]

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
-from quasiharmonic.io.formats.normals import normal_lines
+from quasiharmonic.io.formats.vertex_data import normal_lines
 from quasiharmonic.io.formats.welding import weld
 from quasiharmonic.io.models.meshdata import Carried, MeshData
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
@@ -38,6 +39,11 @@ class VertexPool:
     first: int
     count: int
 
+    @property
+    def rows(self) -> slice:
+        """The vertices among those of all pools."""
+        return slice(self.first, self.first + self.count)
+
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
@@ -50,23 +56,26 @@ class Primitive:
     end: int
 
 
+@dataclass(frozen=True, eq=False)
 class CarriedGltf(Carried):
     """A glTF document, the folder of its image files, and the relation of the surface to its primitives.
 
     ``rows`` (f, 3) has for every corner its vertex among those of all pools.
     """
 
-    def __init__(
-        self,
-        document: Document,
-        folder: Path,
-        pools: list[VertexPool],
-        parts: list[Primitive],
-        rows: IntArray,
-        mesh: MeshData,
-    ) -> None:
-        super().__init__(mesh.V, mesh.F)
-        self.document, self.folder, self.pools, self.parts, self.rows = document, folder, pools, parts, rows
+    document: Document
+    folder: Path
+    pools: list[VertexPool]
+    parts: list[Primitive]
+    rows: IntArray
+
+    def parts_of(self, pool: int) -> list[Primitive]:
+        """Return the primitives that use a pool, by its index."""
+        return [part for part in self.parts if part.pool == pool]
+
+    def faces_of(self, pool: int) -> IntArray:
+        """Return the triangles of a pool, in the order of its primitives."""
+        return np.concatenate([np.arange(part.begin, part.end) for part in self.parts_of(pool)])
 
     def further(self) -> list[str]:
         tree = self.document.tree
@@ -102,12 +111,9 @@ def read_gltf(path: str | os.PathLike[str]) -> MeshData:
         If the file is not glTF 2.0, is damaged, is compressed by an extension, or has no triangles.
     """
     document = load(path)
-    try:
-        # Overflow is reported later, by the checks for finite numbers.
-        with np.errstate(over="ignore", invalid="ignore"):
-            mesh = _mesh(document, os.fspath(path))
-    except (*DAMAGE, RecursionError) as error:
-        raise MeshFileError(path, f"is damaged: {fault(error)}") from error
+    # Overflow is reported later, by the checks for finite numbers.
+    with reading(path, "is damaged: ", DAMAGE, describe=fault), np.errstate(over="ignore", invalid="ignore"):
+        mesh = _mesh(document, os.fspath(path))
     if mesh is None:
         raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
     return mesh
@@ -141,7 +147,8 @@ def _mesh(document: Document, source: str) -> MeshData | None:
         statement_faces=np.array([face for _, face in statements], dtype=np.int64),
         source=source,
     )
-    return replace(mesh, carried=CarriedGltf(document, Path(source).parent, pools, parts, rows, mesh))
+    carried = CarriedGltf(mesh.V, mesh.F, document, Path(source).parent, pools, parts, rows)
+    return replace(mesh, carried=carried)
 
 
 def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntArray, list[tuple[bytes, int]]]:
@@ -228,38 +235,37 @@ def _attribute(
             continue
         if table.shape[1] > width:
             raise ValueError(f"{name} has {table.shape[1]} numbers for each vertex")
-        rows = slice(pool.first, pool.first + pool.count)
-        numbers[rows, : table.shape[1]] = table
-        numbers[rows, table.shape[1] :] = 1.0
-        known[rows] = True
+        numbers[pool.rows, : table.shape[1]] = table
+        numbers[pool.rows, table.shape[1] :] = 1.0
+        known[pool.rows] = True
     return numbers, known
 
 
 def _positions(document: Document, pools: list[VertexPool]) -> tuple[FloatArray, FloatArray]:
     """Return positions (v, 3) in the scene, and the mesh (v,) of each."""
     points, _ = _attribute(document, pools, "POSITION", 3)
-    placed = _placements(document.tree)
-    for pool in pools:
-        if pool.mesh in placed:
-            rows = slice(pool.first, pool.first + pool.count)
-            matrix = placed[pool.mesh]
-            points[rows] = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+    for rows, matrix in _moved_rows(document, pools):
+        points[rows] = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
     return points, repeat_each([pool.mesh for pool in pools], [pool.count for pool in pools]).astype(np.float64)
 
 
 def _transform_normals(document: Document, pools: list[VertexPool], normals: FloatArray) -> FloatArray:
     """Return normals (v, 3) in the scene, of unit length if a transformation was applied."""
+    for rows, matrix in _moved_rows(document, pools):
+        # Normals transform by the cofactor matrix, which also exists for singular matrices.
+        cofactors = np.stack([np.cross(matrix[(i + 1) % 3, :3], matrix[(i + 2) % 3, :3]) for i in range(3)])
+        turned = normals[rows] @ cofactors.T
+        length = np.linalg.norm(turned, axis=1, keepdims=True)
+        normals[rows] = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0)
+    return normals
+
+
+def _moved_rows(document: Document, pools: list[VertexPool]) -> Iterator[tuple[slice, FloatArray]]:
+    """Yield the vertices of each pool whose mesh is transformed in the scene, and the transformation (4, 4)."""
     placed = _placements(document.tree)
     for pool in pools:
         if pool.mesh in placed:
-            rows = slice(pool.first, pool.first + pool.count)
-            linear = placed[pool.mesh][:3, :3]
-            # Normals transform by the cofactor matrix, which also exists for singular matrices.
-            cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
-            turned = normals[rows] @ cofactors.T
-            length = np.linalg.norm(turned, axis=1, keepdims=True)
-            normals[rows] = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0)
-    return normals
+            yield pool.rows, placed[pool.mesh]
 
 
 def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
@@ -303,9 +309,8 @@ def _local(node: dict[str, Any], index: int) -> FloatArray:
 def _numbers(node: dict[str, Any], name: str, default: list[int], index: int) -> FloatArray:
     """The numbers of a node's entry, as many as its default has; `ValueError` for anything else."""
     values = node.get(name, default)
-    if not isinstance(values, list) or len(values) != len(default):
-        count = f"{len(values)}" if isinstance(values, list) else ascii(values)[:40]
-        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {count}")
-    if not all(isinstance(value, int | float) for value in values):
-        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {ascii(values)[:40]}")
+    is_list = isinstance(values, list)
+    if not is_list or len(values) != len(default) or not all(isinstance(value, int | float) for value in values):
+        found = f"{len(values)}" if is_list and len(values) != len(default) else ascii(values)[:40]
+        raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {found}")
     return np.array(values, dtype=np.float64)

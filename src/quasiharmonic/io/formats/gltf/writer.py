@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
-from quasiharmonic.io.formats.normals import normal_rows
+from quasiharmonic.io.formats.vertex_data import colours_of, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.models.materials import materials_lost
 from quasiharmonic.io.models.meshdata import MeshData
@@ -68,9 +68,9 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
         lost.append(f"{same} at positions that coincide with others in single precision")
     if mesh.polygons is not None:
         lost.append("polygons, which are written as triangles")
-    if mesh.extra is not None and _colours(mesh) is None:
+    if mesh.extra is not None and colours_of(mesh) is None:
         lost.append("data after the coordinates of some vertices, unless they are colours")
-    if mesh.FN is not None and _normals(mesh) is None:
+    if mesh.FN is not None and normals_of(mesh) is None:
         lost.append("normals, because some faces have none")
     words = {line.split(None, 1)[0] for line in mesh.statements.splitlines() if line.split()}
     if words & {b"o", b"g", b"s"}:
@@ -83,18 +83,15 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
 def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     """Return the document that was read, with the texture coordinates of a mesh."""
     document = carried.document.copy()
-    users = _users(carried)
+    users, all_places = _users(carried), _convert_places(mesh.corner_uv)
     for number, pool in enumerate(carried.pools):
-        parts = [part for part in carried.parts if part.pool == number]
-        faces = np.concatenate([np.arange(part.begin, part.end) for part in parts])
-        FT = None if mesh.FT is None else mesh.FT[faces]
+        parts, faces = carried.parts_of(number), carried.faces_of(number)
         primitives = [document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in parts]
-        if FT is None or (FT < 0).all():
+        places = all_places[faces]
+        if np.isnan(places).all():
             continue
-        if (FT < 0).any() or mesh.vt is None:
+        if np.isnan(places).any():
             raise ValueError("some faces of a primitive have no texture coordinates, which glTF does not support")
-        places = _convert_places(mesh.vt)[FT]
-        old_places = _places_of(document, pool, carried.rows[faces] - pool.first)
         rows, origin, corner = _split(carried.rows[faces] - pool.first, _bits(places), pool.count)
         table = places.reshape(-1, 2)[corner]
         if PLACES in pool.attributes:
@@ -106,17 +103,10 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
             for primitive, own in zip(primitives, np.split(rows, bounds), strict=True):
                 primitive["mode"] = 4
                 primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
-        _set_attribute(document, pool, primitives, PLACES, table, users)
-        if old_places is None or not np.array_equal(old_places, places):
+        _set_numbers(document, [primitive["attributes"] for primitive in primitives], PLACES, table, users)
+        if _has_moved(carried, number, all_places):
             _drop_tangents(primitives)
     return document
-
-
-def _places_of(document: Document, pool: VertexPool, rows: IntArray) -> NDArray[np.float32] | None:
-    """Return the texture coordinates (f, 3, 2) of a pool's triangles; None if there are none."""
-    if PLACES not in pool.attributes:
-        return None
-    return document.reals(pool.attributes[PLACES]).astype(np.float32)[rows]
 
 
 def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
@@ -128,15 +118,18 @@ def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
 
 def _has_old_tangents(carried: CarriedGltf, mesh: MeshData) -> bool:
     """Whether the file has tangents, and the mesh has other texture coordinates."""
-    numbers = [number for number, pool in enumerate(carried.pools) if "TANGENT" in pool.attributes]
-    if not numbers or mesh.FT is None or mesh.vt is None:
-        return False
-    for part in (part for part in carried.parts if part.pool in numbers):
-        pool, faces = carried.pools[part.pool], np.arange(part.begin, part.end)
-        old = _places_of(carried.document, pool, carried.rows[faces] - pool.first)
-        if old is None or not np.array_equal(old, _convert_places(mesh.vt)[mesh.FT[faces]]):
-            return True
-    return False
+    places = _convert_places(mesh.corner_uv)
+    tangents = [number for number, pool in enumerate(carried.pools) if "TANGENT" in pool.attributes]
+    return not np.isnan(places).all() and any(_has_moved(carried, number, places) for number in tangents)
+
+
+def _has_moved(carried: CarriedGltf, number: int, places: NDArray[np.float32]) -> bool:
+    """Whether a pool's triangles have other texture coordinates than ``places`` (f, 3, 2) in the file."""
+    pool, faces = carried.pools[number], carried.faces_of(number)
+    if PLACES not in pool.attributes:
+        return True
+    old = carried.document.reals(pool.attributes[PLACES]).astype(np.float32)
+    return not np.array_equal(old[carried.rows[faces] - pool.first], places[faces])
 
 
 def _paint(document: Document, texture: Texture) -> None:
@@ -193,55 +186,50 @@ def _extend(
     document: Document, pool: VertexPool, primitives: list[dict[str, Any]], origin: IntArray, users: dict[int, int]
 ) -> None:
     """Copy the attributes of a pool's vertices to their copies."""
-    for name in pool.attributes:
-        if name != PLACES:
-            table = document.numbers(pool.attributes[name])[origin]
-            _set_attribute(document, pool, primitives, name, table, users, repeated=True)
+    attributes = [(name, accessor) for name, accessor in pool.attributes.items() if name != PLACES]
+    shared = [([primitive["attributes"] for primitive in primitives], attributes)]
     for t, target in enumerate(pool.targets):
-        for name, accessor in target.items():
-            new = _other(document, accessor, document.numbers(accessor)[origin], users, repeated=True)
-            for primitive in primitives:
-                primitive["targets"][t][name] = new
+        shared.append(([primitive["targets"][t] for primitive in primitives], list(target.items())))
+    for holders, entries in shared:
+        for name, accessor in entries:
+            _set_numbers(document, holders, name, document.numbers(accessor)[origin], users, repeated=True)
 
 
-def _set_attribute(
+def _set_numbers(
     document: Document,
-    pool: VertexPool,
-    primitives: list[dict[str, Any]],
+    holders: list[dict[str, int]],
     name: str,
     table: NDArray[Any],
     users: dict[int, int],
     *,
     repeated: bool = False,
 ) -> None:
-    old = pool.attributes.get(name)
-    new = document.add(table) if old is None else _other(document, old, table, users, repeated=repeated)
-    for primitive in primitives:
-        primitive["attributes"][name] = new
+    """Replace the numbers of an attribute that several primitives share; a copy, if something else refers to them."""
+    accessor = holders[0].get(name)
+    if accessor is None:
+        accessor = document.add(table)
+    else:
+        if users[accessor] > 1:
+            document.tree["accessors"].append(dict(document.tree["accessors"][accessor]))
+            accessor = len(document.tree["accessors"]) - 1
+            users[accessor] = 1
+        document.put(accessor, table, repeated=repeated)
+    for holder in holders:
+        holder[name] = accessor
 
 
-def _other(document: Document, accessor: int, table: NDArray[Any], users: dict[int, int], *, repeated: bool) -> int:
-    """Replace the numbers of an accessor, or of a copy of it if something else refers to it; return the index."""
-    if users[accessor] > 1:
-        document.tree["accessors"].append(dict(document.tree["accessors"][accessor]))
-        accessor = len(document.tree["accessors"]) - 1
-        users[accessor] = 1
-    document.put(accessor, table, repeated=repeated)
-    return accessor
-
-
-def _convert_places(vt: FloatArray) -> NDArray[np.float32]:
-    """Return texture coordinates (m, 2) in glTF's convention: v downwards, in single precision."""
-    v = 1 - vt[:, 1]
+def _convert_places(uv: FloatArray) -> NDArray[np.float32]:
+    """Return texture coordinates (..., 2) in glTF's convention: v downwards, in single precision."""
+    v = 1 - uv[..., 1]
     # Round v so that 1 - v is exact in double precision, and readers lose nothing.
     v = np.where(np.abs(v) < 2.0**-29, np.rint(v / _EXACT) * _EXACT, v)
-    return _single("a place", np.stack([vt[:, 0], v], axis=1))
+    return _single("a place", np.stack([uv[..., 0], v], axis=-1))
 
 
 def _single(what: str, numbers: FloatArray) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):
         single = numbers.astype(np.float32)
-    if not np.isfinite(single).all():
+    if np.isinf(single).any():
         raise ValueError(f"{what} exceeds single precision, the only one in glTF: write .ply or .obj")
     return single
 
@@ -261,12 +249,10 @@ def _new(mesh: MeshData) -> Document:
         "meshes": [{"primitives": []}],
     }
     document = Document(tree, [])
-    bare: BoolArray = np.full(len(mesh.F), mesh.FT is None)
-    places = np.zeros((*mesh.F.shape, 2), dtype=np.float32)
-    if mesh.FT is not None and mesh.vt is not None:
-        bare = np.asarray((mesh.FT < 0).any(axis=1))
-        places[~bare] = _convert_places(mesh.vt)[mesh.FT[~bare]]
-    normals, colours = _normals(mesh), _colours(mesh)
+    places = _convert_places(mesh.corner_uv)
+    bare = np.asarray(np.isnan(places).any(axis=(1, 2)))
+    places[bare] = 0
+    normals, colours = normals_of(mesh), colours_of(mesh)
     line = np.zeros_like(mesh.F) if normals is None or mesh.FN is None else mesh.FN
     keys = np.concatenate([_bits(places), line[:, :, None]], axis=2)
     rows, origin, corner = _split(mesh.F, keys, len(mesh.V))
@@ -306,7 +292,7 @@ def _runs(mesh: MeshData, bare: BoolArray) -> Iterator[tuple[int, int, str | Non
     """
     lines = mesh.statements.split(b"\n")[:-1]
     uses = [(line, int(at)) for line, at in zip(lines, mesh.statement_faces, strict=True) if line.startswith(b"usemtl")]
-    first = np.arange(len(mesh.F) + 1) if mesh.polygons is None else mesh.polygons.first_triangle
+    first = mesh.rings.first_triangle
     label = np.zeros(len(mesh.F), dtype=np.int64)
     names: list[str | None] = [None]
     for line, at in uses:
@@ -316,16 +302,3 @@ def _runs(mesh: MeshData, bare: BoolArray) -> Iterator[tuple[int, int, str | Non
     edges = [0, *change.tolist(), len(mesh.F)]
     for begin, end in pairwise(edges):
         yield begin, end, names[label[begin]], bool(bare[begin])
-
-
-def _colours(mesh: MeshData) -> FloatArray | None:
-    """Return colours of vertices, with or without opacity; None unless all vertices have one."""
-    extra = mesh.extra
-    if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
-        return None
-    return extra
-
-
-def _normals(mesh: MeshData) -> FloatArray | None:
-    """Return all normals; None if a corner has none."""
-    return None if mesh.FN is None or (mesh.FN < 0).any() else normal_rows(mesh.normals)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.lowlevel.atomic import writing
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives import places, results
 from quasiharmonic.ui.batch.archives.finding import Archive
@@ -21,6 +22,9 @@ from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.shards import Shard
 from quasiharmonic.ui.batch.supervisor import Finished, is_valid
+
+# What messages call the folder of unpacked problems.
+_SCRATCH = "to the folder for temporary files"
 
 
 @dataclass
@@ -109,7 +113,10 @@ class ArchivedProblems:
                 self._in_read = self._known
 
     def collect(self, item: Finished | None) -> list[Finished]:
-        """Move a finished problem's results from the scratch folder into the journal; return the finished items."""
+        """Move a finished problem's results from the scratch folder into the journal, and finish archives.
+
+        Return the finished items.
+        """
         with self._lock:
             if item is not None:
                 self._journal(item)
@@ -118,10 +125,6 @@ class ArchivedProblems:
                 self._finish(opened)
             ready, self._ready = self._ready, []
             return ready
-
-    def finish(self) -> list[Finished]:
-        """Finish the remaining archives; return the finished items."""
-        return self.collect(None)
 
     def records(self) -> Iterator[records.Record]:
         """Yield the records of all finished problems, in the order of the archives."""
@@ -198,12 +201,10 @@ class ArchivedProblems:
         # The name of the member may be unsuitable for this system.
         mesh_path = folder / f"mesh.{mesh.rpartition('.')[2]}"
         fixed_path = None if fixed is None else folder / "fixed.txt"
-        try:
+        with writing(_SCRATCH):
             mesh_path.write_bytes(sample.files[mesh])
             if fixed is not None and fixed_path is not None:
                 fixed_path.write_bytes(sample.files[fixed])
-        except OSError as error:
-            raise OutputError(f"cannot write to the folder for temporary files: {error}") from error
         return ProblemFiles(names["problem"], mesh_path, fixed_path, results=folder, source=names["source"])
 
     def _journal(self, item: Finished) -> None:
@@ -226,10 +227,8 @@ class ArchivedProblems:
 
     def _new_folder(self) -> Path:
         folder = self._scratch / str(next(self._numbers))
-        try:
+        with writing(_SCRATCH):
             folder.mkdir()
-        except OSError as error:
-            raise OutputError(f"cannot write to the folder for temporary files: {error}") from error
         return folder
 
     def _finish(self, opened: _OpenArchive) -> None:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
+import io
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
-from quasiharmonic.io.errors import OutputError
-from quasiharmonic.ui.batch import records
+from quasiharmonic.io.lowlevel.atomic import writing
 from quasiharmonic.ui.batch.archives import results
-from quasiharmonic.ui.batch.archives.tar_stream import Damage, pack_member, read_members
 from quasiharmonic.ui.batch.records import Record
-from quasiharmonic.util.untrusted import parse_json
 
 # Keys of a record that are kept, to decide whether it is still valid, and to count it in the archive's metadata.
 _KEPT = "key", "outcome", "time_limit", "memory_limit", "seconds"
@@ -46,17 +43,15 @@ class Journal:
         self.path = path
         self.part = path.with_name(path.name + results.PART)
         self.entries: dict[str, _Entry] = {}
-        try:
+        with writing(self.part):
             path.parent.mkdir(parents=True, exist_ok=True)
             if not self.part.exists() and path.exists():
                 if not results.is_parquet(path):
                     os.replace(path, self.part)
                 else:
-                    for key, record, data in results.read_results(path):
-                        self.add(key, record, data)
+                    for result in results.read_results(path):
+                        self.add(*result)
             self._repair()
-        except OSError as error:
-            raise _cannot_write(self.part, error) from error
 
     def record(self, key: str) -> Record | None:
         """Return the kept values of the newest record of a problem; None if there is none."""
@@ -65,32 +60,21 @@ class Journal:
 
     def add(self, key: str, record: Record, data: bytes | None) -> None:
         """Append a result; OutputError if it cannot be written."""
-        packed = b"" if data is None else pack_member(key + results.MAP, data)
-        packed += pack_member(key + results.RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
-        try:
-            with open(self.part, "ab") as file:
-                start = file.tell()
-                file.write(packed)
-        except OSError as error:
-            raise _cannot_write(self.part, error) from error
+        packed = results.pack_result(key, record, data)
+        with writing(self.part), open(self.part, "ab") as file:
+            start = file.tell()
+            file.write(packed)
         self._note(key, start, start + len(packed), record)
 
     def finish(self, order: Sequence[str], stamp: str, settings: str) -> None:
         """Write the finished archive, in the given order of names, and delete the journal."""
-        entries = [(key, self.entries[key]) for key in order]
-        about = results.describe((entry.record for _, entry in entries), stamp, settings)
-        try:
+        entries = [self.entries[key] for key in order]
+        about = results.describe((entry.record for entry in entries), stamp, settings)
+        with writing(self.path):
             # An archive without problems has no journal.
             with open(self.part, "a+b") as file:
-                if results.is_parquet(self.path):
-                    results.write_parquet(self.path, about, _unpacked(file, entries))
-                else:
-                    results.write_tar(self.path, about, _packed(file, entries))
+                results.write_results(self.path, about, _read_entries(file, entries))
             self.part.unlink()
-        except OutputError:
-            raise
-        except OSError as error:
-            raise _cannot_write(self.path, error) from error
 
     def _note(self, key: str, start: int, end: int, record: Record) -> None:
         self.entries[key] = _Entry(start, end, {name: record[name] for name in _KEPT if name in record})
@@ -100,39 +84,17 @@ class Journal:
         if not self.part.exists():
             return
         with open(self.part, "r+b") as file:
-            end, start, mapped = 0, None, ""
-            for member in read_members(file, lambda name: name.endswith(results.RECORD)):
-                if isinstance(member, Damage):
+            end = 0
+            for one in results.read_tar_results(file, maps=False):
+                if one.result is None:
                     break
-                key, extension = os.path.splitext(member.name)
-                if extension == results.MAP:
-                    start, mapped = member.start, key
-                    continue
-                record = records.parse_record(member.data or b"")
-                if extension != results.RECORD or record is None:
-                    break
-                self._note(key, start if start is not None and mapped == key else member.start, member.end, record)
-                start, end = None, member.end
+                self._note(one.result.key, one.start, one.end, one.result.record)
+                end = one.end
             file.truncate(end)
 
 
-def _packed(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator[bytes]:
-    for _, entry in entries:
+def _read_entries(file: BinaryIO, entries: Iterable[_Entry]) -> Iterator[results.Result]:
+    for entry in entries:
         file.seek(entry.start)
-        yield file.read(entry.end - entry.start)
-
-
-def _unpacked(file: BinaryIO, entries: Iterable[tuple[str, _Entry]]) -> Iterator[tuple[str, Record, bytes | None]]:
-    import io
-
-    for (key, _), packed in zip(entries, _packed(file, entries), strict=True):
-        data: dict[str, Any] = {
-            os.path.splitext(member.name)[1]: member.data
-            for member in read_members(io.BytesIO(packed))
-            if not isinstance(member, Damage)
-        }
-        yield key, parse_json(data[results.RECORD]), data.get(results.MAP)
-
-
-def _cannot_write(path: Path, error: OSError) -> OutputError:
-    return OutputError(f"cannot write {path}: {error.strerror or error}")
+        packed = io.BytesIO(file.read(entry.end - entry.start))
+        yield from (one.result for one in results.read_tar_results(packed) if one.result is not None)

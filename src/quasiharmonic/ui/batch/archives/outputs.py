@@ -11,6 +11,7 @@ from typing import Any
 
 from quasiharmonic.ui.batch.archives import places
 from quasiharmonic.ui.batch.archives.results import MAX_ABOUT, PART, is_parquet, parse_about, read_about
+from quasiharmonic.ui.batch.archives.tar_stream import global_comment
 
 
 class Outputs:
@@ -39,7 +40,7 @@ class Outputs:
             return read_about(path)
         if not is_parquet(path):
             start = places.read_start(self._at(name), MAX_ABOUT)
-            return None if start is None else parse_about(start)
+            return None if start is None else parse_about(global_comment(start))
         with self.reading(name) as copy:
             return None if copy is None else read_about(copy)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.lowlevel.atomic import writing
+from quasiharmonic.util.optional import explain_missing
 
 T = TypeVar("T")
 # Number of attempts, and seconds before the second one; each further pause is twice as long.
@@ -68,26 +68,17 @@ def fetch(location: str, folder: Path) -> Path:
 
 
 def send(path: Path, location: str) -> None:
-    """Copy a file to a location. OutputError if it cannot be written."""
-    try:
-        if not is_url(location):
-            Path(location).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, location)
-            return
+    """Copy a file to a URL. OutputError if it cannot be written."""
+    with writing(location):
         system, target = _open(location)
         # A folder of an object store needs not exist.
         _retry(lambda: system.makedirs(target.rpartition("/")[0], exist_ok=True), location)
         _retry(lambda: system.put_file(str(path), target), location)
-    except OSError as error:
-        raise OutputError(f"cannot write {location}: {error}") from error
 
 
 def read_start(location: str, size: int) -> bytes | None:
-    """Return the first bytes of a file; None if there is none."""
+    """Return the first bytes of an object by URL; None if there is none."""
     try:
-        if not is_url(location):
-            with open(location, "rb") as file:
-                return file.read(size)
         system, path = _open(location)
         return _retry(lambda: system.cat_file(path, start=0, end=size), location)
     except FileNotFoundError:
@@ -96,14 +87,10 @@ def read_start(location: str, size: int) -> bytes | None:
 
 def _open(location: str) -> tuple[Any, str]:
     """Return the file system of a URL and the path in it; ImportError if a package is missing."""
-    try:
+    with explain_missing("URLs need fsspec", "'quasiharmonic[remote]'"):
         from fsspec.core import url_to_fs
-    except ImportError as error:
-        raise ImportError("URLs need fsspec: pip install 'quasiharmonic[remote]'") from error
-    try:
+    with explain_missing(location, "'quasiharmonic[remote]' for S3"):
         return url_to_fs(location)
-    except ImportError as error:
-        raise ImportError(f"{location}: {error}: pip install 'quasiharmonic[remote]' for S3") from error
 
 
 def _retry(action: Callable[[], T], location: str) -> T:

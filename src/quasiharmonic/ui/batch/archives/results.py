@@ -10,9 +10,8 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.ui.batch import records
@@ -24,6 +23,7 @@ from quasiharmonic.ui.batch.archives.tar_stream import (
     global_comment,
     open_tar,
     pack_comment,
+    pack_member,
     read_members,
 )
 from quasiharmonic.ui.batch.records import Record, load_pyarrow
@@ -37,6 +37,14 @@ MAP, RECORD = ".obj", ".json"
 MAX_ABOUT = 1 << 16
 _MARK = b"quasiharmonic"
 _ROWS = 64
+
+
+class Result(NamedTuple):
+    """Result of a problem in an archive."""
+
+    key: str  # Name of the problem in the archive
+    record: Record
+    data: bytes | None  # The map, if there is one and it was asked for
 
 
 def results_name(name: str) -> str:
@@ -57,23 +65,19 @@ def read_about(path: Path) -> dict[str, Any] | None:
     try:
         if is_parquet(path):
             with load_pyarrow().ParquetFile(path) as parquet:
-                text = (parquet.schema_arrow.metadata or {})[_MARK].decode()
+                text = (parquet.schema_arrow.metadata or {}).get(_MARK, b"").decode()
         else:
             with open(path, "rb") as file:
-                text = global_comment(file.read(MAX_ABOUT)) or ""
-    except (OSError, ValueError, KeyError):
+                text = global_comment(file.read(MAX_ABOUT))
+    except (OSError, ValueError):
         return None
-    return _parse(text)
+    return parse_about(text)
 
 
-def parse_about(start: bytes) -> dict[str, Any] | None:
-    """Return the metadata of a tar file of results with these first bytes; None if they are invalid."""
-    return _parse(global_comment(start) or "")
-
-
-def _parse(text: str) -> dict[str, Any] | None:
+def parse_about(text: str | None) -> dict[str, Any] | None:
+    """Return the metadata in a text; None if they are missing or invalid."""
     try:
-        about = parse_json(text)
+        about = parse_json(text or "")
     except ValueError:
         return None
     return about if isinstance(about, dict) and {"stamp", "settings", "outcomes"} <= set(about) else None
@@ -95,35 +99,33 @@ def outcomes(about: dict[str, Any]) -> Iterator[tuple[Record, int]]:
         yield {"outcome": outcome, "time_limit": time_limit, "memory_limit": memory_limit}, count
 
 
-def write_tar(path: Path, about: dict[str, Any], members: Iterable[bytes]) -> None:
-    """Write packed members as an archive of results; it appears when it is complete and on the disk."""
-
-    def write(file: BinaryIO) -> None:
-        file.write(pack_comment(json.dumps(about)))
-        for member in members:
-            file.write(member)
-        file.write(END_MARK)
-
-    write_whole(path, write)
+def write_results(path: Path, about: dict[str, Any], found: Iterable[Result]) -> None:
+    """Write an archive of results; it appears when it is complete and on the disk."""
+    write = _write_parquet if is_parquet(path) else _write_tar
+    write_whole(path, lambda file: write(file, json.dumps(about), found))
 
 
-def write_parquet(path: Path, about: dict[str, Any], results: Iterable[tuple[str, Record, bytes | None]]) -> None:
-    """Write names, records and maps as an archive of results; it appears when it is complete and on the disk."""
-    parquet = load_pyarrow()
+def _write_tar(file: BinaryIO, about: str, found: Iterable[Result]) -> None:
+    file.write(pack_comment(about))
+    for result in found:
+        file.write(pack_result(*result))
+    file.write(END_MARK)
+
+
+def pack_result(key: str, record: Record, data: bytes | None) -> bytes:
+    """Return the members of a result in a tar file: the map, if there is one, and the record after it."""
+    packed = b"" if data is None else pack_member(key + MAP, data)
+    return packed + pack_member(key + RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
+
+
+def _write_parquet(file: BinaryIO, about: str, found: Iterable[Result]) -> None:
+    load_pyarrow()
     import pyarrow
 
     schema = records.table_schema()
     schema = schema.insert(0, pyarrow.field(KEYS[0], pyarrow.string())).append(pyarrow.field("obj", pyarrow.binary()))
-    schema = schema.with_metadata({_MARK: json.dumps(about)})
-
-    rows = ({KEYS[0]: key, **records.table_row(record), "obj": data} for key, record, data in results)
-
-    def write(file: BinaryIO) -> None:
-        with parquet.ParquetWriter(file, schema) as writer:
-            while some := list(islice(rows, _ROWS)):
-                writer.write_table(pyarrow.Table.from_pylist(some, schema=schema))
-
-    write_whole(path, write)
+    rows = ({KEYS[0]: key, **records.table_row(record), "obj": data} for key, record, data in found)
+    records.write_parquet(file, schema.with_metadata({_MARK: about}), rows, _ROWS)
 
 
 def find_map(folder: Path, problem: str) -> bytes | None:
@@ -157,31 +159,48 @@ def find_records(folder: Path) -> Iterator[Record]:
                 yield record
 
 
-def read_results(path: Path, *, maps: bool = True) -> Iterator[tuple[str, Record, bytes | None]]:
-    """Yield name, record and, if requested, the map of the results in an archive.
+def read_results(path: Path, *, maps: bool = True) -> Iterator[Result]:
+    """Yield the results in an archive, their maps only if requested.
 
     Damaged ones are skipped. OSError if the archive cannot be opened.
     """
-    yield from _parquet_results(path, maps) if is_parquet(path) else _tar_results(path, maps)
+    if is_parquet(path):
+        yield from _parquet_results(path, maps)
+    else:
+        with open_tar(os.fspath(path)) as file:
+            yield from (one.result for one in read_tar_results(file, maps=maps) if one.result is not None)
 
 
-def _tar_results(path: Path, maps: bool) -> Iterator[tuple[str, Record, bytes | None]]:
-    with open_tar(os.fspath(path)) as file:
-        data: tuple[str, bytes | None] | None = None
-        for member in read_members(file, lambda name: maps or name.endswith(RECORD)):
-            if isinstance(member, Damage):
-                continue
-            key, extension = os.path.splitext(member.name)
-            if extension == MAP:
-                data = key, member.data
-            elif extension == RECORD and (record := records.parse_record(member.data or b"")) is not None:
-                yield key, record, data[1] if data is not None and data[0] == key else None
+class TarResult(NamedTuple):
+    """Result in a tar file."""
+
+    result: Result | None  # None if it is damaged
+    start: int  # Offset of its first header
+    end: int  # Offset after it
 
 
-def _parquet_results(path: Path, maps: bool) -> Iterator[tuple[str, Record, bytes | None]]:
+def read_tar_results(file: BinaryIO, *, maps: bool = True) -> Iterator[TarResult]:
+    """Read the results of a tar file, which have the record after the map."""
+    mapped: Member | None = None
+    for member in read_members(file, lambda name: maps or name.endswith(RECORD)):
+        if isinstance(member, Damage):
+            yield TarResult(None, member.start, member.start)
+            continue
+        key, extension = os.path.splitext(member.name)
+        if extension == MAP:
+            mapped = member
+        elif extension == RECORD:
+            own = mapped if mapped is not None and mapped.name == key + MAP else None
+            record = records.parse_record(member.data or b"")
+            data, start = (None, member.start) if own is None else (own.data, own.start)
+            yield TarResult(None if record is None else Result(key, record, data), start, member.end)
+            mapped = None
+
+
+def _parquet_results(path: Path, maps: bool) -> Iterator[Result]:
     with load_pyarrow().ParquetFile(path) as file:
         columns = [name for name in file.schema_arrow.names if maps or name != "obj"]
         for rows in file.iter_batches(_ROWS, columns=columns):
             for row in rows.to_pylist():
                 key, data = row.pop(KEYS[0]), row.pop("obj", None)
-                yield key, {name: value for name, value in row.items() if value is not None}, data
+                yield Result(key, {name: value for name, value in row.items() if value is not None}, data)

@@ -1,11 +1,25 @@
-"""``qhm animate``: map a mesh to a sequence of targets, and write the frames or an animation."""
+"""``qhm animate``: map a mesh to a sequence of targets, and write the frames or an animation.
+
+Map a surface to a sequence of targets, each frame from the one before it. With --polish every frame has little
+distortion, and vertices do not jump between frames.
+
+Exit status: 0 every frame is written and certified injective as written; 1 one is not; 2 wrong input or call, nothing
+written; 3 written, but the report failed. Ctrl-C writes the frames so far.
+
+    qhm animate face.obj frames/*.obj -o film.gif
+    qhm animate face.obj frames/*.obj --polish symmetric-dirichlet -o frames_out/
+"""
 
 from __future__ import annotations
 
 import argparse
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli import pipeline, report, written_map
+from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, count, flag, number, pick, set_default
+from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,19 +36,8 @@ PICTURES = ".gif", ".mp4"
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments
 
-    parser = commands.add_parser(
-        "animate",
-        description="Map a surface to a sequence of targets, each frame from the one before it. With --polish every "
-        "frame has little distortion, and vertices do not jump between frames.",
-        epilog="Exit status: 0 every frame is written and certified injective as written; 1 one is not; 2 wrong input "
-        "or call, nothing written; 3 written, but the report failed. Ctrl-C writes the frames so far.",
-        examples=(
-            "qhm animate face.obj frames/*.obj -o film.gif",
-            "qhm animate face.obj frames/*.obj --polish symmetric-dirichlet -o frames_out/",
-        ),
-    )
+    parser = add_command(commands, "animate", __doc__, run)
     parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('read')} file: the surface")
     parser.add_argument(
         "targets",
@@ -52,29 +55,19 @@ def add_parser(commands: Commands) -> None:
         action="append",
         help="folder to write the frames to as 0000.obj, 0001.obj, …, or a moving picture, .gif or .mp4; repeatable",
     )
-    parser.add_argument(
-        "--fixed",
-        type=Path,
-        metavar="FILE",
-        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
+    add_options(
+        parser,
+        "fixed",
+        polish=choice(ENERGIES, "lower this distortion energy in every frame"),
+        max_motion_ratio=number(
+            float,
+            "for --polish: maximum vertex motion, relative to the maximum boundary motion (default: 3)",
+            metavar="TIMES",
+        ),
+        fill_gaps=flag("replace frames without a map by the average of the frames around them"),
+        frames_per_second=number(count, "frame rate of a moving picture (default: 24)"),
     )
-    parser.add_argument("--polish", choices=arguments.ENERGIES, help="lower this distortion energy in every frame")
-    parser.add_argument(
-        "--max-motion-ratio",
-        type=float,
-        metavar="TIMES",
-        help="for --polish: maximum vertex motion, relative to the maximum boundary motion (default: 3)",
-    )
-    parser.add_argument(
-        "--fill-gaps", action="store_true", help="replace frames without a map by the average of the frames around them"
-    )
-    parser.add_argument(
-        "--frames-per-second", type=arguments.count, metavar="N", help="frame rate of a moving picture (default: 24)"
-    )
-    parser.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
-    arguments.add_linear_solver(parser)
-    arguments.add_report(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "max_iterations", "linear_solver", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -85,12 +78,11 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apps.animation.frame_sequence import animate
     from quasiharmonic.geometry.mesh.topology import boundary_edges
     from quasiharmonic.problem import Problem
-    from quasiharmonic.ui.cli import arguments, progress_line, report
     from quasiharmonic.ui.plot.animation import check_animation
 
-    arguments.set_default(options, "max_motion_ratio", None, asked=options.polish is not None, belongs="--polish")
+    set_default(options, "max_motion_ratio", None, asked=options.polish is not None, belongs="--polish")
     drawn = [path for path in options.output if path.suffix.lower() in PICTURES]
-    arguments.set_default(options, "frames_per_second", 24, asked=bool(drawn), belongs="a moving picture (-o x.gif)")
+    set_default(options, "frames_per_second", 24, asked=bool(drawn), belongs="a moving picture (-o x.gif)")
     targets = _files(options.targets)
     inputs = (options.input, options.fixed, *targets)
     for path in drawn:
@@ -101,23 +93,15 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("-o: the same output is given twice")
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
-    with report.about(options.input):
-        if fixed is None:
+    if fixed is None:
+        with report.about(options.input):
             fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))
     positions = _targets(targets, mesh, fixed)
     with report.about(options.input):
         problem = Problem(mesh.V, mesh.F, fixed, positions[0])
-    with report.about(options.input), progress_line.line(_words) as show:
-        animation = animate(
-            problem,
-            positions,
-            polish=options.polish,
-            max_motion_ratio=options.max_motion_ratio,
-            fill_gaps=options.fill_gaps,
-            max_iterations=options.max_iterations,
-            linear_solver=options.linear_solver,
-            callback=show,
-        )
+    given = pick(options, "polish", "max_motion_ratio", "fill_gaps", "max_iterations", "linear_solver")
+    with pipeline.working(options.input, _words) as show:
+        animation = animate(problem, positions, callback=show, **given)
     if not animation.frames:
         raise KeyboardInterrupt
     written: dict[Path, tuple[bool, list[str]]] = {}
@@ -129,24 +113,22 @@ def run(options: argparse.Namespace) -> int:
         before = [*folders, *drawn[:t]]
         with report.after_writing(before[0]) if before else nullcontext():
             _draw(path, problem, animation, options.frames_per_second)
-    with report.after_writing(options.output[0]):
-        missing = len(positions) - len(animation.frames)
-        facts: dict[str, Any] = {
-            **animation.to_dict(),
-            "asked": len(positions),
-            "input": str(options.input),
-            "outputs": [str(path) for path in options.output],
-        }
-        lines = [f"wrote {', '.join(map(str, options.output))}", animation.summary()]
+    missing = len(positions) - len(animation.frames)
+
+    def describe() -> pipeline.Account:
+        outputs = [str(path) for path in options.output]
+        facts = {**animation.to_dict(), "asked": len(positions), "input": str(options.input), "outputs": outputs}
+        lines = [f"wrote {', '.join(outputs)}", animation.summary()]
         if missing:
             lines.append(f"{missing} further frames were requested")
         for folder, (_, others) in written.items():
             if others:
                 names = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
                 lines.append(f"not written by this run, but in {folder}: {names}")
-        report.emit(facts, options.json, "\n".join(lines))
-    certified = all(every for every, _ in written.values())
-    return 0 if not missing and certified and animation.found.all() else 1
+        certified = all(every for every, _ in written.values())
+        return pipeline.Account(facts, lines, bool(not missing and certified and animation.found.all()))
+
+    return pipeline.finish(options, describe, options.output[0])
 
 
 def _files(given: list[Path]) -> list[Path]:
@@ -181,7 +163,6 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.ui.cli import report
 
     if files[0].suffix.lower() == ".npy":
         return _array(files[0], len(mesh.V), fixed)
@@ -201,15 +182,14 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
 
 def _array(path: Path, n: int, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
     from quasiharmonic import io
+    from quasiharmonic.io.errors import reading
     from quasiharmonic.util.arrays import real_array
     from quasiharmonic.util.untrusted import read_npy
 
-    try:
+    if not path.is_file():
+        raise io.MeshFileError(path, "there is no such file")
+    with reading(path, "not an array of numbers in NumPy's format: "):
         array = read_npy(path)
-    except FileNotFoundError as error:
-        raise io.MeshFileError(path, "there is no such file") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: not an array of numbers in NumPy's format: {error}") from error
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, fixed.size) and array.shape[2] == 2
     if not shaped or array.dtype.kind not in "iuf":
         raise ValueError(
@@ -225,7 +205,6 @@ def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[b
     Return whether all written files are certified injective, and the frames in the folder that belong to another run.
     """
     from quasiharmonic import io
-    from quasiharmonic.ui.cli import report, written_map
 
     certified = True
     digits = max(4, len(str(len(animation.frames) - 1)))

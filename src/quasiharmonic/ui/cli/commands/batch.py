@@ -1,15 +1,42 @@
-"""``qhm batch``: map every problem of a data set, and write a record of each."""
+"""``qhm batch``: map every problem of a data set, and write a record of each.
+
+Map every problem of a data set, each in a separate process: a failure does not affect other problems. Maps and
+records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has all records. To
+continue an interrupted run, give the same command again.
+
+Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not (the records give
+the reason); 2 wrong call, or stopped: finished results are kept; 3 finished, but the report failed.
+
+    qhm batch problems/ -o results/ --report
+    qhm batch meshes/ -o flat/ --flatten --cut -j 4
+    qhm batch -o results/ --report --against other.csv
+    qhm batch problems/ -o results/ --shard $SLURM_ARRAY_TASK_ID/16
+    qhm batch -o results/ --merge --report
+"""
 
 from __future__ import annotations
 
 import argparse
-import sys
-import time
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli.progress_line import overwrite
+from quasiharmonic.ui.cli import progress_line, report, targets
+from quasiharmonic.ui.cli.arguments import (
+    SHARED,
+    add_command,
+    add_options,
+    byte_count,
+    choice,
+    count,
+    file,
+    flag,
+    number,
+    pick,
+    text,
+)
 from quasiharmonic.ui.cli.streams import tell
+from quasiharmonic.util.options import ENERGIES, FLATTENED
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
@@ -23,25 +50,7 @@ LOG = 30.0
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.ui.cli import arguments, targets
-
-    parser = commands.add_parser(
-        "batch",
-        description="Map every problem of a data set, each in a separate process: a failure does not affect "
-        "other problems. "
-        "Maps and records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has "
-        "all records. To continue an interrupted run, give the same command again.",
-        epilog="Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not "
-        "(the records give the reason); 2 wrong call, or stopped: finished results are kept; 3 "
-        "finished, but the report failed.",
-        examples=(
-            "qhm batch problems/ -o results/ --report",
-            "qhm batch meshes/ -o flat/ --flatten --cut -j 4",
-            "qhm batch -o results/ --report --against other.csv",
-            "qhm batch problems/ -o results/ --shard $SLURM_ARRAY_TASK_ID/16",
-            "qhm batch -o results/ --merge --report",
-        ),
-    )
+    parser = add_command(commands, "batch", __doc__, run)
     parser.add_argument(
         "source",
         metavar="DIR_OR_LIST",
@@ -59,126 +68,64 @@ def add_parser(commands: Commands) -> None:
         metavar="OUT",
         help="folder for the results; a URL is possible if the problems are in archives",
     )
-    parser.add_argument(
-        "--report",
-        action="store_true",
-        help="write OUT/report.html about the run: success, distortion, times, the slowest, worst and failed problems "
-        "with images; without DIR_OR_LIST, about the run or the table of records (.csv, .parquet) that -o names",
+    add_options(
+        parser,
+        report=flag(
+            "write OUT/report.html about the run: success, distortion, times, the slowest, worst and failed problems "
+            "with images; without DIR_OR_LIST, about the run or the table of records (.csv, .parquet) that -o names"
+        ),
+        against=file(
+            "for --report: compare with another run, or with a table about another program, with the columns problem "
+            "and seconds",
+            metavar="OTHER",
+        ),
+        table=choice(("csv", "parquet"), "format of the table of records (default: csv)", default="csv"),
+        retry=flag("retry problems that failed by an error, a crash or a limit"),
+        shard=text(
+            "I/N",
+            "solve shard I (1 to N) of N disjoint shards, for array jobs; they may share OUT and run at the same time",
+        ),
+        merge=file(
+            "join the tables of finished shards in the folders RUN (default: OUT) into OUT/records.csv",
+            metavar="RUN",
+            nargs="*",
+        ),
     )
-    parser.add_argument(
-        "--against",
-        type=Path,
-        metavar="OTHER",
-        help="for --report: compare with another run, or with a table about another program, with the columns problem "
-        "and seconds",
-    )
-    parser.add_argument(
-        "--table", choices=("csv", "parquet"), default="csv", help="format of the table of records (default: csv)"
-    )
-    parser.add_argument(
-        "--retry", action="store_true", help="retry problems that failed by an error, a crash or a limit"
-    )
-
-    parser.add_argument(
-        "--shard",
-        metavar="I/N",
-        help="solve shard I (1 to N) of N disjoint shards, for array jobs; they may share OUT and run at the same time",
-    )
-    parser.add_argument(
-        "--merge",
-        type=Path,
-        nargs="*",
-        metavar="RUN",
-        help="join the tables of finished shards in the folders RUN (default: OUT) into OUT/records.csv",
-    )
-
     work = parser.add_argument_group("workers and limits")
     work.add_argument(
-        "-j", "--jobs", type=arguments.count, metavar="N", help="problems solved in parallel (default: one per core)"
+        "-j", "--jobs", type=count, metavar="N", help="problems solved in parallel (default: one per core)"
     )
-    work.add_argument(
-        "--threads", type=arguments.count, default=1, metavar="N", help="solver threads per problem (default: 1)"
+    add_options(
+        work,
+        threads=number(count, "solver threads per problem (default: 1)", default=1),
+        scheduler=text("ADDRESS", "use the workers of the Dask cluster with this scheduler, tcp://HOST:PORT"),
+        time_limit=number(
+            _seconds,
+            "time limit per problem in seconds; 0 for no limit (default: 600)",
+            metavar="SECONDS",
+            default=600.0,
+        ),
+        memory_limit=number(byte_count, "limit of resident memory per problem, such as 800M or 4G", metavar="SIZE"),
     )
-    work.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="use the workers of the Dask cluster with this scheduler, tcp://HOST:PORT",
+    solver = parser.add_argument_group("solution of each problem, as for qhm map or qhm flatten")
+    add_options(
+        solver,
+        to=text("OUTLINE", f"map every mesh file onto an outline: {targets.FORMS}"),
+        flatten=flag("flatten every mesh file with a free boundary, without overlap"),
+        cut=flag("with --to and --flatten: cut surfaces that cannot be flattened, along seams"),
+        start=flag("for --flatten: start from the map in the files' texture coordinates"),
+        pack=flag("with --to and --flatten: pack the islands into the unit square by their shapes"),
+        energy=choice(FLATTENED, "energy that --flatten lowers (default: symmetric-dirichlet)"),
+        polish=choice(ENERGIES, "then lower distortion: %(choices)s", metavar="ENERGY"),
+        slide=flag(
+            "let boundary vertices slide along the outline while --polish lowers distortion; corners stay fixed"
+        ),
     )
-    work.add_argument(
-        "--time-limit",
-        type=_seconds,
-        default=600.0,
-        metavar="SECONDS",
-        help="time limit per problem in seconds; 0 for no limit (default: 600)",
+    add_options(
+        solver,
+        *("font", "corners", "corner_angle", "refine", "pieces", "reference", "max_iterations", "linear_solver"),
+        strategy=SHARED["strategy"] | {"default": None},
     )
-    work.add_argument(
-        "--memory-limit",
-        type=arguments.byte_count,
-        metavar="SIZE",
-        help="limit of resident memory per problem, such as 800M or 4G",
-    )
-
-    solver = parser.add_argument_group("solution of each problem")
-    solver.add_argument(
-        "--to",
-        metavar="OUTLINE",
-        help=f"map every mesh file onto an outline: {targets.FORMS}",
-    )
-    solver.add_argument("--font", metavar="FONT", help="for letters and words: a font file or the name of a font")
-    solver.add_argument(
-        "--corner-angle",
-        type=targets.degrees,
-        default=20.0,
-        metavar="DEG",
-        help="for --to: turning angle from which a point of the outline is a corner (default: %(default)g)",
-    )
-    solver.add_argument(
-        "--flatten",
-        action="store_true",
-        help="flatten every mesh file with a free boundary, without overlap",
-    )
-    solver.add_argument(
-        "--cut", action="store_true", help="with --to and --flatten: cut surfaces that cannot be flattened, along seams"
-    )
-    solver.add_argument(
-        "--start", action="store_true", help="for --flatten: start from the map in the files' texture coordinates"
-    )
-    solver.add_argument(
-        "--pack",
-        action="store_true",
-        help="with --to and --flatten: pack the islands into the unit square by their shapes",
-    )
-    solver.add_argument(
-        "--corners",
-        metavar="V,V,…",
-        help="for --to: corners of the boundary, in every form of qhm map: auto, near:x,y,z, vertices, or a file",
-    )
-    solver.add_argument(
-        "--refine",
-        action="store_true",
-        help="if no map exists, split as few inner edges as necessary (adds vertices)",
-    )
-    solver.add_argument(
-        "--energy",
-        choices=arguments.FLATTENED,
-        help="energy that --flatten lowers (default: symmetric-dirichlet)",
-    )
-    arguments.add_strategy(solver)
-    solver.add_argument(
-        "--polish", choices=arguments.ENERGIES, metavar="ENERGY", help="then lower distortion: %(choices)s"
-    )
-    solver.add_argument(
-        "--slide",
-        action="store_true",
-        help="let boundary vertices slide along the outline while --polish lowers distortion; corners stay fixed",
-    )
-    solver.add_argument(
-        "--pieces", type=Path, metavar="FILE", help="for --to and --slide: sides of boundary vertices, as for qhm map"
-    )
-    solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
-    solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
-    arguments.add_linear_solver(solver)
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -186,7 +133,6 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.ui import batch
     from quasiharmonic.ui.batch.archives import places
     from quasiharmonic.ui.batch.shards import read_shard, table_name
-    from quasiharmonic.ui.cli import report
 
     if options.against is not None and not options.report:
         raise ValueError("--against needs --report: add --report, or omit --against")
@@ -200,49 +146,22 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("--strategy needs a given boundary, but --flatten leaves the boundary free: omit one of them")
     if options.report:
         _folder(options)
-    settings = batch.Settings(
-        to=options.to,
-        font=options.font,
-        corner_angle=options.corner_angle,
-        flatten=options.flatten,
-        energy=options.energy,
-        start=options.start,
-        pack=options.pack,
-        cut=options.cut,
-        corners=options.corners,
-        refine=options.refine,
-        strategy=options.strategy or "speed",
-        polish=options.polish,
-        slide=options.slide,
-        pieces=None if options.pieces is None else str(options.pieces),
-        reference=options.reference,
-        max_iterations=options.max_iterations,
-        linear_solver=options.linear_solver,
-    )
-    show = _Display()
+    options.strategy = options.strategy or "speed"
+    options.pieces = None if options.pieces is None else str(options.pieces)
+    settings = batch.Settings(**pick(options, *(one.name for one in fields(batch.Settings))))
+    limits = pick(options, "jobs", "threads", "memory_limit")
+    rest = pick(options, "retry", "table", "shard", "scheduler")
+    time_limit = options.time_limit or None
     try:
-        progress = batch.run(
-            options.source,
-            options.output,
-            settings,
-            jobs=options.jobs,
-            threads=options.threads,
-            time_limit=options.time_limit or None,
-            memory_limit=options.memory_limit,
-            retry=options.retry,
-            table=options.table,
-            shard=options.shard,
-            scheduler=options.scheduler,
-            callback=show,
-        )
+        with progress_line.line(_words, live=LIVE, log=LOG) as show:
+            progress = batch.run(
+                options.source, options.output, settings, time_limit=time_limit, callback=show, **limits, **rest
+            )
     except KeyboardInterrupt:
-        show.clear()
         tell(
             f"qhm batch: interrupted; finished results are kept in {options.output}; give the same command to continue"
         )
         return 2
-    finally:
-        show.clear()
     wanted = "bijective" if options.flatten else "injective"
     records = places.join(options.output, table_name(read_shard(options.shard), options.table))
     with report.after_writing(records):
@@ -256,7 +175,6 @@ def run(options: argparse.Namespace) -> int:
 def _merge(options: argparse.Namespace) -> int:
     """Merge tables, print a summary and write the report page; return the exit status."""
     from quasiharmonic.ui import batch
-    from quasiharmonic.ui.cli import report
 
     if options.source is not None or options.shard is not None:
         raise ValueError("--merge joins finished runs: omit the data set and --shard")
@@ -285,7 +203,6 @@ def _folder(options: argparse.Namespace) -> Path:
 
 def _write_report(options: argparse.Namespace) -> int:
     """Write the page about a run or a table of records; return the exit status."""
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.ui.report import write_report
 
     output = _folder(options)
@@ -312,30 +229,10 @@ def _account(progress: Progress, wanted: str, table: str) -> str:
     return "\n".join(lines)
 
 
-class _Display:
-    """Progress display: one overwritten line on a terminal, otherwise occasional lines."""
-
-    def __init__(self) -> None:
-        self._terminal = sys.stderr is not None and sys.stderr.isatty()
-        self._shown = time.monotonic() - LIVE if self._terminal else time.monotonic()
-
-    def __call__(self, progress: Progress) -> None:
-        now = time.monotonic()
-        if sys.stderr is None or now - self._shown < (LIVE if self._terminal else LOG):
-            return
-        self._shown = now
-        text = f"{progress.done}/{progress.total} done   {progress.failed} failed   {progress.rate:.3g}/s"
-        if progress.seconds_left is not None:
-            text += f"   {_duration(progress.seconds_left)} left"
-        if self._terminal:
-            overwrite(text)
-        else:
-            tell(text)
-
-    def clear(self) -> None:
-        """Erase the progress line."""
-        if self._terminal:
-            overwrite("")
+def _words(progress: Progress) -> str:
+    text = f"{progress.done}/{progress.total} done   {progress.failed} failed   {progress.rate:.3g}/s"
+    left = progress.seconds_left
+    return text if left is None else f"{text}   {_duration(left)} left"
 
 
 def _duration(seconds: float) -> str:

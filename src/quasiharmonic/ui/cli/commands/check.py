@@ -1,10 +1,26 @@
-"""``qhm check``: say what a mesh is, certify its map exactly, and find what prevents a map."""
+"""``qhm check``: say what a mesh is, certify its map exactly, and find what prevents a map.
+
+Report the components, boundaries, genus and defects of a mesh. If the file has a map (vt of an OBJ; a planar mesh
+without vt is its own map), verify it exactly. A map with seams is verified in the plane. Tetrahedra are verified in
+space. If the map is not injective, look for obstructions: conditions that no map with these fixed vertices meets.
+
+Exit status: 0 every island of the map is injective (every triangle strictly positive; of several islands some may be
+mirrored), or there is no map and the mesh has no defect, or the boundary is listed; 1 otherwise; 2 the file cannot be
+read.
+
+    qhm check model.obj
+    qhm check problem/ --json report.json
+    qhm check model.obj --boundary --plot boundary.png
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from quasiharmonic.ui.cli import boundary_report, finite_elements, pipeline, report, written_map
+from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, flag
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,23 +35,8 @@ if TYPE_CHECKING:
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments
 
-    parser = commands.add_parser(
-        "check",
-        description="Report the components, boundaries, genus and defects of a mesh. If the file has a map (vt of an "
-        "OBJ; a planar mesh without vt is its own map), verify it exactly. A map with seams is verified in the plane. "
-        "Tetrahedra are verified in space. "
-        "If the map is not injective, look for obstructions: conditions that no map with these fixed vertices meets.",
-        epilog="Exit status: 0 every island of the map is injective (every triangle strictly positive; of several "
-        "islands some may be mirrored), or there is no map and the mesh has no defect, or the boundary is listed; "
-        "1 otherwise; 2 the file cannot be read.",
-        examples=(
-            "qhm check model.obj",
-            "qhm check problem/ --json report.json",
-            "qhm check model.obj --boundary --plot boundary.png",
-        ),
-    )
+    parser = add_command(commands, "check", __doc__, run)
     parser.add_argument(
         "input",
         type=Path,
@@ -43,43 +44,31 @@ def add_parser(commands: Commands) -> None:
         help=f"{format_names('read')} file, a finite-element mesh ({format_names('read_elements')}), or a folder with "
         "input.obj and handles.txt",
     )
-    parser.add_argument(
-        "--fixed",
-        type=Path,
-        metavar="FILE",
-        help="file of fixed vertices for the obstructions, 0-based, one per line (default: the boundary)",
+    add_options(
+        parser, fixed=file("file of fixed vertices for the obstructions, 0-based, one per line (default: the boundary)")
     )
-    parser.add_argument(
-        "--as",
-        dest="precision",
-        choices=("float64", "float32"),
-        help="round the positions to this precision first (default: float64)",
+    precision = "round the positions to this precision first (default: float64)"
+    parser.add_argument("--as", dest="precision", **choice(("float64", "float32"), precision))
+    add_options(
+        parser,
+        any_triangulation=flag(
+            "also require that every face is convex in the plane, so that the result holds for any triangulation"
+        ),
+        boundary=flag("only list the boundary of the surface: its loops, and corners for qhm map --corners"),
+        plot=file("draw the boundary that --boundary lists", metavar="IMAGE"),
     )
-    parser.add_argument(
-        "--any-triangulation",
-        action="store_true",
-        help="also require that every face is convex in the plane, so that the result holds for any triangulation",
-    )
-    parser.add_argument(
-        "--boundary",
-        action="store_true",
-        help="only list the boundary of the surface: its loops, and corners for qhm map --corners",
-    )
-    parser.add_argument("--plot", type=Path, metavar="IMAGE", help="draw the boundary that --boundary lists")
-    arguments.add_report(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
     """Read, inspect, certify, diagnose, report; or report the boundary."""
     from quasiharmonic import io
     from quasiharmonic.problem.inspection import inspect_mesh
-    from quasiharmonic.ui.cli import boundary_report, finite_elements, report
 
     if options.boundary and (options.precision or options.any_triangulation or options.fixed):
         raise ValueError("--boundary verifies no map: omit --as, --any-triangulation and --fixed")
     options.input, options.fixed = io.problem_files(options.input, options.fixed)
-    report.check_json(options.json, inputs=(options.input, options.fixed))
+    report.check_new({}, options.json, inputs=(options.input, options.fixed))
     if options.boundary:
         return boundary_report.run(options)
     if options.plot is not None:
@@ -99,11 +88,9 @@ def run(options: argparse.Namespace) -> int:
             facts["changes"], table = _clean(mesh)
             lines.append(table)
         lines.append("The file has no map: no texture coordinates, and the mesh is not planar.")
-        report.emit_verdict({**facts, "injective": None}, options.json, "\n".join(lines))
-        return 0 if found.clean else 1
+        return pipeline.conclude(options, pipeline.Account({**facts, "injective": None}, lines, found.clean))
     good, more, text = _verify(mesh, options, fixed)
-    report.emit_verdict({**facts, **more}, options.json, "\n".join([*lines, *text]))
-    return 0 if good else 1
+    return pipeline.conclude(options, pipeline.Account({**facts, **more}, [*lines, *text], good))
 
 
 def _clean(mesh: MeshData) -> tuple[dict[str, Any], str]:
@@ -122,8 +109,6 @@ def _verify(
     mesh: MeshData, options: argparse.Namespace, fixed: NDArray[np.int64] | None
 ) -> tuple[bool, dict[str, Any], list[str]]:
     """Certify the map of a mesh; return whether it passes, the entries of the report, and its text."""
-    from quasiharmonic.ui.cli import written_map
-
     precision = options.precision or "float64"
     certified = written_map.certify_map(mesh, precision=precision)
     further = len(certified.V) - len(mesh.V)
@@ -152,7 +137,7 @@ def _convexity(mesh: MeshData, certified: WrittenMap) -> tuple[NDArray[np.int64]
     from quasiharmonic.geometry.exact.convexity import find_concave
     from quasiharmonic.util.arrays import count_of, names_of
 
-    bent = find_concave(mesh.polygons, certified.F, certified.uv)
+    bent = find_concave(mesh.rings, certified.F, certified.uv)
     if bent.size:
         return (
             bent,

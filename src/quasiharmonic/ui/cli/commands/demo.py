@@ -1,10 +1,21 @@
-"""``qhm demo``: map a built-in surface onto a letter."""
+"""``qhm demo``: map a built-in surface onto a letter.
+
+Make the head of a cat, map it onto the letter R, and write demo.obj, demo.png and demo.json.
+
+Exit status: 0 the written map is certified injective; 1 it is not; 2 nothing was written; 3 the map was written, but
+the report failed.
+
+    qhm demo
+    qhm demo -o folder/
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli.arguments import add_command
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
@@ -14,20 +25,10 @@ LETTER = "R"
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    parser = commands.add_parser(
-        "demo",
-        description="Make the head of a cat, map it onto the letter R, and write demo.obj, demo.png and demo.json.",
-        epilog="Exit status: 0 the written map is certified injective; 1 it is not; 2 nothing was written; 3 the map "
-        "was written, but the report failed.",
-        examples=(
-            "qhm demo",
-            "qhm demo -o folder/",
-        ),
-    )
+    parser = add_command(commands, "demo", __doc__, run)
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("qhm-demo"), metavar="DIR", help="folder to write to (qhm-demo)"
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -38,19 +39,23 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.geometry.mesh.topology import boundary_loops
     from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem import Problem
-    from quasiharmonic.ui.cli import report, written_map
+    from quasiharmonic.solver.mapping import solve
+    from quasiharmonic.ui.cli import progress_line, report, written_map
     from quasiharmonic.ui.cli.commands import map
 
     folder: Path = options.output
+    output = folder / "demo.obj"
     with io.new_folder(folder):
         V, F = surfaces.cat()
         (loop,) = boundary_loops(F, len(V))
         problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
-        mapped = each_island(SeamedMesh(V, F), lambda _: map.search(problem, "speed", None, 2000, "auto"))
-        written = written_map.write(folder / "demo.obj", io.MeshData(V, F).with_places(mapped.mesh))
-    with report.after_writing(folder / "demo.obj"):
+        with progress_line.line() as show:
+            mapped = each_island(SeamedMesh(V, F), lambda _: solve(problem, callback=show))
+        io.write_mapped(output, io.MeshData(V, F).with_places(mapped.mesh))
+    with report.after_writing(output):
+        written = written_map.certify_map(io.read_mesh(output))
         map.draw(folder / "demo.png", written, [problem], mapped)
         facts = {**mapped.to_dict(), **written.to_dict(), **report.sizes(problem.domain)}
-        report.emit(facts, str(folder / "demo.json"), report.describe_maps(mapped, written, folder / "demo.obj"))
+        report.emit(facts, str(folder / "demo.json"), report.describe_maps(mapped, written, output))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
     return 0 if written.injective else 1

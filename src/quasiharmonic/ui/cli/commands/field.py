@@ -1,12 +1,32 @@
-"""``qhm field``: compute the nearest displacement field of an image without folds, and its inverse."""
+"""``qhm field``: compute the nearest displacement field of an image without folds, and its inverse.
+
+Make a displacement field invertible with the least change. Away from folds the field is unchanged, bit for bit. A
+.npy array has shape (height, width, 2), with displacements along x (to the right) and y (down) in the unit of
+--spacing, or (depth, height, width, 3) on a volume. NIfTI files (.nii, .nii.gz) need nibabel, ITK's files (.mha,
+.nrrd) need SimpleITK; their vectors are along the axes of space, as ITK, ANTs and elastix write them. On volumes, six
+tetrahedra per cell are certified; ITK and ANTs interpolate trilinearly, for which --interpolation trilinear gives a
+certificate.
+
+Exit status: 0 the written field is certified without folds; 1 written, but the inverse that --inverse requests does
+not exist, because the border overlaps itself; 2 wrong input or call, or no such field was found, nothing written; 3
+written, but the report failed.
+
+    qhm field field.npy -o field_without_folds.npy
+    qhm field field.npy --inverse inverse.npy -o field_without_folds.npy
+    qhm field warp.nii.gz -o warp_without_folds.nii.gz
+"""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.ui.cli import pipeline, report
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, file, flag, number
+
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -16,73 +36,49 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.ui.cli import arguments
-
-    parser = commands.add_parser(
-        "field",
-        description="Make a displacement field invertible with the least change. Away from folds "
-        "the field is unchanged, bit for bit. A .npy array has shape (height, width, 2), with displacements "
-        "along x (to the right) and y (down) in the unit of --spacing, or (depth, height, width, 3) on a volume. NIfTI "
-        "files (.nii, .nii.gz) need nibabel, ITK's files (.mha, .nrrd) need SimpleITK; their vectors are along the "
-        "axes of space, as ITK, ANTs and elastix write them. On volumes, six tetrahedra per cell are certified; "
-        "ITK and ANTs interpolate trilinearly, for which --interpolation trilinear gives a certificate.",
-        epilog="Exit status: 0 the written field is certified without folds; 1 written, but the inverse that "
-        "--inverse requests does not exist, because the border overlaps itself; 2 wrong input or call, or no such "
-        "field was found, nothing written; 3 written, but the report failed.",
-        examples=(
-            "qhm field field.npy -o field_without_folds.npy",
-            "qhm field field.npy --inverse inverse.npy -o field_without_folds.npy",
-            "qhm field warp.nii.gz -o warp_without_folds.nii.gz",
+    parser = add_command(commands, "field", __doc__, run)
+    add_files(parser, ".npy, .nii, .nii.gz, .mha or .nrrd file", "file to write, of the same kind")
+    add_options(
+        parser,
+        inverse=file(
+            "also write the inverse of the new field, of the same kind and grid; NaN outside the field's image"
         ),
+        spacing=number(
+            float,
+            "for .npy: distance between pixels, or distances along x, along y, and along z (default: 1)",
+            metavar="LENGTH",
+            nargs="+",
+        ),
+        min_jacobian=number(
+            float,
+            "lower bound of the Jacobian determinants at the corners of pixels, or of the volume ratios of the six "
+            "tetrahedra of each cell of a volume (default: 0.01)",
+            metavar="DET",
+            default=0.01,
+        ),
+        interpolation=choice(
+            ("linear", "trilinear"),
+            "for volumes: trilinear also verifies that no cell folds between the voxels if they are interpolated "
+            "trilinearly; if one may fold, no file is written (default: linear)",
+            default="linear",
+        ),
+        fix_border=flag("keep the displacements of the border's pixels"),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help=".npy, .nii, .nii.gz, .mha or .nrrd file")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="file to write, of the same kind")
-    parser.add_argument(
-        "--inverse",
-        type=Path,
-        metavar="FILE",
-        help="also write the inverse of the new field, of the same kind and grid; NaN outside the field's image",
-    )
-    parser.add_argument(
-        "--spacing",
-        type=float,
-        nargs="+",
-        metavar="LENGTH",
-        help="for .npy: distance between pixels, or distances along x, along y, and along z (default: 1)",
-    )
-    parser.add_argument(
-        "--min-jacobian",
-        type=float,
-        default=0.01,
-        metavar="DET",
-        help="lower bound of the Jacobian determinants at the corners of pixels, or of the volume ratios of the six "
-        "tetrahedra of each cell of a volume (default: 0.01)",
-    )
-    parser.add_argument(
-        "--interpolation",
-        choices=("linear", "trilinear"),
-        default="linear",
-        help="for volumes: trilinear also verifies that no cell folds between the voxels if they are interpolated "
-        "trilinearly; if one may fold, no file is written (default: linear)",
-    )
-    parser.add_argument("--fix-border", action="store_true", help="keep the displacements of the border's pixels")
-    arguments.add_report(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "json")
 
 
 def run(options: argparse.Namespace) -> int:
     """Read, make invertible, write, report."""
     from quasiharmonic.apps.displacement_fields.nearest import InvertibleField, fold_free, nearest_invertible
-    from quasiharmonic.apps.tetrahedra.voxel_fields import describe_fixed
+    from quasiharmonic.apps.displacement_fields.voxels import describe_fixed
     from quasiharmonic.io.fields import field_suffix, read_field
-    from quasiharmonic.ui.cli import report
 
-    outputs = {"-o": options.output, **({} if options.inverse is None else {"--inverse": options.inverse})}
-    report.check_new(outputs, options.json, inputs=(options.input,))
-    for path in outputs.values():
+    report.check_new({"-o": options.output, "--inverse": options.inverse}, options.json, inputs=(options.input,))
+    outputs = [path for path in (options.output, options.inverse) if path is not None]
+    for path in outputs:
         field_suffix(path)
     given = read_field(options.input)
-    for path in outputs.values():
+    for path in outputs:
         given.check_output(path)
     field, spacing = given.field, _spacing(options, given)
     with report.about(options.input):
@@ -100,7 +96,8 @@ def run(options: argparse.Namespace) -> int:
         _check_interpolation(repaired.field, spacing, options.interpolation)
     given.write(options.output, repaired.field)
     invertible = bool(repaired.certificate.bijective if isinstance(repaired, InvertibleField) else repaired.bijective)
-    with report.after_writing(options.output):
+
+    def describe() -> pipeline.Account:
         # Rotation to the axes of space rounds, so the file is verified.
         written = read_field(options.output).field
         if not fold_free(written, spacing=spacing, interpolation=options.interpolation).all():
@@ -108,13 +105,12 @@ def run(options: argparse.Namespace) -> int:
         facts: dict[str, Any] = {
             "injective": repaired.success,
             "bijective": invertible,
-            "folds": repaired.folds,
             "moved": int(repaired.moved_mask.sum()),
+            "folds": repaired.folds,
             "patches": repaired.patches,
             "distance": repaired.distance,
             "seconds": repaired.seconds,
-            "input": str(options.input),
-            "output": str(options.output),
+            **pipeline.name_files(options),
         }
         lines = [f"wrote {options.output}: {repaired.summary()}"]
         if options.inverse is not None and invertible:
@@ -122,8 +118,9 @@ def run(options: argparse.Namespace) -> int:
             facts["inverse"] = str(options.inverse)
         elif options.inverse is not None:
             lines.append(f"{options.inverse} is not written: the field has no inverse")
-        report.emit(facts, options.json, "\n".join(lines))
-    return 0 if invertible or options.inverse is None else 1
+        return pipeline.Account(facts, lines, invertible or options.inverse is None)
+
+    return pipeline.finish(options, describe, options.output)
 
 
 def _spacing(options: argparse.Namespace, given: DisplacementField) -> float | list[float]:

@@ -1,4 +1,15 @@
-"""``qhm flatten``: compute a bijective map of a mesh with free boundary and low distortion."""
+"""``qhm flatten``: compute a bijective map of a mesh with free boundary and low distortion.
+
+Map a surface with a boundary into the plane. The boundary is free and moves to lower distortion. No triangle is
+inverted, and nothing overlaps.
+
+Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing written; 3
+written, but the report failed. Ctrl-C writes the best map so far.
+
+    qhm flatten scan.obj -o flat.obj
+    qhm flatten model.glb --cut --pack --texture checkerboard -o model_uv.glb
+    qhm flatten shirt.obj --energy arap-barrier --pattern shirt.svg -o shirt_flat.obj
+"""
 
 from __future__ import annotations
 
@@ -8,8 +19,24 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, written_map
+from quasiharmonic.ui.cli.arguments import (
+    add_command,
+    add_files,
+    add_options,
+    choice,
+    declared,
+    file,
+    flag,
+    number,
+    pick,
+    set_default,
+)
+from quasiharmonic.util.options import FlattenOptions
+
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
+    from quasiharmonic.io import MeshData
     from quasiharmonic.ui.cli.arguments import Commands
 
 
@@ -20,75 +47,47 @@ _PIECE_GAP = 2.1
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments, material, seam_options
 
-    parser = commands.add_parser(
-        "flatten",
-        description="Map a surface with a boundary into the plane. The boundary is free and moves to lower "
-        "distortion. No "
-        "triangle is inverted, and nothing overlaps.",
-        epilog="Exit status: 0 the written file is certified bijective; 1 it is not; 2 wrong input or call, nothing "
-        "written; 3 written, but the report failed. Ctrl-C writes the best map so far.",
-        examples=(
-            "qhm flatten scan.obj -o flat.obj",
-            "qhm flatten model.glb --cut --pack --texture checkerboard -o model_uv.glb",
-            "qhm flatten shirt.obj --energy arap-barrier --pattern shirt.svg -o shirt_flat.obj",
+    parser = add_command(commands, "flatten", __doc__, run)
+    add_files(parser, f"{format_names('read')} file", f"{format_names('write_map')} file to write")
+    add_options(
+        parser,
+        "rings",
+        **declared(FlattenOptions),
+        weights=file("file of triangle weights, one positive number per line"),
+        start=flag("start from the map in the input's texture coordinates (vt)"),
+        fixed=file("file of vertices, 0-based, one per line, to fix at the input's vt"),
+    )
+    add_options(
+        parser,
+        *("cut", "seams", "islands", "pack", "resolution", "padding"),
+        pattern=file("also draw the outline true to scale, as .svg or .dxf"),
+        unit=choice(("mm", "cm", "m", "in"), "length unit of the surface, for --pattern (default: mm)"),
+        allowance=number(
+            float, "distance of the cutting line outside the outline, in that unit", metavar="WIDTH", default=0.0
         ),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('read')} file")
-    parser.add_argument("-o", "--output", type=Path, required=True, help=f"{format_names('write_map')} file to write")
-    parser.add_argument(
-        "--energy",
-        choices=arguments.FLATTENED,
-        default="symmetric-dirichlet",
-        help="energy to lower; mips preserves only angles, distances preserves distances between nearby vertices "
-        "(default: symmetric-dirichlet)",
-    )
-    arguments.add_rings(parser)
-    parser.add_argument(
-        "--weights", type=Path, metavar="FILE", help="file of triangle weights, one positive number per line"
-    )
-    parser.add_argument(
-        "--start", action="store_true", help="start from the map in the input's texture coordinates (vt)"
-    )
-    parser.add_argument(
-        "--fixed",
-        type=Path,
-        metavar="FILE",
-        help="file of vertices, 0-based, one per line, to fix at the input's vt",
-    )
-    parser.add_argument("--unit-square", action="store_true", help="scale the map evenly into the unit square")
-    seam_options.add_options(parser)
-    seam_options.add_islands(parser)
-    seam_options.add_packing(parser)
-    parser.add_argument(
-        "--pattern", type=Path, metavar="FILE", help="also draw the outline true to scale, as .svg or .dxf"
-    )
-    parser.add_argument(
-        "--unit", choices=("mm", "cm", "m", "in"), help="length unit of the surface, for --pattern (default: mm)"
-    )
-    parser.add_argument(
-        "--allowance",
-        type=float,
-        default=0.0,
-        metavar="WIDTH",
-        help="distance of the cutting line outside the outline, in that unit",
-    )
-    parser.add_argument(
-        "--max-iterations",
-        type=arguments.steps,
-        default=500,
-        metavar="N",
-        help="maximum steps on each connected surface; 0 keeps the start (default: 500)",
-    )
-    arguments.add_linear_solver(parser)
-    material.add_options(parser)
-    arguments.add_report(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
     """Read, flatten, write, read back, certify, report."""
+    began = time.perf_counter()
+    seam_options.check_options(options)
+    seam_options.check_packing(options)
+    set_default(options, "rings", 20, asked=options.energy == "distances", belongs="--energy distances")
+    set_default(options, "unit", "mm", asked=options.pattern is not None, belongs="--pattern")
+    _check_options(options)
+    seams = None if options.seams in ("file", "none") else Path(options.seams)
+    return pipeline.change_map(
+        options,
+        lambda mesh: _flatten(options, mesh, began),
+        inputs=(options.weights, options.fixed, seams),
+    )
+
+
+def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
+    """Flatten a mesh."""
     import numpy as np
 
     from quasiharmonic import io
@@ -96,24 +95,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apps.flattening.patterns import write_pattern
     from quasiharmonic.energies.measures import distortion
     from quasiharmonic.problem.inspection import describe_soup, find_close_vertices
-    from quasiharmonic.ui.cli import arguments, material, progress_line, report, seam_options, streams, written_map
 
-    began = time.perf_counter()
-    seam_options.check_options(options)
-    seam_options.check_packing(options)
-    arguments.set_default(options, "rings", 20, asked=options.energy == "distances", belongs="--energy distances")
-    arguments.set_default(options, "unit", "mm", asked=options.pattern is not None, belongs="--pattern")
-    inputs = (
-        options.input,
-        options.weights,
-        options.fixed,
-        None if options.seams in ("file", "none") else Path(options.seams),
-    )
-    report.check_outputs(options.output, None, options.json, inputs, pattern=options.pattern)
-    _check_pattern(options)
-    if options.pack and (options.unit_square or options.fixed is not None or options.pattern is not None):
-        raise ValueError("--pack determines size and position: omit --unit-square, --fixed and --pattern")
-    mesh = material.read_mesh(options, options.input)
     given: dict[str, Any] = {}
     if options.start or options.fixed is not None:
         if options.cut or options.seams != "file":
@@ -128,23 +110,12 @@ def run(options: argparse.Namespace) -> int:
     triangles = np.array([len(island.F) for island in found.mesh.islands])
     if (close := find_close_vertices(mesh.V, triangles)).size:
         streams.tell(describe_soup(close))
-    with report.about(options.input), progress_line.line() as show:
-        mapped = atlas.flatten(
-            found.mesh,
-            start=options.start,
-            energy=options.energy,
-            unit_square=options.unit_square,
-            rings=options.rings,
-            gap=_PIECE_GAP * options.allowance,
-            islands=options.islands,
-            max_iterations=options.max_iterations,
-            linear_solver=options.linear_solver,
-            callback=show,
-            **given,
-        )
-    flattened = mesh.with_places(seam_options.pack_islands(options, mapped.mesh))
-    certified = written_map.write(options.output, flattened)
-    with report.after_writing(options.output):
+    given |= pick(options, "start", "rings", "islands", *declared(FlattenOptions))
+    with pipeline.working(options.input) as show:
+        mapped = atlas.flatten(found.mesh, gap=_PIECE_GAP * options.allowance, callback=show, **given)
+
+    def describe(written: MeshData) -> pipeline.Account:
+        certified = written_map.certify_map(written)
         # Some formats hold the map alone; their vertices have the numbers of the surface's.
         V = mesh.V if len(mesh.V) == len(certified.V) else certified.V
         flat = io.without_idle(V, certified.F, certified.uv)
@@ -159,35 +130,37 @@ def run(options: argparse.Namespace) -> int:
             # Each island has its own energy, so there is no value for several islands.
             "mean_energy": _mean_energy(mapped),
             "distortion": measured.to_dict(),
-            "input": str(options.input),
-            "output": str(options.output),
             "seconds_in_all": time.perf_counter() - began,
         }
         worst = measured.statistics("isometric").maximum
-        lines = [report.describe_maps(mapped, certified, options.output), *found.notes, f"maximum stretch {worst:.3g}"]
+        lines = [
+            report.describe_maps(mapped, certified, options.output),
+            *found.notes,
+            f"maximum stretch {worst:.3g}",
+        ]
         if measured.distances is not None:
             lines.append(measured.distances.summary())
         if options.pattern is not None:
             facts["pattern"] = str(options.pattern)
             write_pattern(options.pattern, *flat[1:], unit=options.unit, allowance=options.allowance)
             lines.append(f"wrote {options.pattern}, true to scale")
-        lines.append(mapped.status.value)
-        written_map.add_old_textures(facts, lines, mesh, flattened)
-        report.emit(facts, options.json, "\n".join(lines))
-    return 0 if certified.apart else 1
+        return pipeline.Account(facts, [*lines, mapped.status.value], certified.apart)
+
+    return pipeline.Changed(mesh.with_places(seam_options.pack_islands(options, mapped.mesh)), describe)
 
 
-def _check_pattern(options: argparse.Namespace) -> None:
-    """Raise ValueError for invalid pattern options, before any work."""
+def _check_options(options: argparse.Namespace) -> None:
+    """Raise ValueError for options that exclude each other, and for invalid ones of the pattern."""
     from quasiharmonic.apps.flattening.patterns import check_pattern
 
-    if options.pattern is None:
-        if options.allowance:
-            raise ValueError("--allowance needs --pattern: add it")
-        return
-    if options.unit_square:
-        raise ValueError("--pattern is true to scale, but --unit-square scales the map: omit one of them")
-    check_pattern(options.pattern, unit=options.unit, allowance=options.allowance)
+    if options.pattern is None and options.allowance:
+        raise ValueError("--allowance needs --pattern: add it")
+    if options.pattern is not None:
+        if options.unit_square:
+            raise ValueError("--pattern is true to scale, but --unit-square scales the map: omit one of them")
+        check_pattern(options.pattern, unit=options.unit, allowance=options.allowance)
+    if options.pack and (options.unit_square or options.fixed is not None or options.pattern is not None):
+        raise ValueError("--pack determines size and position: omit --unit-square, --fixed and --pattern")
 
 
 def _mean_energy(mapped: MappedAtlas) -> float | None:

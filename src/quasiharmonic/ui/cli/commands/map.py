@@ -1,4 +1,15 @@
-"""``qhm map``: map a mesh onto a target boundary, and certify the written file."""
+"""``qhm map``: map a mesh onto a target boundary, and certify the written file.
+
+Place the free vertices of a mesh such that no triangle is inverted. The targets of the fixed vertices are the input's
+texture coordinates (vt), or an outline given by --to.
+
+Exit status: 0 the written file is certified injective; 1 a map was written that is not; 2 wrong input or call,
+nothing written; 3 a map was written, but the report failed.
+
+    qhm map model.obj --to letter:R -o map.obj
+    qhm map problem/ -o map.obj --refine
+    qhm map model.glb --to rect:2x1 --corners auto --slide -o map.glb
+"""
 
 from __future__ import annotations
 
@@ -7,13 +18,26 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from quasiharmonic.ui.cli import pipeline, progress_line, report, seam_options, slide_options, targets, written_map
+from quasiharmonic.ui.cli.arguments import (
+    add_command,
+    add_files,
+    add_options,
+    choice,
+    declared,
+    file,
+    flag,
+    pick,
+    set_default,
+)
+from quasiharmonic.util.options import ENERGIES, MapOptions
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
-    from quasiharmonic.geometry.curves import BoundaryCurves
-    from quasiharmonic.geometry.mesh.refinement import Refined
+    from quasiharmonic.io import MeshData
     from quasiharmonic.io.seamed_mesh import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.result import MapResult
@@ -25,78 +49,69 @@ if TYPE_CHECKING:
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments, material, seam_options, slide_options, targets
 
-    parser = commands.add_parser(
-        "map",
-        description="Place the free vertices of a mesh such that no triangle is inverted. The targets of the "
-        "fixed vertices "
-        "are the input's texture coordinates (vt), or an outline given by --to.",
-        epilog="Exit status: 0 the written file is certified injective; 1 a map was written that is not; "
-        "2 wrong input or call, nothing written; 3 a map was written, but the report failed.",
-        examples=(
-            "qhm map model.obj --to letter:R -o map.obj",
-            "qhm map problem/ -o map.obj --refine",
-            "qhm map model.glb --to rect:2x1 --corners auto --slide -o map.glb",
-        ),
+    parser = add_command(commands, "map", __doc__, run)
+    add_files(
+        parser,
+        f"{format_names('read')} file, or a folder with input.obj and handles.txt",
+        f"{format_names('write_map')} file to write",
     )
-    parser.add_argument(
-        "input",
-        type=Path,
-        help=f"{format_names('read')} file, or a folder with input.obj and handles.txt",
-        metavar="INPUT",
-    )
-    parser.add_argument("-o", "--output", type=Path, required=True, help=f"{format_names('write_map')} file to write")
     targets.add_options(parser)
-    parser.add_argument("--plot", type=Path, metavar="IMAGE", help="draw the rest surface, the start and the map")
-    parser.add_argument(
-        "--kind",
-        choices=("map", "distortion"),
-        help="for --plot: draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂) with its histogram",
+    kind = "for --plot: draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂) with its histogram"
+    add_options(
+        parser,
+        plot=file("draw the rest surface, the start and the map", metavar="IMAGE"),
+        kind=choice(("map", "distortion"), kind),
     )
-    seam_options.add_islands(parser)
-    seam_options.add_packing(parser)
-    material.add_options(parser)
-    arguments.add_report(parser)
-    distortion = parser.add_mutually_exclusive_group()
-    distortion.add_argument(
-        "--polish",
-        choices=arguments.ENERGIES,
-        metavar="ENERGY",
-        help="then lower distortion until it converges: %(choices)s (default: 20 steps of blend, up to "
-        "100,000 triangles)",
+    add_options(parser, "islands", "pack", "resolution", "padding", "texture", "json", "surface")
+    add_options(
+        parser.add_mutually_exclusive_group(),
+        polish=choice(
+            ENERGIES,
+            "then lower distortion until it converges: %(choices)s (default: 20 steps of blend, up to "
+            "100,000 triangles)",
+            metavar="ENERGY",
+        ),
+        no_polish=flag("keep the first injective map"),
     )
-    distortion.add_argument("--no-polish", action="store_true", help="keep the first injective map")
-    slide_options.add_options(parser)
+    add_options(parser, "slide", "pieces")
     solver = parser.add_argument_group("solution")
-    arguments.add_strategy(solver)
-    solver.add_argument("--reference", choices=("equilateral", "rest", "corrected"), help="reference triangles")
-    solver.add_argument("--max-iterations", type=arguments.count, default=2000, metavar="N", help="(default: 2000)")
-    arguments.add_linear_solver(solver)
-    parser.set_defaults(run=run)
+    add_options(solver, "reference", *declared(MapOptions))
 
 
 def run(options: argparse.Namespace) -> int:
     """Read, map, write, read back, certify, report."""
     from quasiharmonic import io
-    from quasiharmonic.apps.atlas.mapped_atlas import each_island, merge_refined
-    from quasiharmonic.problem.result import Status
-    from quasiharmonic.ui.cli import arguments, material, report, seam_options, slide_options, targets, written_map
 
     began = time.perf_counter()
     if options.slide and options.no_polish:
         raise ValueError("--slide needs polishing: omit --no-polish")
     slide_options.check_options(options)
     seam_options.check_packing(options)
-    arguments.set_default(options, "kind", "map", asked=options.plot is not None, belongs="--plot")
-    mesh_path, fixed_path = io.problem_files(options.input, options.fixed)
+    set_default(options, "kind", "map", asked=options.plot is not None, belongs="--plot")
+    source, fixed = io.problem_files(options.input, options.fixed)
     if options.to is not None:
         # The handles of a folder belong to the target in its own vt.
-        fixed_path = None
-    report.check_outputs(
-        options.output, options.plot, options.json, inputs=(mesh_path, fixed_path, *targets.files(options))
+        fixed = None
+    return pipeline.change_map(
+        options,
+        lambda mesh: _map(options, mesh, source, fixed, began),
+        source=source,
+        inputs=(fixed, *targets.files(options)),
     )
-    mesh = material.read_mesh(options, mesh_path)
+
+
+def _map(
+    options: argparse.Namespace, mesh: MeshData, source: Path, fixed_path: Path | None, began: float
+) -> pipeline.Changed:
+    """Map a mesh, island by island."""
+    from quasiharmonic import io
+    from quasiharmonic.apps.atlas.mapped_atlas import each_island, merge_refined
+    from quasiharmonic.energies.polishing import smooth
+    from quasiharmonic.problem.result import Status
+    from quasiharmonic.solver.mapping import solve
+    from quasiharmonic.solver.refine.attempts import on_refinement
+
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     targets.check_options(options, mesh, fixed)
     found = seam_options.surface(options, mesh, disks_too=False)
@@ -109,42 +124,47 @@ def run(options: argparse.Namespace) -> int:
         one = targets.make_problem(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
-        chosen = options.strategy or "speed", options.polish, options.max_iterations, options.linear_solver
-        result = search(problem, *chosen, slide=one.slide if options.polish else False, refine=options.refine)
+        given = pick(options, "polish", *declared(MapOptions))
+        slide = one.slide if options.polish else False
+        with progress_line.line() as show:
+            result = solve(problem, slide=slide, callback=show, **given)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-            fine = refined_by(problem, result.refined)
-            result = smooth_briefly(fine, result, options.linear_solver, one.slide)
+            # The short default polish lowers the worst distortion at little cost.
+            fine = on_refinement(problem, result.refined)
+            with progress_line.line() as show:
+                result = smooth(fine, result, linear_solver=options.linear_solver, callback=show, slide=one.slide)
         return result
 
-    with report.about(mesh_path):
+    with report.about(source):
         mapped = each_island(found.mesh, solve_island, reflect=options.to is None, only=options.islands)
     refined = [one.result.refined for one in mapped.islands]
     refined += [None] * (len(islands) - len(refined))
-    written = mesh.with_places(mapped.mesh)
+    new = mesh.with_places(mapped.mesh)
     if any(refined):
-        written = merge_refined(mesh, mapped.mesh.islands, refined, mapped.places())
+        new = merge_refined(mesh, mapped.mesh.islands, refined, mapped.places())
     if options.pack:
-        written = written.with_places(seam_options.pack_islands(options, io.mapped(written)))
-    certified = written_map.write(options.output, written)
-    added = sum(one.result.added for one in mapped.islands)
-    with report.after_writing(options.output):
+        new = new.with_places(seam_options.pack_islands(options, io.mapped(new)))
+
+    def describe(written: MeshData) -> pipeline.Account:
+        certified = written_map.certify_map(written)
         if options.plot is not None:
             problems = zip((one.fitted.problem for one in posed), refined, strict=False)
-            draw(options.plot, certified, [refined_by(*one) for one in problems], mapped, options.kind)
+            draw(options.plot, certified, [on_refinement(*one) for one in problems], mapped, options.kind)
+        added = sum(one.result.added for one in mapped.islands)
+        filled = sum(one.fitted.filled_holes for one in posed)
         facts = {
             **mapped.to_dict(),
             **certified.to_dict(),
-            "vertices": len(written.V),
-            "triangles": len(written.F),
+            "vertices": len(new.V),
+            "triangles": len(new.F),
             "fixed": sum(len(one.fitted.problem.fixed) for one in posed),
             **({} if options.to is None else {"to": options.to}),
             **found.facts,
-            **sum_facts([one.facts for one in posed]),
+            **({"filled_holes": filled} if filled else {}),
+            **({"slide": True} if options.slide else {}),
             **({"added_vertices": added} if options.refine else {}),
-            "input": str(options.input),
-            "output": str(options.output),
             "seconds_in_all": time.perf_counter() - began,
         }
         notes = [*found.notes, *dict.fromkeys(note for one in posed for note in one.notes)]
@@ -155,55 +175,10 @@ def run(options: argparse.Namespace) -> int:
             for island, one in zip(islands, mapped.islands, strict=False)
             if one.result.crowded.size
         ]
-        written_map.add_old_textures(facts, notes, mesh, written)
-        report.emit(facts, options.json, "\n".join([report.describe_maps(mapped, certified, options.output), *notes]))
-    return 0 if certified.injective else 1
+        lines = [report.describe_maps(mapped, certified, options.output), *notes]
+        return pipeline.Account(facts, lines, certified.injective)
 
-
-def search(
-    problem: Problem,
-    strategy: str,
-    polish: str | None,
-    max_iterations: int,
-    linear_solver: str,
-    slide: bool | BoundaryCurves = False,
-    refine: bool = False,
-) -> MapResult:
-    """Solve with progress on the terminal."""
-    from quasiharmonic.solver.mapping import solve
-    from quasiharmonic.ui.cli import progress_line
-
-    with progress_line.line() as show:
-        return solve(
-            problem,
-            strategy=strategy,
-            polish=polish,
-            max_iterations=max_iterations,
-            linear_solver=linear_solver,
-            callback=show,
-            slide=slide,
-            refine=refine,
-        )
-
-
-def refined_by(problem: Problem, refined: Refined | None) -> Problem:
-    """Return the problem on the refined mesh of a result."""
-    if refined is None:
-        return problem
-    from quasiharmonic.solver.refine.attempts import on_refinement
-
-    return on_refinement(problem, refined)
-
-
-def smooth_briefly(
-    problem: Problem, result: MapResult, linear_solver: str, slide: bool | BoundaryCurves = False
-) -> MapResult:
-    """Run the short default polish, which lowers the worst distortion at little cost."""
-    from quasiharmonic.energies.polishing import smooth
-    from quasiharmonic.ui.cli import progress_line
-
-    with progress_line.line() as show:
-        return smooth(problem, result, linear_solver=linear_solver, callback=show, slide=slide)
+    return pipeline.Changed(new, describe)
 
 
 def describe_crowded(vertices: NDArray[np.int64]) -> str:
@@ -211,15 +186,6 @@ def describe_crowded(vertices: NDArray[np.int64]) -> str:
     from quasiharmonic.util.arrays import names_of
 
     return f"double precision is insufficient next to the fixed {names_of('vertex', 'vertices', vertices)}"
-
-
-def sum_facts(facts: list[dict[str, int]]) -> dict[str, int]:
-    """Return the sum of the report entries of all islands."""
-    total: dict[str, int] = {}
-    for one in facts:
-        for name, value in one.items():
-            total[name] = value if isinstance(value, bool) else total.get(name, 0) + value
-    return total
 
 
 def draw(path: Path, certified: WrittenMap, problems: list[Problem], mapped: MappedAtlas, kind: str = "map") -> None:

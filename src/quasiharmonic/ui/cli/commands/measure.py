@@ -1,10 +1,23 @@
-"""``qhm measure``: measure the distortion of a map, in summary and per triangle."""
+"""``qhm measure``: measure the distortion of a map, in summary and per triangle.
+
+Measure the distortion of every triangle by the map in the input's texture coordinates (vt). Means and quantiles are
+weighted by the surface's area. For measures of size the map is scaled to the surface's area first. Of a
+finite-element mesh, measure the quality of its elements.
+
+Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but the report failed.
+
+    qhm measure map.obj
+    qhm measure map.obj --export distortion.ply --json report.json
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli import finite_elements, pipeline, report
+from quasiharmonic.ui.cli.arguments import add_command, add_options, file, flag, set_default
 
 if TYPE_CHECKING:
     from quasiharmonic.energies.measures import Distortion
@@ -14,36 +27,17 @@ if TYPE_CHECKING:
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments
 
-    parser = commands.add_parser(
-        "measure",
-        description="Measure the distortion of every triangle by the map in the input's texture coordinates (vt). "
-        "Means and quantiles are weighted by the surface's area. For measures of size the map is scaled to the "
-        "surface's area first. Of a finite-element mesh, measure the quality of its elements.",
-        epilog="Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but the report failed.",
-        examples=(
-            "qhm measure map.obj",
-            "qhm measure map.obj --export distortion.ply --json report.json",
-        ),
-    )
+    parser = add_command(commands, "measure", __doc__, run)
     parser.add_argument(
         "input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map, injective or not"
     )
-    parser.add_argument(
-        "--export",
-        type=Path,
-        metavar="FILE",
-        help=f"write every measure of every triangle as {format_names('encode_values')}",
+    add_options(
+        parser,
+        export=file(f"write every measure of every triangle as {format_names('encode_values')}"),
+        distances=flag("also compare distances between vertices some edges apart, along the surface and in the plane"),
     )
-    parser.add_argument(
-        "--distances",
-        action="store_true",
-        help="also compare distances between vertices some edges apart, along the surface and in the plane",
-    )
-    arguments.add_rings(parser)
-    arguments.add_report(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "rings", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -54,11 +48,10 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apps.atlas.atlas_verdict import mirrored_islands, reflect_mirrored
     from quasiharmonic.energies.measures import distortion
     from quasiharmonic.io.seamed_mesh import SeamedMesh
-    from quasiharmonic.ui.cli import arguments, finite_elements, report
     from quasiharmonic.util.arrays import names_of
 
-    arguments.set_default(options, "rings", 20, asked=options.distances, belongs="--distances")
-    report.check_json(options.json, inputs=(options.input, options.export))
+    set_default(options, "rings", 20, asked=options.distances, belongs="--distances")
+    report.check_new({}, options.json, inputs=(options.input, options.export))
     if options.export is not None:
         report.check_export(options.export, inputs=(options.input,))
     if finite_elements.has_elements(options.input):
@@ -76,19 +69,16 @@ def run(options: argparse.Namespace) -> int:
         # Viewers colour by the first value; the isometric distortion bounds the error of a texture.
         values = {"isometric": found.isometric, **found.per_triangle()}
         io.write_per_triangle(options.export, V, F, uv, values)
-    facts = {**found.to_dict(), "input": str(options.input), "triangles": len(mesh.F)}
+    facts = {**found.to_dict(), "triangles": len(mesh.F)}
     lines = [_table(found, len(mesh.F))]
     if mirrored.size:
         lines.append(f"mirrored {names_of('island', 'islands', mirrored)} measured with reversed orientation")
     if found.distances is not None:
         lines.append(found.distances.summary())
-    text = "\n".join(lines)
+    account = pipeline.Account({"input": str(options.input), **facts}, lines)
     if options.export is None:
-        report.emit_verdict(facts, options.json, text)
-        return 0
-    with report.after_writing(options.export):
-        report.emit(facts, options.json, text)
-    return 0
+        return pipeline.conclude(options, account)
+    return pipeline.finish(options, lambda: account, options.export)
 
 
 def _table(found: Distortion, count: int) -> str:

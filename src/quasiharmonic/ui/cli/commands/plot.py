@@ -1,10 +1,23 @@
-"""``qhm plot``: draw the map of a file."""
+"""``qhm plot``: draw the map of a file.
+
+Draw the map that the input's texture coordinates (vt) give, injective or not.
+
+Exit status: 0 the image is written; 2 wrong input or call, nothing written.
+
+    qhm plot map.obj -o map.png
+    qhm plot map.obj --kind distortion --measure area_ratio -o distortion.svg
+    qhm plot model.glb --kind texture -o model.png
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli import finite_elements, report, written_map
+from quasiharmonic.ui.cli.arguments import MEASURES, add_command, add_options, choice, set_default, text
+from quasiharmonic.ui.cli.material import CHECKERBOARD
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
@@ -13,48 +26,33 @@ if TYPE_CHECKING:
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments
 
-    parser = commands.add_parser(
-        "plot",
-        description="Draw the map that the input's texture coordinates (vt) give, injective or not.",
-        epilog="Exit status: 0 the image is written; 2 wrong input or call, nothing written.",
-        examples=(
-            "qhm plot map.obj -o map.png",
-            "qhm plot map.obj --kind distortion --measure area_ratio -o distortion.svg",
-            "qhm plot model.glb --kind texture -o model.png",
-        ),
-    )
+    parser = add_command(commands, "plot", __doc__, run)
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="IMAGE", help="image to write: .png, .svg or .pdf"
     )
-    parser.add_argument(
-        "--kind",
-        choices=("map", "distortion", "texture"),
-        help="map: the surface and the map, inverted triangles in red (default); distortion: both coloured by a "
-        "measure, and its histogram; texture: the surface with the model's own texture, --texture, or a checkerboard",
+    add_options(
+        parser,
+        kind=choice(
+            ("map", "distortion", "texture"),
+            "map: the surface and the map, inverted triangles in red (default); distortion: both coloured by a "
+            "measure, and its histogram; texture: the surface with the model's own texture, --texture, or a "
+            "checkerboard",
+        ),
+        measure=choice(MEASURES, "measure for --kind distortion: %(choices)s (default: isometric)", metavar="NAME"),
+        texture=text(
+            "IMAGE",
+            "texture of --kind texture: a PNG or JPEG file, which repeats beyond the unit square, or checkerboard "
+            "(default: the model's own texture if it has one)",
+        ),
     )
-    parser.add_argument(
-        "--measure",
-        choices=arguments.MEASURES,
-        metavar="NAME",
-        help="measure for --kind distortion: %(choices)s (default: isometric)",
-    )
-    parser.add_argument(
-        "--texture",
-        metavar="IMAGE",
-        help="texture of --kind texture: a PNG or JPEG file, which repeats beyond the unit square, or checkerboard "
-        "(default: the model's own texture if it has one)",
-    )
-    parser.set_defaults(run=run)
+    add_options(parser, "surface")
 
 
 def run(options: argparse.Namespace) -> int:
     """Read and draw."""
     from quasiharmonic import io
-    from quasiharmonic.ui.cli import arguments, finite_elements, report, written_map
-    from quasiharmonic.ui.cli.material import CHECKERBOARD
     from quasiharmonic.ui.plot import save_distortion_figure, save_map_figure, save_texture_figure
 
     image = None if options.texture in (None, CHECKERBOARD) else Path(options.texture)
@@ -62,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     if finite_elements.has_elements(options.input):
         return finite_elements.plot(options)
     shows_measure = options.kind == "distortion"
-    arguments.set_default(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
+    set_default(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
     if options.texture is not None and options.kind not in (None, "texture"):
         raise ValueError(f"--texture is not supported by --kind {options.kind}: use --kind texture, or omit it")
     mesh = io.read_mesh(options.input)
@@ -75,6 +73,4 @@ def run(options: argparse.Namespace) -> int:
             save_texture_figure(options.output, V, F, uv, texture=texture)
         else:
             save_map_figure(options.output, V, F, uv, inverted=written_map.certify_map(mesh).inverted)
-    with report.after_writing(options.output):
-        print(f"wrote {options.output}", flush=True)
-    return 0
+    return report.tell_written(options.output)

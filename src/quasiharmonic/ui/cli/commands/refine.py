@@ -1,10 +1,23 @@
-"""``qhm refine``: split edges of a problem without a map until a map may exist."""
+"""``qhm refine``: split edges of a problem without a map until a map may exist.
+
+Split only the edges that qhm check lists, until it lists none. Three files are written: the mesh with an initial map
+(vt), the input of qhm map; its fixed vertices, OUTPUT.handles; and the origin of its vertices and triangles,
+OUTPUT.origin.json (OUTPUT without its suffix).
+
+Exit status: 0 written, and no known obstruction to an injective map remains; 1 written, but an obstruction remains
+that no refinement removes; 2 wrong input or call, nothing written; 3 written, but the report failed.
+
+    qhm refine problem/ -o finer.obj
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli import pipeline, report
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,30 +31,9 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
-    from quasiharmonic.ui.cli import arguments
-
-    parser = commands.add_parser(
-        "refine",
-        description="Split only the edges that qhm check lists, until it lists none. Three files are written: the "
-        "mesh with an initial map (vt), the input of qhm map; its fixed vertices, OUTPUT.handles; and the origin of "
-        "its vertices and triangles, OUTPUT.origin.json (OUTPUT without its suffix).",
-        epilog="Exit status: 0 written, and no known obstruction to an injective map remains; 1 written, but an "
-        "obstruction remains that no refinement removes; 2 wrong input or call, nothing written; 3 written, but the "
-        "report failed.",
-        examples=("qhm refine problem/ -o finer.obj",),
-    )
-    parser.add_argument(
-        "input", type=Path, metavar="INPUT", help="OBJ file, or a folder with input.obj and handles.txt"
-    )
-    parser.add_argument("-o", "--output", type=Path, required=True, help="OBJ file to write")
-    parser.add_argument(
-        "--fixed",
-        type=Path,
-        metavar="FILE",
-        help="file of fixed vertices, 0-based, one per line (default: the boundary)",
-    )
-    arguments.add_report(parser)
-    parser.set_defaults(run=run)
+    parser = add_command(commands, "refine", __doc__, run)
+    add_files(parser, "OBJ file, or a folder with input.obj and handles.txt", "OBJ file to write")
+    add_options(parser, "fixed", "json")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -49,7 +41,6 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.problem import Problem
     from quasiharmonic.solver.refine.refining import refine_problem
-    from quasiharmonic.ui.cli import report
 
     output: Path = options.output
     if output.suffix.lower() != ".obj":
@@ -65,15 +56,15 @@ def run(options: argparse.Namespace) -> int:
         result = refine_problem(problem)
     with io.no_remains(output, handles, origin):
         write(output, handles, origin, mesh, problem, result)
-    with report.after_writing(output):
+
+    def describe() -> pipeline.Account:
         split = len(result.refined.parents)
         facts = {
             "split": split,
             "rounds": result.rounds,
             "diagnosis": result.diagnosis.to_dict(),
             **report.sizes(result.problem.domain),
-            "input": str(options.input),
-            "output": str(output),
+            **pipeline.name_files(options),
             "handles": str(handles),
             "origin": str(origin),
         }
@@ -81,8 +72,9 @@ def run(options: argparse.Namespace) -> int:
         lines.append(result.diagnosis.summary())
         if not result.diagnosis.forbids_injective:
             lines.append(f"Next: qhm map {output} --fixed {handles} -o …")
-        report.emit(facts, options.json, "\n".join(lines))
-    return 1 if result.diagnosis.forbids_injective else 0
+        return pipeline.Account(facts, lines, not result.diagnosis.forbids_injective)
+
+    return pipeline.finish(options, describe, output)
 
 
 def write(output: Path, handles: Path, origin: Path, mesh: MeshData, problem: Problem, result: RefinedProblem) -> None:

@@ -1,10 +1,22 @@
-"""``qhm studio``: edit a map interactively in the browser."""
+"""``qhm studio``: edit a map interactively in the browser.
+
+Open a page with a surface beside its map: drag corners, pins and the boundary, and the map follows. Every map shown
+is certified. Needs the extra 'studio'. Only this machine can open the page, at the address that is printed. Ctrl-C
+stops the server.
+
+Exit status: 0 ended by Ctrl-C; 2 wrong input or call.
+
+    qhm studio
+    qhm studio model.obj
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli.arguments import add_command
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
@@ -14,17 +26,7 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "studio",
-        description="Open a page with a surface beside its map: drag corners, pins and the boundary, and the map "
-        "follows. Every map shown is certified. Needs the extra 'studio'. Only this machine can open the page, at the "
-        "address that is printed. Ctrl-C stops the server.",
-        epilog="Exit status: 0 ended by Ctrl-C; 2 wrong input or call.",
-        examples=(
-            "qhm studio",
-            "qhm studio model.obj",
-        ),
-    )
+    parser = add_command(commands, "studio", __doc__, run)
     parser.add_argument(
         "input",
         type=Path,
@@ -34,7 +36,6 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--port", type=int, default=0, metavar="N", help="port to listen on (default: any free port)")
     parser.add_argument("--no-browser", action="store_true", help="print the address and do not open the browser")
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

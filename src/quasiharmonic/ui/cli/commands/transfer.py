@@ -1,4 +1,15 @@
-"""``qhm transfer``: transfer values, positions and landmarks from one surface to another."""
+"""``qhm transfer``: transfer values, positions and landmarks from one surface to another.
+
+Transfer positions, values and landmarks from one surface to another. Points that the maps of both surfaces send to
+the same position correspond. Both maps must be bijective, which is certified exactly, so the correspondence is one to
+one. For maps onto one outline, call qhm map --to with the same outline for both.
+
+Exit status: 0 both maps are certified bijective, and the files are written; 2 wrong input or call, or a map is not
+bijective, nothing written; 3 written, but the report failed.
+
+    qhm transfer a_map.obj b_map.obj --values depth.csv depth_on_b.csv
+    qhm transfer a_map.obj b_map.obj --landmarks points.txt points_on_b.csv -o b_in_the_shape_of_a.obj
+"""
 
 from __future__ import annotations
 
@@ -6,6 +17,9 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from quasiharmonic.ui.cli import pipeline, report, written_map
+from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, set_default
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,21 +45,8 @@ class _MappedFile:
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments
 
-    parser = commands.add_parser(
-        "transfer",
-        description="Transfer positions, values and landmarks from one surface to another. Points that the maps of "
-        "both surfaces send to the same position correspond. Both maps must be bijective, which is certified exactly, "
-        "so the correspondence is one to one. For maps onto one outline, call qhm map --to with the same outline "
-        "for both.",
-        epilog="Exit status: 0 both maps are certified bijective, and the files are written; 2 wrong input or call, or "
-        "a map is not bijective, nothing written; 3 written, but the report failed.",
-        examples=(
-            "qhm transfer a_map.obj b_map.obj --values depth.csv depth_on_b.csv",
-            "qhm transfer a_map.obj b_map.obj --landmarks points.txt points_on_b.csv -o b_in_the_shape_of_a.obj",
-        ),
-    )
+    parser = add_command(commands, "transfer", __doc__, run)
     for name, text in (("source", "surface that the data belong to"), ("target", "surface that receives them")):
         parser.add_argument(
             name, type=Path, metavar=name.upper(), help=f"{text}: {format_names('write_map')} file with a map"
@@ -53,41 +54,35 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "-o",
         "--output",
-        type=Path,
-        metavar="FILE",
-        help="write the target with its vertices moved to the corresponding points of the source: its triangles, and "
-        f"the source's shape; as {format_names('write_map', 'seams')}",
+        **file(
+            "write the target with its vertices moved to the corresponding points of the source: its triangles, and "
+            f"the source's shape; as {format_names('write_map', 'seams')}"
+        ),
     )
-    parser.add_argument(
-        "--values",
-        nargs=2,
-        type=Path,
-        metavar=("FILE", "OUT"),
-        help=f"transfer values of the source to the target's vertices: {', '.join(_TABLES)} (one row per vertex or "
-        "triangle), or GIFTI data to read",
+    pair = {"nargs": 2, "metavar": ("FILE", "OUT")}
+    add_options(
+        parser,
+        values=file(
+            f"transfer values of the source to the target's vertices: {', '.join(_TABLES)} (one row per vertex or "
+            "triangle), or GIFTI data to read",
+            **pair,
+        ),
+        per=choice(
+            ("vertex", "triangle"), "for --values: whether rows belong to vertices or to triangles (default: vertex)"
+        ),
+        landmarks=file(
+            "transfer vertices of the source, 0-based, one per line; writes .csv: vertex, triangle of the target, "
+            "three weights of its corners, its nearest corner, position",
+            **pair,
+        ),
+        outside=choice(
+            ("nearest", "nan"),
+            "for points without a corresponding point: the nearest point of the other map's boundary, or nan "
+            "(default: nearest)",
+            default="nearest",
+        ),
     )
-    parser.add_argument(
-        "--per",
-        choices=("vertex", "triangle"),
-        help="for --values: whether rows belong to vertices or to triangles (default: vertex)",
-    )
-    parser.add_argument(
-        "--landmarks",
-        nargs=2,
-        type=Path,
-        metavar=("FILE", "OUT"),
-        help="transfer vertices of the source, 0-based, one per line; writes .csv: vertex, triangle of the target, "
-        "three weights of its corners, its nearest corner, position",
-    )
-    parser.add_argument(
-        "--outside",
-        choices=("nearest", "nan"),
-        default="nearest",
-        help="for points without a corresponding point: the nearest point of the other map's boundary, or nan "
-        "(default: nearest)",
-    )
-    arguments.add_report(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -98,10 +93,9 @@ def run(options: argparse.Namespace) -> int:
 
     from quasiharmonic import io
     from quasiharmonic.apps.inverse.transfer import SurfaceMap
-    from quasiharmonic.ui.cli import arguments, report, written_map
     from quasiharmonic.util.arrays import count_of
 
-    arguments.set_default(options, "per", "vertex", asked=options.values is not None, belongs="--values")
+    set_default(options, "per", "vertex", asked=options.values is not None, belongs="--values")
     outputs = _outputs(options)
     inputs = (options.source, options.target, *(pair[0] for pair in (options.values, options.landmarks) if pair))
     report.check_new(outputs, options.json, inputs=inputs)
@@ -144,8 +138,8 @@ def run(options: argparse.Namespace) -> int:
     if marks is not None:
         io.write_whole(options.landmarks[1], marks)
         written.append(str(options.landmarks[1]))
-    with report.after_writing(Path(written[0])):
-        facts["written"] = written
+
+    def describe() -> pipeline.Account:
         instead = "the nearest point of its boundary" if options.outside == "nearest" else "nan"
         lines = [
             f"wrote {', '.join(written)}",
@@ -155,8 +149,9 @@ def run(options: argparse.Namespace) -> int:
         ]
         if outside:
             lines.append(f"{count_of('vertex', 'vertices', outside)} outside the source's map: {instead}")
-        report.emit(facts, options.json, "\n".join(lines))
-    return 0
+        return pipeline.Account({**facts, "written": written}, lines)
+
+    return pipeline.finish(options, describe, Path(written[0]))
 
 
 def _outputs(options: argparse.Namespace) -> dict[str, Path]:
@@ -185,7 +180,6 @@ def _read(path: Path) -> _MappedFile:
 
     from quasiharmonic import io
     from quasiharmonic.apps.inverse.inverse_map import InverseMap
-    from quasiharmonic.ui.cli import report
 
     mesh = io.read_mesh(path)
     V, F, uv = io.cut_at_seams(mesh)
@@ -250,6 +244,7 @@ def _read_table(path: Path) -> NDArray[np.float64]:
     import numpy as np
 
     from quasiharmonic import io
+    from quasiharmonic.io.errors import reading
     from quasiharmonic.util.arrays import real_array
     from quasiharmonic.util.untrusted import read_npy
 
@@ -258,7 +253,7 @@ def _read_table(path: Path) -> NDArray[np.float64]:
         return io.read_gifti_values(path)
     if path.suffix.lower() not in _TABLES:
         raise ValueError(f"--values {path}: supported: {', '.join(_TABLES)}, .gii")
-    try:
+    with reading(path, "not a table of numbers: ", (ValueError, EOFError)):
         if path.suffix.lower() == ".npy":
             return real_array(str(path), read_npy(path))
         lines = [line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
@@ -267,8 +262,6 @@ def _read_table(path: Path) -> NDArray[np.float64]:
         if rows and not any(_is_number(word) for word in rows[0]):
             rows = rows[1:]
         table = np.array(rows, dtype=np.float64)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path}: not a table of numbers: {error}") from error
     return table[:, 0] if table.ndim == 2 and table.shape[1] == 1 else table
 
 

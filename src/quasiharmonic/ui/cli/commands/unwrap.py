@@ -1,4 +1,16 @@
-"""``qhm unwrap``: compute texture coordinates for any model, packed into a texture."""
+"""``qhm unwrap``: compute texture coordinates for any model, packed into a texture.
+
+Compute texture coordinates for any model: cut it into few charts with little stretch, and pack them into a texture.
+The vertices, faces, materials and other data of the file stay the same. Degenerate and repeated faces, mixed winding
+and edges of three or more faces are accepted and reported.
+
+Exit status: 0 every chart is certified bijective, and no two charts overlap; 1 this is not so; 2 wrong input or call,
+nothing written; 3 written, but the report failed. Ctrl-C writes nothing.
+
+    qhm unwrap model.obj -o out.glb
+    qhm unwrap scan.ply --max-stretch 1.2 --resolution 4096 --padding 8 -o out.ply
+    qhm unwrap model.glb --texture checkerboard -o out.glb
+"""
 
 from __future__ import annotations
 
@@ -9,6 +21,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quasiharmonic.ui.cli import material, pipeline, written_map
+from quasiharmonic.ui.cli.arguments import (
+    add_command,
+    add_files,
+    add_options,
+    byte_count,
+    count,
+    file,
+    flag,
+    number,
+    pick,
+    steps,
+)
+
 if TYPE_CHECKING:
     from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStep
     from quasiharmonic.io import MeshData
@@ -18,128 +44,86 @@ if TYPE_CHECKING:
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
-    from quasiharmonic.ui.cli import arguments, material
 
-    parser = commands.add_parser(
-        "unwrap",
-        description="Compute texture coordinates for any model: cut it into few charts with little stretch, and pack "
-        "them into a texture. The vertices, faces, materials and other data of the file stay the same. Degenerate and "
-        "repeated faces, mixed winding and edges of three or more faces are accepted and reported.",
-        epilog="Exit status: 0 every chart is certified bijective, and no two charts overlap; 1 this is not so; 2 "
-        "wrong input or call, nothing written; 3 written, but the report failed. Ctrl-C writes nothing.",
-        examples=(
-            "qhm unwrap model.obj -o out.glb",
-            "qhm unwrap scan.ply --max-stretch 1.2 --resolution 4096 --padding 8 -o out.ply",
-            "qhm unwrap model.glb --texture checkerboard -o out.glb",
+    parser = add_command(commands, "unwrap", __doc__, run)
+    add_files(parser, f"{format_names('read')} file", f"{format_names('write_map', 'seams')} file to write")
+    add_options(
+        parser,
+        max_stretch=number(
+            float,
+            "bound on the stretch, which 99 %% of the surface keep; smaller values need more seams (default: 1.5)",
+            metavar="S",
+            default=1.5,
         ),
+        max_charts=number(count, "maximum number of charts (default: no limit)"),
+        resolution=number(
+            _resolution, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)", default=(2048, 2048)
+        ),
+        padding=number(float, "minimum texels between two charts (default: 4)", default=4.0),
+        texels_per_unit=number(float, "texels per unit of length of the model (default: as many as fit)", metavar="D"),
+        tiles=number(count, "UDIM tiles (default: 1)", default=1),
+        no_rotate=flag("do not rotate charts to fit better"),
+        stack=flag("let identical and mirrored components share their texture coordinates"),
+        outward=flag("treat closed components that are inside out as turned outward"),
+        keep_seams=flag("keep the seams of the input's texture coordinates (vt), and add seams only where necessary"),
+        edge_costs=file(
+            "file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line"
+        ),
+        seed=number(steps, "seed of random choices (default: 0)", default=0),
+        jobs=number(count, "number of threads (default: all cores)"),
+        memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
-    parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('read')} file")
-    parser.add_argument(
-        "-o", "--output", type=Path, required=True, help=f"{format_names('write_map', 'seams')} file to write"
-    )
-    parser.add_argument(
-        "--max-stretch",
-        type=float,
-        default=1.5,
-        metavar="S",
-        help="bound on the stretch, which 99 %% of the surface keep; smaller values need more seams (default: 1.5)",
-    )
-    parser.add_argument(
-        "--max-charts", type=arguments.count, metavar="N", help="maximum number of charts (default: no limit)"
-    )
-    parser.add_argument(
-        "--resolution",
-        type=_resolution,
-        default=(2048, 2048),
-        metavar="N",
-        help="side of the texture in texels, or WIDTHxHEIGHT (default: 2048)",
-    )
-    parser.add_argument(
-        "--padding", type=float, default=4.0, metavar="N", help="minimum texels between two charts (default: 4)"
-    )
-    parser.add_argument(
-        "--texels-per-unit",
-        type=float,
-        metavar="D",
-        help="texels per unit of length of the model (default: as many as fit)",
-    )
-    parser.add_argument("--tiles", type=arguments.count, default=1, metavar="N", help="UDIM tiles (default: 1)")
-    parser.add_argument("--no-rotate", action="store_true", help="do not rotate charts to fit better")
-    parser.add_argument(
-        "--stack", action="store_true", help="let identical and mirrored components share their texture coordinates"
-    )
-    parser.add_argument(
-        "--outward", action="store_true", help="treat closed components that are inside out as turned outward"
-    )
-    parser.add_argument(
-        "--keep-seams",
-        action="store_true",
-        help="keep the seams of the input's texture coordinates (vt), and add seams only where necessary",
-    )
-    parser.add_argument(
-        "--edge-costs",
-        type=Path,
-        metavar="FILE",
-        help="file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line",
-    )
-    parser.add_argument(
-        "--seed", type=arguments.steps, default=0, metavar="N", help="seed of random choices (default: 0)"
-    )
-    parser.add_argument("--jobs", type=arguments.count, metavar="N", help="number of threads (default: all cores)")
-    parser.add_argument(
-        "--memory",
-        type=arguments.byte_count,
-        metavar="SIZE",
-        help="stop if more resident memory is used, such as 800M or 4G",
-    )
-    material.add_options(parser)
-    arguments.add_report(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
     """Read, unwrap, write, read back, compare, report."""
     from quasiharmonic import io
-    from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions
-    from quasiharmonic.apps.unwrapping.unwrap import unwrap
-    from quasiharmonic.ui.cli import material, progress_line, report, written_map
-    from quasiharmonic.util.arrays import count_of
-    from quasiharmonic.util.untrusted import bounded
 
     began = time.perf_counter()
     io.find_format(options.output, "write_map", "seams")
-    report.check_outputs(options.output, None, options.json, inputs=(options.input, options.edge_costs))
+    return pipeline.change_map(
+        options,
+        lambda mesh: _unwrap(options, mesh, began),
+        inputs=(options.edge_costs,),
+        read=_read,
+    )
+
+
+def _read(options: argparse.Namespace, source: Path) -> MeshData:
+    """Read the model within the limit of memory."""
+    from quasiharmonic.util.untrusted import bounded
+
     with bounded(options.memory):
-        mesh = material.read_mesh(options, options.input)
-    with report.about(options.input), progress_line.line(_words) as show:
+        return material.read_mesh(options, source)
+
+
+def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
+    """Unwrap a mesh."""
+    from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions
+    from quasiharmonic.apps.unwrapping.unwrap import unwrap
+    from quasiharmonic.util.arrays import count_of
+
+    size = pick(options, "max_stretch", "max_charts", "resolution", "padding", "texels_per_unit", "tiles")
+    given = pick(options, "stack", "outward", "seed", "jobs")
+    with pipeline.working(options.input, _words) as show:
         result = unwrap(
             mesh.V,
             mesh.F,
-            max_stretch=options.max_stretch,
-            max_charts=options.max_charts,
-            resolution=options.resolution,
-            padding=options.padding,
-            texels_per_unit=options.texels_per_unit,
-            tiles=options.tiles,
             rotate=not options.no_rotate,
-            stack=options.stack,
-            outward=options.outward,
             edge_costs=_edge_costs(mesh, options.edge_costs),
             uv=corner_positions(mesh) if options.keep_seams else None,
-            seed=options.seed,
             callback=_bound_memory(show, options.memory),
-            jobs=options.jobs,
+            **size,
+            **given,
         )
     unwrapped, divided = add_map(mesh, result)
-    written_map.tell_losses(options.output, unwrapped)
-    io.write_mapped(options.output, unwrapped)
-    with report.after_writing(options.output):
-        same = _is_written(options.output, result)
+
+    def describe(written: MeshData) -> pipeline.Account:
+        same = _is_written(written, result)
         facts = {
             **result.to_dict(),
             "success": result.success and same,
-            "input": str(options.input),
-            "output": str(options.output),
             "vertices": len(mesh.V),
             "triangles": len(mesh.F),
             "divided_polygons": divided,
@@ -148,19 +132,18 @@ def run(options: argparse.Namespace) -> int:
         lines = [f"wrote {options.output}: {result.message}", result.summary(), *_cleaning(result)]
         if divided:
             lines.append(f"{count_of('polygon', 'polygons', divided)} written as triangles, because seams cross them")
-        written_map.add_old_textures(facts, lines, mesh, unwrapped)
-        written_map.add_bent(facts, lines, unwrapped)
+        account = pipeline.Account(facts, lines, result.success and same)
+        written_map.add_bent(account.facts, account.closing, unwrapped)
         if not same:
-            lines.append(f"{options.output} has other coordinates than were certified")
-        report.emit(facts, options.json, "\n".join(lines))
-    return 0 if result.success and same else 1
+            account.closing.append(f"{options.output} has other coordinates than were certified")
+        return account
+
+    return pipeline.Changed(unwrapped, describe)
 
 
 def _resolution(text: str) -> tuple[int, int]:
     """Convert N or WIDTHxHEIGHT; for argparse."""
-    from quasiharmonic.ui.cli import arguments
-
-    sides = [arguments.count(side) for side in text.lower().split("x")]
+    sides = [count(side) for side in text.lower().split("x")]
     if len(sides) > 2:
         raise argparse.ArgumentTypeError(f"{text} is neither N nor WIDTHxHEIGHT")
     return sides[0], sides[-1]
@@ -214,13 +197,10 @@ def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) 
     return check
 
 
-def _is_written(output: Path, result: UnwrapResult) -> bool:
+def _is_written(written: MeshData, result: UnwrapResult) -> bool:
     """Return whether a file has exactly the certified texture coordinates, triangle by triangle."""
     import numpy as np
 
-    from quasiharmonic import io
-
-    written = io.read_mesh(output)
     if written.vt is None or written.FT is None or written.FT.shape != result.indices.shape:
         return False
     return bool(np.array_equal(written.vt[written.FT], result.uvs[result.indices]))

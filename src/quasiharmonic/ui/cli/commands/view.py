@@ -1,10 +1,22 @@
-"""``qhm view``: show a surface and its map in a window."""
+"""``qhm view``: show a surface and its map in a window.
+
+Show a surface and the map in its texture coordinates (vt) in a window, with a checkerboard, distortion and inverted
+triangles. Needs the extra 'view'.
+
+Exit status: 0 shown; 2 wrong input or call, or no window can be opened.
+
+    qhm view map.obj
+    qhm view map.obj --screenshot view.png
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from quasiharmonic.ui.cli import report
+from quasiharmonic.ui.cli.arguments import add_command, add_options, file
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
@@ -14,30 +26,15 @@ def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = commands.add_parser(
-        "view",
-        description="Show a surface and the map in its texture coordinates (vt) in a window, with a "
-        "checkerboard, distortion and inverted triangles. Needs the extra 'view'.",
-        epilog="Exit status: 0 shown; 2 wrong input or call, or no window can be opened.",
-        examples=(
-            "qhm view map.obj",
-            "qhm view map.obj --screenshot view.png",
-        ),
-    )
+    parser = add_command(commands, "view", __doc__, run)
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
-    parser.add_argument(
-        "--screenshot",
-        type=Path,
-        metavar="PNG",
-        help="write the view to this file instead of opening a window; needs no display",
-    )
-    parser.set_defaults(run=run)
+    shot = file("write the view to this file instead of opening a window; needs no display", metavar="PNG")
+    add_options(parser, "surface", screenshot=shot)
 
 
 def run(options: argparse.Namespace) -> int:
     """Read and show."""
     from quasiharmonic import io
-    from quasiharmonic.ui.cli import report
     from quasiharmonic.ui.plot.interactive import show
 
     if options.screenshot is not None:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.ui.studio.protocol import Array
+from quasiharmonic.ui.studio.session.drag import DragMap
 from quasiharmonic.ui.studio.session.seams import find_seam_sides, sides_of
 from quasiharmonic.ui.studio.session.state import SessionState, bad_triangles, verdict
 from quasiharmonic.util.arrays import FloatArray
@@ -81,27 +81,26 @@ def handle_fields(state: SessionState) -> dict[str, Any]:
     }
 
 
-def certificates_of(state: SessionState) -> list[Certificate]:
-    """Return the certificates of all islands; each must have a map."""
-    return [one.result.certificate for one in state.islands if one.result is not None]
+def map_message(
+    state: SessionState, origin: FloatArray, dragged: tuple[int, DragMap] | None
+) -> tuple[dict[str, Any], dict[str, Array], FloatArray]:
+    """Return verdict and positions for a message, and the whole map; of an island that is dragged its last map.
 
-
-def map_arrays(
-    state: SessionState, origin: FloatArray, *, changed: tuple[int, FloatArray, Certificate] | None = None
-) -> Message:
-    """Return verdict and positions of a map; with ``changed`` those of one island, which moves."""
-    certificates = certificates_of(state)
-    if changed is None:
+    If an island is dragged, the message has only the positions of this island.
+    """
+    certificates = [one.result.certificate for one in state.islands if one.result is not None]
+    uv = places = state.uv
+    if dragged is None:
         header = verdict(certificates, len(state.overlapping))
-        return header, {
-            "places": (state.uv - origin).astype(np.float32),
-            "bad": bad_triangles(certificates),
-        }
-    k, uv, certificate = changed
-    certificates[k] = certificate
-    # Overlaps between islands are checked when the drag ends.
-    header = verdict(certificates, 0) | {"start": int(state.numbering.starts[k])}
-    return header, {"places": (uv - origin).astype(np.float32), "bad": bad_triangles(certificates)}
+    else:
+        k, shown = dragged
+        start, places = int(state.numbering.starts[k]), shown.uv * state.islands[k].sign
+        uv[start : start + len(places)] = places
+        certificates[k] = shown.certificate
+        # Overlaps between islands are checked when the drag ends.
+        header = verdict(certificates, 0) | {"start": start}
+    arrays = {"places": (places - origin).astype(np.float32), "bad": bad_triangles(certificates)}
+    return header, arrays, uv
 
 
 def asked_boundary(state: SessionState, targets: Mapping[int, FloatArray], origin: FloatArray) -> Array:

@@ -20,8 +20,7 @@ class History:
 
     def __init__(self, storage: Storage | None = None) -> None:
         self._storage = storage
-        self._states: list[SessionState] = []
-        self._numbers: list[int] = []
+        self._states: list[tuple[int, SessionState]] = []  # With their numbers
         self._at = -1
         self._next = 0
         self._saved = 0
@@ -33,25 +32,24 @@ class History:
     @property
     def state(self) -> SessionState:
         """The state that the page shows."""
-        return self._states[self._at]
+        return self._states[self._at][1]
 
     def clear(self, texture: Texture | None) -> None:
         """Forget all states, for another model with its own image; the next state counts as saved."""
-        self._states, self._numbers, self._at = [], [], -1
+        self._states, self._at = [], -1
         self.texture, self._saved = texture, self._next
 
     def add(self, state: SessionState) -> None:
         """Add a state after the current one; later ones are forgotten."""
-        del self._states[self._at + 1 :], self._numbers[self._at + 1 :]
-        self._states.append(state)
-        self._numbers.append(self._next)
+        del self._states[self._at + 1 :]
+        self._states.append((self._next, state))
         self._next += 1
-        del self._states[:-MAX_STATES], self._numbers[:-MAX_STATES]
+        del self._states[:-MAX_STATES]
         self._at = len(self._states) - 1
 
     def change(self, state: SessionState) -> None:
         """Replace the current state by one with the same map."""
-        self._states[self._at] = state
+        self._states[self._at] = self._states[self._at][0], state
 
     def go(self, step: int) -> None:
         """Undo (-1) or redo (1) one step, if there is one."""
@@ -62,7 +60,7 @@ class History:
 
     def mark_saved(self) -> None:
         """Remember that the current state was saved."""
-        self._saved = self._numbers[self._at]
+        self._saved = self._states[self._at][0]
         self.write()
 
     def fields(self) -> dict[str, Any]:
@@ -70,7 +68,7 @@ class History:
         return {
             "undo": self._at > 0,
             "redo": self._at < len(self._states) - 1,
-            "unsaved": self._numbers[self._at] != self._saved,
+            "unsaved": self._states[self._at][0] != self._saved,
         }
 
     def write(self) -> None:
@@ -79,18 +77,15 @@ class History:
             return
         count = max(2, _MAX_STORED // max(len(self.state.mesh.F), 1))
         low = max(0, self._at + 1 - count)
-        high = min(len(self._states), low + count)
-        some = slice(low, high)
-        self._storage.write(
-            Snapshot(self._states[some], self._at - low, self.texture, self._saved, self._numbers[some])
-        )
+        states = dict(self._states[low : low + count])
+        self._storage.write(Snapshot(states, self._at - low, self.texture, self._saved))
 
     def restore(self) -> bool:
         """Take over the stored states; return whether there are any."""
         found = None if self._storage is None else self._storage.read()
         if found is None or not found.states:
             return False
-        self._states, self._numbers, self._at = list(found.states), list(found.numbers), found.at
+        self._states, self._at = list(found.states.items()), found.at
         self.texture, self._saved = found.texture, found.saved
-        self._next = max(self._numbers) + 1
+        self._next = max(found.states) + 1
         return True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,9 +17,9 @@ from quasiharmonic.ui.studio.session.outlines import Outline
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class IslandState:
-    """One island.
+    """One island; it is not changed, except for what it computes once.
 
     Its result and its problem belong to the reflection of the island if it is mirrored.
     """
@@ -71,35 +71,23 @@ class IslandState:
     def with_problem(self, problem: Problem) -> IslandState:
         """Return the island with another problem, whose analyses are kept."""
         other = replace(self, fixed=problem.fixed, target=problem.target)
-        return other._share(problem, self.__dict__.get("loops"))
+        # Stored, so that they are not computed again.
+        other.problem, other.loops = problem, self.loops
+        return other
 
     def with_target(self, target: FloatArray) -> IslandState:
         """Return the island with other target positions, as after a drag; it then has no outline."""
         return replace(self.with_problem(self.problem.with_target(target)), outline=None, chosen=(), by_angle=False)
 
-    def with_result(self, result: MapResult) -> IslandState:
-        """Return the island with another map."""
-        other = replace(self, result=result)
-        return other._share(self.__dict__.get("problem"), self.__dict__.get("loops"))
-
-    def _share(self, problem: Problem | None, loops: list[IntArray] | None) -> IslandState:
-        """Store values that are known, so that they are not computed again."""
-        if problem is not None:
-            self.__dict__["problem"] = problem
-        if loops is not None:
-            self.__dict__["loops"] = loops
-        return self
-
     def __getstate__(self) -> dict[str, Any]:
         """Return the contents for a snapshot; what can be computed again is left out."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("problem", "loops")}
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
 
 class Numbering:
     """Numbers of vertices and triangles on the page: those of one island after another."""
 
     def __init__(self, mesh: SeamedMesh, islands: tuple[IslandState, ...]) -> None:
-        self.islands = islands
         self.starts = np.cumsum([0, *(len(one.island.vertices) for one in islands)])
         self.first_triangles = np.cumsum([0, *(len(one.island.F) for one in islands)])
         self.origin = np.concatenate([one.island.vertices for one in islands])

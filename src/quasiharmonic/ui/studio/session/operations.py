@@ -6,7 +6,7 @@ A step depends on the model, on its options and, if it starts from a map, on tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from quasiharmonic.apps.repair.fitting import find_corner_vertices, fit_boundary
 from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops, edges
+from quasiharmonic.geometry.mesh.topology import boundary_edges, edges, trace_loops
 from quasiharmonic.io import MeshData
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Problem
@@ -32,7 +32,7 @@ from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 from quasiharmonic.ui.studio.session import recipes
 from quasiharmonic.ui.studio.session.islands import IslandState
 from quasiharmonic.ui.studio.session.outlines import Outline
-from quasiharmonic.ui.studio.session.recipes import FIXED, POLISHING_STEPS, SEAMS, START, Recipe, Source
+from quasiharmonic.ui.studio.session.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Source
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -56,7 +56,7 @@ def make_start(mesh: SeamedMesh) -> Source:
 def saved_start(mesh: SeamedMesh) -> Recipe:
     """Return the recipe of a map that no step makes: the file with it."""
     source = make_start(mesh)
-    python = recipes.write_script([f"mesh = atlas.SeamedMesh({source.name!r})"], names=["atlas"])
+    python = recipes.write_script([f"mesh = atlas.as_seamed_mesh({source.name!r})"])
     return Recipe(f"qhm check {source.name}", python, source.start)
 
 
@@ -76,52 +76,35 @@ def map_to_outline(
     ``corners`` are boundary vertices of the first selected island and the outline's corners that they go to. "auto"
     chooses vertices by angle; without corners arc length decides.
     """
-    only, posed = choose(state), list[Problem]()
+    only, posed = choose(state), list[tuple[Problem, list[int]]]()
     source = find_source(state, with_map=only is not None)
     own = state.active.island.vertices
     named = () if isinstance(corners, str) else tuple((int(own[v]), k) for v, k in corners)
     spec = CornerSpec("auto" if isinstance(corners, str) else named) if corners else None
-    fills: list[bool] = []
+    width, fills = np.ptp(np.concatenate(outline.contours)[:, 0]), False
 
     def lower(island: Island) -> MapResult:
+        nonlocal fills
         asked = None if spec is None else spec.within(island.vertices)
-        fitted = fit_boundary(island.V, island.F, outline.contours, corners=asked, beside=len(posed))
-        posed.append(fitted.problem)
-        fills.append(bool(fitted.filled_holes))
-        return solve_smoothly(fitted.problem, callback)
+        copy = [contour + np.array([len(posed) * 1.05 * width, 0.0]) for contour in outline.contours]
+        fitted = fit_boundary(island.V, island.F, copy, corners=asked)
+        problem, fills = fitted.problem, fills or bool(fitted.filled_holes)
+        onto = filled(copy) if fitted.filled_holes else copy
+        posed.append((problem, find_corner_vertices(problem.fixed, problem.target, onto)))
+        return solve_smoothly(problem, callback)
 
     mapped = each_island(state.mesh, lower, reflect=False, only=only)
     word = corners if corners == "auto" else ",".join(f"{v}:{k}" for v, k in named) or None
-    options = recipes.option_words(to=outline.to, corners=word)
-    command = recipes.write_command(["map", source.command, *options, *recipes.island_words(only)], "again.obj", source)
+    options = {"to": Given(outline, Code(), {"to": outline.to, "corners": word}, outline.texts)}
     small = all(len(state.islands[k].island.F) <= LARGEST_SMOOTHED for k in state.selected)
-    python = recipes.outline_script(
-        source,
-        outline.to,
-        any(fills),
-        corners if corners == "auto" else dict(corners),
-        state.selected,
-        small,
-        checked=not all(mapped.islands[k].result.injective for k in state.selected),
-    )
-    texts = {} if outline.content is None else {outline.to: outline.content}
-    recipe = Recipe(command, python, source.start, texts, outline.to)
-    after = rebuild(state, mapped, recipe)
-    for i, k in enumerate(state.selected):
-        right = i * 1.05 * np.ptp(np.concatenate(outline.contours)[:, 0])
-        contours = filled(outline.contours) if fills[i] else outline.contours
-        copies = [contour + np.array([right, 0.0]) for contour in contours] if i else contours
-        one = after.islands[k]
-        found = find_corner_vertices(posed[i].fixed, posed[i].target, copies)
-        one = replace(
-            one,
-            outline=outline,
-            corners=tuple(found),
-            chosen=() if isinstance(corners, str) or i else tuple(corners),
-            by_angle=corners == "auto",
-            pins=(),
-        )
-        after = after.with_island(k, one.with_problem(posed[i]))
+    chosen = corners if isinstance(corners, str) else dict(corners)
+    lines = recipes.outline_lines(source, outline.to, fills, chosen, state.selected, small)
+    recipe = recipes.record_call("map", source, "again.obj", options, only, lines=lines)
+    after = rebuild(state, mapped, replace(recipe, outline=outline.to))
+    for i, (k, (problem, found)) in enumerate(zip(state.selected, posed, strict=True)):
+        by_angle, given = corners == "auto", () if isinstance(corners, str) or i else tuple(corners)
+        one = replace(after.islands[k], outline=outline, corners=tuple(found), chosen=given, by_angle=by_angle)
+        after = after.with_island(k, one.with_problem(problem))
     return after
 
 
@@ -134,7 +117,7 @@ def map_in_place(
     """
     source = find_source(state, with_map=True) if start is state.mesh else make_start(start)
     fixed = _list_fixed(state, only)
-    numbers = None if fixed is None else np.array(fixed)
+    numbers = None if fixed is None else fixed.value
 
     def lower(island: Island) -> MapResult:
         return solve_smoothly(fix_in_place(island, numbers).problem, callback)
@@ -142,55 +125,36 @@ def map_in_place(
     mapped = each_island(start, lower, only=only)
     done = mapped.islands if only is None else [mapped.islands[k] for k in only]
     anew = all(one.result.injective for one in done)
-    options = [*recipes.option_words(fixed=None if fixed is None else FIXED), *recipes.island_words(only)]
-    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in fixed).encode()}
     if anew or not follows:
-        command = recipes.write_command(["map", source.command, *options], "again.obj", source)
-        name = None if fixed is None else FIXED
         chosen = list(range(len(mapped.islands))) if only is None else only
         small = max(len(one.triangles) for one in done) <= LARGEST_SMOOTHED
         smoothed = [k for k in chosen if small and mapped.islands[k].result.injective]
-        python = recipes.map_script(source, only, only if smoothed == chosen else smoothed, name)
+        lines = recipes.map_lines(source, only, only if smoothed == chosen else smoothed, fixed)
+        recipe = recipes.record_call("map", source, "again.obj", {"fixed": fixed}, only, lines=lines)
     else:
-        given: dict[str, Any] = {"energy": "blend", "max_iterations": SMOOTHING_STEPS}
-        mapped = atlas.polish(start, fixed=numbers, islands=only, callback=callback, **given)
-        words = ["polish", source.command, *recipes.option_words(**given), *options]
-        command = recipes.write_command(words, "again.obj", source)
-        read = recipes.read_indices(None if fixed is None else FIXED)
-        more = recipes.arguments(**given, fixed=read, islands=only)
-        python = recipes.write_script(
-            [f"result = atlas.polish({source.name!r}{more})", "mesh = result.mesh"], names=["atlas"]
-        )
-    recipe = Recipe(command, python, source.start, texts, anew=anew, dragged=start is not state.mesh)
-    return rebuild(state, mapped, recipe, keep=True, corners=True)
+        options = {"energy": "blend", "max_iterations": SMOOTHING_STEPS, "fixed": fixed}
+        mapped = atlas.polish(start, islands=only, callback=callback, **recipes.values(options))
+        recipe = recipes.record_call("polish", source, "again.obj", options, only)
+    recipe = replace(recipe, anew=anew, dragged=start is not state.mesh)
+    return rebuild(state, mapped, recipe, keep=("pins", "corners"))
 
 
 def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
     """Lower an energy of the selected islands until it converges."""
     only, source = choose(state), find_source(state, with_map=True)
-    fixed = _list_fixed(state, only, slide=slide)
     outline = state.active.outline if slide and len(state.islands) == 1 else None
-    curves: bool | BoundaryCurves = slide if outline is None else BoundaryCurves(outline.curves())
-    given: dict[str, Any] = {"energy": energy, "max_iterations": POLISHING_STEPS}
-    numbers = None if fixed is None else np.array(fixed)
-    mapped = atlas.polish(state.mesh, fixed=numbers, slide=curves, islands=only, callback=callback, **given)
-    to = None if outline is None else outline.to
-    options = recipes.option_words(energy=energy, slide=slide, to=to, fixed=None if fixed is None else FIXED)
-    words = ["polish", source.command, *options, *recipes.island_words(only)]
-    command = recipes.write_command(words, "again.obj", source)
-    track = recipes.Code(f"BoundaryCurves(outline_curves({to!r}))") if outline is not None else slide
-    read = recipes.read_indices(None if fixed is None else FIXED)
-    more = recipes.arguments(**given, fixed=read, slide=track, islands=only)
-    python = recipes.write_script(
-        [f"result = atlas.polish({source.name!r}{more})", "mesh = result.mesh"],
-        names=["atlas", *(["BoundaryCurves"] if outline is not None else [])],
-        modules=["from quasiharmonic.targets import outline_curves"] if outline is not None else [],
-    )
-    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in fixed).encode()}
-    if outline is not None and outline.content is not None:
-        texts[outline.to] = outline.content
-    recipe = Recipe(command, python, source.start, texts, to)
-    return rebuild(state, mapped, recipe, keep=True, outlines=True)
+    curves = slide if outline is None else _sliding_curves(outline)
+    options = {"energy": energy, "slide": curves, "fixed": _list_fixed(state, only, slide=slide)}
+    mapped = atlas.polish(state.mesh, islands=only, callback=callback, **recipes.values(options))
+    recipe = recipes.record_call("polish", source, "again.obj", options, only)
+    recipe = replace(recipe, outline=None if outline is None else outline.to)
+    return rebuild(state, mapped, recipe, keep=("pins", "corners", "outline", "chosen", "by_angle"))
+
+
+def _sliding_curves(outline: Outline) -> Given:
+    """Return the curves of an outline, for a boundary that slides."""
+    code = Code(f"BoundaryCurves(outline_curves({outline.to!r}))")
+    return Given(BoundaryCurves(outline.curves()), code, {"slide": True, "to": outline.to}, outline.texts)
 
 
 def flatten_islands(state: SessionState, callback: Callback = None) -> SessionState:
@@ -203,23 +167,14 @@ def flatten_islands(state: SessionState, callback: Callback = None) -> SessionSt
     cut = only is None and not all(is_flattenable(one.island) for one in state.islands)
     if cut:
         mesh = cut_apart(mesh, polygons=_polygons(state, source), disks_too=True)
-    fixed = np.array(pins) if pins and not cut else None
-    mapped = atlas.flatten(mesh, fixed=fixed, islands=only, callback=callback)
-    options = recipes.option_words(cut=cut, fixed=None if fixed is None else FIXED)
-    command = recipes.write_command(
-        ["flatten", source.command, *options, *recipes.island_words(only)], "flat.obj", source
-    )
-    read = recipes.read_indices(None if fixed is None else FIXED)
-    more = recipes.arguments(fixed=read, islands=only)
-    lines, names = [f"result = atlas.flatten({source.name!r}{more})", "mesh = result.mesh"], ["atlas"]
+    options = {"fixed": _saved_list(pins) if pins and not cut else None}
+    mapped = atlas.flatten(mesh, islands=only, callback=callback, **recipes.values(options))
+    words, lines = ["--cut"] if cut else [], list[str]()
     if cut:
-        lines, names = _cut_lines(source, state), ["atlas", "find_cuts"]
-        lines += [f"result = atlas.flatten(mesh{more})", "mesh = result.mesh"]
-        if "io.read_mesh" in lines[0]:
-            names.append("io")
-    texts = {} if fixed is None else {FIXED: "".join(f"{v}\n" for v in pins).encode()}
-    recipe = Recipe(command, recipes.write_script(lines, names=names), source.start, texts)
-    after = rebuild(state, mapped, recipe, keep=not cut)
+        lines = [f"mesh = atlas.as_seamed_mesh({source.name!r})", *_cut_lines(state, source)]
+        lines += recipes.call_lines("flatten", "mesh", {}, None)
+    recipe = recipes.record_call("flatten", source, "flat.obj", options, only, words=words, lines=lines)
+    after = rebuild(state, mapped, recipe, keep=() if cut else ("pins",))
     return replace(after, from_file=state.from_file and not cut)
 
 
@@ -229,13 +184,12 @@ def pack_all(state: SessionState, resolution: int, padding: float) -> SessionSta
     laid = atlas.flatten(state.mesh, start=True, max_iterations=0)
     mesh = atlas.pack(laid.mesh, resolution=resolution, padding=padding)
     size = {"resolution": resolution, "padding": padding}
-    words = ["flatten", source.command, "--start", "--max-iterations", "0", "--pack", *recipes.option_words(**size)]
-    command = recipes.write_command(words, "packed.obj", source)
+    words = ["--start", "--max-iterations", "0", "--pack"]
     lines = [
         f"flat = atlas.flatten({source.name!r}, start=True, max_iterations=0).mesh",
         f"mesh = atlas.pack(flat{recipes.arguments(**size)})",
     ]
-    recipe = Recipe(command, recipes.write_script(lines, names=["atlas"]), source.start)
+    recipe = recipes.record_call("flatten", source, "packed.obj", size, words=words, lines=lines)
     return as_it_is(state, mesh, recipe, keep=True)
 
 
@@ -263,10 +217,8 @@ def _cos_sin(degrees: float) -> tuple[float, float]:
 def is_flattenable(island: Island) -> bool:
     """Whether an island has a boundary and no handle."""
     found, n = edges(island.F, len(island.vertices)), len(island.vertices)
-    if not len(found.boundary):
-        return False
-    euler = n - len(found.interior) - len(found.boundary) + len(island.F)
-    return euler == 2 - len(boundary_loops(island.F, n))
+    loops = len(trace_loops(found.boundary))
+    return loops > 0 and n - len(found.interior) - len(found.boundary) + len(island.F) == 2 - loops
 
 
 def solve_smoothly(problem: Problem, callback: Callback) -> MapResult:
@@ -285,12 +237,9 @@ def rebuild(
     state: SessionState,
     mapped: MappedAtlas,
     recipe: Recipe,
-    *,
-    keep: bool = False,
-    corners: bool = False,
-    outlines: bool = False,
+    keep: Collection[str] = (),
 ) -> SessionState:
-    """Return the state after a step; with ``keep`` pins stay, with ``corners`` and ``outlines`` these, too."""
+    """Return the state after a step; islands that are the same keep the constraints named in ``keep``."""
     changed = set(range(len(mapped.islands))) if len(mapped.islands) != len(state.islands) else set(state.selected)
     if any(one.result.status is Status.INTERRUPTED for one in mapped.islands):
         raise KeyboardInterrupt
@@ -307,19 +256,9 @@ def rebuild(
             result = replace(result, uv=uv, certificate=certify(island.F, uv))
         new = IslandState(island, one.mirrored, result)
         if before is not None and keep and np.array_equal(before.island.F, island.F):
-            new = replace(new, pins=before.pins, corners=before.corners if corners else ())
-            if outlines:
-                new = replace(
-                    new,
-                    outline=before.outline,
-                    corners=before.corners,
-                    chosen=before.chosen,
-                    by_angle=before.by_angle,
-                )
+            new = replace(new, **{name: getattr(before, name) for name in keep})
         islands.append(fix_where_it_is(new))
-    return replace(
-        state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=_still(state, islands), drawn=None
-    )
+    return _with_map(state, mapped.mesh, islands, recipe)
 
 
 def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, *, keep: bool = False) -> SessionState:
@@ -334,7 +273,7 @@ def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, *, keep: boo
         result = MapResult(uv=uv, status=Status.INJECTIVE if found.injective else Status.STALLED, certificate=found)
         pins = state.islands[k].pins if keep and k < len(state.islands) else ()
         islands.append(fix_where_it_is(IslandState(island, mirrored, result, pins=pins)))
-    return replace(state, mesh=mesh, islands=tuple(islands), recipe=recipe, selected=_still(state, islands), drawn=None)
+    return _with_map(state, mesh, islands, recipe)
 
 
 def fix_where_it_is(one: IslandState) -> IslandState:
@@ -345,12 +284,13 @@ def fix_where_it_is(one: IslandState) -> IslandState:
     return replace(one, fixed=fixed, target=one.result.uv[fixed])
 
 
-def _still(state: SessionState, islands: Sequence[IslandState]) -> tuple[int, ...]:
-    """Return the selection if the islands are still the same; otherwise all of them."""
-    return state.selected if len(islands) == len(state.islands) else tuple(range(len(islands)))
+def _with_map(state: SessionState, mesh: SeamedMesh, islands: list[IslandState], recipe: Recipe) -> SessionState:
+    """Return the state with another map; all islands are selected if their number has changed."""
+    selected = state.selected if len(islands) == len(state.islands) else tuple(range(len(islands)))
+    return replace(state, mesh=mesh, islands=tuple(islands), recipe=recipe, selected=selected, drawn=None)
 
 
-def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> list[int] | None:
+def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> Given | None:
     """Return the fixed vertices of the selected islands, in the surface's numbering; None if these are the boundary.
 
     With ``slide``, only the pins are fixed.
@@ -362,23 +302,26 @@ def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool 
     for one in chosen:
         boundary = boundary_edges(one.island.F, len(one.island.vertices))[: 0 if slide else None]
         rows.append(one.island.vertices[np.union1d(boundary, np.array(one.pins, int))])
-    return np.unique(np.concatenate(rows)).tolist()
+    return _saved_list(np.unique(np.concatenate(rows)).tolist())
+
+
+def _saved_list(vertices: list[int]) -> Given:
+    """Return fixed vertices as an argument, from a file that the page saves."""
+    content = "".join(f"{vertex}\n" for vertex in vertices).encode()
+    code = Code(f"np.loadtxt({FIXED!r}, dtype=np.int64)")
+    return Given(np.array(vertices), code, {"fixed": FIXED}, {FIXED: content})
 
 
 def _polygons(state: SessionState, source: Source) -> Any:
     return state.sheet.mesh.polygons if source.start is None else None
 
 
-def _cut_lines(source: Source, state: SessionState) -> list[str]:
-    """Return the lines that cut a surface as ``--cut`` does."""
+def _cut_lines(state: SessionState, source: Source) -> list[str]:
+    """Return the lines that cut a mesh as ``--cut`` does."""
     if _polygons(state, source) is None:
-        return [
-            f"mesh = atlas.SeamedMesh({source.name!r})",
-            "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))",
-        ]
+        return ["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"]
     return [
-        f"model = io.read_mesh({source.name!r})",
-        "mesh, inside = atlas.SeamedMesh(model), model.polygons.diagonals(model.F)",
+        f"inside = io.read_mesh({source.name!r}).polygons.diagonals(mesh.F)",
         "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams, forbidden_edges=inside))",
     ]
 
@@ -395,19 +338,18 @@ def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> 
     if cut:
         mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
     mapped = atlas.flatten(mesh, callback=callback)
-    words = ["flatten", source.command, "--seams", SEAMS if len(drawn) else "none", *recipes.option_words(cut=cut)]
     lines = [
-        f"mesh = atlas.SeamedMesh({source.name!r})",
+        f"mesh = atlas.as_seamed_mesh({source.name!r})",
         "mesh = atlas.SeamedMesh(mesh.V, mesh.F)",
         *([f"mesh = mesh.cut(np.loadtxt({SEAMS!r}, dtype=np.int64).reshape(-1, 2))"] if len(drawn) else []),
-        *(["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"] if cut else []),
-        "result = atlas.flatten(mesh)",
-        "mesh = result.mesh",
+        *(_cut_lines(state, source) if cut else []),
+        *recipes.call_lines("flatten", "mesh", {}, None),
     ]
     texts = {SEAMS: "".join(f"{a} {b}\n" for a, b in drawn.tolist()).encode()} if len(drawn) else {}
-    python = recipes.write_script(lines, names=["atlas", *(["find_cuts"] if cut else [])])
-    recipe = Recipe(recipes.write_command(words, "flat.obj", source), python, source.start, texts)
-    return replace(rebuild(state, mapped, recipe), from_file=False, selected=tuple(range(len(mapped.islands))))
+    options = {"seams": Given(drawn, Code(), {"seams": SEAMS if texts else "none", "cut": cut}, texts)}
+    recipe = recipes.record_call("flatten", source, "flat.obj", options, lines=lines)
+    after = rebuild(state, mapped, recipe)
+    return replace(after, from_file=False, selected=tuple(range(len(mapped.islands))))
 
 
 def require_map(state: SessionState) -> None:

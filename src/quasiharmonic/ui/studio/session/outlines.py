@@ -6,14 +6,14 @@ This module never reads a file named by a page: names are those of shapes, and d
 from __future__ import annotations
 
 import re
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.targets import outline, outline_curves, read_svg
+from quasiharmonic.ui.studio.session.uploads import stored_file
 from quasiharmonic.util.arrays import FloatArray
 
 # A decimal number of limited length.
@@ -36,13 +36,16 @@ class Outline:
     contours: list[FloatArray]  # each (k, 2)
     content: bytes | None = None  # Contents of that file; None if ``to`` is the name of a shape
 
+    @property
+    def texts(self) -> dict[str, bytes]:
+        """Contents of the files that ``to`` names, by name."""
+        return {} if self.content is None else {self.to: self.content}
+
     def curves(self) -> list[Curve]:
         """Return the curves for a sliding boundary."""
         if self.content is None:
             return outline_curves(self.to)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / self.to
-            path.write_bytes(self.content)
+        with stored_file(self.to, self.content) as path:
             return outline_curves(path)
 
 
@@ -61,9 +64,7 @@ def read_drawing(name: str, content: bytes) -> Outline:
     shown = re.sub(r"[^\w.-]", "_", PurePosixPath(name.replace("\\", "/")).stem)[:60].strip(".") or "drawing"
     if len(content) > MAX_BYTES:
         raise ValueError(f"{shown}.svg has {len(content):,} bytes; at most {MAX_BYTES:,} are allowed")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "dropped.svg"
-        path.write_bytes(content)
+    with stored_file("dropped.svg", content) as path:
         try:
             contours = read_svg(path)
         except (ValueError, OSError) as error:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from quasiharmonic.energies.polishing import SMOOTHING_STEPS
 from quasiharmonic.io import MeshData
@@ -12,8 +14,12 @@ from quasiharmonic.io import MeshData
 #: Names of the files that the page saves: the map, the map from which the last step started, the fixed vertices, the
 #: seams that the user drew.
 MAP, START, FIXED, SEAMS = "map.obj", "start.obj", "fixed.txt", "seams.txt"
-#: Number of steps of `polish` as a step of its own.
-POLISHING_STEPS = 200
+# Names that scripts use, by the modules that they import them from.
+_IMPORTS = {
+    "quasiharmonic": ("BoundaryCurves", "atlas", "find_cuts", "injective_map", "io", "polish", "unwrap"),
+    "quasiharmonic.targets": ("boundary_to", "filled", "outline", "outline_curves"),
+    "quasiharmonic.apps.unwrapping.model_files": ("polygon_costs",),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +52,6 @@ class Source:
         return self.name if not self.name.startswith("-") else f"./{self.name}"
 
 
-def write_command(words: Sequence[str], output: str, source: Source) -> str:
-    """Return a command line that writes ``output``, or another name if the input has this one."""
-    return shlex.join(["qhm", *words, "-o", output if source.name != output else f"new_{output}"])
-
-
 def option_words(**options: object) -> list[str]:
     """Return the words of options; None and False are left out."""
     words = []
@@ -62,84 +63,108 @@ def option_words(**options: object) -> list[str]:
     return words
 
 
-def island_words(only: Sequence[int] | None) -> list[str]:
-    """Return the option that chooses islands."""
-    return [] if only is None else ["--islands", ",".join(map(str, only))]
-
-
-def arguments(**options: object) -> str:
-    """Return further arguments of a Python call; None and False are left out."""
-    return "".join(
-        f", {name}={value if isinstance(value, Code) else repr(value)}"
-        for name, value in options.items()
-        if value is not None and value is not False
-    )
-
-
 class Code(str):
     """Python code, as opposed to a text."""
 
     __slots__ = ()
 
 
-def write_script(lines: Sequence[str], *, names: Sequence[str] = (), modules: Sequence[str] = ()) -> str:
-    """Return a script with its imports: ``names`` of the library, and further ``modules`` lines."""
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Value of an argument, and how command and script spell it."""
+
+    value: Any
+    code: Code
+    words: Mapping[str, object] = field(default_factory=dict)  # Options of the command
+    texts: Mapping[str, bytes] = field(default_factory=dict)  # Files that command and script read
+
+
+def arguments(**options: object) -> str:
+    """Return further arguments of a Python call; None and False are left out."""
+    codes = {name: value.code if isinstance(value, Given) else value for name, value in options.items()}
+    return "".join(
+        f", {name}={value if isinstance(value, Code) else repr(value)}"
+        for name, value in codes.items()
+        if value is not None and value is not False
+    )
+
+
+def values(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments themselves."""
+    return {name: value.value if isinstance(value, Given) else value for name, value in options.items()}
+
+
+def record_call(
+    verb: str,
+    source: Source,
+    output: str,
+    options: Mapping[str, Any],
+    only: Sequence[int] | None = None,
+    *,
+    words: Sequence[str] = (),
+    lines: Sequence[str] = (),
+) -> Recipe:
+    """Return the recipe of a call for some islands: its command ``verb``, and a script with the function of `atlas`.
+
+    ``words`` are further words of the command, and ``lines`` those of another script.
+    """
+    given = [value for value in options.values() if isinstance(value, Given)]
+    plain = {name: value for name, value in options.items() if not isinstance(value, Given)}
+    chosen = {name: value for one in given for name, value in one.words.items()}
+    chosen["islands"] = None if only is None else ",".join(map(str, only))
+    command = ["qhm", verb, source.command, *words, *option_words(**plain, **chosen)]
+    # The file that a step starts from is not overwritten.
+    command += ["-o", output if source.name != output else f"new_{output}"]
+    script = write_script(lines or call_lines(verb, repr(source.name), options, only))
+    texts = {name: content for one in given for name, content in one.texts.items()}
+    return Recipe(shlex.join(command), script, source.start, texts)
+
+
+def call_lines(verb: str, mesh: str, options: Mapping[str, Any], only: Sequence[int] | None) -> list[str]:
+    """Return the lines that call a function of `atlas` for some islands of ``mesh``, which is Python code."""
+    return [f"result = atlas.{verb}({mesh}{arguments(**options, islands=only)})", "mesh = result.mesh"]
+
+
+def write_script(lines: Sequence[str]) -> str:
+    """Return a script with its imports."""
     text = "\n".join(lines)
     head = ["import numpy as np", ""] if "np." in text else []
-    head += [f"from quasiharmonic import {', '.join(sorted(set(names)))}"]
-    return "\n".join([*head, *modules, "", text, ""])
+    for module, names in _IMPORTS.items():
+        used = [name for name in names if re.search(rf"(?<![\w.]){name}[.(]", text)]
+        head += [f"from {module} import {', '.join(used)}"] if used else []
+    return "\n".join([*head, "", text, ""])
 
 
-def map_script(source: Source, only: Sequence[int] | None, smoothed: Sequence[int] | None, fixed: str | None) -> str:
+def map_lines(
+    source: Source, only: Sequence[int] | None, smoothed: Sequence[int] | None, fixed: Given | None
+) -> list[str]:
     """Return a script that maps the islands ``only`` again and keeps their fixed vertices; None means all islands.
 
     The script then smooths the islands ``smoothed``; None means all.
     """
-    read = read_indices(fixed)
-    lines = [f"result = atlas.injective_map({source.name!r}{arguments(fixed=read, islands=only)})"]
-    if smoothed is None or len(smoothed):
-        more = arguments(fixed=read, islands=smoothed, energy="blend", max_iterations=SMOOTHING_STEPS)
-        lines.append(f"result = atlas.polish(result.mesh{more})")
-    return write_script([*lines, "mesh = result.mesh"], names=["atlas"])
+    lines = call_lines("injective_map", repr(source.name), {"fixed": fixed}, only)
+    smoothing = {"fixed": fixed, "energy": "blend", "max_iterations": SMOOTHING_STEPS}
+    return lines if smoothed == [] else [*lines, *call_lines("polish", "mesh", smoothing, smoothed)]
 
 
-def outline_script(
-    source: Source, to: str, filled: bool, corners: object, islands: Sequence[int], smoothed: bool, checked: bool
-) -> str:
-    """Return a script that maps islands to an outline; several of them to copies side by side.
-
-    ``smoothed`` if it smooths the maps, and ``checked`` if only those without inverted triangles.
-    """
+def outline_lines(
+    source: Source, to: str, filled: bool, corners: object, islands: Sequence[int], smoothed: bool
+) -> list[str]:
+    """Return a script that maps islands to copies of an outline, side by side; it smooths them if ``smoothed``."""
     contours = f"outline({to!r})"
-    lines = [
-        f"mesh = atlas.SeamedMesh({source.name!r})",
+    more = arguments(fixed=Code("fixed"), energy="blend", max_iterations=SMOOTHING_STEPS)
+    smoothing = ["    if result.injective:", f"        result = polish(island.V, island.F, result.uv{more})"]
+    return [
+        f"mesh = atlas.as_seamed_mesh({source.name!r})",
         f"contours = {f'filled({contours})' if filled else contours}",
+        "width = np.ptp(np.concatenate(contours)[:, 0])",
         "places = [island.uv for island in mesh.islands]",
-    ]
-    if len(islands) > 1:
-        lines += [
-            "width = (1 + 0.05) * np.ptp(np.concatenate(contours)[:, 0])",
-            f"for i, k in enumerate({list(islands)}):",
-            "    island = mesh.islands[k]",
-            "    copy = [contour + np.array([i * width, 0.0]) for contour in contours]",
-        ]
-    else:
-        lines += [f"for k in {list(islands)}:", "    island = mesh.islands[k]", "    copy = contours"]
-    lines += [
+        f"for i, k in enumerate({list(islands)}):",
+        "    island = mesh.islands[k]",
+        "    copy = [contour + np.array([i * 1.05 * width, 0.0]) for contour in contours]",
         f"    fixed, target = boundary_to(island.V, island.F, copy{arguments(corners=corners or None)})",
         "    result = injective_map(island.V, island.F, fixed, target)",
+        *(smoothing if smoothed else []),
+        "    places[k] = result.uv",
+        "mesh = mesh.with_places(places)",
     ]
-    if smoothed:
-        more = arguments(fixed=Code("fixed"), energy="blend", max_iterations=SMOOTHING_STEPS)
-        lines += ["    if result.injective:"] if checked else []
-        indent = "        " if checked else "    "
-        lines.append(f"{indent}result = polish(island.V, island.F, result.uv{more})")
-    lines += ["    places[k] = result.uv", "mesh = mesh.with_places(places)"]
-    used = [name for name in ("boundary_to", "filled", "outline") if any(f"{name}(" in line for line in lines)]
-    names = ["atlas", "injective_map", *(["polish"] if smoothed else [])]
-    return write_script(lines, names=names, modules=[f"from quasiharmonic.targets import {', '.join(used)}"])
-
-
-def read_indices(name: str | None) -> Code | None:
-    """Return the code that reads a list of vertices."""
-    return None if name is None else Code(f"np.loadtxt({name!r}, dtype=np.int64)")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from quasiharmonic.energies.polishing import ENERGIES
 from quasiharmonic.io.models.textures import Texture, texture_of
 from quasiharmonic.ui.studio.protocol import Array, Frame
 from quasiharmonic.ui.studio.session import frames, operations, validation
@@ -32,11 +33,10 @@ from quasiharmonic.ui.studio.session.setup import (
 from quasiharmonic.ui.studio.session.state import DistortionMonitor, SessionState, describe_obstructions
 from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import Sheet, make_first_sheet, read_upload
-from quasiharmonic.ui.studio.session.unwrapping import UnwrapOptions, unwrap_model
+from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
 
-ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
 _LARGEST_TEXTURE = 16_384
 
 Tell = Callable[[Mapping[str, Any], Mapping[str, Array]], None]
@@ -107,13 +107,16 @@ class Session:
         return True
 
     def handle(self, frame: Frame) -> None:
-        """Execute the command of a message; errors of any type are sent to the page, and the state stays."""
+        """Execute the command of a message by the method ``_do_COMMAND``.
+
+        Errors of any type are sent to the page, and the state stays.
+        """
         what = frame.header.get("do")
-        do = self._HANDLERS.get(what) if isinstance(what, str) else None
+        do = getattr(self, f"_do_{what}", None) if isinstance(what, str) else None
         try:
             if do is None:
                 raise RequestError(f"unknown request {str(what)[:40]!r}")
-            do(self, frame)
+            do(frame)
         except KeyboardInterrupt:
             self._show()
         except Exception as error:
@@ -127,10 +130,10 @@ class Session:
 
     # --- models, selection and seams ---------------------------------------------------------------------------------
 
-    def _load(self, frame: Frame) -> None:
+    def _do_load(self, frame: Frame) -> None:
         self.open(read_upload(validation.text(frame, "name"), validation.content(frame)))
 
-    def _image(self, frame: Frame) -> None:
+    def _do_image(self, frame: Frame) -> None:
         texture = texture_of(validation.content(frame))
         if texture is None:
             raise RequestError("this file is not a PNG or JPEG image")
@@ -138,12 +141,12 @@ class Session:
         self._history.write()
         self._send_image()
 
-    def _select(self, frame: Frame) -> None:
+    def _do_select(self, frame: Frame) -> None:
         chosen = validation.indices(frame, "islands", len(self.state.islands))
         self._history.change(replace(self.state, selected=tuple(chosen or range(len(self.state.islands)))))
         self._show()
 
-    def _seam(self, frame: Frame) -> None:
+    def _do_seam(self, frame: Frame) -> None:
         """Add the shortest path between two vertices to the seams."""
         state, mesh = self.state, self.state.mesh
         ends = [int(state.numbering.origin[validation.number_below(frame, n, len(state.numbering.origin))])
@@ -153,24 +156,24 @@ class Session:
         path = shortest_path(mesh.V, mesh.F, *ends)
         self._keep(replace(state, drawn=add_edges(find_seams(state), path)))
 
-    def _erase(self, frame: Frame) -> None:
+    def _do_erase(self, frame: Frame) -> None:
         """Remove the chain of seams nearest to a vertex."""
         state = self.state
         vertex = int(state.numbering.origin[validation.vertex(frame, len(state.numbering.origin))])
         self._keep(replace(state, drawn=erase_chain(find_seams(state), state.mesh.V, vertex)))
 
-    def _turn(self, frame: Frame) -> None:
+    def _do_turn(self, frame: Frame) -> None:
         self._keep(turn_over(self.state), fit=True)
 
     # --- new maps ----------------------------------------------------------------------------------------------------
 
-    def _outline(self, frame: Frame) -> None:
+    def _do_outline(self, frame: Frame) -> None:
         self._map_to(make_outline(frame.header.get("to")))
 
-    def _drawing(self, frame: Frame) -> None:
+    def _do_drawing(self, frame: Frame) -> None:
         self._map_to(read_drawing(validation.text(frame, "name"), validation.content(frame)))
 
-    def _polygon(self, frame: Frame) -> None:
+    def _do_polygon(self, frame: Frame) -> None:
         self._map_to(make_polygon(validation.points(frame)))
 
     def _map_to(self, outline: Outline, corners: Any = ()) -> None:
@@ -178,32 +181,29 @@ class Session:
         self._busy("finding the map")
         self._keep(operations.map_to_outline(self.state, outline, corners, self._step), fit=True)
 
-    def _corner(self, frame: Frame) -> None:
-        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+    def _do_corner(self, frame: Frame) -> None:
+        k, vertex = self._find(frame)
         self._busy("finding the map")
         self._keep(with_corner(self.state, k, vertex, self._step))
 
-    def _corners(self, frame: Frame) -> None:
+    def _do_corners(self, frame: Frame) -> None:
         outline = self.state.active.outline
         if outline is None:
             raise RequestError("corners need an outline: choose one under Boundary first")
         self._map_to(outline, "auto")
 
-    def _flatten(self, frame: Frame) -> None:
+    def _do_flatten(self, frame: Frame) -> None:
         self._busy("flattening")
         self._keep(operations.flatten_islands(self.state, self._step), fit=True)
 
-    def _unwrap(self, frame: Frame) -> None:
-        options = UnwrapOptions(
-            float(validation.amount(frame, "max_stretch", 1, 10, 1.5)),
-            int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, 2048)),
-            float(validation.amount(frame, "padding", 0, 64, 4)),
-            frame.header.get("keep_seams") is True,
-        )
+    def _do_unwrap(self, frame: Frame) -> None:
+        max_stretch, size = float(validation.amount(frame, "max_stretch", 1, 10, 1.5)), _read_size(frame, 2048)
+        keep_seams = frame.header.get("keep_seams") is True
         self._busy("unwrapping")
-        self._keep(unwrap_model(self.state, options, self._step), fit=True)
+        after = unwrap_model(self.state, self._step, max_stretch=max_stretch, keep_seams=keep_seams, **size)
+        self._keep(after, fit=True)
 
-    def _place(self, frame: Frame) -> None:
+    def _do_place(self, frame: Frame) -> None:
         """Move or rotate the selected islands."""
         by, turn = validation.place(frame), validation.amount(frame, "turn", -360, 360, 0)
         # The page has already moved them.
@@ -211,15 +211,14 @@ class Session:
         self._refuse_drawn()
         self._keep(operations.move_islands(self.state, by, float(turn)))
 
-    def _pack(self, frame: Frame) -> None:
+    def _do_pack(self, frame: Frame) -> None:
         self._refuse_drawn()
         operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        resolution = int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, 1024))
+        size = _read_size(frame, 1024)
         self._busy("packing")
-        padding = float(validation.amount(frame, "padding", 0, 64, 4))
-        self._keep(operations.pack_all(self.state, resolution, padding), fit=True)
+        self._keep(operations.pack_all(self.state, **size), fit=True)
 
-    def _polish(self, frame: Frame) -> None:
+    def _do_polish(self, frame: Frame) -> None:
         energy, slide = validation.text(frame, "energy"), frame.header.get("slide") is True
         if energy not in ENERGIES:
             raise RequestError(f"unknown energy {energy[:40]!r}: use {', '.join(ENERGIES)}")
@@ -234,8 +233,8 @@ class Session:
 
     # --- drags and pins ----------------------------------------------------------------------------------------------
 
-    def _pin(self, frame: Frame) -> None:
-        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+    def _do_pin(self, frame: Frame) -> None:
+        k, vertex = self._find(frame)
         one = self.state.islands[k]
         if any(vertex in loop for loop in one.loops):
             raise RequestError("that vertex is on the boundary, which is already fixed: drag it in the map")
@@ -244,14 +243,18 @@ class Session:
         if vertex not in one.pins:
             self._keep(pin_vertices(self.state, k, [*one.pins, vertex]))
 
-    def _unpin(self, frame: Frame) -> None:
-        k, vertex = self.state.numbering.find(validation.vertex(frame, len(self.state.numbering.origin)))
+    def _find(self, frame: Frame) -> tuple[int, int]:
+        """Return island and own number of the vertex that a message names."""
+        numbering = self.state.numbering
+        return numbering.find(validation.vertex(frame, len(numbering.origin)))
+
+    def _do_unpin(self, frame: Frame) -> None:
+        k, vertex = self._find(frame)
         self._keep(pin_vertices(self.state, k, [v for v in self.state.islands[k].pins if v != vertex]))
 
-    def _grab(self, frame: Frame) -> None:
-        vertex = validation.vertex(frame, len(self.state.numbering.origin))
+    def _do_grab(self, frame: Frame) -> None:
+        k, vertex = self._find(frame)
         self._refuse_drawn()
-        k, vertex = self.state.numbering.find(vertex)
         one = self.state.islands[k]
         if one.result is None or one.fixed is None or one.target is None:
             raise RequestError("there is no map to drag yet: press Unwrap or Flatten first")
@@ -267,7 +270,7 @@ class Session:
         place = problem.target[np.flatnonzero(problem.fixed == vertex)[0]]
         self._drag_state = _DragState(k, place, share, follower)
 
-    def _drag(self, frame: Frame) -> None:
+    def _do_drag(self, frame: Frame) -> None:
         to, seq = validation.place(frame), validation.number(frame, "seq")
         drag = self._drag_state
         if drag is None:
@@ -284,7 +287,7 @@ class Session:
         fields = {"state": "following", "reached": shown.reached}
         self._tell_map(fields, seq=seq, shown=shown, asked=asked)
 
-    def _drop(self, frame: Frame) -> None:
+    def _do_drop(self, frame: Frame) -> None:
         drag, self._drag_state = self._drag_state, None
         if drag is None or drag.goal is None:
             return
@@ -303,10 +306,10 @@ class Session:
 
     # --- history and files -------------------------------------------------------------------------------------------
 
-    def _undo(self, frame: Frame) -> None:
+    def _do_undo(self, frame: Frame) -> None:
         self._go(-1)
 
-    def _redo(self, frame: Frame) -> None:
+    def _do_redo(self, frame: Frame) -> None:
         self._go(1)
 
     def _go(self, step: int) -> None:
@@ -314,11 +317,11 @@ class Session:
         self._history.go(step)
         self._show(fit=True)
 
-    def _stop(self, frame: Frame) -> None:
+    def _do_stop(self, frame: Frame) -> None:
         """Show the state again; the arrival of this message has already stopped the computation."""
         self._show()
 
-    def _save(self, frame: Frame) -> None:
+    def _do_save(self, frame: Frame) -> None:
         form = frame.header.get("format", "obj")
         files = list_files(self.state, form if isinstance(form, str) else "", self._history.texture)
         for name, content in files.items():
@@ -379,27 +382,13 @@ class Session:
     ) -> None:
         """Send the whole map, or that of the dragged island, with its certificate; otherwise only the target."""
         state, drag = self.state, self._drag_state
-        header: dict[str, Any] = {
-            "kind": "map",
-            "seq": seq,
-            "after": self._after,
-            "fit": False,
-            "origin": self._origin.tolist(),
-        }
+        header = {"kind": "map", "seq": seq, "after": self._after, "fit": False, "origin": self._origin.tolist()}
         header |= {**frames.handle_fields(state), **fields}
         arrays: dict[str, Array] = {}
         if everything or shown is not None:
-            changed = None
-            uv = state.uv
-            if shown is not None and drag is not None:
-                start = int(state.numbering.starts[drag.island])
-                moved = shown.uv * state.islands[drag.island].sign
-                uv[start : start + len(moved)] = moved
-                changed = drag.island, moved, shown.certificate
-            more, found = frames.map_arrays(state, self._origin, changed=changed)
-            header |= more
-            arrays |= found
-            header |= self._measured.look(uv, now=seq < 0) | {"scale": self._measured.scale}
+            dragged = None if shown is None or drag is None else (drag.island, shown)
+            more, arrays, uv = frames.map_message(state, self._origin, dragged)
+            header |= more | self._measured.look(uv, now=seq < 0)
         targets = {} if asked is None or drag is None else {drag.island: asked}
         if targets or (everything and not state.in_place):
             arrays["asked"] = frames.asked_boundary(state, targets, self._origin)
@@ -409,32 +398,12 @@ class Session:
         self._working = True
         self._tell({"kind": "busy", "what": what}, {})
 
-    _HANDLERS: dict[str, Callable[[Session, Frame], None]] = {  # noqa: RUF012
-        "load": _load,
-        "image": _image,
-        "select": _select,
-        "seam": _seam,
-        "erase": _erase,
-        "turn": _turn,
-        "outline": _outline,
-        "drawing": _drawing,
-        "polygon": _polygon,
-        "corner": _corner,
-        "corners": _corners,
-        "flatten": _flatten,
-        "unwrap": _unwrap,
-        "pack": _pack,
-        "place": _place,
-        "pin": _pin,
-        "unpin": _unpin,
-        "grab": _grab,
-        "drag": _drag,
-        "drop": _drop,
-        "polish": _polish,
-        "undo": _undo,
-        "redo": _redo,
-        "stop": _stop,
-        "save": _save,
+
+def _read_size(frame: Frame, resolution: int) -> dict[str, Any]:
+    """Return resolution, by default the given one, and padding of a texture."""
+    return {
+        "resolution": int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, resolution)),
+        "padding": float(validation.amount(frame, "padding", 0, 64, 4)),
     }
 
 

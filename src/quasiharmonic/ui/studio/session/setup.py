@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.targets import nearest_on_boundary
 from quasiharmonic.ui.studio.session.islands import IslandState
@@ -18,6 +17,7 @@ from quasiharmonic.ui.studio.session.operations import (
     fix_where_it_is,
     fixed_positions,
     flatten_islands,
+    is_flattenable,
     map_in_place,
     map_to_outline,
     saved_start,
@@ -26,7 +26,7 @@ from quasiharmonic.ui.studio.session.outlines import make_outline
 from quasiharmonic.ui.studio.session.recipes import Recipe
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.surface import Sheet, has_complete_map
-from quasiharmonic.ui.studio.session.unwrapping import UnwrapOptions, unwrap_model
+from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
 
@@ -54,7 +54,7 @@ def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = No
     if has_complete_map(sheet.mesh) or (sheet.fixed is not None and sheet.is_file and sheet.mesh.FT is not None):
         return _take_map(sheet, bare, callback)
     if len(bare.islands) == 1 and sheet.is_file:
-        if _is_disk(bare.islands[0]):
+        if len(bare.islands[0].loops) == 1 and is_flattenable(bare.islands[0].island):
             # Some disks have no map to a square: a boundary of three vertices, triangles with all corners on one side.
             with suppress(ValueError):
                 square = map_to_outline(bare, make_outline(_FIRST_OUTLINE), callback=callback)
@@ -65,7 +65,7 @@ def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = No
                 return flatten_islands(bare, callback)
             except (ValueError, RuntimeError):
                 pass
-    return bare if len(sheet.surface.F) > MAX_AUTOMATIC else unwrap_model(bare, UnwrapOptions(), callback)
+    return bare if len(sheet.surface.F) > MAX_AUTOMATIC else unwrap_model(bare, callback)
 
 
 def _take_map(sheet: Sheet, bare: SessionState, callback: Callable[[Any], object] | None) -> SessionState:
@@ -92,11 +92,6 @@ def _with_file_pins(one: IslandState, pins: Sequence[int]) -> IslandState:
     edge = np.concatenate([np.empty(0, dtype=np.int64), *one.loops])
     own = np.setdiff1d(np.flatnonzero(np.isin(one.island.vertices, pins)), edge)
     return replace(one, pins=tuple(own.tolist()))
-
-
-def _is_disk(one: IslandState) -> bool:
-    found, n = edges(one.island.F, len(one.island.vertices)), len(one.island.vertices)
-    return len(one.loops) == 1 and n - len(found.interior) - len(found.boundary) + len(one.island.F) == 1
 
 
 def with_corner(state: SessionState, k: int, vertex: int, callback: Callable[[Any], object] | None) -> SessionState:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -38,7 +38,7 @@ class SessionState:
     recipe: Recipe  # How the map was computed
     selected: tuple[int, ...] = (0,)  # Indices of the selected islands, ascending, at least one
     from_file: bool = True  # Whether the seams are those of the file
-    drawn: IntArray | None = field(default=None)  # (k, 2): edges of the seams that the user drew, if they changed
+    drawn: IntArray | None = None  # (k, 2): edges of the seams that the user drew, if they changed
 
     @cached_property
     def numbering(self) -> Numbering:
@@ -93,25 +93,25 @@ class SessionState:
     @property
     def pins(self) -> list[int]:
         """Fixed interior vertices, in the numbering of the page."""
-        starts = self.numbering.starts
-        return [int(v + start) for one, start in zip(self.islands, starts, strict=False) for v in one.pins]
+        return self._numbers([one.pins for one in self.islands])
 
     @property
     def corners(self) -> list[int]:
         """Corners of all islands, in the numbering of the page."""
-        starts = self.numbering.starts
-        return [int(v + start) for one, start in zip(self.islands, starts, strict=False) for v in one.corners]
+        return self._numbers([one.corners for one in self.islands])
+
+    def _numbers(self, vertices: list[tuple[int, ...]]) -> list[int]:
+        """Return vertices of each island in the numbering of the page."""
+        return [int(v + start) for some, start in zip(vertices, self.numbering.starts, strict=False) for v in some]
 
     def with_island(self, k: int, island: IslandState) -> SessionState:
         """Return the state with another island of index ``k``; the mesh is unchanged."""
         islands = (*self.islands[:k], island, *self.islands[k + 1 :])
-        other = replace(self, islands=islands)
-        other.__dict__["numbering"] = self.numbering
-        return other
+        return replace(self, islands=islands)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the contents for a snapshot; what can be computed again is left out."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("numbering", "overlapping")}
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
 
 def place(one: IslandState) -> FloatArray:
@@ -125,11 +125,10 @@ class DistortionMonitor:
     def __init__(self, V: FloatArray, F: Array) -> None:
         self._V, self._F = V, F
         self._when, self._cost = -np.inf, 0.0
-        self.numbers: dict[str, Any] = {}
-        self.scale = 1.0
+        self._numbers: dict[str, Any] = {}
 
     def look(self, uv: FloatArray, *, now: bool) -> dict[str, Any]:
-        """Return energy, worst stretch and used space of a map; recent values unless ``now`` is True."""
+        """Return energy, worst stretch, used space and scale of a map; recent values unless ``now`` is True."""
         began = time.perf_counter()
         if now or began - self._when > max(0.15, 8 * self._cost):
             measured = distortion(self._V, self._F, uv)
@@ -137,16 +136,16 @@ class DistortionMonitor:
             with np.errstate(invalid="ignore"):
                 energy = float(measured.share[defined] @ measured.symmetric_dirichlet[defined])
             worst = float(measured.isometric[defined].max()) if defined.any() else np.inf
-            self.numbers = {
+            self._numbers = {
                 "energy": energy if np.isfinite(energy) else None,
                 "worst": worst if np.isfinite(worst) else None,
                 "used": _find_used_space(self._F, uv),
                 "packed": bool(uv.min() >= 0 and uv.max() <= 1),
+                "scale": measured.scale if np.isfinite(measured.scale) else 1.0,
             }
-            self.scale = measured.scale if np.isfinite(measured.scale) else 1.0
             self._when = time.perf_counter()
             self._cost = self._when - began
-        return self.numbers
+        return self._numbers
 
 
 def _find_used_space(F: Array, uv: FloatArray) -> float | None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
-from dataclasses import dataclass, replace
+import secrets
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
@@ -13,9 +13,9 @@ from quasiharmonic import io
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
 from quasiharmonic.apps.unwrapping.model_files import divide_polygons
 from quasiharmonic.geometry.surfaces import cat
-from quasiharmonic.io.models.meshdata import vertex_places
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem.inspection import MeshReport, inspect_mesh
+from quasiharmonic.ui.studio.session.uploads import stored_file
 from quasiharmonic.util.arrays import IntArray
 
 #: Maximum number of triangles; larger meshes are too slow to draw and drag.
@@ -42,6 +42,8 @@ class Sheet:
     turned: bool = False  # Whether the triangles of the surface are reversed
     fixed: IntArray | None = None  # (k,): fixed vertices, if the file comes with a list
     texture: io.Texture | None = None  # The model's own texture
+    # A name that stays the same in other processes; another model has another one
+    key: str = field(init=False, default_factory=lambda: secrets.token_hex(8))
 
     @property
     def is_file(self) -> bool:
@@ -110,9 +112,7 @@ def read_upload(name: str, content: bytes) -> Sheet:
     shown = PurePosixPath(name.replace("\\", "/")).name[:100]
     # A page uploads one file, without further files that it may refer to.
     suffix = io.find_format(shown, "read", "single_file").suffix
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"dropped{suffix}"
-        path.write_bytes(content)
+    with stored_file(f"dropped{suffix}", content) as path:
         try:
             mesh = io.read_mesh(path)
             sheet = make_sheet(mesh, shown)
@@ -146,6 +146,4 @@ def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> S
 
 def has_complete_map(mesh: io.MeshData) -> bool:
     """Return whether every triangle of a file has texture coordinates."""
-    if mesh.FT is None or mesh.vt is None:
-        return False
-    return bool((mesh.FT >= 0).all()) and not np.isnan(vertex_places(mesh)[0][mesh.F]).any()
+    return not np.isnan(mesh.corner_uv).any()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -13,63 +14,47 @@ from quasiharmonic.apps.unwrapping.unwrap import unwrap
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.ui.studio.session import recipes
 from quasiharmonic.ui.studio.session.operations import as_it_is, make_start
-from quasiharmonic.ui.studio.session.recipes import Code, Recipe, Source
+from quasiharmonic.ui.studio.session.recipes import Code, Given, Source
 from quasiharmonic.ui.studio.session.state import SessionState
 
 
-@dataclass(frozen=True)
-class UnwrapOptions:
-    """Options of `unwrap` that the page offers."""
-
-    max_stretch: float = 1.5
-    resolution: int = 2048
-    padding: float = 4.0
-    keep_seams: bool = False
-
-
 def unwrap_model(
-    state: SessionState, options: UnwrapOptions, callback: Callable[[UnwrapStep], object] | None = None
+    state: SessionState,
+    callback: Callable[[UnwrapStep], object] | None = None,
+    *,
+    max_stretch: float = 1.5,
+    resolution: int = 2048,
+    padding: float = 4.0,
+    keep_seams: bool = False,
 ) -> SessionState:
-    """Unwrap the whole model; with ``keep_seams``, or after seams were drawn, along the current seams at least."""
+    """Unwrap the whole model; with ``keep_seams``, or after seams were drawn, along the current seams at least.
+
+    The other options are those of `unwrap`.
+    """
     sheet = state.sheet
     kept: SeamedMesh | None = None
     if state.drawn is not None:
         kept = _with_any_positions(SeamedMesh(sheet.surface.V, sheet.surface.F).cut(state.drawn))
-    elif options.keep_seams and state.mapped:
+    elif keep_seams and state.mapped:
         kept = state.mesh
+    options: dict[str, Any] = {"max_stretch": max_stretch, "resolution": resolution, "padding": padding}
     if kept is None and not sheet.turned:
         source, V, F = Source(sheet.name, None), sheet.mesh.V, sheet.mesh.F
-        costs = polygon_costs(sheet.mesh)
+        if (costs := polygon_costs(sheet.mesh)) is not None:
+            options["edge_costs"] = Given(costs, Code("polygon_costs(model)"))
     else:
-        bare = SeamedMesh(sheet.surface.V, sheet.surface.F)
-        source, V, F, costs = make_start(bare if kept is None else kept), sheet.surface.V, sheet.surface.F, None
-    uv = None if kept is None or kept.uv is None else kept.uv[kept.FT]
-    size = {"max_stretch": options.max_stretch, "resolution": options.resolution, "padding": options.padding}
-    result = unwrap(
-        V,
-        F,
-        max_stretch=options.max_stretch,
-        resolution=options.resolution,
-        padding=options.padding,
-        edge_costs=costs,
-        uv=uv,
-        callback=callback,
-    )
+        mesh = SeamedMesh(sheet.surface.V, sheet.surface.F) if kept is None else kept
+        source, V, F = make_start(mesh), mesh.V, mesh.F
+        if mesh.uv is not None:
+            options["uv"] = Given(mesh.uv[mesh.FT], Code("model.vt[model.FT]"), {"keep_seams": True})
+    result = unwrap(V, F, callback=callback, **recipes.values(options))
     FT = sheet.from_file(result.indices) if source.start is None else result.indices
-    words = ["unwrap", source.command, *recipes.option_words(**size, keep_seams=uv is not None)]
-    more = recipes.arguments(
-        **size,
-        edge_costs=None if costs is None else Code("polygon_costs(model)"),
-        uv=None if uv is None else Code("model.vt[model.FT]"),
-    )
     lines = [
         f"model = io.read_mesh({source.name!r})",
-        f"result = unwrap(model.V, model.F{more})",
+        f"result = unwrap(model.V, model.F{recipes.arguments(**options)})",
         "mesh = atlas.SeamedMesh(model.V, model.F, result.indices, result.uvs)",
     ]
-    module = "from quasiharmonic.apps.unwrapping.model_files import polygon_costs"
-    python = recipes.write_script(lines, names=["atlas", "io", "unwrap"], modules=[] if costs is None else [module])
-    recipe = Recipe(recipes.write_command(words, "unwrapped.obj", source), python, source.start)
+    recipe = recipes.record_call("unwrap", source, "unwrapped.obj", options, lines=lines)
     mesh = SeamedMesh(sheet.surface.V, sheet.surface.F, FT, result.uvs)
     after = as_it_is(state, mesh, recipe)
     return replace(after, from_file=False, selected=tuple(range(len(after.islands))))

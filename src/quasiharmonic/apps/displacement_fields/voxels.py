@@ -17,13 +17,25 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.displacement_fields.grid import (
+    Grid,
+    NearestField,
+    check_field,
+    check_fixed,
+    check_unfolded,
+    find_cells,
+    find_fixed_cells,
+    find_points,
+    grow,
+    label_patches,
+    name_points,
+)
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
 from quasiharmonic.apps.tetrahedra.descent import Descent
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
+from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, cross, dot
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import inspect_faces
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each, real_array
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
 from quasiharmonic.util.progress import heartbeat
 
 # Orders of the axes x, y, z, and the sign that makes the determinant of the steps positive at rest.
@@ -46,7 +58,7 @@ _BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class InvertibleVolume(Outcome):
+class InvertibleVolume(NearestField):
     """The nearest displacement field on voxels without folds that was found.
 
     Attributes
@@ -68,24 +80,13 @@ class InvertibleVolume(Outcome):
     seconds : float
     """
 
-    field: FloatArray
-    moved_mask: BoolArray
-    folds: int
     remaining: BoolArray
     bijective: bool
-    patches: int
-    distance: float
-    seconds: float
 
     @property
     def success(self) -> bool:
         """Whether no cell remains: every tetrahedron is positive, decided exactly, and above the bound."""
         return not self.remaining.any()
-
-    @property
-    def message(self) -> str:
-        """The text of `summary`."""
-        return self.summary()
 
     def summary(self) -> str:
         """Describe the field in one or two sentences."""
@@ -116,25 +117,22 @@ class InverseVolume:
         return f"{100 * float(self.outside.mean()):.3g} % of the voxels lie outside"
 
 
-class VoxelGrid:
-    """A grid of voxels of a shape (d, h, w), with the spacings along x, y and z."""
+class VoxelGrid(Grid):
+    """A grid of voxels."""
 
-    def __init__(self, shape: tuple[int, ...], spacing: ArrayLike) -> None:
-        sides = real_array("spacing", spacing)
-        if sides.shape not in ((), (3,)) or not (np.isfinite(sides) & (sides > 0)).all():
-            raise ValueError(f"spacing must be a positive number, or three (along x, y and z), not {spacing!r}")
-        self.shape = shape
-        self.spacing: FloatArray = np.broadcast_to(sides, 3).copy()
+    def number_cells(self, cells: BoolArray) -> IntArray:
+        """Return the first voxels (k,) of cells given by a mask, voxels counted slice by slice."""
+        return np.flatnonzero(np.pad(cells, ((0, 1), (0, 1), (0, 1))))
 
-    def positions(self, field: FloatArray, begin: int = 0, stop: int | None = None) -> FloatArray:
-        """Return the positions of the mapped voxels of slices ``begin`` to ``stop``."""
-        stop = self.shape[0] if stop is None else stop
-        axes = [np.arange(count) * side for count, side in zip(self.shape[::-1], self.spacing, strict=True)]
-        p = field[begin:stop].copy()
-        p[..., 0] += axes[0]
-        p[..., 1] += axes[1][:, None]
-        p[..., 2] += axes[2][begin:stop, None, None]
-        return p
+    def each_layer(self, field: FloatArray, scale: FloatArray) -> Iterator[tuple[int, FloatArray, list[FloatArray]]]:
+        """Yield the number of every layer of cells, positions (3, 2, h, w), and their differences along x, y and z.
+
+        The differences are divided by ``scale``, which has an entry for each coordinate.
+        """
+        for z in range(self.shape[0] - 1):
+            heartbeat()
+            p = np.moveaxis(self.positions(field, z, z + 2), -1, 0)
+            yield z, p, [np.diff(p, axis=axis) / scale[:, None, None, None] for axis in (3, 2, 1)]
 
     def tetrahedra(self, cells: IntArray) -> IntArray:
         """The tetrahedra (6 k, 4) of cells given by their first voxels (k,), voxels counted slice by slice."""
@@ -144,21 +142,6 @@ class VoxelGrid:
             row = np.cumsum([0, *steps[list(order)]])
             orders.append(row if sign > 0 else row[[1, 0, 2, 3]])
         return (cells[:, None, None] + np.array(orders)).reshape(-1, 4)
-
-
-def check_volume_field(field: ArrayLike) -> FloatArray:
-    """Check a displacement field on voxels, and return a copy as (d, h, w, 3) float64."""
-    array = real_array("field", field)
-    if array.ndim != 4 or array.shape[3] != 3 or min(array.shape[:3]) < 2:
-        advice = ": pass numpy.moveaxis(field, 0, -1)" if array.ndim == 4 and array.shape[0] == 3 else ""
-        raise ValueError(
-            "field must have shape (depth, height, width, 3), displacements along x, y and z for at least 2 × 2 × 2 "
-            f"voxels, not {array.shape}{advice}"
-        )
-    bad = ~np.isfinite(array).all(axis=3)
-    if bad.any():
-        raise ValueError(f"field is not finite at {_name_voxels(np.asarray(bad))}")
-    return array
 
 
 def in_units(field: FloatArray, spacing: ArrayLike) -> tuple[VoxelGrid, FloatArray, int]:
@@ -174,14 +157,10 @@ def in_units(field: FloatArray, spacing: ArrayLike) -> tuple[VoxelGrid, FloatArr
 
 def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | None) -> BoolArray:
     """Cells (d − 1, h − 1, w − 1) with a determinant not above a bound; for None, not positive, decided exactly."""
-    d, h, w = (count - 1 for count in grid.shape)
-    folds = np.zeros((d, h, w), dtype=np.bool_)
+    _, h, w = grid.cell_shape
+    folds = np.zeros(grid.cell_shape, dtype=np.bool_)
     # For the bound, a cell has volume 1. Exact signs are those of the positions as stored.
-    scale = np.ones((3, 1, 1, 1)) if min_jacobian is None else grid.spacing[:, None, None, None]
-    for z in range(d):
-        heartbeat()
-        p = np.moveaxis(grid.positions(field, z, z + 2), -1, 0)
-        steps = [np.diff(p, axis=axis) / scale for axis in (3, 2, 1)]
+    for z, p, steps in grid.each_layer(field, np.ones(3) if min_jacobian is None else grid.spacing):
         unsure = np.zeros((h, w), dtype=np.bool_)
         for order, sign in _ORDERS:
             at = [0, 0, 0]
@@ -190,12 +169,7 @@ def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | 
                 edges.append(steps[axis][:, at[2], at[1] : at[1] + h, at[0] : at[0] + w])
                 at[axis] = 1
             a, b, c = edges
-            terms = (
-                a[0] * (b[1] * c[2] - b[2] * c[1]),
-                a[1] * (b[2] * c[0] - b[0] * c[2]),
-                a[2] * (b[0] * c[1] - b[1] * c[0]),
-            )
-            D = sign * (terms[0] + terms[1] + terms[2])
+            D = sign * dot(a, cross(b, c))
             if min_jacobian is not None:
                 folds[z] |= ~(min_jacobian < D)
             else:
@@ -203,8 +177,8 @@ def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | 
                 size = np.abs(a).sum(axis=0) * np.abs(b).sum(axis=0) * np.abs(c).sum(axis=0)
                 unsure |= ~(_SURE * size + _UNDERFLOW < D)
         if unsure.any():
-            first = np.flatnonzero(np.pad(unsure, ((0, 1), (0, 1))))
-            T = VoxelGrid((2, *grid.shape[1:]), grid.spacing).tetrahedra(first)
+            slices = VoxelGrid((2, *grid.shape[1:]), grid.spacing)
+            T = slices.tetrahedra(slices.number_cells(unsure[None]))
             flat = np.moveaxis(p, 0, -1).reshape(-1, 3)
             wrong = (ExactSigns(flat)(T) <= 0).reshape(-1, 6).any(axis=1)
             folds[z][np.nonzero(unsure)] = wrong
@@ -216,15 +190,9 @@ def nearest_invertible_volume(
 ) -> InvertibleVolume:
     """`quasiharmonic.nearest_invertible` for fields on voxels (d, h, w, 3)."""
     began = time.perf_counter()
-    given = check_volume_field(field)
+    given = check_field(field)
     grid, scaled, exponent = in_units(given, spacing)
-    still = np.zeros(grid.shape, dtype=np.bool_)
-    if fixed is not None:
-        still = np.asarray(fixed)
-        if still.shape != grid.shape or still.dtype != bool:
-            raise ValueError(
-                f"fixed must be a bool array of shape {grid.shape}, not {still.dtype} of shape {still.shape}"
-            )
+    still = check_fixed(fixed, grid)
     wrong = find_folded_cells(grid, scaled, min_jacobian)
     mended = scaled.copy()
     if wrong.any():
@@ -240,42 +208,18 @@ def nearest_invertible_volume(
         folds=int(np.count_nonzero(wrong)),
         remaining=folds | low,
         bijective=not folds.any() and not _surface_crosses(grid, mended),
-        patches=_label(moved)[1],
+        patches=int(label_patches(moved).max()),
         distance=float(np.ldexp(np.sqrt((away**2).mean()), exponent)),
         seconds=time.perf_counter() - began,
     )
 
 
-def _label(mask: BoolArray) -> tuple[IntArray, int]:
-    from scipy.ndimage import label
-
-    labels, count = label(mask, structure=np.ones((3, 3, 3), dtype=bool))
-    return labels, int(count)
-
-
-def _grow(mask: BoolArray, steps: int) -> BoolArray:
-    from scipy.ndimage import maximum_filter
-
-    return np.asarray(maximum_filter(mask, 2 * steps + 1, mode="constant"))
-
-
-def _voxels_of(cells: BoolArray) -> BoolArray:
-    """The voxels of cells."""
-    voxels = np.zeros(tuple(count + 1 for count in cells.shape), dtype=np.bool_)
-    d, h, w = cells.shape
-    for z, y, x in np.ndindex(2, 2, 2):
-        voxels[z : z + d, y : y + h, x : x + w] |= cells
-    return voxels
-
-
 def describe_fixed(remaining: BoolArray, fixed: BoolArray) -> str:
     """Return a sentence on remaining cells (d − 1, h − 1, w − 1) whose eight voxels are all fixed; empty if none."""
-    d, h, w = (count - 1 for count in fixed.shape)
-    corners = [fixed[z : z + d, y : y + h, x : x + w] for z, y, x in np.ndindex(2, 2, 2)]
-    unrepairable = remaining & np.logical_and.reduce(corners)
+    unrepairable = find_fixed_cells(remaining, fixed)
     if not unrepairable.any():
         return ""
-    return f" All eight voxels of some of these cells are fixed; the first of each is {_name_voxels(unrepairable)}."
+    return f" All eight voxels of some of these cells are fixed; the first of each is {name_points(unrepairable)}."
 
 
 def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArray, min_jacobian: float) -> None:
@@ -283,10 +227,10 @@ def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArr
     from scipy.ndimage import find_objects
 
     given, margin = field.copy(), _MARGIN
-    free = _grow(_voxels_of(wrong), margin) & ~fixed
+    free = grow(find_points(wrong), margin, fixed)
     todo = free
     for _ in range(_MAX_ROUNDS):
-        labels, _ = _label(free)
+        labels = label_patches(free)
         again = np.zeros(grid.shape, dtype=np.bool_)
         wanted = set(np.unique(labels[todo & free]).tolist()) - {0}
         for number, place in enumerate(find_objects(labels), start=1):
@@ -299,7 +243,7 @@ def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArr
         if not again.any():
             return
         margin *= _GROWTH
-        todo = _grow(again, margin) & ~fixed
+        todo = grow(again, margin, fixed)
         if np.array_equal(todo | free, free):
             return
         free = todo | free
@@ -313,13 +257,7 @@ def _repair_patch(
     ``field`` and ``given`` are parts of the new and the given field around the patch, and ``mask`` its voxels.
     """
     grid = VoxelGrid(mask.shape, spacing)
-    d, h, w = (count - 1 for count in grid.shape)
-    cells = np.zeros((d, h, w), dtype=np.bool_)
-    for z, y, x in np.ndindex(2, 2, 2):
-        cells |= mask[z : z + d, y : y + h, x : x + w]
-    where = np.argwhere(cells)
-    first = np.ravel_multi_index(tuple(where.T), grid.shape)
-    nodes, number = np.unique(grid.tetrahedra(np.asarray(first)), return_inverse=True)
+    nodes, number = np.unique(grid.tetrahedra(grid.number_cells(find_cells(mask))), return_inverse=True)
     T = number.reshape(-1, 4)
     index = np.stack(np.unravel_index(nodes, grid.shape), axis=1)
     unit = float(np.cbrt(np.prod(grid.spacing)))
@@ -330,10 +268,7 @@ def _repair_patch(
     energy = ShapeEnergy(T, rest, floor=min(_AIM * min_jacobian + 1e-9, 0.99))
     descent = Descent(energy, free, before, anchor=(before, 1.0 / len(T)))
     with np.errstate(all="ignore"):
-        if not energy.determinants(before).min() > energy.floor:
-            for _ in descent.untangle(_UNTANGLING_STEPS):
-                pass
-        if not energy.determinants(descent.X).min() > energy.floor:
+        if not descent.make_valid(_UNTANGLING_STEPS):
             return False
         for weight in _WEIGHTS:
             descent.anchor = before, 1.0 / (weight * len(T))
@@ -353,13 +288,10 @@ def _repair_patch(
 
 def _surface_crosses(grid: VoxelGrid, field: FloatArray) -> bool:
     """Whether triangles of the surface of the mapped grid meet outside their common vertices and edges."""
-    d, h, w = (count - 1 for count in grid.shape)
-    border = np.ones((d, h, w), dtype=np.bool_)
-    border[1:-1, 1:-1, 1:-1] = False
-    first = np.ravel_multi_index(tuple(np.argwhere(border).T), grid.shape)
-    voxel = np.ones(grid.shape, dtype=np.bool_)
-    voxel[1:-1, 1:-1, 1:-1] = False
-    F = inspect_faces(grid.tetrahedra(np.asarray(first)), int(np.prod(grid.shape))).boundary
+    cells, voxel = np.ones(grid.cell_shape, dtype=np.bool_), np.ones(grid.shape, dtype=np.bool_)
+    for border in (cells, voxel):
+        border[1:-1, 1:-1, 1:-1] = False
+    F = inspect_faces(grid.tetrahedra(grid.number_cells(cells)), voxel.size).boundary
     F = F[voxel.ravel()[F].all(axis=1) & _on_one_side(grid, F)]
     nodes, number = np.unique(F, return_inverse=True)
     X = grid.positions(field).reshape(-1, 3)[nodes]
@@ -375,13 +307,8 @@ def _on_one_side(grid: VoxelGrid, F: IntArray) -> BoolArray:
 
 def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
     """`quasiharmonic.inverse_field` for fields on voxels (d, h, w, 3), affine on the tetrahedra of each cell."""
-    grid, given, exponent = in_units(check_volume_field(field), spacing)
-    wrong = find_folded_cells(grid, given, None)
-    if wrong.any():
-        raise ValueError(
-            f"the field folds, so it has no inverse: at the cells whose first voxels are {_name_voxels(wrong)}. "
-            "use `nearest_invertible` to get the nearest invertible field"
-        )
+    grid, given, exponent = in_units(check_field(field), spacing)
+    check_unfolded(find_folded_cells(grid, given, None))
     if _surface_crosses(grid, given):
         raise ValueError("the field has no inverse: the surface of the grid crosses itself")
     back = np.full((int(np.prod(grid.shape)), 3), np.nan)
@@ -406,9 +333,8 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
 
 def _candidates(grid: VoxelGrid, X: FloatArray) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:
     """Yield pairs of tetrahedra (k, 4) and voxels (k,) in their boxes, and the voxels' positions in voxels (k, 3)."""
-    d, h, w = (count - 1 for count in grid.shape)
     last = np.array(grid.shape[::-1]) - 1
-    first = np.asarray(np.ravel_multi_index(tuple(np.indices((d, h, w)).reshape(3, -1)), grid.shape))
+    first = grid.number_cells(np.ones(grid.cell_shape, dtype=np.bool_))
     for start in range(0, len(first), _BLOCK // 6):
         heartbeat()
         T = grid.tetrahedra(first[start : start + _BLOCK // 6])
@@ -424,11 +350,3 @@ def _candidates(grid: VoxelGrid, X: FloatArray) -> Iterator[tuple[IntArray, IntA
         place = low[of] + np.stack([x, y, z], axis=1)
         voxel = np.asarray(np.ravel_multi_index(tuple(place.T[::-1]), grid.shape))
         yield T[of], voxel, place.astype(np.float64)
-
-
-def _name_voxels(mask: BoolArray, most: int = 5) -> str:
-    """Name the first voxels of a mask (d, h, w)."""
-    where = np.argwhere(mask)
-    listed = ", ".join(str(tuple(row)) for row in where[:most].tolist())
-    rest = f", … ({len(where)} in all)" if len(where) > most else ""
-    return f"{'voxel' if len(where) == 1 else 'voxels'} {listed}{rest}, slice, row and column"

@@ -6,9 +6,9 @@ from itertools import product
 
 import numpy as np
 
-from quasiharmonic.apps.tetrahedra.voxel_fields import VoxelGrid
+from quasiharmonic.apps.displacement_fields.voxels import VoxelGrid
+from quasiharmonic.apps.tetrahedra.energy import cross
 from quasiharmonic.util.arrays import BoolArray, FloatArray
-from quasiharmonic.util.progress import heartbeat
 
 # Coefficients of at most this multiple of a bound of their terms may be rounding errors.
 _ROUNDING = 2.0**-46
@@ -21,25 +21,21 @@ def least_coefficients(grid: VoxelGrid, field: FloatArray) -> FloatArray:
     polynomial of degree two in each coordinate. It is at least its smallest Bernstein coefficient. Coefficients that
     may be rounding errors are lowered, so that positive ones are certain. A cell at rest has coefficients of 1.
     """
-    d, h, w = (count - 1 for count in grid.shape)
-    least = np.empty((d, h, w))
-    scale = grid.spacing[:, None, None, None]
-    for z in range(d):
-        heartbeat()
-        p = np.moveaxis(grid.positions(field, z, z + 2), -1, 0)
-        by_x, by_y, by_z = (np.diff(p, axis=axis) / scale for axis in (3, 2, 1))
+    _, h, w = grid.cell_shape
+    least = np.empty(grid.cell_shape)
+    for z, _, (by_x, by_y, by_z) in grid.each_layer(field, grid.spacing):
         total = np.zeros((3, 3, 3, h, w))
         bound = np.zeros((3, 3, 3, h, w))
         for j, k in product(range(2), repeat=2):
             a = by_x[:, k, j : j + h]
             for i, n in product(range(2), repeat=2):
                 b = by_y[:, n, :, i : i + w]
-                cross = np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+                normal = cross(a, b)
                 size = np.abs(a).sum(axis=0) * np.abs(b).sum(axis=0)
                 for m, q in product(range(2), repeat=2):
                     c = by_z[:, 0, q : q + h, m : m + w]
                     at = k + n, j + q, i + m
-                    total[at] += (cross * c).sum(axis=0)
+                    total[at] += (normal * c).sum(axis=0)
                     bound[at] += size * np.abs(c).sum(axis=0)
         # A coefficient is the sum of its terms divided by three binomial coefficients.
         share = np.array([1.0, 0.5, 1.0])

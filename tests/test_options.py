@@ -1,0 +1,132 @@
+"""Options of the operations: one class each, which checks its values and gives the functions their signatures."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from dataclasses import FrozenInstanceError, fields
+from typing import TypedDict, Unpack
+
+import pytest
+
+import quasiharmonic
+from quasiharmonic import flatten, harmonise, injective_map, injective_maps, keep_distances, morph, polish, solve
+from quasiharmonic.energies import polishing
+from quasiharmonic.linsolve import BACKENDS
+from quasiharmonic.solver.search import harmonising, stages
+from quasiharmonic.util import options
+from quasiharmonic.util.options import (
+    DistanceOptions,
+    FlattenOptions,
+    HarmoniseOptions,
+    MapOptions,
+    MorphOptions,
+    Options,
+    PolishOptions,
+    TetrahedraOptions,
+    option,
+    positive,
+    takes,
+)
+
+FUNCTIONS = [
+    (injective_map, MapOptions),
+    (solve, MapOptions),
+    (injective_maps, MapOptions),
+    (polish, PolishOptions),
+    (harmonise, HarmoniseOptions),
+    (flatten, FlattenOptions),
+    (keep_distances, DistanceOptions),
+    (morph, MorphOptions),
+    (quasiharmonic.injective_tetrahedra, TetrahedraOptions),
+]
+
+
+@pytest.mark.parametrize(("function", "of"), FUNCTIONS, ids=lambda one: one.__name__)
+def test_signatures_show_every_option_with_its_default(function, of):
+    parameters = inspect.signature(function).parameters
+    shown = {one.name: parameters[one.name].default for one in fields(of) if one.name in parameters}
+    assert shown
+    assert shown.items() <= {one.name: one.default for one in fields(of)}.items() | {("callback", None)}
+    if function is not injective_maps:
+        assert len(shown) == len(fields(of))
+    assert not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    assert all(parameters[name].annotation is not parameters[name].empty for name in shown)
+
+
+@pytest.mark.parametrize(("function", "of"), FUNCTIONS, ids=lambda one: one.__name__)
+def test_docstrings_describe_every_option(function, of):
+    names = [one.name for one in fields(of) if one.name in inspect.signature(function).parameters]
+    assert [name for name in names if name not in function.__doc__] == []
+
+
+@pytest.mark.parametrize(("function", "of"), FUNCTIONS, ids=lambda one: one.__name__)
+def test_an_unknown_option_is_an_error(function, of):
+    with pytest.raises(TypeError, match=rf"{function.__name__}\(\) got an unexpected keyword argument 'polsh'"):
+        function([], [], [], [], polsh=1) if function not in (solve, injective_maps) else function([], polsh=1)
+
+
+@pytest.mark.parametrize(
+    ("of", "wrong"),
+    [
+        (MapOptions, {"max_iterations": 0}),
+        (MapOptions, {"max_iterations": 1.5}),
+        (MapOptions, {"record_every": -1}),
+        (MapOptions, {"refine": "yes"}),
+        (MapOptions, {"callback": 3}),
+        (PolishOptions, {"tol": -1.0}),
+        (PolishOptions, {"max_iterations": -1}),
+        (HarmoniseOptions, {"reference": "other"}),
+        (HarmoniseOptions, {"conformal": float("nan")}),
+        (DistanceOptions, {"rings": 0}),
+        (FlattenOptions, {"gap": -0.5}),
+        (FlattenOptions, {"unit_square": 2}),
+        (TetrahedraOptions, {"tol": 0.0}),
+    ],
+)
+def test_a_wrong_value_is_an_error_that_names_the_option(of, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        of(**wrong)
+
+
+def test_options_are_frozen():
+    with pytest.raises(FrozenInstanceError):
+        MapOptions().refine = True
+
+
+def test_names_are_those_of_the_values():
+    """The lists of names stand apart from the values, so that the command line does not import them."""
+    assert tuple(polishing.ENERGIES) == options.ENERGIES
+    assert set(options.HARMONISED) == set(harmonising.ENERGIES)
+    assert tuple(stages.STRATEGIES) == options.STRATEGIES
+    assert set(options.LINEAR_SOLVERS) == {"auto", *BACKENDS}
+
+
+def test_a_new_option_needs_a_field_and_a_type():
+    class Keywords(TypedDict, total=False):
+        depth: int
+
+    class Depth(Options):
+        pass
+
+    from dataclasses import dataclass
+
+    @dataclass(frozen=True, kw_only=True)
+    class Dive(Depth):
+        depth: int = option(3, check=positive)
+
+    @takes(Dive, Keywords)
+    def dive(place: str, **given: Unpack[Keywords]) -> int:
+        return Dive(**given).depth
+
+    assert dive("sea") == 3
+    assert dive("sea", depth=7) == 7
+    assert str(inspect.signature(dive)).startswith("(place: 'str', *, depth: 'int' = 3)")
+    with pytest.raises(ValueError, match="depth"):
+        dive("sea", depth=0)
+
+
+def test_the_options_import_nothing_heavy():
+    code = "import sys, quasiharmonic.util.options; print({'numpy', 'scipy'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
