@@ -13,7 +13,7 @@ from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status
 from quasiharmonic.solver.methods.untangling import untangle
-from quasiharmonic.util.arrays import IntArray, find_exponent, to_points
+from quasiharmonic.util.arrays import IntArray
 
 # Maximum number of untangling steps; successful runs need a few dozen.
 _STEPS = 300
@@ -30,7 +30,7 @@ def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     if not before:
         return result
     began, steps = time.perf_counter(), 0
-    exponent = find_exponent(result.uv)
+    exponent = int(np.frexp(np.abs(result.uv).max())[1])
     w = in_units(result.uv, exponent)
     areas = (signed_areas(problem.F, places).sum() for places in (w, in_units(problem.V, 0)))
     rest = problem.V * np.sqrt(np.divide(*areas))
@@ -38,7 +38,7 @@ def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
         w, steps = further, steps + 1
         if steps == _STEPS:
             break
-    uv = np.ldexp(to_points(w), exponent)
+    uv = np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
     uv[problem.fixed] = problem.target
     after = inverted_triangles(corners, uv).size
     seconds = time.perf_counter() - began
