@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, real_array
 from quasiharmonic.util.outcome import SummarisedOutcome
 
@@ -124,6 +125,11 @@ class NearestField(SummarisedOutcome):
     patches: int
     distance: float
     seconds: float
+
+    @property
+    def status(self) -> Status:
+        """``INJECTIVE`` if the field is, otherwise ``STALLED``."""
+        return Status.of(self.success)
 
 
 class PixelGrid(Grid):

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,6 +37,7 @@ from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, cross, dot
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import inspect_faces
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
+from quasiharmonic.util.outcome import Verdict
 from quasiharmonic.util.progress import heartbeat
 
 # Orders of the axes x, y, z, and the sign that makes the determinant of the steps positive at rest.
@@ -55,6 +57,29 @@ _UNDERFLOW = 2.0**-1000
 _AIM = 1.05
 # Candidates per block of the inversion.
 _BLOCK = 1 << 16
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class VoxelVerdict(Verdict):
+    """The exact verdict on a displacement field on voxels; see `InvertibleVolume` for the attributes."""
+
+    remaining: BoolArray
+    bijective: bool
+
+    @property
+    def valid(self) -> bool:
+        """Whether no cell remains."""
+        return not self.remaining.any()
+
+    def summary(self) -> str:
+        """Describe the verdict in one sentence."""
+        covered = "no point is covered twice" if self.bijective else "not bijective"
+        left = int(np.count_nonzero(self.remaining))
+        return f"{count_of('cell', 'cells', left)} of {self.remaining.size} fold; {covered}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        return {"valid": self.valid, "bijective": self.bijective, "remaining": int(np.count_nonzero(self.remaining))}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,6 +112,11 @@ class InvertibleVolume(NearestField):
     def success(self) -> bool:
         """Whether no cell remains: every tetrahedron is positive, decided exactly, and above the bound."""
         return not self.remaining.any()
+
+    @property
+    def certificate(self) -> VoxelVerdict:
+        """The exact verdict on ``field``."""
+        return VoxelVerdict(self.remaining, self.bijective)
 
     def summary(self) -> str:
         """Describe the field in one or two sentences."""
