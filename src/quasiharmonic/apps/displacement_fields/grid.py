@@ -209,6 +209,12 @@ def check_unfolded(wrong: BoolArray) -> None:
         )
 
 
+def mean_length(change: FloatArray) -> float:
+    """Return the root mean square length of displacements (…, n), without overflow."""
+    largest = float(np.abs(change).max()) or 1.0
+    return largest * float(np.sqrt(((change / largest) ** 2).sum(axis=-1).mean()))
+
+
 def name_points(mask: BoolArray, most: int = 5) -> str:
     """Name the first points of a mask: ``pixels (0, 3), (2, 7), … (17 in all), row and column``."""
     words, where = _WORDS[mask.ndim], np.argwhere(mask)
