@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.collapse import has_collapsed, thin_triangles
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.disk_start import map_to_disk
+from quasiharmonic.apps.flattening.disk_start import map_to_disk, surface_area
 from quasiharmonic.apps.flattening.layout import to_given_unit
 from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
@@ -93,10 +93,7 @@ class Piece:
         self.exponent = int(np.frexp(np.abs(domain.V).max())[1])
         self.V = np.zeros((domain.n, 3))
         self.V[:, : domain.V.shape[1]] = np.ldexp(domain.V, -self.exponent)
-
-        corners = self.V[self.F]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self.area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
+        self.area = surface_area(self.V, self.F)
 
     @classmethod
     def unite(cls, pieces: Sequence[Piece]) -> Piece:
