@@ -254,7 +254,6 @@ def test_record_stores_intermediate_maps(dome):
 
 # --- by way of a coarse mesh
 
-
 # Rings of the pairs, and vertices of the coarse mesh.
 RINGS, LEAST = 13, 800
 
