@@ -99,33 +99,6 @@ class Grid:
         return self.positions(np.zeros((*self.shape, len(self.shape))))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class NearestField(SummarisedOutcome):
-    """The nearest displacement field without folds that was found, and its distance from the given one.
-
-    Attributes
-    ----------
-    field : (h, w, 2) or (d, h, w, 3) float64
-        The new field.
-    moved_mask : (h, w) or (d, h, w) bool
-        Pixels or voxels whose displacement changed; the others are bitwise unchanged.
-    folds : int
-        Number of cells that the given field folds: a determinant is not above ``min_jacobian``.
-    patches : int
-        Number of separate regions of the grid in which the field changed.
-    distance : float
-        Root mean square distance from the given field, over all pixels or voxels, in the field's unit.
-    seconds : float
-    """
-
-    field: FloatArray
-    moved_mask: BoolArray
-    folds: int
-    patches: int
-    distance: float
-    seconds: float
-
-
 class PixelGrid(Grid):
     """A grid of pixels."""
 
@@ -168,6 +141,33 @@ class PixelGrid(Grid):
         # Overflow gives inf or NaN.
         with np.errstate(over="ignore", invalid="ignore"):
             return np.stack([x.real * y.imag - x.imag * y.real for x, y in sides], axis=-1)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NearestField(SummarisedOutcome):
+    """The nearest displacement field without folds that was found, and its distance from the given one.
+
+    Attributes
+    ----------
+    field : (h, w, 2) or (d, h, w, 3) float64
+        The new field.
+    moved_mask : (h, w) or (d, h, w) bool
+        Pixels or voxels whose displacement changed; the others are bitwise unchanged.
+    folds : int
+        Number of cells that the given field folds: a determinant is not above ``min_jacobian``.
+    patches : int
+        Number of separate regions of the grid in which the field changed.
+    distance : float
+        Root mean square distance from the given field, over all pixels or voxels, in the field's unit.
+    seconds : float
+    """
+
+    field: FloatArray
+    moved_mask: BoolArray
+    folds: int
+    patches: int
+    distance: float
+    seconds: float
 
 
 def check_field(field: ArrayLike) -> FloatArray:

@@ -133,8 +133,8 @@ class SurfaceModel(MapModel):
         surface: NewtonObjective | None = None,
     ) -> None:
         self.surface, self._pairs = energy if surface is None else surface, pairs
-        self._of_map = len(uv), fixed, linear_solver
-        super().__init__(energy, Coordinates.of(uv, fixed, 0), NewtonSystem(energy.F, energy.g, *self._of_map))
+        self._for_systems = len(uv), fixed, linear_solver
+        super().__init__(energy, Coordinates.of(uv, fixed, 0), NewtonSystem(energy.F, energy.g, *self._for_systems))
 
     def start(self, uv: FloatArray) -> NewtonState:
         """Return the state of a map (n, 2)."""
@@ -179,7 +179,7 @@ class SurfaceModel(MapModel):
 
     @cached_property
     def _rotation_path(self) -> RotationPath | None:
-        return RotationPath.of(self.surface.F, self.surface.g, *self._of_map)
+        return RotationPath.of(self.surface.F, self.surface.g, *self._for_systems)
 
     def _search_rotating(self, state: NewtonState, full: ComplexArray, expected_decrease: float) -> NewtonState | None:
         """Take a full or longer step along a rotating path; None if the energy does not decrease enough."""
@@ -253,7 +253,7 @@ class GuardedModel(SurfaceModel):
             # The new pattern includes possible and earlier contacts, so that it lasts for several steps.
             self._known = _unite_pairs(self._known, near.corners, n)
             g = np.concatenate([energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
-            self.system = NewtonSystem(np.concatenate([energy.F, self._known.T]), g, *self._of_map)
+            self.system = NewtonSystem(np.concatenate([energy.F, self._known.T]), g, *self._for_systems)
             known, uncoupled = near.split(self._known, n)
         energy.contacts, energy.uncoupled = known, uncoupled
         energy.stiffness = self._weight * max(self.distortion(state), _MIN_ENERGY) / len(energy.F)

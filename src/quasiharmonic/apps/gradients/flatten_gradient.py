@@ -120,7 +120,7 @@ def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: 
         fixed=domain.fixed,
         forces=minimum.forces,
         inverse=minimum.solve,
-        strain=lambda: strain,
+        make_strain=lambda: strain,
         rest_shape=domain.V.shape,
         unit=2.0**exponent,
         scale=scale,
