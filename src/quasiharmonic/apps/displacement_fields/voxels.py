@@ -29,6 +29,7 @@ from quasiharmonic.apps.displacement_fields.grid import (
     find_points,
     grow,
     label_patches,
+    mean_length,
     name_points,
 )
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
@@ -231,7 +232,6 @@ def nearest_invertible_volume(
     repaired = np.where(moved[..., None], np.ldexp(mended, exponent), given)
     folds = find_folded_cells(grid, mended, None)
     low = find_folded_cells(grid, mended, min_jacobian) if moved.any() else wrong
-    away = np.sqrt(((mended - scaled) ** 2).sum(axis=3))
     return InvertibleVolume(
         field=repaired,
         moved_mask=moved,
@@ -239,7 +239,7 @@ def nearest_invertible_volume(
         remaining=folds | low,
         bijective=not folds.any() and not _surface_crosses(grid, mended),
         patches=int(label_patches(moved).max()),
-        distance=float(np.ldexp(np.sqrt((away**2).mean()), exponent)),
+        distance=float(np.ldexp(mean_length(mended - scaled), exponent)),
         seconds=time.perf_counter() - began,
     )
 
