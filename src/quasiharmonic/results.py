@@ -1,41 +1,69 @@
-"""Classes that functions return as results or as parts of them; programs name them only in annotations."""
+"""Classes that functions return: results, certificates, statuses, and parts of them.
+
+Every result has ``success``, ``status``, ``message``, ``n_iterations``, ``seconds``, ``certificate``, ``summary()`` and
+``to_dict()``; every certificate has ``valid``, ``bijective``, ``summary()`` and ``to_dict()``.
+"""
 
 from quasiharmonic.apps.air_mesh.airmesh import AirMeshState
-from quasiharmonic.apps.animation.frames import FrameStep
+from quasiharmonic.apps.animation.frames import Animation, FrameStep
+from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
+from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
 from quasiharmonic.apps.atlas.seam_cuts import CutMesh
+from quasiharmonic.apps.displacement_fields.nearest import InvertibleField
+from quasiharmonic.apps.displacement_fields.voxels import InvertibleVolume
 from quasiharmonic.apps.inverse.inverse_map import SurfacePoints
-from quasiharmonic.apps.repair.uv_repair import RepairedIsland
+from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
+from quasiharmonic.apps.repair.uv_repair import RepairedIsland, RepairResult
+from quasiharmonic.apps.tetrahedra.certificate import TetrahedraCertificate
+from quasiharmonic.apps.tetrahedra.result import TetrahedraResult, TetrahedraStatus
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
-from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.warping.image_warp import WarpResult
 from quasiharmonic.energies.distances import DistanceError
 from quasiharmonic.energies.measures import Statistics
+from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.mesh.refinement import Refined
 from quasiharmonic.problem.diagnosis import Forbids, Kind, Obstruction
-from quasiharmonic.problem.result import RefinementAttempt, Snapshot, Stage, Step
+from quasiharmonic.problem.result import MapResult, RefinementAttempt, Snapshot, Stage, Status, Step
 from quasiharmonic.solver.refine.refining import RefinedProblem
 
 __all__ = [
     "AirMeshState",
+    "Animation",
+    "AtlasVerdict",
+    "Certificate",
     "CleanedMesh",
     "CutMesh",
     "DistanceError",
     "Forbids",
     "FrameStep",
+    "InvertibleField",
+    "InvertibleVolume",
     "Kind",
+    "MapResult",
+    "MappedAtlas",
     "Miss",
+    "MorphResult",
     "Obstruction",
     "Refined",
     "RefinedProblem",
     "RefinementAttempt",
+    "RepairResult",
     "RepairedIsland",
     "Snapshot",
     "Stage",
     "Statistics",
+    "Status",
     "Step",
     "Stretch",
     "SurfacePoints",
+    "TetrahedraCertificate",
+    "TetrahedraResult",
+    "TetrahedraStatus",
     "UnwrapCertificate",
+    "UnwrapResult",
     "UnwrapStatus",
     "UnwrapStep",
+    "WarpResult",
 ]

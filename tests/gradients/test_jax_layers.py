@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from quasiharmonic.apps.gradients.layers import FlattenLayer, PolishLayer
+from quasiharmonic.apps.gradients.layers import make_flattened_layer, make_solved_layer
 from shared.derivative_problems import flattened_ring, held_ring, tensors
 
 jax = pytest.importorskip("jax")
@@ -104,11 +104,11 @@ def test_programs_are_compiled_once():
         return 0
 
     for _ in range(3):
-        program(PolishLayer.of(problem, {"polish": "mips", "start": 1.0 * V}))
-        program(FlattenLayer.of(V, F.copy(), None, {"energy": "mips"}))
+        program(make_solved_layer(problem, {"polish": "mips", "start": 1.0 * V}))
+        program(make_flattened_layer(V, F.copy(), None, {"energy": "mips"}))
     assert len(traced) == 2
-    program(PolishLayer.of(problem, {"polish": "mips", "start": 1.1 * V}))
-    program(PolishLayer.of(held_ring(), {"polish": "mips", "start": 1.0 * V}))
+    program(make_solved_layer(problem, {"polish": "mips", "start": 1.1 * V}))
+    program(make_solved_layer(held_ring(), {"polish": "mips", "start": 1.0 * V}))
     assert len(traced) == 4
 
 

@@ -99,6 +99,11 @@ class Status(Enum):
         return self in (Status.INJECTIVE, Status.POLISHED, Status.NEARBY)
 
     @classmethod
+    def of(cls, success: bool) -> Status:
+        """Return the status of a call that only succeeds or fails."""
+        return cls.INJECTIVE if success else cls.STALLED
+
+    @classmethod
     def most_severe(cls, statuses: Iterable[Status]) -> Status:
         """Return the status of several maps together: that of the map that made the least progress."""
         return min(statuses, key=_MOST_SEVERE_FIRST.index)
@@ -319,11 +324,6 @@ class MapResult(ReadOnly, Displayable, Outcome):
         return self.injective and self.status.acceptable
 
     @property
-    def message(self) -> str:
-        """The message of `status`."""
-        return self.status.value
-
-    @property
     def converged(self) -> bool:
         """Whether the minimised energy has converged; see `Status`. A search without polish converges at 0."""
         return self.injective and self.status.converged
@@ -420,15 +420,10 @@ class MapResult(ReadOnly, Displayable, Outcome):
     def to_dict(self) -> dict[str, Any]:
         """Return the report of ``--json``: all data except the map itself, in plain Python types."""
         return {
-            "success": self.success,
+            **super().to_dict(),
             "injective": self.injective,
-            "status": self.status.name.lower(),
-            "message": self.message,
-            "n_iterations": self.n_iterations,
-            "seconds": self.seconds,
             "linear_solver": self.linear_solver,
             "stages": [stage.to_dict() for stage in self.stages],
-            "certificate": self.certificate.to_dict(),
             "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
             **(self._refinement() if self.refinement_attempts else {}),
         }

@@ -1,10 +1,54 @@
-"""Success and message of a result, with the names of SciPy's `OptimizeResult`."""
+"""Results and certificates: what all of them have, with the names of SciPy's `OptimizeResult`."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
+
+class Verdict:
+    """Base of certificates: an exact verdict on stored positions.
+
+    ``valid`` tells whether every element is strictly positive, ``bijective`` whether in addition no point is covered
+    twice (None if that was not checked). ``summary()`` and ``to_dict()`` describe the verdict.
+    """
+
+    if TYPE_CHECKING:
+
+        @property
+        def valid(self) -> bool: ...
+
+        @property
+        def bijective(self) -> bool | None: ...
+
+    def summary(self) -> str:
+        """Describe what is certified, or what is wrong and where."""
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.summary().partition(chr(10))[0]}>"
+
 
 class Outcome:
-    """Base of results: `success`, `message`, and ``bool(result)``."""
+    """Base of results.
+
+    A result has a ``status``, whose value is a message for the user, a ``certificate``, and the wall time ``seconds``.
+    ``bool(result)`` is `success`.
+    """
+
+    if TYPE_CHECKING:
+
+        @property
+        def status(self) -> Any: ...
+
+        @property
+        def certificate(self) -> Any: ...
+
+        @property
+        def seconds(self) -> float: ...
 
     @property
     def success(self) -> bool:
@@ -14,7 +58,27 @@ class Outcome:
     @property
     def message(self) -> str:
         """The outcome in one or two sentences, and what to do if it is not a success."""
-        raise NotImplementedError
+        return str(self.status.value)
+
+    @property
+    def n_iterations(self) -> int:
+        """Number of iterations; 0 for methods without any."""
+        return 0
+
+    def summary(self) -> str:
+        """Describe the outcome in a few lines."""
+        return f"{self.message}\n{self.certificate.summary()}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result for JSON, without arrays of positions."""
+        return {
+            "success": self.success,
+            "status": self.status.name.lower(),
+            "message": self.message,
+            "n_iterations": self.n_iterations,
+            "seconds": self.seconds,
+            "certificate": self.certificate.to_dict(),
+        }
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.message.partition(chr(10))[0]}>"
@@ -22,6 +86,40 @@ class Outcome:
     def __bool__(self) -> bool:
         """Return `success`."""
         return self.success
+
+
+class OutcomeOf(Outcome):
+    """Base of results that contain the result of a map, as ``result``."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def result(self) -> Outcome: ...
+
+    @property
+    def success(self) -> bool:
+        """Whether the map is a success."""
+        return self.result.success
+
+    @property
+    def status(self) -> Any:
+        """The status of the map."""
+        return self.result.status
+
+    @property
+    def certificate(self) -> Any:
+        """The certificate of the map."""
+        return self.result.certificate
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the map."""
+        return self.result.seconds
+
+    @property
+    def n_iterations(self) -> int:
+        """Iterations of the map."""
+        return self.result.n_iterations
 
 
 class SummarisedOutcome(Outcome):

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.problem.result import MapResult
+from quasiharmonic.geometry.exact.certificate import Certificate
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -19,7 +20,7 @@ from quasiharmonic.util.arrays import (
     names_of,
     real_array,
 )
-from quasiharmonic.util.outcome import SummarisedOutcome
+from quasiharmonic.util.outcome import SummarisedOutcome, Verdict
 from quasiharmonic.util.tables import make_dataframe
 
 if TYPE_CHECKING:
@@ -47,6 +48,32 @@ class FrameStep:
     frames: int
     sweep: int
     move: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AnimationVerdict(Verdict):
+    """The exact verdict on the frames of an animation: one certificate for each."""
+
+    frames: tuple[Certificate, ...]
+
+    @property
+    def valid(self) -> bool:
+        """Whether every triangle of every frame is strictly positive."""
+        return all(frame.valid for frame in self.frames)
+
+    @property
+    def bijective(self) -> bool:
+        """Whether every frame is bijective."""
+        return all(frame.bijective for frame in self.frames)
+
+    def summary(self) -> str:
+        """Describe the verdict in one sentence."""
+        positive, bijective = (sum(bool(getattr(f, name)) for f in self.frames) for name in ("valid", "bijective"))
+        return f"{positive} of {count_of('frame', 'frames', len(self.frames))} injective, {bijective} bijective"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        return {"valid": self.valid, "bijective": self.bijective, "summary": self.summary()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +123,27 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
     def success(self) -> bool:
         """Whether every frame is a success and the work was not interrupted."""
         return not self.interrupted and bool(self.frames) and all(frame.success for frame in self.frames)
+
+    @property
+    def status(self) -> Status:
+        """``INTERRUPTED``, or the status of the frame that made the least progress."""
+        statuses = [frame.status for frame in self.frames]
+        return Status.most_severe([Status.INTERRUPTED] if self.interrupted or not statuses else statuses)
+
+    @property
+    def certificate(self) -> AnimationVerdict:
+        """The exact verdict on all frames."""
+        return AnimationVerdict(tuple(frame.certificate for frame in self.frames))
+
+    @property
+    def n_iterations(self) -> int:
+        """Iterations over all frames."""
+        return sum(frame.n_iterations for frame in self.frames)
+
+    @property
+    def seconds(self) -> float:
+        """Wall time over all frames."""
+        return sum(frame.seconds for frame in self.frames)
 
     @property
     def uv(self) -> FloatArray:
@@ -176,7 +224,7 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
     def to_dict(self) -> dict[str, Any]:
         """Return all data except the maps, for JSON."""
         return {
-            "success": self.success,
+            **super().to_dict(),
             "frames": len(self.frames),
             "certified": int(np.count_nonzero(self.found)),
             "overlapping": np.flatnonzero(self.found & ~self.bijective).tolist(),

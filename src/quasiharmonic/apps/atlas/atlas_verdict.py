@@ -14,6 +14,7 @@ from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of
+from quasiharmonic.util.outcome import Verdict
 from quasiharmonic.util.tables import make_dataframe
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ class IslandVerdict(IslandReport):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AtlasVerdict:
+class AtlasVerdict(Verdict):
     """The verdict on a map with seams, made by `certify`.
 
     Attributes
@@ -106,8 +107,10 @@ class AtlasVerdict:
     islands: tuple[IslandVerdict, ...]
     overlapping: IntArray
 
-    def __repr__(self) -> str:
-        return f"<AtlasVerdict: {self.summary().partition(chr(10))[0]}>"
+    @property
+    def valid(self) -> bool:
+        """Whether every triangle has the sign of its island, and none is degenerate; equal to `injective`."""
+        return self.injective
 
     @property
     def injective(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -69,10 +70,20 @@ class MappedAtlas(Outcome):
         """Whether the results of all islands are successes; False if the call was interrupted."""
         return len(self.islands) == len(self.mesh.islands) and all(island.result.success for island in self.islands)
 
+    @cached_property
+    def certificate(self) -> AtlasVerdict:
+        """The exact verdict on the stored positions of all islands."""
+        return certify(self.mesh)
+
     @property
-    def message(self) -> str:
-        """The message of `status`."""
-        return self.status.value
+    def n_iterations(self) -> int:
+        """Iterations over all islands."""
+        return sum(island.result.n_iterations for island in self.islands)
+
+    @property
+    def seconds(self) -> float:
+        """Wall time over all islands."""
+        return sum(island.result.seconds for island in self.islands)
 
     @property
     def status(self) -> Status:
@@ -85,8 +96,8 @@ class MappedAtlas(Outcome):
         return [*done, *(island.uv for island in self.mesh.islands[len(done) :])]
 
     def verdict(self) -> AtlasVerdict:
-        """Return the exact verdict on the stored positions."""
-        return certify(self.mesh)
+        """Return the exact verdict on the stored positions; equal to `certificate`."""
+        return self.certificate
 
     def to_dict(self) -> dict[str, Any]:
         """The results for JSON: with one island its result, otherwise totals and the list of islands."""
@@ -94,12 +105,8 @@ class MappedAtlas(Outcome):
         if len(results) == 1:
             return results[0].to_dict()
         return {
-            "success": self.success,
+            **super().to_dict(),
             "injective": self.injective,
-            "status": self.status.name.lower(),
-            "message": self.message,
-            "n_iterations": sum(result.n_iterations for result in results),
-            "seconds": sum(result.seconds for result in results),
             "linear_solver": results[0].linear_solver,
             "islands": [island.to_dict() for island in self.islands],
         }

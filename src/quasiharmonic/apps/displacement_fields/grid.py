@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, real_array
 from quasiharmonic.util.outcome import SummarisedOutcome
 
@@ -99,33 +100,6 @@ class Grid:
         return self.positions(np.zeros((*self.shape, len(self.shape))))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class NearestField(SummarisedOutcome):
-    """The nearest displacement field without folds that was found, and its distance from the given one.
-
-    Attributes
-    ----------
-    field : (h, w, 2) or (d, h, w, 3) float64
-        The new field.
-    moved_mask : (h, w) or (d, h, w) bool
-        Pixels or voxels whose displacement changed; the others are bitwise unchanged.
-    folds : int
-        Number of cells that the given field folds: a determinant is not above ``min_jacobian``.
-    patches : int
-        Number of separate regions of the grid in which the field changed.
-    distance : float
-        Root mean square distance from the given field, over all pixels or voxels, in the field's unit.
-    seconds : float
-    """
-
-    field: FloatArray
-    moved_mask: BoolArray
-    folds: int
-    patches: int
-    distance: float
-    seconds: float
-
-
 class PixelGrid(Grid):
     """A grid of pixels."""
 
@@ -170,6 +144,38 @@ class PixelGrid(Grid):
             return np.stack([x.real * y.imag - x.imag * y.real for x, y in sides], axis=-1)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class NearestField(SummarisedOutcome):
+    """The nearest displacement field without folds that was found, and its distance from the given one.
+
+    Attributes
+    ----------
+    field : (h, w, 2) or (d, h, w, 3) float64
+        The new field.
+    moved_mask : (h, w) or (d, h, w) bool
+        Pixels or voxels whose displacement changed; the others are bitwise unchanged.
+    folds : int
+        Number of cells that the given field folds: a determinant is not above ``min_jacobian``.
+    patches : int
+        Number of separate regions of the grid in which the field changed.
+    distance : float
+        Root mean square distance from the given field, over all pixels or voxels, in the field's unit.
+    seconds : float
+    """
+
+    field: FloatArray
+    moved_mask: BoolArray
+    folds: int
+    patches: int
+    distance: float
+    seconds: float
+
+    @property
+    def status(self) -> Status:
+        """``INJECTIVE`` if the field is, otherwise ``STALLED``."""
+        return Status.of(self.success)
+
+
 def check_field(field: ArrayLike) -> FloatArray:
     """Check a displacement field, and return a copy as (h, w, 2) or (d, h, w, 3) float64.
 
@@ -207,6 +213,12 @@ def check_unfolded(wrong: BoolArray) -> None:
             f"the field folds, so it has no inverse: at the cells whose first {_WORDS[wrong.ndim].many} are "
             f"{name_points(wrong)}. use `nearest_invertible` to get the nearest invertible field"
         )
+
+
+def mean_length(change: FloatArray) -> float:
+    """Return the root mean square length of displacements (…, n), without overflow."""
+    largest = float(np.abs(change).max()) or 1.0
+    return largest * float(np.sqrt(((change / largest) ** 2).sum(axis=-1).mean()))
 
 
 def name_points(mask: BoolArray, most: int = 5) -> str:

@@ -17,6 +17,7 @@ from quasiharmonic.apps.displacement_fields.grid import (
     find_fixed_cells,
     grow,
     label_patches,
+    mean_length,
     name_points,
 )
 from quasiharmonic.apps.displacement_fields.patch_descent import descend_patches
@@ -170,15 +171,13 @@ def nearest_invertible(
             raise RuntimeError("rounding folds the new field: its displacements are too large for its spacing")
     certificate = certify(grid.triangles(), grid.positions(repaired).reshape(-1, 2))
     moved = (repaired != given).any(axis=2)
-    away = np.hypot(*np.moveaxis(repaired - given, 2, 0))
-    farthest = float(away.max())
     return InvertibleField(
         field=repaired,
         moved_mask=moved,
         certificate=certificate,
         folds=int(np.count_nonzero(wrong)),
         patches=int(label_patches(moved).max()),
-        distance=farthest * float(np.sqrt(((away / (farthest or 1.0)) ** 2).mean())),
+        distance=mean_length(repaired - given),
         seconds=time.perf_counter() - began,
     )
 

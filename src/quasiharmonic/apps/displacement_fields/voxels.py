@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +29,7 @@ from quasiharmonic.apps.displacement_fields.grid import (
     find_points,
     grow,
     label_patches,
+    mean_length,
     name_points,
 )
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
@@ -36,6 +38,7 @@ from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, cross, dot
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import inspect_faces
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
+from quasiharmonic.util.outcome import Verdict
 from quasiharmonic.util.progress import heartbeat
 
 # Orders of the axes x, y, z, and the sign that makes the determinant of the steps positive at rest.
@@ -55,6 +58,29 @@ _UNDERFLOW = 2.0**-1000
 _AIM = 1.05
 # Candidates per block of the inversion.
 _BLOCK = 1 << 16
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class VoxelVerdict(Verdict):
+    """The exact verdict on a displacement field on voxels; see `InvertibleVolume` for the attributes."""
+
+    remaining: BoolArray
+    bijective: bool
+
+    @property
+    def valid(self) -> bool:
+        """Whether no cell remains."""
+        return not self.remaining.any()
+
+    def summary(self) -> str:
+        """Describe the verdict in one sentence."""
+        covered = "no point is covered twice" if self.bijective else "not bijective"
+        left = int(np.count_nonzero(self.remaining))
+        return f"{count_of('cell', 'cells', left)} of {self.remaining.size} fold; {covered}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        return {"valid": self.valid, "bijective": self.bijective, "remaining": int(np.count_nonzero(self.remaining))}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,6 +113,11 @@ class InvertibleVolume(NearestField):
     def success(self) -> bool:
         """Whether no cell remains: every tetrahedron is positive, decided exactly, and above the bound."""
         return not self.remaining.any()
+
+    @property
+    def certificate(self) -> VoxelVerdict:
+        """The exact verdict on ``field``."""
+        return VoxelVerdict(self.remaining, self.bijective)
 
     def summary(self) -> str:
         """Describe the field in one or two sentences."""
@@ -201,7 +232,6 @@ def nearest_invertible_volume(
     repaired = np.where(moved[..., None], np.ldexp(mended, exponent), given)
     folds = find_folded_cells(grid, mended, None)
     low = find_folded_cells(grid, mended, min_jacobian) if moved.any() else wrong
-    away = np.sqrt(((mended - scaled) ** 2).sum(axis=3))
     return InvertibleVolume(
         field=repaired,
         moved_mask=moved,
@@ -209,7 +239,7 @@ def nearest_invertible_volume(
         remaining=folds | low,
         bijective=not folds.any() and not _surface_crosses(grid, mended),
         patches=int(label_patches(moved).max()),
-        distance=float(np.ldexp(np.sqrt((away**2).mean()), exponent)),
+        distance=float(np.ldexp(mean_length(mended - scaled), exponent)),
         seconds=time.perf_counter() - began,
     )
 

@@ -52,17 +52,17 @@ class Contacts:
 
     def smallest_gap(self, w: ComplexArray) -> float:
         """The smallest ratio of distance to reach; ``inf`` without contacts."""
-        d, _, _ = _nearest(*w[self.corners])
+        d, _, _ = nearest_on_edges(*w[self.corners])
         return float(np.min(d[self.reach > 0] / self.reach[self.reach > 0], initial=np.inf))
 
     def value(self, w: ComplexArray) -> float:
         """The sum of the barriers for a map (n,) complex128."""
-        d, _, _ = _nearest(*w[self.corners])
+        d, _, _ = nearest_on_edges(*w[self.corners])
         return float(np.sum(self._excess(d) ** 2))
 
     def gradient(self, w: ComplexArray) -> ComplexArray:
         """The derivative of `value` with respect to positions, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
-        d, normal, s = _nearest(*w[self.corners])
+        d, normal, s = nearest_on_edges(*w[self.corners])
         pull = -2 * self._excess(d) * self.reach / d**2 * normal
         parts = np.concatenate([pull, -(1 - s) * pull, -s * pull])
         at = self.corners.ravel()
@@ -70,7 +70,7 @@ class Contacts:
 
     def curvature(self, w: ComplexArray) -> QuadraticForm:
         """The second derivative along the current contact directions, in the derivatives that `HATS` defines."""
-        d, normal, s = _nearest(*w[self.corners])
+        d, normal, s = nearest_on_edges(*w[self.corners])
         half: FloatArray = 0.5 * self._stiffness(d)
         # dv − da = dp + dq and db − da = i (dp − dq).
         alpha: ComplexArray = normal.conj() * (1 - 1j * s)
@@ -89,7 +89,7 @@ class Contacts:
 
         The square of a sum of three terms is at most three times the sum of their squares.
         """
-        d, normal, s = _nearest(*w[self.corners])
+        d, normal, s = nearest_on_edges(*w[self.corners])
         bound = 3 * self._stiffness(d) * np.stack([np.ones(s.shape), (1 - s) ** 2, s**2])
         at = self.corners.ravel()
 
@@ -112,7 +112,7 @@ class Contacts:
 
     def within(self, w: ComplexArray, max_ratio: float) -> Contacts:
         """Return the contacts whose distance is below ``max_ratio`` times their reach."""
-        d, _, _ = _nearest(*w[self.corners])
+        d, _, _ = nearest_on_edges(*w[self.corners])
         near = d < max_ratio * self.reach
         return Contacts(self.corners[:, near], self.reach[near])
 
@@ -172,7 +172,7 @@ class Rim:
         found = [self._exclude_own_edges(*pairs) for pairs in box_pairs_between(*boxes)]
         i, j = np.concatenate(found, axis=1) if found else np.zeros((2, 0), dtype=np.int64)
         reach = _REACH * np.minimum(around[i], length[j])
-        d, normal, s = _nearest(p[i], p[j], q[j])
+        d, normal, s = nearest_on_edges(p[i], p[j], q[j])
         near = np.flatnonzero(d < _LOOKOUT * reach)
         i, j, reach, normal, s = i[near], j[near], reach[near], normal[near], s[near]
         # The path from the vertex to the edge must lie outside the surface at both ends,
@@ -206,8 +206,11 @@ def _to_rows(w: ComplexArray) -> FloatArray:
     return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
 
 
-def _nearest(v: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
-    """Distances of points from segments, unit vectors from the nearest points, and these points' parameters s."""
+def nearest_on_edges(v: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:
+    """Return distances of points from segments, unit vectors from the nearest points, and these points' parameters s.
+
+    The arrays are complex, and broadcast as in NumPy.
+    """
     along = b - a
     square = along.real**2 + along.imag**2
     s = np.clip(((v - a) * along.conj()).real / np.where(square > 0, square, 1), 0, 1)

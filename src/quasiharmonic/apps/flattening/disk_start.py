@@ -31,9 +31,7 @@ def map_to_disk(
     # Edges of length zero get a small length, so that no two vertices share a position.
     length = lengths[longest] + 1e-6 * lengths[longest].mean()
     angle = 2 * np.pi * np.cumsum(length) / length.sum()
-    corners = V[F]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    radius = np.sqrt(0.5 * float(np.linalg.norm(cross, axis=1).sum()) / np.pi)
+    radius = np.sqrt(surface_area(V, F) / np.pi)
     circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     problem = Problem(
         np.concatenate([V, *(V[hole].mean(axis=0)[None] for hole in holes)]),
@@ -44,3 +42,10 @@ def map_to_disk(
     )
     result = solve(problem, linear_solver=linear_solver, max_iterations=200)
     return result.uv[: len(V)] if result.injective else None
+
+
+def surface_area(V: FloatArray, F: IntArray) -> float:
+    """Return the area of triangles F (f, 3) between points V (n, 3)."""
+    corners = V[F]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return 0.5 * float(np.linalg.norm(normals, axis=1).sum())

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.collapse import has_collapsed, thin_triangles
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.disk_start import map_to_disk
+from quasiharmonic.apps.flattening.disk_start import map_to_disk, surface_area
 from quasiharmonic.apps.flattening.layout import to_given_unit
 from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
@@ -27,7 +27,7 @@ from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import FloatArray, count_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, count_of
 from quasiharmonic.util.options import FlattenOptions
 
 #: Surfaces with at least this number of triangles are flattened with coarse meshes.
@@ -56,6 +56,12 @@ _MANY = 100
 def energy_name(options: FlattenOptions) -> str:
     """Return the name of the energy of a flattening, for reports."""
     return options.energy if isinstance(options.energy, str) else type(options.energy).__name__
+
+
+def is_scale_free(measure: DeformationEnergy, w: ComplexArray) -> bool:
+    """Whether the energy of a map (n,) does not depend on its scale."""
+    here, doubled = measure.value(w), measure.value(2 * w)
+    return abs(doubled - here) <= _EQUAL_ENERGY * here
 
 
 class Piece:
@@ -87,10 +93,7 @@ class Piece:
         self.exponent = int(np.frexp(np.abs(domain.V).max())[1])
         self.V = np.zeros((domain.n, 3))
         self.V[:, : domain.V.shape[1]] = np.ldexp(domain.V, -self.exponent)
-
-        corners = self.V[self.F]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self.area = 0.5 * float(np.linalg.norm(normal, axis=1).sum())
+        self.area = surface_area(self.V, self.F)
 
     @classmethod
     def unite(cls, pieces: Sequence[Piece]) -> Piece:
@@ -174,7 +177,7 @@ class Flattening:
         if self._bijective is None:
             raise KeyboardInterrupt
         uv = self._bijective
-        if self._is_scale_free(uv):
+        if is_scale_free(self._measure, in_units(uv, 0)):
             uv = self._fit_scale(uv)
         return self._run.result(uv, self._piece.F, status, loops=self._piece.loops, linear_solver=self._solver)
 
@@ -219,7 +222,7 @@ class Flattening:
             return False
         assert self._bijective is not None
         piece, uv = self._piece, self._bijective
-        angles_alone = self._is_scale_free(uv)
+        angles_alone = is_scale_free(self._measure, in_units(uv, 0))
         return has_collapsed(
             piece.V, piece.F, piece.loops, piece.area, uv, self._overlapping, angles_alone=angles_alone
         )
@@ -313,12 +316,6 @@ class Flattening:
         for other in [name for name in available() if name != self._solver][:1]:
             self._options = replace(self._options, linear_solver=other)
             yield f"coarse mesh, {other}", partial(flatten_coarse, *surface, other)
-
-    def _is_scale_free(self, uv: FloatArray) -> bool:
-        """Whether the energy does not depend on the map's scale."""
-        w = in_units(uv, 0)
-        here, doubled = self._measure.value(w), self._measure.value(2 * w)
-        return abs(doubled - here) <= _EQUAL_ENERGY * here
 
     def _fit_scale(self, uv: FloatArray) -> FloatArray:
         """Scale a map to the surface's area; if this inverts a triangle, scale exactly by a power of two."""

@@ -5,7 +5,7 @@ One vertex is fixed to prevent drift. Rotation remains possible; a raised diagon
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -107,62 +107,6 @@ class _StepRecord(NamedTuple):
     gap: float
 
 
-class Guard:
-    """Contacts of the boundary with itself, which repel each other so that a map stays bijective.
-
-    ``energy`` is the surface's energy with the contacts. ``slack`` is a factor on the tolerance; early stages stop
-    sooner.
-    """
-
-    def __init__(self, rim: Rim, surface: NewtonObjective) -> None:
-        self.energy = GuardedEnergy(surface)
-        self._rim = rim
-        self._stages = iter(_STAGES)
-        self._weight, self.slack = next(self._stages)
-        self._known = Contacts.none().corners
-
-    def relax(self) -> bool:
-        """Lower the weight of the contacts; return False if it is the last one."""
-        following = next(self._stages, None)
-        if following is not None:
-            self._weight, self.slack = following
-        return following is not None
-
-    def contacts(self, w: ComplexArray) -> Contacts:
-        """Contacts at a map (n,)."""
-        return self._rim.contacts(w)
-
-    def prepare(self, state: NewtonState, known_system: Callable[[IntArray, ComplexArray], None]) -> NewtonState:
-        """Update the contacts and their weight; ``known_system`` rebuilds the system for other triangles."""
-        energy, near, n = self.energy, state.extra.near, state.w.size
-        known, uncoupled = near.split(self._known, n)
-        repelling = near.within(state.w, 1.0).reach.size
-        if uncoupled.within(state.w, 1.0).reach.size > _MAX_UNCOUPLED * repelling:
-            # The new pattern includes possible and earlier contacts, so that it lasts for several steps.
-            self._known = _unite_pairs(self._known, near.corners, n)
-            g = np.concatenate([energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
-            known_system(np.concatenate([energy.F, self._known.T]), g)
-            known, uncoupled = near.split(self._known, n)
-        energy.contacts, energy.uncoupled = known, uncoupled
-        distortion = energy.surface.value_of(state.derivatives.surface)
-        energy.stiffness = self._weight * max(distortion, _MIN_ENERGY) / len(energy.F)
-        return state._replace(value=energy.value_of(state.derivatives))
-
-    def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
-        """Add contacts outside the system's pattern to its diagonal."""
-        uncoupled, stiffness = self.energy.uncoupled, self.energy.stiffness
-        if uncoupled.reach.size:
-            system.add_blocks(*(stiffness * part[system.free] for part in uncoupled.blocks(w)))
-
-    def accept(self, state: NewtonState, w: ComplexArray, uv: FloatArray) -> tuple[Contacts, float] | None:
-        """Return the contacts at a map and their gap; None if the boundary meets itself or gaps shrink too much."""
-        near = self._rim.contacts(w)
-        gap = near.smallest_gap(w)
-        # New pairs are compared with _NARROWER at most, as otherwise no step might be short enough.
-        before = min(state.extra.gap, near.smallest_gap(state.w), _NARROWER)
-        return None if gap < _NARROWER * before or self._rim.meets_itself(uv) else (near, gap)
-
-
 class Pairs(Protocol):
     """Second derivatives between distant vertices, for which the system has no entries."""
 
@@ -174,7 +118,10 @@ class Pairs(Protocol):
 
 
 class SurfaceModel(MapModel):
-    """The model of a map with a free boundary, with or without a guard; see `SurfaceDescent`."""
+    """The model of a map with a free boundary, which may overlap itself; see `SurfaceDescent`.
+
+    ``surface`` is the energy of the surface, and ``energy`` the objective.
+    """
 
     def __init__(
         self,
@@ -182,61 +129,34 @@ class SurfaceModel(MapModel):
         uv: FloatArray,
         linear_solver: str,
         fixed: IntArray,
-        rim: Rim | None,
         pairs: Pairs | None,
+        surface: NewtonObjective | None = None,
     ) -> None:
-        self.surface, self.guard, self._pairs = energy, None if rim is None else Guard(rim, energy), pairs
-        self._of_map = len(uv), fixed, linear_solver
-        super().__init__(
-            energy if self.guard is None else self.guard.energy,
-            Coordinates.of(uv, fixed, 0),
-            NewtonSystem(energy.F, energy.g, *self._of_map),
-        )
-        self.slack = 1.0 if self.guard is None else self.guard.slack
+        self.surface, self._pairs = energy if surface is None else surface, pairs
+        self._for_systems = len(uv), fixed, linear_solver
+        super().__init__(energy, Coordinates.of(uv, fixed, 0), NewtonSystem(energy.F, energy.g, *self._for_systems))
 
     def start(self, uv: FloatArray) -> NewtonState:
         """Return the state of a map (n, 2)."""
-        state = self.evaluate(in_units(uv, 0))
-        near = Contacts.none() if self.guard is None else self.guard.contacts(state.w)
-        return state._replace(extra=_StepRecord(np.inf, np.inf, 0, near, near.smallest_gap(state.w)))
+        return self.evaluate(in_units(uv, 0))._replace(extra=_StepRecord(np.inf, np.inf, 0, Contacts.none(), np.inf))
 
     def distortion(self, state: NewtonState) -> float:
         """The value of the surface's energy, without contacts."""
-        return state.value if self.guard is None else self.surface.value_of(state.derivatives.surface)
+        return state.value
 
     def relax_barrier(self) -> bool:
         """Lower the weight of the barrier that guards the map; return False if there is none or it is the last."""
-        if self.guard is None or not self.guard.relax():
-            return False
-        self.slack = self.guard.slack
-        return True
-
-    def prepare(self, state: NewtonState) -> NewtonState:
-        """See `NewtonModel`."""
-        if self.guard is None:
-            return state
-
-        def rebuild(F: IntArray, g: ComplexArray) -> None:
-            self.system = NewtonSystem(F, g, *self._of_map)
-
-        return self.guard.prepare(state, rebuild)
+        return False
 
     def assemble(self, state: NewtonState, negative: float) -> None:
         """See `NewtonModel`."""
         super().assemble(state, negative)
-        if self.guard is not None:
-            self.guard.add_to(self.system, state.w)
         if self._pairs is not None:
             self._pairs.add_to(self.system, state.w)
 
     def solve(self, load: ComplexArray) -> ComplexArray:
         """See `NewtonModel`."""
         return super().solve(load) if self._pairs is None else self._pairs.solve(self.system, load)
-
-    def check_numbers(self, state: NewtonState) -> None:
-        """See `NewtonModel`."""
-        if isinstance(self.surface, DeformationEnergy):
-            self.surface.check_numbers(state.derivatives if self.guard is None else state.derivatives.surface)
 
     def search(
         self, state: NewtonState, direction: ComplexArray, expected_decrease: float, shortened: bool
@@ -259,7 +179,7 @@ class SurfaceModel(MapModel):
 
     @cached_property
     def _rotation_path(self) -> RotationPath | None:
-        return RotationPath.of(self.surface.F, self.surface.g, *self._of_map)
+        return RotationPath.of(self.surface.F, self.surface.g, *self._for_systems)
 
     def _search_rotating(self, state: NewtonState, full: ComplexArray, expected_decrease: float) -> NewtonState | None:
         """Take a full or longer step along a rotating path; None if the energy does not decrease enough."""
@@ -283,15 +203,86 @@ class SurfaceModel(MapModel):
     def _evaluate_step(self, state: NewtonState, w: ComplexArray, bound: float) -> tuple[float, NewtonState | None]:
         """Return the objective at a map reached from ``state``, and its state if it is accepted."""
         value, there = self.evaluate_trial(w, bound)
+        return value, None if there is None else there._replace(extra=state.extra)
+
+
+class GuardedModel(SurfaceModel):
+    """The model of a map whose boundary ``rim`` must not overlap itself.
+
+    Contacts of the boundary with itself repel each other. ``slack`` is a factor on the tolerance; early stages stop
+    sooner.
+    """
+
+    energy: GuardedEnergy
+
+    def __init__(
+        self,
+        surface: NewtonObjective,
+        uv: FloatArray,
+        linear_solver: str,
+        fixed: IntArray,
+        pairs: Pairs | None,
+        rim: Rim,
+    ) -> None:
+        super().__init__(GuardedEnergy(surface), uv, linear_solver, fixed, pairs, surface)
+        self._rim = rim
+        self._stages = iter(_STAGES)
+        self._weight, self.slack = next(self._stages)
+        self._known = Contacts.none().corners
+
+    def start(self, uv: FloatArray) -> NewtonState:
+        state = super().start(uv)
+        near = self._rim.contacts(state.w)
+        return state._replace(extra=state.extra._replace(near=near, gap=near.smallest_gap(state.w)))
+
+    def distortion(self, state: NewtonState) -> float:
+        return self.surface.value_of(state.derivatives.surface)
+
+    def relax_barrier(self) -> bool:
+        following = next(self._stages, None)
+        if following is not None:
+            self._weight, self.slack = following
+        return following is not None
+
+    def prepare(self, state: NewtonState) -> NewtonState:
+        """Update the contacts and their weight, and the system if too many contacts are outside its pattern."""
+        energy, near, n = self.energy, state.extra.near, state.w.size
+        known, uncoupled = near.split(self._known, n)
+        repelling = near.within(state.w, 1.0).reach.size
+        if uncoupled.within(state.w, 1.0).reach.size > _MAX_UNCOUPLED * repelling:
+            # The new pattern includes possible and earlier contacts, so that it lasts for several steps.
+            self._known = _unite_pairs(self._known, near.corners, n)
+            g = np.concatenate([energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
+            self.system = NewtonSystem(np.concatenate([energy.F, self._known.T]), g, *self._for_systems)
+            known, uncoupled = near.split(self._known, n)
+        energy.contacts, energy.uncoupled = known, uncoupled
+        energy.stiffness = self._weight * max(self.distortion(state), _MIN_ENERGY) / len(energy.F)
+        return state._replace(value=energy.value_of(state.derivatives))
+
+    def assemble(self, state: NewtonState, negative: float) -> None:
+        """See `NewtonModel`; contacts outside the system's pattern are added to its diagonal."""
+        super().assemble(state, negative)
+        uncoupled, stiffness = self.energy.uncoupled, self.energy.stiffness
+        if uncoupled.reach.size:
+            self.system.add_blocks(*(stiffness * part[self.system.free] for part in uncoupled.blocks(state.w)))
+
+    def check_numbers(self, state: NewtonState) -> None:
+        """See `NewtonModel`."""
+        if isinstance(self.surface, DeformationEnergy):
+            self.surface.check_numbers(state.derivatives.surface)
+
+    def _evaluate_step(self, state: NewtonState, w: ComplexArray, bound: float) -> tuple[float, NewtonState | None]:
+        """A map is also rejected if the boundary meets itself or gaps shrink too much."""
+        value, there = super()._evaluate_step(state, w, bound)
         if there is None:
             return value, None
-        if self.guard is None:
-            return value, there._replace(extra=state.extra)
-        found = self.guard.accept(state, w, self.positions(w))
-        if found is None:
+        near = self._rim.contacts(w)
+        gap = near.smallest_gap(w)
+        # New pairs are compared with _NARROWER at most, as otherwise no step might be short enough.
+        before = min(state.extra.gap, near.smallest_gap(state.w), _NARROWER)
+        if gap < _NARROWER * before or self._rim.meets_itself(self.positions(w)):
             return value, None
-        near, gap = found
-        return value, there._replace(extra=state.extra._replace(near=near, gap=gap))
+        return value, there._replace(extra=there.extra._replace(near=near, gap=gap))
 
 
 class SurfaceDescent(NewtonDescent):
@@ -313,7 +304,8 @@ class SurfaceDescent(NewtonDescent):
         rim: Rim | None = None,
         pairs: Pairs | None = None,
     ) -> None:
-        model = SurfaceModel(energy, uv, linear_solver, np.asarray(fixed, dtype=np.int64), rim, pairs)
+        options = uv, linear_solver, np.asarray(fixed, dtype=np.int64), pairs
+        model = SurfaceModel(energy, *options) if rim is None else GuardedModel(energy, *options, rim)
         super().__init__(model, model.start(uv))
 
     @property

@@ -76,14 +76,14 @@ class Equilibrium:
 
     ``fixed`` (k,) are the fixed vertices, and ``on_curves`` those of them whose positions curves determine. ``inverse``
     returns the displacement (n,) of all vertices under a load (n,), zero at fixed vertices; it is symmetric.
-    ``strain`` makes the strain of the rest triangles when it is first used. ``unit`` is the unit of the forces' map,
-    and ``rest_shape`` the shape of the rest positions.
+    ``make_strain`` makes the strain of the rest triangles when it is first used. ``unit`` is the unit of the forces'
+    map, and ``rest_shape`` the shape of the rest positions.
     """
 
     fixed: IntArray
     forces: Forces
     inverse: Callable[[ComplexArray], ComplexArray]
-    strain: Callable[[], Strain] | None
+    make_strain: Callable[[], Strain] | None
     rest_shape: tuple[int, ...]
     unit: float = 1.0
     on_curves: IntArray | None = None
@@ -97,9 +97,9 @@ class Equilibrium:
         return np.ones(self.fixed.size, dtype=bool) if self.on_curves is None else ~np.isin(self.fixed, self.on_curves)
 
     @cached_property
-    def made_strain(self) -> Strain | None:
+    def strain(self) -> Strain | None:
         """The strain of the rest triangles; None if the map does not depend on them."""
-        return None if self.strain is None else self.strain()
+        return None if self.make_strain is None else self.make_strain()
 
     @property
     def scaled(self) -> bool:
@@ -121,7 +121,7 @@ class Gradients:
         With respect to the Beltrami coefficients, ``∂/∂Re μ + i ∂/∂Im μ``; None for maps without them.
     """
 
-    _of: Equilibrium
+    _equilibrium: Equilibrium
     _pull: ComplexArray
     _response: TriangleResponse
     _on_pin: complex
@@ -130,30 +130,32 @@ class Gradients:
     @cached_property
     def target(self) -> FloatArray:
         """The gradient with respect to the target positions of the fixed vertices."""
-        of = self._of
-        by_places = self._pull - of.forces.gather(self._response.hp, self._response.hq)
-        if of.scale is not None:
-            by_places += self._on_scale * of.scale.by_places
-        if of.gauge is not None and of.gauge.pin is not None:
-            by_places[of.gauge.pin] += self._on_pin
-        by_held = by_places[of.fixed] / of.unit
-        by_held[~of.follows] = 0
+        state = self._equilibrium
+        by_places = self._pull - state.forces.gather(self._response.hp, self._response.hq)
+        if state.scale is not None:
+            by_places += self._on_scale * state.scale.by_places
+        if state.gauge is not None and state.gauge.pin is not None:
+            by_places[state.gauge.pin] += self._on_pin
+        by_held = by_places[state.fixed] / state.unit
+        by_held[~state.follows] = 0
         return to_rows(by_held)
 
     @cached_property
     def rest(self) -> FloatArray:
         """The gradient with respect to the rest positions."""
-        out = np.zeros(self._of.rest_shape)
-        if self._of.made_strain is not None:
-            out -= self._of.made_strain.pull(*self._of.forces.pull_strain(self._response))
-        if self._of.scale is not None:
-            out += self._on_scale * self._of.scale.by_rest
+        state = self._equilibrium
+        out = np.zeros(state.rest_shape)
+        if state.strain is not None:
+            out -= state.strain.pull(*state.forces.pull_strain(self._response))
+        if state.scale is not None:
+            out += self._on_scale * state.scale.by_rest
         return out
 
     @cached_property
     def mu(self) -> ComplexArray | None:
         """The gradient with respect to the Beltrami coefficients."""
-        return None if self._of.tensors is None else -self._of.tensors.of(self._of.forces, self._response)
+        tensors = self._equilibrium.tensors
+        return None if tensors is None else -tensors.of(self._equilibrium.forces, self._response)
 
 
 class Derivative:
@@ -175,7 +177,7 @@ class Derivative:
         self.uv = uv
         self.uv.flags.writeable = False
         self.doubts = tuple(doubts)
-        self._of = equilibrium
+        self._equilibrium = equilibrium
 
     @property
     def reliable(self) -> bool:
@@ -206,29 +208,29 @@ class Derivative:
         ValueError
             If an argument has the wrong shape or is not finite, or ``mu`` is given for a map without tensors.
         """
-        n, of = len(self.uv), self._of
+        n, state = len(self.uv), self._equilibrium
         held = np.zeros(n, dtype=np.complex128)
         load = np.zeros(n, dtype=np.complex128)
-        moved = np.zeros(of.rest_shape)
+        moved = np.zeros(state.rest_shape)
         if target is not None:
-            positions = to_complex(target_positions(target, of.fixed.size)) / of.unit
-            held[of.fixed[of.follows]] = positions[of.follows]
-            load += of.forces.by_places(held)
+            positions = to_complex(target_positions(target, state.fixed.size)) / state.unit
+            held[state.fixed[state.follows]] = positions[state.follows]
+            load += state.forces.by_places(held)
         if rest is not None:
-            moved = _check_rest(rest, of.rest_shape)
-            if of.made_strain is not None:
-                load += of.forces.by_strain(*of.made_strain.of(moved))
+            moved = _check_rest(rest, state.rest_shape)
+            if state.strain is not None:
+                load += state.forces.by_strain(*state.strain.of(moved))
         if mu is not None:
-            if of.tensors is None:
+            if state.tensors is None:
                 raise ValueError("mu is supported only for quasi-harmonic maps")
-            load += of.tensors.by_mu(of.forces, _check_mu(mu, of.forces.share.size))
-        more = 0.0 if of.scale is None else of.scale.change(held, moved)
-        if of.scaled:
-            load += more * of.forces.by_scale
-        dw = held - of.inverse(load)
-        if of.gauge is not None:
-            dw = of.gauge.select(dw, held, more)
-        return to_rows(of.unit * dw)
+            load += state.tensors.by_mu(state.forces, _check_mu(mu, state.forces.share.size))
+        more = 0.0 if state.scale is None else state.scale.change(held, moved)
+        if state.scaled:
+            load += more * state.forces.by_scale
+        dw = held - state.inverse(load)
+        if state.gauge is not None:
+            dw = state.gauge.select(dw, held, more)
+        return to_rows(state.unit * dw)
 
     def vjp(self, cotangent: ArrayLike) -> Gradients:
         """Return the gradients of a function of the map with respect to the map's inputs.
@@ -247,15 +249,15 @@ class Derivative:
         ValueError
             If the cotangent has the wrong shape or is not finite.
         """
-        of = self._of
-        pull = of.unit * to_complex(map_array("cotangent", cotangent, len(self.uv)))
+        state = self._equilibrium
+        pull = state.unit * to_complex(map_array("cotangent", cotangent, len(self.uv)))
         on_pin, on_scale = 0j, 0.0
-        if of.gauge is not None:
-            pull, on_pin, on_scale = of.gauge.pull_back(pull)
-        adjoint = of.inverse(pull)
-        if of.scaled:
-            on_scale -= work(of.forces.by_scale, adjoint)
-        return Gradients(of, pull, of.forces.respond(adjoint), on_pin, on_scale)
+        if state.gauge is not None:
+            pull, on_pin, on_scale = state.gauge.pull_back(pull)
+        adjoint = state.inverse(pull)
+        if state.scaled:
+            on_scale -= work(state.forces.by_scale, adjoint)
+        return Gradients(state, pull, state.forces.respond(adjoint), on_pin, on_scale)
 
 
 def _check_rest(rest: ArrayLike, shape: tuple[int, ...]) -> FloatArray:

@@ -8,6 +8,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.flattening.piece import is_scale_free
 from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, Scale, to_rows
 from quasiharmonic.apps.gradients.freedom import Freedom
 from quasiharmonic.apps.gradients.gauge import Gauge
@@ -22,9 +23,6 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray
 from quasiharmonic.util.options import FlattenOptions, takes
-
-# Energies with a relative difference of at most this are equal, as in `flattening.piece`.
-_EQUAL_ENERGY = 1e-6
 
 
 class FlattenDerivativeKeywords(TypedDict, total=False):
@@ -122,7 +120,7 @@ def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: 
         fixed=domain.fixed,
         forces=minimum.forces,
         inverse=minimum.solve,
-        strain=lambda: strain,
+        make_strain=lambda: strain,
         rest_shape=domain.V.shape,
         unit=2.0**exponent,
         scale=scale,
@@ -138,9 +136,9 @@ def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge
         return None
     # Energies beyond the range of doubles are reported where derivatives are taken.
     with np.errstate(all="ignore"):
-        here, doubled = measure.value(w), measure.value(2 * w)
+        scales = is_scale_free(measure, w)
     pin = int(domain.fixed[0]) if domain.fixed.size else None
-    return Gauge(w, pin, abs(doubled - here) <= _EQUAL_ENERGY * here, domain.loops)
+    return Gauge(w, pin, scales, domain.loops)
 
 
 def _overlaps(domain: Domain, w: ComplexArray) -> bool:

@@ -126,9 +126,7 @@ class OnCurves(Freedom):
         self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
         system.curve_stiffness = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * self._unit
         bends = self._barrier_hessian(s)
-        for end in (0, 1):
-            number = self._deviation.pairs[:, end]
-            np.add.at(system.curve_stiffness, number[number >= 0], bends[number >= 0, end, end])
+        self._add_at_ends(system.curve_stiffness, bends[:, (0, 1), (0, 1)])
         both = (tangent[self._deviation.pairs[self._both]] != 0).all(axis=1)
         system.coupling = np.where(both, bends[self._both, 0, 1], 0)
 
@@ -158,11 +156,15 @@ class OnCurves(Freedom):
 
     def _barrier_gradient(self, s: FloatArray) -> FloatArray:
         """The barrier's derivatives by the arc lengths of the sliding vertices, in units; (l,)."""
-        out, by_edges = np.zeros(s.size), self._by_edges(s)
+        out = np.zeros(s.size)
+        self._add_at_ends(out, self._by_edges(s))
+        return out
+
+    def _add_at_ends(self, out: FloatArray, by_ends: FloatArray) -> None:
+        """Add values at the ends of the edges (e, 2) to those of the sliding vertices (l,)."""
         for end in (0, 1):
             number = self._deviation.pairs[:, end]
-            np.add.at(out, number[number >= 0], by_edges[number >= 0, end])
-        return out
+            np.add.at(out, number[number >= 0], by_ends[number >= 0, end])
 
     @cached_property
     def _colours(self) -> IntArray:

@@ -7,10 +7,8 @@ leading batch axes. Batches of several arguments are broadcast as in NumPy.
 from __future__ import annotations
 
 import warnings
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypedDict
 
 import numpy as np
@@ -28,7 +26,7 @@ from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve_problem
-from quasiharmonic.util.arrays import FloatArray, IntArray, index_array, real_array
+from quasiharmonic.util.arrays import FloatArray, index_array, real_array
 from quasiharmonic.util.options import FlattenOptions, MapOptions, Options, option
 
 #: An argument, converted to NumPy.
@@ -69,34 +67,23 @@ class SolvedOptions(MapOptions):
     polish: Any = option("symmetric-dirichlet")
 
 
-@dataclass(frozen=True, eq=False)
-class Layer(ABC):
-    """A map as a function of arrays. Layers with equal settings are equal, so programs are compiled once for them."""
+@dataclass(frozen=True)
+class Layer:
+    """A map as a function of arrays. Layers with equal settings are equal, so programs are compiled once for them.
 
-    def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and isinstance(other, Layer) and self._settings == other._settings
+    ``shapes`` are the shapes of one problem's arguments, by name. ``derivative`` returns the derivative of one
+    problem's map for its arguments, and for its positions (n, 2) if they are known; it raises MapNotFound if there is
+    no map.
+    """
 
-    def __hash__(self) -> int:
-        return hash(self._settings)
-
-    @cached_property
-    def _settings(self) -> tuple[Any, ...]:
-        """The layer's settings for comparison: arrays and plain values by content, other objects by identity."""
-        return tuple(_to_comparable(getattr(self, field.name)) for field in fields(self))
-
-    @property
-    @abstractmethod
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """The shapes of one problem's arguments, by name."""
+    settings: Hashable
+    shapes: Mapping[str, tuple[int, ...]] = field(compare=False)
+    derivative: Callable[[Mapping[str, Array], FloatArray | None], Derivative] = field(compare=False)
 
     @property
     def map_shape(self) -> tuple[int, int]:
         """The shape (n, 2) of one problem's map."""
         return self.shapes["rest"][0], 2
-
-    @abstractmethod
-    def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        """Return the derivative of one problem's map, computed unless ``uv`` is given; MapNotFound if there is none."""
 
     def batch(self, arrays: Mapping[str, Array]) -> tuple[int, ...]:
         """Return the common batch axes of the arguments; ValueError if they cannot be broadcast."""
@@ -118,87 +105,60 @@ class Layer(ABC):
         return own
 
 
-@dataclass(frozen=True, eq=False)
-class TensorLayer(Layer):
-    """`quasiharmonic.quasi_harmonic_map` as a function of ``mu``, ``target`` and ``rest``."""
+def make_tensor_layer(problem: Problem, reference: Reference, linear_solver: str) -> Layer:
+    """Return `quasiharmonic.quasi_harmonic_map` as a function of ``mu``, ``target`` and ``rest``."""
 
-    problem: Problem
-    reference: Reference
-    linear_solver: str
+    def differentiate(arrays: Mapping[str, Array], uv: FloatArray | None) -> Derivative:
+        posed = pose_problem(problem, arrays)
+        return quasi_harmonic_derivative(posed, arrays.get("mu"), reference=reference, linear_solver=linear_solver)
 
-    @cached_property
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        problem = self.problem
-        return {"mu": (len(problem.F),), "target": problem.target.shape, "rest": problem.V.shape}
-
-    def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        problem = pose_problem(self.problem, arrays)
-        return quasi_harmonic_derivative(
-            problem, arrays.get("mu"), reference=self.reference, linear_solver=self.linear_solver
-        )
+    shapes = {"mu": (len(problem.F),), "target": problem.target.shape, "rest": problem.V.shape}
+    return Layer(_to_comparable(("tensors", problem, reference, linear_solver)), shapes, differentiate)
 
 
-@dataclass(frozen=True, eq=False)
-class PolishLayer(Layer):
-    """`quasiharmonic.solve` with a polish, as a function of ``target`` and ``rest``."""
+def make_solved_layer(problem: Problem, options: SolvedKeywords) -> Layer:
+    """Return `quasiharmonic.solve` with a polish as a function of ``target`` and ``rest``."""
+    checked = SolvedOptions(**options)
+    start = None if checked.start is None else np.asarray(checked.start, dtype=np.float64)
+    checked = replace(checked, start=start)
 
-    problem: Problem
-    options: SolvedOptions
+    def differentiate(arrays: Mapping[str, Array], uv: FloatArray | None) -> Derivative:
+        posed = pose_problem(problem, arrays)
+        found = _check_found(solve_problem(posed, checked)) if uv is None else uv
+        return differentiate_polish(posed.domain, found, polish_options(checked))
 
-    @classmethod
-    def of(cls, problem: Problem, options: SolvedKeywords) -> PolishLayer:
-        """Make a layer from a call's arguments."""
-        checked = SolvedOptions(**options)
-        start = None if checked.start is None else np.asarray(checked.start, dtype=np.float64)
-        return cls(problem, replace(checked, start=start))
+    shapes = {"target": problem.target.shape, "rest": problem.V.shape}
+    return Layer(_to_comparable(("solved", problem, checked)), shapes, differentiate)
 
-    @cached_property
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        return {"target": self.problem.target.shape, "rest": self.problem.V.shape}
 
-    def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        problem, options = pose_problem(self.problem, arrays), self.options
+def make_flattened_layer(rest: Any, F: ArrayLike, target: Any, options: FlattenedKeywords) -> Layer:
+    """Return `quasiharmonic.flatten` as a function of ``rest`` and, if there are fixed vertices, ``target``.
+
+    Only the shape of ``rest`` is read, as it may be a traced array.
+    """
+    checked = FlattenOptions(**options)
+    fixed, weights, start = checked.fixed, checked.weights, checked.start
+    if (fixed is None) != (target is None):
+        raise ValueError("give fixed and target together: fixed vertices and their target positions")
+    shape = tuple(getattr(rest, "shape", ()))
+    if len(shape) < 2 or shape[-1] not in (2, 3):
+        raise ValueError(f"rest must have shape (n, 2) or (n, 3), or batch axes before these, not {shape}")
+    checked = replace(
+        checked,
+        fixed=None if fixed is None else index_array("fixed", fixed),
+        weights=None if weights is None else real_array("weights", weights),
+        start=None if start is None else real_array("start", start),
+    )
+    triangles = index_array("F", F)
+
+    def differentiate(arrays: Mapping[str, Array], uv: FloatArray | None) -> Derivative:
+        V = arrays["rest"]
         if uv is None:
-            uv = _check_found(solve_problem(problem, options))
-        return differentiate_polish(problem.domain, uv, polish_options(options))
+            uv = _check_found(flatten_surface(V, triangles, replace(checked, target=arrays.get("target"))))
+        return differentiate_flattened(V, triangles, uv, checked)
 
-
-@dataclass(frozen=True, eq=False)
-class FlattenLayer(Layer):
-    """`quasiharmonic.flatten` as a function of ``rest`` and, if there are fixed vertices, ``target``."""
-
-    F: IntArray
-    vertices: tuple[int, int]
-    options: FlattenOptions
-
-    @classmethod
-    def of(cls, rest: Any, F: ArrayLike, target: Any, options: FlattenedKeywords) -> FlattenLayer:
-        """Make a layer from a call's arguments; only the shape of ``rest`` is read, as it may be a traced array."""
-        checked = FlattenOptions(**options)
-        fixed, weights, start = checked.fixed, checked.weights, checked.start
-        if (fixed is None) != (target is None):
-            raise ValueError("give fixed and target together: fixed vertices and their target positions")
-        shape = tuple(getattr(rest, "shape", ()))
-        if len(shape) < 2 or shape[-1] not in (2, 3):
-            raise ValueError(f"rest must have shape (n, 2) or (n, 3), or batch axes before these, not {shape}")
-        checked = replace(
-            checked,
-            fixed=None if fixed is None else index_array("fixed", fixed),
-            weights=None if weights is None else real_array("weights", weights),
-            start=None if start is None else real_array("start", start),
-        )
-        return cls(index_array("F", F), (shape[-2], shape[-1]), checked)
-
-    @cached_property
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        target = {} if self.options.fixed is None else {"target": (self.options.fixed.size, 2)}
-        return {"rest": self.vertices, **target}
-
-    def derivative(self, arrays: Mapping[str, Array], uv: FloatArray | None = None) -> Derivative:
-        V, options = arrays["rest"], self.options
-        if uv is None:
-            uv = _check_found(flatten_surface(V, self.F, replace(options, target=arrays.get("target"))))
-        return differentiate_flattened(V, self.F, uv, options)
+    shapes = {"rest": shape[-2:]} if checked.fixed is None else {"rest": shape[-2:], "target": (checked.fixed.size, 2)}
+    return Layer(_to_comparable(("flattened", triangles, shape[-2:], checked)), shapes, differentiate)
 
 
 def pose_problem(problem: Problem, arrays: Mapping[str, Array]) -> Problem:
@@ -218,7 +178,7 @@ def compute_maps(layer: Layer, arrays: Mapping[str, Array]) -> tuple[FloatArray,
     uv, derivatives = np.empty((*lead, *layer.map_shape)), []
     for item in np.ndindex(lead):
         try:
-            derivative = layer.derivative(layer.item(arrays, item))
+            derivative = layer.derivative(layer.item(arrays, item), None)
         except ValueError as error:
             if lead:
                 error.add_note(f"This is item {', '.join(map(str, item))} of the batch.")
@@ -292,10 +252,12 @@ def _warn(derivative: Derivative, item: tuple[int, ...]) -> None:
         warnings.warn(f"{which}{doubt.value}", DoubtfulDerivative, stacklevel=4)
 
 
-def _to_comparable(value: Any) -> Any:
-    """Return arrays and plain values by content, options by their fields, and other objects by identity."""
+def _to_comparable(value: Any) -> Hashable:
+    """Return arrays and plain values by content, options and tuples by their entries, and other objects by identity."""
     if isinstance(value, Options):
-        return tuple(_to_comparable(getattr(value, field.name)) for field in fields(value))
+        value = tuple(getattr(value, one.name) for one in fields(value))
+    if isinstance(value, tuple):
+        return tuple(_to_comparable(one) for one in value)
     if isinstance(value, np.ndarray):
         return value.shape, value.tobytes()
-    return value if isinstance(value, str | bool | int | float | tuple | None) else id(value)
+    return value if isinstance(value, str | bool | int | float | None) else id(value)

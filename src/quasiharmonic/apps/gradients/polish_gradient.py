@@ -115,7 +115,7 @@ def differentiate_polish(domain: Domain, uv: ArrayLike, options: PolishOptions) 
         fixed=domain.fixed,
         forces=minimum.forces,
         inverse=minimum.solve,
-        strain=lambda: strain,
+        make_strain=lambda: strain,
         rest_shape=domain.V.shape,
         unit=2.0**exponent,
         on_curves=None if track is None else find_curve_vertices(track),

@@ -94,7 +94,7 @@ def quasi_harmonic_derivative(
         fixed=problem.fixed,
         forces=Forces(corners, problem.n, half, mesh.m, dw.p, dw.q, by_p, by_q, form),
         inverse=operator.respond,
-        strain=strain,
+        make_strain=strain,
         rest_shape=problem.V.shape,
         tensors=TensorForces(field),
     )

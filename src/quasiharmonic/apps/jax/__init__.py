@@ -23,12 +23,12 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.gradients.layers import (
     DoubtfulDerivative,
     FlattenedKeywords,
-    FlattenLayer,
     MapNotFound,
-    PolishLayer,
     SolvedKeywords,
     SolvedOptions,
-    TensorLayer,
+    make_flattened_layer,
+    make_solved_layer,
+    make_tensor_layer,
 )
 from quasiharmonic.apps.jax.callbacks import apply_layer
 from quasiharmonic.geometry.mesh.reference import Reference
@@ -51,7 +51,8 @@ def quasi_harmonic_map(
 
     The gradient by ``mu`` is ``∂/∂Re μ − i ∂/∂Im μ``, JAX's convention.
     """
-    return apply_layer(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
+    settings = problem, reference, linear_solver
+    return apply_layer(make_tensor_layer, settings, {"mu": mu, "target": target, "rest": rest})
 
 
 @takes(SolvedOptions, SolvedKeywords)
@@ -63,7 +64,7 @@ def injective_map(
     **options: Unpack[SolvedKeywords],
 ) -> jax.Array:
     """Return polished injective maps (…, n, 2) float64 of arrays, as `quasiharmonic.torch.injective_map`."""
-    return apply_layer(PolishLayer.of(problem, options), {"target": target, "rest": rest})
+    return apply_layer(make_solved_layer, (problem, options), {"target": target, "rest": rest})
 
 
 @takes(FlattenOptions, FlattenedKeywords)
@@ -71,4 +72,4 @@ def flatten(
     rest: jax.Array, F: ArrayLike, *, target: jax.Array | None = None, **options: Unpack[FlattenedKeywords]
 ) -> jax.Array:
     """Return maps (…, n, 2) float64 with a free boundary, as `quasiharmonic.torch.flatten`."""
-    return apply_layer(FlattenLayer.of(rest, F, target, options), {"rest": rest, "target": target})
+    return apply_layer(make_flattened_layer, (rest, F, target, options), {"rest": rest, "target": target})

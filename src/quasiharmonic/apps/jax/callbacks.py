@@ -32,8 +32,9 @@ _lock = Lock()
 _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 
 
-def apply_layer(layer: Layer, arguments: Mapping[str, Any]) -> jax.Array:
+def apply_layer(make: Callable[..., Layer], settings: tuple[Any, ...], arguments: Mapping[str, Any]) -> jax.Array:
     """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes."""
+    layer = make(*settings)
     names, given = select_arguments(layer, arguments, _check)
     # All arrays get the same number of leading axes, so that the axis that `jax.vmap` adds is the first of each.
     axes = [np.ndim(array) - len(layer.shapes[name]) for name, array in zip(names, given, strict=True)]

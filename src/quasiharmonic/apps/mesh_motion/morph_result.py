@@ -12,17 +12,17 @@ from quasiharmonic.apps.tetrahedra.result import summarise_qualities
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import corner_triangles, name_elements
 from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
-from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.problem.result import MapResult
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
 from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import SummarisedOutcome
+from quasiharmonic.util.outcome import OutcomeOf, SummarisedOutcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MorphResult(SummarisedOutcome, Displayable):
+class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
     """A planar mesh after its boundary has moved.
 
     Attributes
@@ -67,11 +67,6 @@ class MorphResult(SummarisedOutcome, Displayable):
     def success(self) -> bool:
         """Whether the mesh is valid and the call was not interrupted."""
         return self.valid and self.status.acceptable
-
-    @property
-    def status(self) -> Status:
-        """The status of the search."""
-        return self.result.status
 
     def drift(self) -> float:
         """Return the maximum distance of a node from its position after one step from the rest mesh.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,8 @@ from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.result import MapResult, Stage, Status
+from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.methods.untangling import untangle
 from quasiharmonic.util.arrays import IntArray
 
@@ -29,7 +29,7 @@ def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     before = inverted_triangles(corners, result.uv).size
     if not before:
         return result
-    began, steps = time.perf_counter(), 0
+    run, steps = Run(), 0
     exponent = int(np.frexp(np.abs(result.uv).max())[1])
     w = in_units(result.uv, exponent)
     areas = (signed_areas(problem.F, places).sum() for places in (w, in_units(problem.V, 0)))
@@ -41,18 +41,11 @@ def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     uv = np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
     uv[problem.fixed] = problem.target
     after = inverted_triangles(corners, uv).size
-    seconds = time.perf_counter() - began
-    stage = Stage("untangling corners", steps, seconds, (before, after), (np.inf, np.inf), kept=after < before)
-    stages = [*result.stages, stage]
+    name, inverted, energy = "untangling corners", (before, after), (np.inf, np.inf)
+    run.add_stage(name, n_iterations=steps, inverted=inverted, energy=energy, kept=after < before)
+    result = replace(result, stages=result.stages + run.stages, seconds=result.seconds + run.seconds)
     if after >= before:
-        return replace(result, status=Status.STALLED, stages=stages, seconds=result.seconds + seconds)
-    return replace(
-        result,
-        uv=uv,
-        status=Status.STALLED if after else Status.INJECTIVE,
-        certificate=certify(problem.F, uv, loops=problem.domain.loops),
-        stages=stages,
-        seconds=result.seconds + seconds,
-        diagnosis=None,
-        mu=None,
-    )
+        return replace(result, status=Status.STALLED)
+    certificate = certify(problem.F, uv, loops=problem.domain.loops)
+    status = Status.STALLED if after else Status.INJECTIVE
+    return replace(result, uv=uv, status=status, certificate=certificate, diagnosis=None, mu=None)

@@ -5,20 +5,23 @@ Seams split a map into islands. `IslandRepair` repairs each island separately.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.atlas.atlas_verdict import IslandReport, mirrored_islands
+from quasiharmonic.apps.atlas import atlas_verdict
+from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict, IslandReport, mirrored_islands
 from quasiharmonic.apps.repair.island_repair import IslandRepair
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.diagnosis import Diagnosis
-from quasiharmonic.problem.result import Step
+from quasiharmonic.problem.result import Status, Step
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -109,11 +112,26 @@ class RepairResult(SummarisedOutcome):
         the end.
     islands : tuple of RepairedIsland
         Reports, in the order of each island's first triangle.
+    mesh : SeamedMesh
+        The surface with its new positions.
+    seconds : float
     """
 
     uv: FloatArray
     FT: IntArray
     islands: tuple[RepairedIsland, ...]
+    mesh: SeamedMesh
+    seconds: float
+
+    @property
+    def status(self) -> Status:
+        """``INJECTIVE`` if every triangle is positive, otherwise ``STALLED``."""
+        return Status.of(self.success)
+
+    @cached_property
+    def certificate(self) -> AtlasVerdict:
+        """The exact verdict on the new positions."""
+        return atlas_verdict.certify(self.mesh)
 
     @property
     def success(self) -> bool:
@@ -150,8 +168,7 @@ class RepairResult(SummarisedOutcome):
         """The report for JSON, without the map."""
         before, now = self._count_inverted()
         return {
-            "success": self.success,
-            "message": self.message,
+            **super().to_dict(),
             "injective": self.injective,
             "inverted_before": before,
             "inverted": now,
@@ -232,6 +249,7 @@ def repair(
     >>> len(result.islands[0].inverted_before), result.injective, result.moved_vertices.tolist()
     (2, True, [0])
     """
+    began = time.perf_counter()
     checked = RepairOptions(**options)
     mesh = SeamedMesh(V, F, FT, uv)
     fixed = vertex_indices("fixed", () if checked.fixed is None else checked.fixed, len(mesh.V))
@@ -241,7 +259,8 @@ def repair(
     ]
     repaired = mesh.with_places([new for new, _ in done])
     assert repaired.uv is not None
-    return RepairResult(repaired.uv, repaired.FT, tuple(report for _, report in done))
+    seconds = time.perf_counter() - began
+    return RepairResult(repaired.uv, repaired.FT, tuple(report for _, report in done), repaired, seconds)
 
 
 def _repair_island(

@@ -47,10 +47,11 @@ from quasiharmonic.util.arrays import (
     real_array,
     unchangeable,
 )
+from quasiharmonic.util.outcome import Verdict
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TetrahedraCertificate(ReadOnly):
+class TetrahedraCertificate(ReadOnly, Verdict):
     """Result of the exact test of a tetrahedral mesh; returned by `certify_tetrahedra`.
 
     Attributes
@@ -95,6 +96,16 @@ class TetrahedraCertificate(ReadOnly):
 
     def _read_only(self) -> Iterator[NDArray[Any]]:
         return (value for value in vars(self).values() if isinstance(value, np.ndarray))
+
+    @property
+    def valid(self) -> bool:
+        """Whether every tetrahedron is strictly positive; equal to `positive`."""
+        return self.positive
+
+    @property
+    def bijective(self) -> bool | None:
+        """Whether no point is covered twice; equal to `injective`."""
+        return self.injective
 
     @property
     def positive(self) -> bool:

@@ -50,7 +50,6 @@ class Descent:
         self._blocks = BlockMatrix(energy.T, energy.n, free)
         self.iterations = 0
         self.converged = False
-        self.conjugate_steps = 0
 
     def untangle(self, max_steps: int) -> Iterator[float]:
         """Lower the regularised energy; yield the least determinant after each step, and end when it is positive."""
@@ -95,23 +94,25 @@ class Descent:
 
     def _value(self, X: FloatArray, epsilon: float) -> float:
         """The function that is lowered."""
-        value = self.energy.value(X, epsilon)
-        if self.anchor is not None:
-            away = X - self.anchor[0]
-            value += 0.5 * self.anchor[1] * float((away * away).sum())
-        return value
+        return self.energy.value(X, epsilon) + self._pull(X)[0]
+
+    def _pull(self, X: FloatArray) -> tuple[float, FloatArray | float]:
+        """The value and the gradient (n, 3) of the term that pulls towards the anchor."""
+        if self.anchor is None:
+            return 0.0, 0.0
+        places, weight = self.anchor
+        away = X - places
+        return 0.5 * weight * float((away * away).sum()), weight * away
 
     def _step(self, epsilon: float) -> float | None:
         """Take a Newton step; return the energy after it, or None if no step lowers the energy."""
         heartbeat()
         value, gradient, blocks = self.energy.derivatives(self.X, epsilon)
         data = self._blocks.assemble(blocks)
+        pull, by_pull = self._pull(self.X)
+        value, gradient = value + pull, gradient + by_pull
         if self.anchor is not None:
-            places, weight = self.anchor
-            away = self.X - places
-            value += 0.5 * weight * float((away * away).sum())
-            gradient = gradient + weight * away
-            data[self._blocks.diagonal] += weight * np.eye(3)
+            data[self._blocks.diagonal] += self.anchor[1] * np.eye(3)
         g = project(self.projections, gradient[self.free]).ravel()
         p = self._direction(data, g)
         decrease = -float(g @ p)
@@ -160,5 +161,4 @@ class Descent:
             z = project(self.projections, np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3))).ravel()
             rz, old = float(r @ z), rz
             p = z + (rz / old) * p
-            self.conjugate_steps += 1
         return x if x.any() else z

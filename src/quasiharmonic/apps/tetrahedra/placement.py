@@ -196,7 +196,7 @@ def extend_harmonically(
     n = len(X)
     displacement = np.zeros_like(X)
     displacement[fixed] = target - X[fixed]
-    stiffness = (G[:, None] * G[None]).sum(axis=2) * energy.volumes
+    stiffness = np.einsum("iat,jat->ijt", G, G) * energy.volumes
     rows, columns = np.broadcast_arrays(T.T[:, None], T.T[None])
     matrix = coo_array((stiffness.ravel(), (rows.ravel(), columns.ravel())), shape=(n, n)).tocsr()
     free = np.setdiff1d(np.unique(T), fixed)

@@ -104,9 +104,9 @@ class TetrahedraResult(Outcome):
         return bool(self.certificate.injective) and self.status is not TetrahedraStatus.INTERRUPTED
 
     @property
-    def message(self) -> str:
-        """The outcome in one sentence."""
-        return self.status.value
+    def n_iterations(self) -> int:
+        """Newton steps; equal to ``iterations``."""
+        return self.iterations
 
     def summary(self) -> str:
         """Describe the outcome, the certificate and the obstructions."""
@@ -120,15 +120,12 @@ class TetrahedraResult(Outcome):
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""
         return {
-            "success": self.success,
+            **super().to_dict(),
             "valid": self.valid,
             "status": self.status.name,
-            "message": self.message,
-            "certificate": self.certificate.to_dict(),
             "forbidden": self.forbidden.tolist(),
             "obstructions": [{"text": o.text, "vertices": list(o.vertices)} for o in self.obstructions],
             "iterations": self.iterations,
-            "seconds": self.seconds,
             "energy": self.energy if np.isfinite(self.energy) else None,
             **summarise_qualities(self.quality_before, self.quality_after),
         }

@@ -21,12 +21,12 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.gradients.layers import (
     DoubtfulDerivative,
     FlattenedKeywords,
-    FlattenLayer,
     MapNotFound,
-    PolishLayer,
     SolvedKeywords,
     SolvedOptions,
-    TensorLayer,
+    make_flattened_layer,
+    make_solved_layer,
+    make_tensor_layer,
 )
 from quasiharmonic.apps.torch.function import apply_layer
 from quasiharmonic.geometry.mesh.reference import Reference
@@ -72,7 +72,8 @@ def quasi_harmonic_map(
     ValueError
         If an argument is on another device or has the wrong shape, or `quasiharmonic.quasi_harmonic_map` raises it.
     """
-    return apply_layer(TensorLayer(problem, reference, linear_solver), {"mu": mu, "target": target, "rest": rest})
+    settings = problem, reference, linear_solver
+    return apply_layer(make_tensor_layer, settings, {"mu": mu, "target": target, "rest": rest})
 
 
 @takes(SolvedOptions, SolvedKeywords)
@@ -104,7 +105,7 @@ def injective_map(
     MapNotFound
         If no injective map was found for one item of the batch.
     """
-    return apply_layer(PolishLayer.of(problem, options), {"target": target, "rest": rest})
+    return apply_layer(make_solved_layer, (problem, options), {"target": target, "rest": rest})
 
 
 @takes(FlattenOptions, FlattenedKeywords)
@@ -139,4 +140,4 @@ def flatten(
     MapNotFound
         If no injective map was found for one item of the batch.
     """
-    return apply_layer(FlattenLayer.of(rest, F, target, options), {"rest": rest, "target": target})
+    return apply_layer(make_flattened_layer, (rest, F, target, options), {"rest": rest, "target": target})

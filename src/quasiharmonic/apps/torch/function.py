@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -23,8 +23,14 @@ _COMPILED = "maps are computed by NumPy and SciPy, so torch.compile breaks the g
 
 
 @torch.compiler.disable(reason=_COMPILED)  # type: ignore[untyped-decorator]
-def apply_layer(layer: Layer, arguments: Mapping[str, torch.Tensor | None]) -> torch.Tensor:
-    """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes."""
+def apply_layer(
+    make: Callable[..., Layer], settings: tuple[Any, ...], arguments: Mapping[str, torch.Tensor | None]
+) -> torch.Tensor:
+    """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes.
+
+    The layer is made from its settings here, because `torch.compile` does not follow this function.
+    """
+    layer = make(*settings)
     names, tensors = select_arguments(layer, arguments, _check)
     maps: torch.Tensor = _Map.apply(layer, names, *tensors)[0]
     return maps

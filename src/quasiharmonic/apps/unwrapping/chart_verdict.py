@@ -16,6 +16,7 @@ from quasiharmonic.geometry.exact.loops import Obstacle
 from quasiharmonic.geometry.exact.predicates import box_pairs
 from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of, repeat_each
+from quasiharmonic.util.outcome import Verdict
 
 # Largest distance between the boxes of stacked charts, in sides of the texture. Congruent charts may differ by a share
 # of 1e-4 of their radius.
@@ -23,7 +24,7 @@ _SAME_PLACE = 1e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class UnwrapCertificate:
+class UnwrapCertificate(Verdict):
     """The exact verdict on the stored texture coordinates of `unwrap`.
 
     The orientation of every triangle is that of the cleaned mesh. Degenerate and repeated triangles of the input are
@@ -49,13 +50,15 @@ class UnwrapCertificate:
     overlapping: IntArray
     clearance: float
 
-    def __repr__(self) -> str:
-        return f"<UnwrapCertificate: {self.summary()}>"
-
     @property
     def injective(self) -> bool:
         """Whether every triangle is strictly positive."""
         return not (self.inverted.size or self.degenerate.size)
+
+    @property
+    def valid(self) -> bool:
+        """Whether every triangle is strictly positive; equal to `injective`."""
+        return self.injective
 
     @property
     def disjoint(self) -> bool:

@@ -24,7 +24,7 @@ from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import injective_map
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, check_non_negative, index_array, map_array
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import OutcomeOf
 
 # Pixels drawn per block, so that the arrays fit into the cache.
 _PIXELS = 1 << 15
@@ -33,7 +33,7 @@ LARGE = 100
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class WarpResult(Outcome):
+class WarpResult(OutcomeOf):
     """A warped image and the map that warped it.
 
     Attributes
@@ -55,16 +55,6 @@ class WarpResult(Outcome):
     F: IntArray
     positions: FloatArray
     result: MapResult
-
-    @property
-    def success(self) -> bool:
-        """Whether the map is a success."""
-        return self.result.success
-
-    @property
-    def message(self) -> str:
-        """The message of the map's status."""
-        return self.result.message
 
 
 def warp_by_landmarks(

@@ -48,6 +48,7 @@ from quasiharmonic.util.arrays import (
     unchangeable,
 )
 from quasiharmonic.util.display import Displayable
+from quasiharmonic.util.outcome import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,7 +60,7 @@ def _none() -> IntArray:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Certificate(ReadOnly, Displayable):
+class Certificate(ReadOnly, Displayable, Verdict):
     """Result of the exact test of a map; returned by `certify`.
 
     Attributes
@@ -122,6 +123,11 @@ class Certificate(ReadOnly, Displayable):
     def injective(self) -> bool:
         """Whether there is at least one triangle and every triangle is strictly positive."""
         return self.triangles > 0 and not (self.inverted.size or self.degenerate.size or self.nonfinite.size)
+
+    @property
+    def valid(self) -> bool:
+        """Whether every triangle is strictly positive; equal to `injective`."""
+        return self.injective
 
     def summary(self) -> str:
         """Describe in one or two sentences what is certified, or what is wrong and where."""

@@ -18,8 +18,10 @@ from dataclasses import replace
 import numpy as np
 
 from quasiharmonic.apps.flattening.connected_parts import Part, name_part, unite_parts
+from quasiharmonic.apps.flattening.contacts import nearest_on_edges
 from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions, renumber_obstruction
 from quasiharmonic.apps.flattening.pins.pin_search import PinSearch
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.loops import check_loops, winding
 from quasiharmonic.geometry.mesh.topology import edges
@@ -158,18 +160,13 @@ def _move_to_free_space(
     around, on = winding(target, tails, heads)
     free = np.flatnonzero((around == 0) & ~on)[:_MAX_PINS]
     if free.size:
-        clearance = _distances(target[free], tails, heads)
+        away, starts, ends = (in_units(points, 0) for points in (target[free], tails, heads))
+        clearance = nearest_on_edges(away[:, None], starts, ends)[0].min(axis=1)
         pin, max_clearance = free[int(np.argmax(clearance))], float(clearance.max())
         away = uv - uv[fixed[pin]]
         return target[pin] + _FILLED * max_clearance / float(np.hypot(*away.T).max()) * away
     low, high = tails.min(axis=0), tails.max(axis=0)
     return uv - uv.min(axis=0) + (high[0] + _GAP * float((high - low).max()), low[1])
-
-
-def _distances(points: FloatArray, tails: FloatArray, heads: FloatArray) -> FloatArray:
-    """Distances of points (k, 2) to the nearest of several segments (m, 2); (k,) float64."""
-    along, away = (heads - tails) @ (1, 1j), (points[:, None] - tails) @ (1, 1j)
-    return np.abs(away - np.clip((away / along).real, 0, 1) * along).min(axis=1)
 
 
 def _renumber_diagnosis(diagnosis: Diagnosis, part: Part) -> Diagnosis:

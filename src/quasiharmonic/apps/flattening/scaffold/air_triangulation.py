@@ -19,8 +19,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.flattening.contacts import nearest_on_edges
 from quasiharmonic.apps.flattening.scaffold.graded_points import Quadtree
 from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay, select_inside
 from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, names_of, to_complex
@@ -146,13 +148,9 @@ def _inner_points(
         p, q = np.concatenate([p, middle]), np.concatenate([middle, q])
     p, q = np.concatenate(pieces, axis=1)
     nearest = KDTree((p + q) / 2).query(points)[1]
-    p, q = p[nearest], q[nearest]
-    along, away = (q - p) @ (1, 1j), (points - p) @ (1, 1j)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        local = away / along
-    local = np.where(np.isfinite(local), local, 0)
-    distance = np.abs(local - np.clip(local.real, 0, 1)) * np.abs(along)
-    return points[(local.imag < 0) & (distance > _CLEARANCE * sizes)]
+    at, start, end = (in_units(positions, 0) for positions in (points, p[nearest], q[nearest]))
+    outside = ((end - start).conj() * (at - start)).imag < 0
+    return points[outside & (nearest_on_edges(at, start, end)[0] > _CLEARANCE * sizes)]
 
 
 def _triangulate(
