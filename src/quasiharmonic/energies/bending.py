@@ -98,10 +98,8 @@ class Plate:
 class PlateSystem(NewtonSystem):
     """Newton system with an added symmetric matrix (n, n) for each coordinate, and with its larger sparsity pattern."""
 
-    def __init__(
-        self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str, constant: csr_array
-    ) -> None:
-        super().__init__(F, g, n, fixed, linear_solver)
+    def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, constant: csr_array) -> None:
+        super().__init__(F, g, n, fixed)
         own = csr_array((np.ones(self._indices.size), self._indices, self._indptr), shape=(2 * self.free.size,) * 2)
         added = triu(kron(constant[self.free][:, self.free], np.eye(2)), format="csr")
         # Compute the pattern with ones as values, so that no entries cancel.
@@ -110,18 +108,18 @@ class PlateSystem(NewtonSystem):
         self._own_slots, self._constant = _entry_indices(own, pattern), np.zeros(pattern.nnz)
         self._constant[_entry_indices(csr_array(added), pattern)] = added.data
         self._starts = pattern.indptr[:-1]
-        self.solver = make_solver(pattern.indptr, pattern.indices, name=linear_solver)
+        self.solver = make_solver(pattern.indptr, pattern.indices)
 
     def assemble(self, form: QuadraticForm) -> None:
         """Add up the triangles' quadratic forms and the constant matrix."""
         super().assemble(form)
-        self._diagonal = self._diagonal + self._constant[self._starts]
+        self.diagonal = self.diagonal + self._constant[self._starts]
 
     def factor(self, shift: float = 0.0) -> None:
         """Factor the assembled matrix; see `NewtonSystem.factor`."""
         values = self._constant.copy()
         values[self._own_slots] += self._values
-        diagonal = self._diagonal * (1 + shift)
+        diagonal = self.diagonal * (1 + shift)
         values[self._starts] = np.where(diagonal > 0, diagonal, 1)
         self.solver.factor(values)
 
@@ -164,7 +162,7 @@ def bend_map(
         deformation, exponent = scale_energy(domain, result.uv, find_energy(energy))
         unit = float(np.ldexp(1.0, exponent))
         constant = csr_array(2 * unit**2 * plate.matrix())
-        system = PlateSystem(deformation.F, deformation.g, domain.n, domain.fixed, "auto", constant)
+        system = PlateSystem(deformation.F, deformation.g, domain.n, domain.fixed, constant)
         coordinates = Coordinates.of(result.uv, domain.fixed, exponent)
         model = MapModel(deformation, coordinates, system, [PlateTerm(plate, unit)])
         descent = NewtonDescent(model, model.evaluate(in_units(result.uv, exponent)))

@@ -29,13 +29,12 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    check_finite,
     check_integer,
     check_range,
     index_array,
     map_array,
     morton_order,
-    real_array,
+    vertex_array,
 )
 from quasiharmonic.util.progress import heartbeat
 
@@ -198,13 +197,10 @@ def surface_distances(
         When an array has the wrong shape, an index is out of range, a coordinate is not finite, a triangle has no area,
         or a number is not a whole number of at least 1 (``crossings`` and ``seed``: at least 0).
     """
-    V, F = real_array("V", V), index_array("F", F)
+    V, F = vertex_array(V), index_array("F", F)
     if F.ndim != 2 or F.shape[1] != 3 or not len(F):
         raise ValueError(f"F must have shape (f, 3) with at least one triangle, not {F.shape}")
-    if V.ndim != 2 or V.shape[1] not in (2, 3):
-        raise ValueError(f"V must have shape (n, 2) or (n, 3), not {V.shape}")
     check_range("F", F, len(V))
-    check_finite("V", "vertex", "vertices", V)
     for name, value in (("rings", rings), ("sources", sources)):
         check_integer(name, value, minimum=1)
     for name, value in (("crossings", crossings), ("seed", seed)):

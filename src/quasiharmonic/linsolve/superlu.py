@@ -25,7 +25,7 @@ class SuperLU(LinearSolver):
         # third of the time of ordering again.
         entries = np.arange(1, self.nnz + 1)
         upper = csr_array((entries, self._indices, self._indptr), shape=(self.n, self.n))
-        lower = csr_array((entries, self._indices, self._indptr), shape=(self.n, self.n)).T.tocsr()
+        lower = upper.T.tocsr()
         lower.setdiag(0)
         lower.eliminate_zeros()
         full = csc_array(upper + lower)

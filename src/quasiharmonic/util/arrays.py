@@ -467,15 +467,21 @@ def count_of(one: str, many: str, count: int) -> str:
     return f"{count} {one if count == 1 else many}"
 
 
-def names_of(one: str, many: str, indices: NDArray[np.integer], limit: int = 5) -> str:
+def names_of(one: str, many: str, indices: NDArray[np.integer]) -> str:
     """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``."""
-    listed = ", ".join(str(int(i)) for i in indices[:limit])
-    rest = f", … ({len(indices)} in all)" if len(indices) > limit else ""
-    return f"{one if len(indices) == 1 else many} {listed}{rest}"
+    return _list_first(one, many, [str(int(i)) for i in indices[:_LISTED]], len(indices))
 
 
-def edge_names(pairs: IntArray, limit: int = 5) -> str:
+def edge_names(pairs: IntArray) -> str:
     """Name the first few of some edges: ``edges (1, 2), (4, 7), … (9 in all)``."""
-    listed = ", ".join(f"({i}, {j})" for i, j in pairs[:limit].tolist())
-    rest = f", … ({len(pairs)} in all)" if len(pairs) > limit else ""
-    return f"{'edge' if len(pairs) == 1 else 'edges'} {listed}{rest}"
+    return _list_first("edge", "edges", [f"({i}, {j})" for i, j in pairs[:_LISTED].tolist()], len(pairs))
+
+
+# Number of elements that a message lists.
+_LISTED = 5
+
+
+def _list_first(one: str, many: str, listed: list[str], count: int) -> str:
+    """Join the names of the first of ``count`` elements, and give their number if there are more."""
+    rest = f", … ({count} in all)" if count > len(listed) else ""
+    return f"{one if count == 1 else many} {', '.join(listed)}{rest}"

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.polygons import Polygons
-from quasiharmonic.geometry.mesh.topology import edge_keys, edges, trace_loops
+from quasiharmonic.geometry.mesh.topology import edges, pair_keys, trace_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.targets.cuts.find import find_cuts
@@ -43,14 +43,10 @@ def cut_along(mesh: SeamedMesh, pairs: ArrayLike, *, polygons: Polygons | None =
     cut = SeamedMesh(mesh.V, mesh.F).cut(pairs)
     if polygons is not None:
         inside, given = polygons.diagonals(mesh.F), np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
-        within = np.isin(_keys(given, len(mesh.V)), _keys(inside, len(mesh.V)))
+        within = np.isin(pair_keys(given, len(mesh.V)), pair_keys(inside, len(mesh.V)))
         if within.any():
             raise ValueError(f"{edge_names(given[within])} inside a polygon: give only edges of the polygons")
     return cut
-
-
-def _keys(pairs: IntArray, n: int) -> IntArray:
-    return edge_keys(pairs[:, 0], pairs[:, 1], n)
 
 
 def _is_disk(F: IntArray, n: int) -> bool:

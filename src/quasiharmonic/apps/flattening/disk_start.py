@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -48,9 +49,3 @@ def surface_area(V: FloatArray, F: IntArray) -> float:
     corners = V[F]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * float(np.linalg.norm(normals, axis=1).sum())
-
-
-def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:
-    """Fill loops, with the surface on their left, by triangles (k, 3) around new vertices numbered from ``n``."""
-    triangles = [np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)]
-    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, to_complex, to_points
 
 # Space between two components, relative to the largest side of all.
 _GAP = 0.05
@@ -19,7 +19,7 @@ def align_with_axis(F: IntArray, uv: FloatArray) -> FloatArray:
     The map is of about unit size, and the axis is that of the image's moments of inertia. The longer tail of the
     image's area points to the right. The result has new rounding errors.
     """
-    w = np.ascontiguousarray(uv).view(np.complex128).ravel()
+    w = to_complex(uv)
     area = signed_areas(F, w)
     corners = w[F]
     middle = corners.mean(axis=1)
@@ -30,7 +30,7 @@ def align_with_axis(F: IntArray, uv: FloatArray) -> FloatArray:
     along = turned[F].mean(axis=1).real
     if (area * along**3).sum() < 0:
         turned = -turned
-    aligned = turned.view(np.float64).reshape(-1, 2)
+    aligned = to_points(turned)
     return aligned - aligned.min(axis=0)
 
 

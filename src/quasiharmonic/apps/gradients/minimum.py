@@ -21,7 +21,7 @@ from quasiharmonic.energies.energies import Deformation
 from quasiharmonic.energies.newton.line_search import backtrack
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.util.arrays import ComplexArray
+from quasiharmonic.util.arrays import ComplexArray, to_points
 from quasiharmonic.util.progress import heartbeat
 
 # Maximum number of steps.
@@ -144,7 +144,7 @@ class Minimum:
             if there is None:
                 return np.inf, None
             value = self._energy.value(there) + self._freedom.extra()
-            accepted = value <= bound and is_injective(self._energy.F, there.view(np.float64).reshape(-1, 2))
+            accepted = value <= bound and is_injective(self._energy.F, to_points(there))
             return value, there if accepted else None
 
         # Near the stationary point only rounding changes the energy, so no decrease is required.

@@ -10,7 +10,7 @@ from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.geometry.mesh.elements import MIDDLES, SIDES
 from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, invert_indices, to_complex, to_points
 
 # Required least control value of an inverted element, relative to that of the triangle of its corners.
 _MARGIN = 0.1
@@ -37,12 +37,12 @@ def follow_sides(before: FloatArray, after: FloatArray, middle: IntArray, ends: 
 
     Nodes of straight sides keep their relative position. If both ends are unchanged, the node is exactly unchanged.
     """
-    z, w = (np.ascontiguousarray(points).view(np.complex128).ravel() for points in (before, after))
+    z, w = (to_complex(points) for points in (before, after))
     (a, b), (p, q) = z[ends].T, w[ends].T
     ratio = np.divide(q - p, b - a, out=np.zeros_like(a), where=a != b)
     place = 0.5 * (p + q) + ratio * (z[middle] - 0.5 * (a + b))
     place = np.where((a == p) & (b == q), z[middle], place)
-    return place.view(np.float64).reshape(-1, 2)
+    return to_points(place)
 
 
 def restore_midsides(F: IntArray, rest: FloatArray, points: FloatArray, fixed: IntArray) -> FloatArray:
@@ -146,8 +146,7 @@ class _Displacement:
         self._F, self._first, self._free = F, first, free
         self._unit = np.abs(jacobian_coefficients(*_chords(F, first))[:, 0])
         self._size = np.sqrt(self._unit.mean())
-        self._number = np.full(len(first), -1)
-        self._number[free] = np.arange(free.size)
+        self._number = invert_indices(len(first), free)
 
     def _find_displacement(self, now: FloatArray) -> FloatArray:
         """Return the displacements (k, 2) of the free nodes, relative to the size of elements."""

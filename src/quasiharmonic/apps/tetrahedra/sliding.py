@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_finite, real_array
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_finite, invert_indices, real_array
 
 # Largest distance of a vertex from a plane, relative to the extent of the mesh.
 _TOLERANCE = 1e-6
@@ -71,8 +71,7 @@ def find_sliding(F: IntArray, X: FloatArray, moved: IntArray, slide: bool | Arra
         normals, named = _snap_to_planes(slide, F, P, normals, (centre, extent, rounding))
         used = np.setdiff1d(used, F[~named])
     vertices = np.setdiff1d(used, moved)
-    number = np.full(len(X), -1)
-    number[vertices] = np.arange(vertices.size)
+    number = invert_indices(len(X), vertices)
     # A unit step along a direction leaves the plane of a triangle by at most this, relative to its height.
     leaning = normals * height[:, None]
     squares = np.zeros((vertices.size, 3, 3))

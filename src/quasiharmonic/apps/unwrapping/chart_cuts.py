@@ -10,7 +10,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
 # An extension reaches at most this number of peaks; fewer if less than this share of the area is over the bound.
 _MAX_PEAKS = 24
@@ -161,8 +161,7 @@ def _line_from(chart: WorkingChart, graph: EdgeGraph, one: int, other: int) -> B
     far, before = graph.distances(loop[[middle]], weight)
     with np.errstate(all="ignore"):
         score = np.where(arc > 0, (far[loop] + _LINE_COST * total) / arc, np.inf)
-    line = np.zeros(len(graph.ends), dtype=bool)
-    line[graph.way_back(before, int(loop[np.argmin(score)]))] = True
+    line = mark(len(graph.ends), graph.way_back(before, int(loop[np.argmin(score)])))
     return line & ~graph.rim
 
 
@@ -218,11 +217,9 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     rest = (network - flow).tocsr()
     rest.data[rest.data < 0] = 0
     rest.eliminate_zeros()
-    reached = np.zeros(size, dtype=bool)
-    reached[breadth_first_order(rest, size - 2, return_predecessors=False)] = True
+    reached = mark(size, breadth_first_order(rest, size - 2, return_predecessors=False))
     side = reached[node[:k]]
-    line = np.zeros(len(graph.ends), dtype=bool)
-    line[edge[side[first] != side[second]]] = True
+    line = mark(len(graph.ends), edge[side[first] != side[second]])
     return line
 
 
@@ -232,8 +229,7 @@ def _group_undivided(cost: FloatArray, graph: EdgeGraph) -> IntArray:
     ``cost`` (k, 3) are the factors of the sides.
     """
     first, second, edge = _pairs(graph)
-    dear = np.zeros(len(graph.ends), dtype=bool)
-    dear[graph.side.T[cost >= UNDIVIDED_COST]] = True
+    dear = mark(len(graph.ends), graph.side.T[cost >= UNDIVIDED_COST])
     joined = dear[edge]
     return label_components(first[joined], second[joined], len(cost))
 

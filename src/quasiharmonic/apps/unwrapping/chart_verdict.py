@@ -9,12 +9,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from quasiharmonic.apps.unwrapping.layout import ChartLayout
+from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.loops import Obstacle
 from quasiharmonic.geometry.exact.predicates import box_pairs
 from quasiharmonic.geometry.mesh.topology import label_components
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, names_of, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of, repeat_each
 from quasiharmonic.util.outcome import Verdict
 
 # Largest distance between the boxes of stacked charts, in sides of the texture. Congruent charts may differ by a share
@@ -120,8 +121,7 @@ def certify_charts(
         uv = uv + shift * _rank_in_stack(uv, chart_of_vertex)[chart_of_vertex, None]
     whole = certificate.certify(F, uv)
     wrong = np.concatenate([whole.inverted, whole.degenerate, whole.nonfinite])
-    good = np.ones(int(chart.max(initial=-1)) + 1, dtype=bool)
-    good[chart[wrong]] = False
+    good = ~mark(int(chart.max(initial=-1)) + 1, chart[wrong])
     overlapping = np.empty((0, 2), dtype=np.int64)
     if any(reason.kind is not Obstacle.NOT_INJECTIVE for reason in whole.reasons):
         good, overlapping = _find_faults(F, uv, chart, chart_of_vertex, whole)
@@ -189,14 +189,5 @@ def _clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vertex: Int
                 (p[other], p[one], q[one]),
                 (q[other], p[one], q[one]),
             ):
-                least = min(least, float(_distances(a, b, c).min()))
+                least = min(least, float(nearest_on_segments(a, b, c)[1].min()))
     return least if least <= reach else np.inf
-
-
-def _distances(points: FloatArray, p: FloatArray, q: FloatArray) -> FloatArray:
-    """Return the distances of points (k, 2) from segments pq (k, 2)."""
-    along, to = q - p, points - p
-    length = (along * along).sum(axis=1)
-    share = np.clip((to * along).sum(axis=1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
-    distance: FloatArray = np.linalg.norm(to - share[:, None] * along, axis=1)
-    return distance

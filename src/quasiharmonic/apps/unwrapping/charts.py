@@ -18,9 +18,9 @@ from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.fans import fans, renumber
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.targets.cuts.find import find_cuts
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each, scale_to_unit
 
 #: Default of ``max_stretch``.
 MAX_STRETCH = 1.5
@@ -173,7 +173,7 @@ def _unfold_small(
     _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
     chosen = np.bincount(component) <= _SMALL
     chosen[component[(times[edge].reshape(sides.shape) < 2).any(axis=1)]] = False
-    chosen[component[np.isin(sides, _keys(cut, len(V))).any(axis=1)]] = False
+    chosen[component[np.isin(sides, pair_keys(cut, len(V))).any(axis=1)]] = False
     rows = rows[chosen[component]]
     if not rows.size:
         return mask, charts
@@ -211,7 +211,7 @@ def _try_map(chart: WorkingChart, corner_uv: FloatArray) -> None:
     uv = np.empty((len(chart.V), 2))
     uv[chart.F] = corner_uv
     # In this unit, areas neither overflow nor underflow.
-    uv = np.ldexp(uv, -int(np.frexp(np.abs(uv).max())[1]))
+    uv = scale_to_unit(uv)
     uv[:, 0] *= np.sign(signed_areas(chart.F, in_units(uv, 0)).sum())
     if is_injective(chart.F, uv):
         chart.use(uv)
@@ -223,7 +223,7 @@ def _cut(V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: Floa
     """Cut triangles into disks; return them as charts without maps. Demanded cuts are extended only to make disks."""
     n = len(V)
     sides = edge_keys(F[rows], F[rows][:, (1, 2, 0)], n)
-    there = given[np.isin(_keys(given, n), sides)]
+    there = given[np.isin(pair_keys(given, n), sides)]
     vertices, own = np.unique(F[rows], return_inverse=True)
     cut = vertices[
         find_cuts(
@@ -241,17 +241,13 @@ def _cut(V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: Floa
 def _split(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[tuple[IntArray, IntArray, IntArray]]:
     """Split triangles along edges (l, 2); return rows, triangles by own vertices, and vertices of each part."""
     sides = edge_keys(F, F[:, (1, 2, 0)], n)
-    split, component = fans(F, np.isin(sides, _keys(cut, n)))
+    split, component = fans(F, np.isin(sides, pair_keys(cut, n)))
     order = np.argsort(component, kind="stable")
     parts = []
     for some in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
         own, corner = renumber(split[some], F[some])
         parts.append((rows[some], own, F[some].ravel()[corner]))
     return parts
-
-
-def _keys(pairs: IntArray, n: int) -> IntArray:
-    return edge_keys(pairs[:, 0], pairs[:, 1], n)
 
 
 def _finish(charts: list[WorkingChart], bound: float, total: float) -> list[Chart]:

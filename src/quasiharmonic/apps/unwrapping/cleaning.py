@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.apps.unwrapping.exclusion import exclude
 from quasiharmonic.apps.unwrapping.sheets import join_sheets
 from quasiharmonic.apps.unwrapping.widening import widen
-from quasiharmonic.geometry.mesh.topology import boundary_edges, components, edge_keys
+from quasiharmonic.geometry.mesh.topology import boundary_edges, components, edge_keys, pair_keys
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.inspection import MeshReport, find_close_vertices, inspect_mesh, tabulate_elements
 from quasiharmonic.util.arrays import (
@@ -274,7 +274,7 @@ def _find_edges(joint: IntArray, corners: IntArray, pairs: IntArray) -> IntArray
     """Return edges (k, 2) of triangles ``joint`` (f, 3) by the vertices ``corners`` (f, 3) at one of their sides."""
     n = int(joint.max()) + 1
     keys, side = np.unique(edge_keys(joint, joint[:, (1, 2, 0)], n), return_index=True)
-    side = side[np.searchsorted(keys, edge_keys(pairs[:, 0], pairs[:, 1], n))]
+    side = side[np.searchsorted(keys, pair_keys(pairs, n))]
     ends = np.stack([corners.ravel()[side], corners[:, (1, 2, 0)].ravel()[side]], axis=1)
     return np.unique(np.sort(ends, axis=1), axis=0)
 

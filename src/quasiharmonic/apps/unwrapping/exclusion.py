@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_twins
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
 
 class Exclusion(NamedTuple):
@@ -50,8 +50,7 @@ def exclude(points: FloatArray, F: IntArray, degenerate: BoolArray) -> Exclusion
     """
     good = np.flatnonzero(~degenerate)
     twin = good[find_twins(F[good])]
-    stays = np.zeros(len(F), dtype=bool)
-    stays[twin] = True
+    stays = mark(len(F), twin)
     row = np.cumsum(stays) - 1
     substitute = np.full(len(F), -1)
     substitute[good] = row[twin]
@@ -72,8 +71,7 @@ def exclude(points: FloatArray, F: IntArray, degenerate: BoolArray) -> Exclusion
 def _find_neighbours(points: FloatArray, F: IntArray, flat: IntArray) -> IntArray:
     """Return the row of F that is nearest to each of the degenerate triangles (k, 3)."""
     n = len(points)
-    touched = np.zeros(n, dtype=bool)
-    touched[flat] = True
+    touched = mark(n, flat)
     touches = touched[F]
     row_of_vertex = np.full(n, -1)
     rows, corner = np.nonzero(touches)

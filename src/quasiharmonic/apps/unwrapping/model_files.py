@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, mark
 
 # Factor on the cost of a seam inside a polygon, which the file cannot store.
 _INSIDE_POLYGON = 1e3
@@ -25,7 +25,7 @@ def polygon_costs(mesh: MeshData, costs: FloatArray | None = None) -> FloatArray
     found = np.ones(mesh.F.shape) if costs is None else costs.copy()
     diagonals, n = mesh.polygons.diagonals(mesh.F), len(mesh.V)
     keys = edge_keys(mesh.F, mesh.F[:, (1, 2, 0)], n)
-    found[np.isin(keys, edge_keys(diagonals[:, 0], diagonals[:, 1], n))] = _INSIDE_POLYGON
+    found[np.isin(keys, pair_keys(diagonals, n))] = _INSIDE_POLYGON
     return found
 
 
@@ -66,8 +66,7 @@ def divide_polygons(mesh: MeshData) -> tuple[MeshData, int]:
     key = (polygons.of_triangle[:, None] * len(mesh.V) + mesh.F).ravel()
     order = np.argsort(key, kind="stable")
     rows, same = mesh.FT.ravel()[order], np.diff(key[order]) == 0
-    divided = np.zeros(len(polygons), dtype=np.bool_)
-    divided[key[order][1:][same & (np.diff(rows) != 0)] // len(mesh.V)] = True
+    divided = mark(len(polygons), key[order][1:][same & (np.diff(rows) != 0)] // len(mesh.V))
     if not divided.any():
         return mesh, 0
     before = np.concatenate([[0], np.cumsum(np.where(divided, polygons.sizes - 2, 1))])

@@ -12,7 +12,7 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.io.adapters.trimesh import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
-from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, find_exponent
 from quasiharmonic.util.outcome import Outcome
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ class UnwrapResult(Outcome):
     def seam_length(self) -> float:
         """Total length of the seams, each counted once, in the unit of the model."""
         # In this unit, squares neither overflow nor underflow.
-        exponent = int(np.frexp(np.abs(self.V).max())[1])
+        exponent = find_exponent(self.V)
         ends = np.ldexp(self.V[self.seams], -exponent)
         return float(np.ldexp(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum(), exponent))
 

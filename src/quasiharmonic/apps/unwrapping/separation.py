@@ -17,7 +17,7 @@ from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, in_un
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.geometry.exact.loops import check_loops, winding
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, sum_at
 
 # Distance that a vertex must have from the edge, relative to the edge's length.
 _GAP = 0.1
@@ -78,7 +78,7 @@ class Penetrations:
         pull = -2 * self._weight * self._depth(w) / self._length * self._normal
         parts = (self._shares * pull).ravel()
         at = self.corners.ravel()
-        return np.bincount(at, parts.real, minlength=w.size) + 1j * np.bincount(at, parts.imag, minlength=w.size)
+        return sum_at(at, parts, w.size)
 
     def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
         """Add a bound of the second derivatives that does not couple vertices."""
@@ -134,8 +134,7 @@ def overlapping_share(chart: WorkingChart) -> float:
     """Share of the area of the triangles at the boundary whose centres are covered more than once."""
     assert chart.uv is not None
     loops = chart.piece.loops
-    rim = np.zeros(len(chart.V), dtype=bool)
-    rim[np.concatenate(loops)] = True
+    rim = mark(len(chart.V), np.concatenate(loops))
     near = np.flatnonzero(rim[chart.F].any(axis=1))
     tails, heads = np.concatenate(loops), np.concatenate([np.roll(loop, -1) for loop in loops])
     turns, _ = winding(chart.uv[chart.F[near]].mean(axis=1), chart.uv[tails], chart.uv[heads])

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, repeat_each
 
 # At an edge of more triangles than this, none are joined. The number of pairs grows with its square.
 _MAX_TRIANGLES = 16
@@ -172,8 +172,7 @@ def _two_colour(one: IntArray, other: IntArray, weight: FloatArray) -> BoolArray
     graph = csr_array((np.ones(start.size, dtype=np.int8), (start, end)), shape=(m + 1, m + 1))
     ahead = breadth_first_order(graph, m)[1][:m].astype(np.int64)
     ahead[roots] = roots
-    colour = np.ones(m, dtype=bool)
-    colour[roots] = False
+    colour = ~mark(m, roots)
     while not np.array_equal(further := ahead[ahead], ahead):
         colour ^= colour[ahead]
         ahead = further
@@ -291,8 +290,7 @@ def _split(F: IntArray, links: Links, turned: BoolArray, contested: IntArray) ->
         # Only the first pair of sides, or the first side, stays at this edge. The others get a vertex of their own.
         away = side[repeat_each(wrong, count) & (leader != repeat_each(leader[first], count))]
         at_start = fan[away] < fan[_ahead(away)]
-        cut = np.zeros(F.size, dtype=bool)
-        cut[np.where(at_start, _behind(away), _ahead(away))] = True
+        cut = mark(F.size, np.where(at_start, _behind(away), _ahead(away)))
         apart = cut[links.one] | cut[links.other]
         contested = np.union1d(contested, [links.one[apart], links.other[apart]])
         links = links.select(~apart)

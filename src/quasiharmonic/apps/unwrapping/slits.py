@@ -8,6 +8,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.util.arrays import mark
 
 # Two sides of a cut lie at the same place if their ends are at most this fraction of their length apart.
 _SAME = 0.01
@@ -32,8 +33,7 @@ def close_slits(chart: WorkingChart) -> WorkingChart | None:
     same = apart <= _SAME * np.abs(z[tail[one]] - z[head[one]])
     if not same.any():
         return None
-    cut = np.zeros(chart.F.size, dtype=bool)
-    cut[np.setdiff1d(rim, np.concatenate([one[same], other[same]]))] = True
+    cut = mark(chart.F.size, np.setdiff1d(rim, np.concatenate([one[same], other[same]])))
     on_surface = chart.vertices[chart.F]
     own, corner = renumber(fans(on_surface, cut.reshape(-1, 3))[0], on_surface)
     count = np.bincount(own.ravel())

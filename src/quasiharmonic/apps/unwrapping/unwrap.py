@@ -25,6 +25,7 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_callback,
     check_integer,
+    find_exponent,
     real_array,
     triangle_array,
     vertex_array,
@@ -138,7 +139,7 @@ def unwrap(
     report("clean")
     cleaned = clean(V, F, outward)
     # In this unit, areas neither overflow nor underflow.
-    exponent = int(np.frexp(np.abs(cleaned.V).max())[1])
+    exponent = find_exponent(cleaned.V)
     exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)

@@ -11,7 +11,7 @@ import numpy as np
 
 from quasiharmonic.geometry.mesh.reference import flat_triangles, rest_frames
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
 # A triangle is thin if its height is smaller than this multiple of its longest side, which flattening cannot cope with,
 # or of the root of the surface's area, which is a few units of the precision of texture coordinates.
@@ -111,8 +111,7 @@ def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
 
 def _joins(F: IntArray, sides: FloatArray, flat: BoolArray, present: BoolArray) -> BoolArray:
     """Return for each triangle (f,) whether it is a flat one that joins others."""
-    touched = np.zeros(int(F.max()) + 1, dtype=bool)
-    touched[F[flat]] = True
+    touched = mark(int(F.max()) + 1, F[flat])
     near = np.flatnonzero((touched[F].sum(axis=1) > 1) & present)
     keys = edge_keys(F[near], F[near][:, (1, 2, 0)], touched.size)
     _, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
@@ -126,8 +125,7 @@ def _joins(F: IntArray, sides: FloatArray, flat: BoolArray, present: BoolArray) 
     order = np.argsort(edge, kind="stable")
     same = (edge[order[1:]] == edge[order[:-1]]) & (edge[order[1:]] >= 0)
     part = label_components(order[:-1][same] // 3, order[1:][same] // 3, near.size)
-    has_area = np.zeros(near.size, dtype=bool)
-    has_area[part[~flat[near]]] = True
+    has_area = mark(near.size, part[~flat[near]])
     joins = np.zeros(len(F), dtype=bool)
     joins[near] = good & has_area[part] & flat[near]
     return joins

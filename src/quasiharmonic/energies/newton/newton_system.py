@@ -46,6 +46,8 @@ class NewtonSystem:
     ----------
     free : (n - k,) int64
         The free vertices, ascending.
+    diagonal : (2 (n - k),) float64
+        Diagonal of the assembled matrix.
     """
 
     def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
@@ -100,18 +102,13 @@ class NewtonSystem:
         rest = form.p2, form.q2, form.pq, form.pqc
         p2, q2, pq, pqc = (np.ascontiguousarray(field, dtype=np.complex128) for field in rest)
         add_up(pp, qq, p2, q2, pq, pqc, self._g, self._slots, self._turns, self._sums)
-        self._diagonal = self._values[self._first]
+        self.diagonal = self._values[self._first]
 
     def add_blocks(self, xx: FloatArray, xy: FloatArray, yy: FloatArray) -> None:
         """Add a symmetric 2×2 block at every free vertex to the assembled matrix; (n - k,) float64 each."""
         for slot, part in zip(self._corner_slots, (xx, xy, yy), strict=True):
             self._values[slot] += part
-        self._diagonal = self._values[self._first]
-
-    @property
-    def diagonal(self) -> FloatArray:
-        """Diagonal of the assembled matrix, (2 (n - k),) float64."""
-        return self._diagonal
+        self.diagonal = self._values[self._first]
 
     def matrix(self) -> csr_array:
         """The full symmetric matrix as assembled, for inspection and tests."""
@@ -127,7 +124,7 @@ class NewtonSystem:
         Because the shift is relative, its effect does not depend on triangle size. Raise `NotPositiveDefinite` if the
         rounded matrix is not positive definite.
         """
-        diagonal = self._diagonal * (1 + shift)
+        diagonal = self.diagonal * (1 + shift)
         # Where the triangles give no stiffness, use 1 on the diagonal.
         self._values[self._first] = np.where(diagonal > 0, diagonal, 1)
         self.solver.factor(self._values)
@@ -178,7 +175,7 @@ class NewtonSystem:
 
     def solve_diagonal(self, load: ComplexArray) -> ComplexArray:
         """Divide the load by the matrix's diagonal, as a fallback if no factorisation exists."""
-        diagonal = np.where(self._diagonal > 0, self._diagonal, 1)
+        diagonal = np.where(self.diagonal > 0, self.diagonal, 1)
         return (np.ascontiguousarray(load).view(np.float64) / diagonal).view(np.complex128)
 
 

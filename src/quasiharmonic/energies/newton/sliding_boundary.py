@@ -113,9 +113,10 @@ class SlidingSystem(NewtonSystem):
         slider = invert_indices(size, self.at)
         row = np.searchsorted(self._indptr, self._side_slots[0], side="right") - 1
         ends = slider[row // 2], slider[self._indices[self._side_slots[0]] // 2]
-        # Blocks with a row or a column of a sliding vertex, and the numbers of these vertices.
-        self._by_row, self._by_column = (np.flatnonzero(end >= 0) for end in ends)
-        self._of_row, self._of_column = ends[0][self._by_row], ends[1][self._by_column]
+        # Slots of blocks with a row of a sliding vertex, and of transposed blocks with a column of one, with the
+        # numbers of these vertices.
+        both = self._side_slots, self._side_slots[[0, 2, 1, 3]]
+        self._sliding_blocks = [(slots[:, end >= 0], end[end >= 0]) for slots, end in zip(both, ends, strict=True)]
         self._row = row // 2
         self.tangent: ComplexArray = np.zeros(sliding.size, dtype=np.complex128)
         self.curve_stiffness: FloatArray = np.zeros(sliding.size)
@@ -134,22 +135,17 @@ class SlidingSystem(NewtonSystem):
     def assemble(self, form: QuadraticForm) -> None:
         """Sum the triangles' forms in the unknowns along ``tangent``, and add ``curve_stiffness`` to the diagonal."""
         super().assemble(form)
-        values, slots = self._values, self._side_slots
-        x, y = self.tangent.real, self.tangent.imag
-        xx, xy, yx, yy = slots[:, self._by_row]
-        a, b = x[self._of_row], y[self._of_row]
-        values[xx], values[xy] = a * values[xx] + b * values[yx], a * values[xy] + b * values[yy]
-        values[yx] = values[yy] = 0
-        xx, xy, yx, yy = slots[:, self._by_column]
-        a, b = x[self._of_column], y[self._of_column]
-        values[xx], values[yx] = a * values[xx] + b * values[xy], a * values[yx] + b * values[yy]
-        values[xy] = values[yy] = 0
+        values, x, y = self._values, self.tangent.real, self.tangent.imag
+        for (xx, xy, yx, yy), slider in self._sliding_blocks:
+            a, b = x[slider], y[slider]
+            values[xx], values[xy] = a * values[xx] + b * values[yx], a * values[xy] + b * values[yy]
+            values[yx] = values[yy] = 0
         xx, xy, yy = self._corner_slots[:, self.at]
         along = x * x * values[xx] + 2 * x * y * values[xy] + y * y * values[yy]
         values[xx] = np.where(self.tangent == 0, 0, along + self.curve_stiffness)
         values[xy] = values[yy] = 0
         values[self._coupled] += self.coupling
-        self._diagonal = values[self._first]
+        self.diagonal = values[self._first]
 
 
 class SlidingModel(MapModel):

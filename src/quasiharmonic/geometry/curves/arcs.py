@@ -161,6 +161,17 @@ def subcurve(control: FloatArray, t: float, u: float) -> FloatArray:
     return np.array(found)
 
 
+def nearest_on_segments(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return where segments are nearest to points, as shares of their lengths in [0, 1], and the distances there.
+
+    All arrays have shape (k, 2), or one that broadcasts to it. A segment may be a point.
+    """
+    side, offset = heads - tails, points - tails
+    square = np.maximum((side**2).sum(axis=-1), np.finfo(np.float64).tiny)
+    share = np.clip((offset * side).sum(axis=-1) / square, 0, 1)
+    return share, np.linalg.norm(offset - share[..., None] * side, axis=-1)
+
+
 def angle_at(angles: FloatArray, t: FloatArray) -> FloatArray:
     """Angles on arcs with angles (k, 2) at parameters in [0, 1]."""
     return angles[:, 0] + t * (angles[:, 1] - angles[:, 0])

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,6 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_ea
 from quasiharmonic.util.kernels import compiled
 
 SignArray = NDArray[np.int8]
-Row = TypeVar("Row", bound=np.generic)
 
 # Maximum number of pairs of boundary edges to list. A collapsed boundary has billions.
 _MAX_CROSSINGS = 1000
@@ -171,7 +169,7 @@ def _may_meet(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> Boo
 def simple_loops(loops: list[IntArray], uv: FloatArray) -> BoolArray:
     """Tell which of many loops are simple, (k,) bool; contacts between different loops do not matter."""
     simple = np.ones(len(loops), dtype=bool)
-    vertices, starts, following = concatenate_loops(loops)
+    vertices, starts, following = _concatenate_loops(loops)
     p = uv.take(vertices, 0)
     for i, j in _find_doubtful(p, np.arange(len(p)), following, starts):
         q = p[following]
@@ -248,8 +246,8 @@ def _cross_rays(
 
 
 @dataclass(frozen=True)
-class _Curves:
-    """Boundary loops as one array of edges, loop by loop."""
+class LoopEdges:
+    """Closed curves as one array of edges, loop by loop."""
 
     start: IntArray
     """(l + 1,) Where each loop's edges start."""
@@ -265,14 +263,14 @@ class _Curves:
     """(k,) The next edge of the same loop."""
 
     @classmethod
-    def of(cls, loops: list[IntArray], uv: FloatArray) -> _Curves:
-        tail, start, following = concatenate_loops(loops)
+    def of(cls, loops: list[IntArray], uv: FloatArray) -> LoopEdges:
+        tail, start, following = _concatenate_loops(loops)
         head, owner = tail[following], repeat_each(np.arange(len(loops)), np.diff(start))
         return cls(start, owner, np.stack([tail, head], 1), uv[tail], uv[head], following)
 
 
-def concatenate_loops(loops: Sequence[NDArray[Row]]) -> tuple[NDArray[Row], IntArray, IntArray]:
-    """Return concatenated loops (k,) or (k, 2), their offsets (l + 1,), and the index of each row's successor (k,)."""
+def _concatenate_loops(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the concatenated loops (k,), their offsets (l + 1,), and the index of each vertex's successor (k,)."""
     starts = np.cumsum([0, *map(len, loops)])
     following = np.arange(1, starts[-1] + 1)
     following[starts[1:] - 1] = starts[:-1]
@@ -281,7 +279,7 @@ def concatenate_loops(loops: Sequence[NDArray[Row]]) -> tuple[NDArray[Row], IntA
 
 def check_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[Reason]]:
     """Pairs of edges that meet where they should not (m, 4), and the reasons why the loops are not valid."""
-    curves = _Curves.of(loops, uv)
+    curves = LoopEdges.of(loops, uv)
     pairs = _find_meeting_edges(curves, uv)
     if not len(pairs):
         # Nesting is defined only for simple, disjoint loops.
@@ -299,7 +297,7 @@ def check_loops(loops: list[IntArray], uv: FloatArray) -> tuple[IntArray, list[R
     return crossings, reasons
 
 
-def _find_meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
+def _find_meeting_edges(curves: LoopEdges, uv: FloatArray) -> IntArray:
     """Sorted pairs of edges (m, 2) that share more than a common vertex."""
     consecutive = np.stack([np.arange(len(curves.ends)), curves.following], axis=1)
     # An edge of zero length lies entirely on the edges before and after it.
@@ -309,14 +307,9 @@ def _find_meeting_edges(curves: _Curves, uv: FloatArray) -> IntArray:
     return np.unique(pairs, axis=0)[:_MAX_CROSSINGS] if len(pairs) else pairs
 
 
-def _find_misplaced(curves: _Curves) -> list[Reason]:
+def _find_misplaced(curves: LoopEdges) -> list[Reason]:
     """Reasons why simple, disjoint loops do not bound a region that is covered once."""
-    p, q, start = curves.p, curves.q, curves.start
-    # At the lexicographically first vertex of a simple loop the turn is strict and has the orientation of the loop.
-    lowest = np.lexsort((p[:, 1], p[:, 0], curves.owner))[start[:-1]]
-    before = np.where(lowest == start[:-1], start[1:], lowest) - 1
-    sense = orientation(p[before], p[lowest], q[lowest])
-    around, inner = _find_nesting(curves, p[lowest])
+    sense, around, inner = find_nesting(curves)
     covered = np.bincount(inner, weights=sense[around], minlength=len(sense)).astype(np.int64)
     fits = ((covered == 0) & (sense > 0)) | ((covered == 1) & (sense < 0))
     reasons = []
@@ -331,20 +324,25 @@ def _find_misplaced(curves: _Curves) -> list[Reason]:
     return reasons
 
 
-def _find_nesting(curves: _Curves, anchor: FloatArray) -> tuple[IntArray, IntArray]:
-    """Pairs of loops, the first around the second; ``anchor`` (l, 2) has one vertex position of each loop."""
-    number = len(anchor)
+def find_nesting(curves: LoopEdges) -> tuple[SignArray, IntArray, IntArray]:
+    """Orientations (l,) of simple, disjoint loops, and the pairs of loops of which the first is around the second."""
+    p, q, start = curves.p, curves.q, curves.start
+    # At the lexicographically first vertex of a simple loop the turn is strict and has the orientation of the loop.
+    lowest = np.lexsort((p[:, 1], p[:, 0], curves.owner))[start[:-1]]
+    before = np.where(lowest == start[:-1], start[1:], lowest) - 1
+    sense = orientation(p[before], p[lowest], q[lowest])
+    number = len(sense)
     if number == 1:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        return sense, np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     turns: dict[int, int] = {}
-    for edge, point, turn in _cross_rays(anchor, curves.p, curves.q):
+    for edge, point, turn in _cross_rays(p[lowest], p, q):
         key, at = np.unique(curves.owner[edge] * number + point, return_inverse=True)
         sums = np.bincount(at, weights=turn, minlength=len(key))
         for pair, change in zip(key.tolist(), sums.tolist(), strict=True):
             turns[pair] = turns.get(pair, 0) + int(change)
     around, inner = np.divmod(np.array([pair for pair, turn in turns.items() if turn], dtype=np.int64), number)
     others = around != inner
-    return around[others], inner[others]
+    return sense, around[others], inner[others]
 
 
 def join_items(items: Sequence[object], limit: int = 5) -> str:

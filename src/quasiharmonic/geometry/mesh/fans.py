@@ -6,6 +6,7 @@ triangles, ``FT``, whose indices differ on the two sides of a cut, like texture 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -117,3 +118,9 @@ def open_along(F: IntArray, cut: IntArray, n: int) -> Corners:
         raise ValueError(f"{edge_names(cut[unknown])}: not an edge of the mesh")
     open_side[open_side] = np.isin(sides, wanted)
     return Corners(*number_fans(F, fans(F, open_side)[0], n))
+
+
+def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:
+    """Fill loops, with the surface on their left, by triangles (k, 3) around new vertices numbered from ``n``."""
+    triangles = [np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)]
+    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles])

@@ -6,7 +6,7 @@ import numpy as np
 
 from quasiharmonic.io.models.meshdata import MeshData, check_mapped, vertex_places
 from quasiharmonic.io.seamed_mesh import SeamedMesh
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, mark
 
 
 def seamed(mesh: MeshData) -> SeamedMesh:
@@ -83,6 +83,5 @@ def without_idle(V: FloatArray, F: IntArray, uv: FloatArray) -> tuple[FloatArray
     V, F, uv
         The same arrays without the unused vertices, and renumbered triangles.
     """
-    used = np.zeros(len(V), dtype=bool)
-    used[F] = True
+    used = mark(len(V), F)
     return V[used], (np.cumsum(used) - 1)[F], uv[used]

@@ -17,9 +17,9 @@ from functools import cached_property
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.loops import Contacts, contacts, winding
+from quasiharmonic.geometry.exact.loops import Contacts, LoopEdges, contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
 # Limit on the pairs of meeting edges to collect; a longer list would not help the user.
@@ -55,6 +55,8 @@ class TargetCurves:
         Boundary loops, with the surface to their left, each from its lowest corner (the leftmost of several).
     ends : (m, 2) int64
         Boundary edges, loop by loop, in order.
+    tails, heads : (m, 2) float64
+        Positions of their ends.
     loop_of : (m,) int64
         Index of the loop of each edge.
     """
@@ -62,23 +64,13 @@ class TargetCurves:
     def __init__(self, positions: FloatArray, loops: list[IntArray]) -> None:
         self.positions = positions
         self.loops = [_from_lowest(positions, loop) for loop in loops]
-        self.ends = np.concatenate([cyclic_pairs(loop) for loop in self.loops])
-        self.loop_of = repeat_each(np.arange(len(loops)), [len(loop) for loop in self.loops])
+        edges = LoopEdges.of(self.loops, positions)
+        self.ends, self.loop_of, self.tails, self.heads = edges.ends, edges.owner, edges.p, edges.q
 
     @cached_property
     def degenerate(self) -> IntArray:
         """Indices of edges of length zero."""
         return np.flatnonzero((self.tails == self.heads).all(axis=1))
-
-    @property
-    def tails(self) -> FloatArray:
-        """Starts of the edges, (m, 2) float64."""
-        return self.positions[self.ends[:, 0]]
-
-    @property
-    def heads(self) -> FloatArray:
-        """Ends of the edges, (m, 2) float64."""
-        return self.positions[self.ends[:, 1]]
 
     @cached_property
     def folds(self) -> IntArray:

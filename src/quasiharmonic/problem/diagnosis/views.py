@@ -9,7 +9,7 @@ visible points, and may contain more.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cmp_to_key
+from functools import cmp_to_key, lru_cache
 from typing import Any
 
 import numpy as np
@@ -50,22 +50,12 @@ class Views:
         self._ends, self._positions, self._lattice, self._corner = ends, positions, lattice, corner
         # For inexact computations.
         self._scaled = scale_to_unit(positions)
-        self._cache: dict[int, Wedges] = {}
         self._effort = effort
-
-    def wedges(self, eye: int) -> Wedges:
-        """Return the wedges visible from a point; from a corner, only those inside the target.
-
-        Walls that end at the point, or lie on a line with it, hide nothing.
-        """
-        if eye not in self._cache:
-            while len(self._cache) >= _MAX_CACHED:
-                del self._cache[next(iter(self._cache))]
-            self._cache[eye] = self._compute_wedges(eye)
-        return self._cache[eye]
+        #: Returns the wedges visible from a point; from a corner, only those inside the target.
+        self.wedges: Callable[[int], Wedges] = lru_cache(_MAX_CACHED)(self._compute_wedges)
 
     def _compute_wedges(self, eye: int) -> Wedges:
-        """Compute the wedges of an eye; see `wedges`."""
+        """Compute the wedges of an eye; walls that end at the eye, or lie on a line with it, hide nothing."""
         self._effort.spend(500 + len(self._ends))
         here, where = self._positions[eye], self._positions
         turn = orientation(here, where[self._ends[:, 0]], where[self._ends[:, 1]])

@@ -20,6 +20,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve import NotPositiveDefinite
@@ -39,7 +40,7 @@ from quasiharmonic.solver.methods.local_repair import (
 )
 from quasiharmonic.solver.methods.reweighting import reweight
 from quasiharmonic.solver.methods.untangling import GRADINGS, untangle
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, check_integer, mark
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, check_integer, mark, to_points
 
 Generator: TypeAlias = np.random.Generator
 
@@ -188,8 +189,7 @@ def left_of(region: ComplexArray, tail: complex, head: complex) -> ComplexArray:
 
 def nearest(region: ComplexArray, point: complex) -> complex:
     """Return the point of a convex polygon's outline that is nearest to a given point."""
-    side = np.roll(region, -1) - region
-    square = np.maximum(np.abs(side) ** 2, np.finfo(np.float64).tiny)
-    along = np.clip((np.conj(side) * (point - region)).real / square, 0, 1)
-    on = region + along * side
-    return complex(on[np.argmin(np.abs(on - point))])
+    ahead = np.roll(region, -1)
+    share, distance = nearest_on_segments(to_points(np.array([point])), to_points(region), to_points(ahead))
+    k = int(np.argmin(distance))
+    return complex(region[k] + share[k] * (ahead[k] - region[k]))

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, points_at
 from quasiharmonic.targets.boundary.turning import BoundaryLoop, mean_turns
 from quasiharmonic.targets.outlines.contours import corners as corners_of
-from quasiharmonic.targets.outlines.contours import nearest_on_sides, turns
+from quasiharmonic.targets.outlines.contours import turns
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, describe, index_array, names_of, to_complex
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
@@ -154,7 +155,7 @@ class Pins:
             if from_points[k] <= least:
                 # Snap exactly to a contour point within the tolerance.
                 return c, float(t[k])
-            share, away = nearest_on_sides(near, contour, np.roll(contour, -1, axis=0))
+            share, away = nearest_on_segments(near, contour, np.roll(contour, -1, axis=0))
             k = int(np.argmin(away))
             best = min(best, (float(away[k]), c, float(t[k] + share[k] * (t[k + 1] - t[k])) % 1.0))
         off, c, along = best

@@ -9,8 +9,9 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
-from quasiharmonic.targets.outlines.contours import check_contour, corners, nearest_on_sides, signed_area
+from quasiharmonic.targets.outlines.contours import check_contour, corners, signed_area
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe
 
 # Vertices of a loop with their parameters along a contour.
@@ -172,7 +173,7 @@ def max_deviation(contour: FloatArray, along: FloatArray, positions: FloatArray)
     order = np.argsort(along, kind="stable")
     # Points before the first vertex belong to the side from the last vertex to it.
     last = order[np.searchsorted(along[order], arc_parameters(contour), side="right") - 1]
-    return float(nearest_on_sides(contour, positions[last], positions[(last + 1) % len(positions)])[1].max())
+    return float(nearest_on_segments(contour, positions[last], positions[(last + 1) % len(positions)])[1].max())
 
 
 def _match(along: FloatArray, wanted: FloatArray) -> IntArray:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, to_complex
@@ -92,19 +93,13 @@ def choose_least_stretch(
 
 def _middles(surface: Domain, outer: int, positions: FloatArray) -> ComplexArray:
     """Positions of the centres of the holes, each filled by a fan; one complex number for every loop."""
-    fans = [surface.F]
-    for i, loop in enumerate(surface.loops):
-        if i != outer:
-            # The surface is to the left of the loop, the fan to its right.
-            apex = np.full(len(loop), surface.n + i)
-            fans.append(np.stack([np.roll(loop, -1), loop, apex], axis=1))
-    F, n = np.concatenate(fans), surface.n + len(surface.loops)
-    # The extra index of the outer loop is not a vertex of any triangle, so it is fixed as well.
-    fixed = np.append(surface.loops[outer], surface.n + outer)
-    laplacian = Laplacian(F, n, fixed).factor(np.full((3, len(F)), -1.0))
+    holes = [loop for i, loop in enumerate(surface.loops) if i != outer]
+    F, n = np.concatenate([surface.F, make_fans(holes, surface.n)]), surface.n + len(holes)
+    laplacian = Laplacian(F, n, surface.loops[outer]).factor(np.full((3, len(F)), -1.0))
     w = np.zeros(n, dtype=np.complex128)
     w[surface.loops[outer]] = to_complex(positions)
-    return laplacian.extend(w)[surface.n :]
+    # The outer loop has no centre.
+    return np.insert(laplacian.extend(w)[surface.n :], outer, np.nan)
 
 
 def _centroid(contour: FloatArray) -> complex:

@@ -69,17 +69,6 @@ def corners(contour: FloatArray, angle: float) -> IntArray:
     return np.flatnonzero(np.abs(turns(contour)) >= np.radians(angle))
 
 
-def nearest_on_sides(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return where segments are nearest to points, as shares of their lengths in [0, 1], and the distances there.
-
-    All arrays have shape (k, 2), or one that broadcasts to it. A segment may be a point.
-    """
-    side = heads - tails
-    square = np.maximum((side**2).sum(axis=1), np.finfo(np.float64).tiny)
-    share = np.clip(((points - tails) * side).sum(axis=1) / square, 0, 1)
-    return share, np.linalg.norm(tails + share[:, None] * side - points, axis=1)
-
-
 def from_corner(contour: FloatArray, angle: float, backwards: bool = False) -> FloatArray:
     """Rotate a contour's points to start at its first corner, so that no side is split at the start.
 

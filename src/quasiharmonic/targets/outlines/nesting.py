@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.exact.loops import concatenate_loops, contacts, winding
+from quasiharmonic.geometry.exact.loops import LoopEdges, contacts, find_nesting
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation
 from quasiharmonic.targets.outlines.contours import check_contour, distinct, in_unit, signed_area
-from quasiharmonic.util.arrays import FloatArray, check_sequence, repeat_each
+from quasiharmonic.util.arrays import FloatArray, check_sequence
 
 # Maximum number of meeting sides to find; the first is reported.
 _MAX_MEETINGS = 100
@@ -88,18 +88,14 @@ def arrange(contours: Sequence[ArrayLike]) -> list[NestedContour]:
     for i, contour in enumerate(found):
         if collinear(contour):
             raise ValueError(f"contour {i} of the outline encloses no area")
-    _check_simple(found)
+    points = np.concatenate(found)
+    curves = LoopEdges.of(np.split(np.arange(len(points)), np.cumsum([len(c) for c in found])[:-1]), points)
+    _check_simple(curves, points)
     areas = [abs(signed_area(c)) for c in in_unit(found)[0]]
-    anchors = np.array([c[np.lexsort((c[:, 1], c[:, 0]))[0]] for c in found])
-    around = np.zeros((len(found), len(found)), dtype=bool)
-    for i, contour in enumerate(found):
-        turns, _ = winding(anchors, contour, np.roll(contour, -1, axis=0))
-        around[i] = turns != 0
-    # A contour's own anchor is on it, not inside it.
-    np.fill_diagonal(around, val=False)
-    depth = around.sum(axis=0)
+    sense, _, inner = find_nesting(curves)
+    depth = np.bincount(inner, minlength=len(found))
     order = sorted(range(len(found)), key=lambda i: -areas[i])
-    return [NestedContour(found[i], int(depth[i]), _clockwise(found[i])) for i in order]
+    return [NestedContour(found[i], int(depth[i]), bool(sense[i] < 0)) for i in order]
 
 
 def collinear(contour: FloatArray) -> bool:
@@ -108,18 +104,10 @@ def collinear(contour: FloatArray) -> bool:
     return not orientation(np.tile(one, (len(contour), 1)), np.tile(other, (len(contour), 1)), contour).any()
 
 
-def _clockwise(contour: FloatArray) -> bool:
-    # A simple contour turns at its lexicographically first point in the direction of its orientation.
-    first = int(np.lexsort((contour[:, 1], contour[:, 0]))[0])
-    before, here, after = contour[first - 1], contour[first], contour[(first + 1) % len(contour)]
-    return bool(orientation(before, here, after) < 0)
-
-
-def _check_simple(contours: list[FloatArray]) -> None:
+def _check_simple(curves: LoopEdges, points: FloatArray) -> None:
     """Raise if two sides of contours share more than the point that joins them."""
-    points, start, following = concatenate_loops(contours)
-    owner = repeat_each(np.arange(len(contours)), np.diff(start))
-    met = contacts(points, np.stack([np.arange(start[-1]), following], axis=1), _MAX_MEETINGS)
+    start, owner, following = curves.start, curves.owner, curves.following
+    met = contacts(points, curves.ends, _MAX_MEETINGS)
     if not len(met.pairs):
         return
     # A side that doubles back also touches neighbouring sides, so report spikes first.

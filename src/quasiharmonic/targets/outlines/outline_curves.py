@@ -50,7 +50,7 @@ def outline_curves(specification: str | PathLike[str], *, font: Font | None = No
     if name == "letter":
         return _contours(glyph_paths(argument, font))
     if name == "word":
-        return word_curves(argument, font, tolerance=TOLERANCE)
+        return word_curves(argument, font, TOLERANCE)
     if name == "disk":
         return [Curve.circle()]
     if name == "ring":

@@ -13,6 +13,8 @@ from quasiharmonic.targets.outlines.nesting import filled, nested
 from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive
 from quasiharmonic.util.optional import explain_missing
 
+#: Overlap of each letter with the one before, in units of the font size, by default.
+OVERLAP = 0.03
 # Points of a united outline closer than this, in units of the font size, are merged.
 _SAME_POINT = 1e-12
 # Maximum number of Newton steps to the intersection of two curves.
@@ -29,7 +31,7 @@ _TANGENT_LETTERS = (
 )
 
 
-def word(text: str, font: Font | None = None, *, overlap: float = 0.03, tolerance: float = 5e-4) -> list[FloatArray]:
+def word(text: str, font: Font | None = None, *, overlap: float = OVERLAP, tolerance: float = 5e-4) -> list[FloatArray]:
     """Outline of several letters that overlap and form one piece.
 
     A connected surface cannot fill an outline of several pieces, so the letters must overlap.
@@ -70,13 +72,13 @@ def word(text: str, font: Font | None = None, *, overlap: float = 0.03, toleranc
     return contours
 
 
-def word_curves(text: str, font: Font | None = None, *, overlap: float = 0.03, tolerance: float = 5e-4) -> list[Curve]:
+def word_curves(text: str, font: Font | None, tolerance: float) -> list[Curve]:
     """Return the exact curves of the contours of `word`: pieces of the letters' curves, joined at their intersections.
 
     There is one closed curve for each contour. Errors as `word`; ValueError also when letters touch at so small an
     angle that the intersection of their curves cannot be found.
     """
-    letters, shifts = _set(text, font, overlap, tolerance)
+    letters, shifts = _set(text, font, OVERLAP, tolerance)
     drawn = [
         Curve.contour([piece - (shift, 0.0) for piece in path])
         for character, shift in zip(text, shifts, strict=True)

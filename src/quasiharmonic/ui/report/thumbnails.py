@@ -14,6 +14,7 @@ from quasiharmonic import io
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives.results import find_map
 from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.util.arrays import scale_to_unit
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
@@ -68,6 +69,6 @@ def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:
 
 def _center(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points translated and scaled by powers of two into a box around the origin, which prevents overflow."""
-    points = np.ldexp(points, -int(np.frexp(np.abs(points).max())[1]))
+    points = scale_to_unit(points)
     points = points - points.mean(axis=0)
     return np.ldexp(points, -int(np.frexp(np.abs(points).max() or 1.0)[1]))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, to_complex, to_points
 
 # Largest distance between vertices of congruent charts, relative to the chart's radius.
 _TOLERANCE = 1e-4
@@ -41,7 +41,7 @@ def find_copies(charts: list[tuple[FloatArray, IntArray]]) -> dict[int, Copy]:
     originals: defaultdict[tuple[int, int], list[_Original]] = defaultdict(list)
     copies = {}
     for i, (uv, F) in enumerate(charts):
-        z = uv.view(np.complex128).ravel()
+        z = to_complex(uv)
         z = z - z.mean()
         same_sizes = originals[len(uv), len(F)]
         for original in same_sizes:
@@ -55,7 +55,7 @@ def find_copies(charts: list[tuple[FloatArray, IntArray]]) -> dict[int, Copy]:
                 copies[i] = Copy(original.chart, motion._replace(shift=shift), deviation)
                 break
         else:
-            same_sizes.append(_Original(i, z, KDTree(z.view(np.float64).reshape(-1, 2))))
+            same_sizes.append(_Original(i, z, KDTree(to_points(z))))
     return copies
 
 
@@ -82,7 +82,7 @@ def _align(
             start = Motion(mirrored, 1, 0).move(z)
             turn = complex(anchor * start[vertex].conj())
             moved = start * (turn / abs(turn)) if turn else start
-            distance, match = tree.query(moved.view(np.float64).reshape(-1, 2))
+            distance, match = tree.query(to_points(moved))
             if distance.max() > tolerance or len(np.unique(match)) < len(match):
                 continue
             if not np.array_equal(_sorted_triangles(match[F]), _sorted_triangles(goal_F)):

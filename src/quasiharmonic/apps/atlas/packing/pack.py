@@ -23,6 +23,7 @@ from quasiharmonic.util.arrays import (
     count_of,
     describe,
     map_array,
+    to_complex,
     triangle_array,
 )
 
@@ -217,7 +218,7 @@ def _place_copy(motion: Motion, original: Placement, scale: float) -> Placement:
 
 def _transform(uv: FloatArray, scale: float, placement: Placement, size: tuple[int, int]) -> FloatArray:
     """Texture coordinates of a chart's vertices."""
-    z = uv.view(np.complex128).ravel()
+    z = to_complex(uv)
     if placement.mirrored:
         z = -z.conjugate()
     z = z * (scale * np.exp(1j * placement.angle)) + complex(*placement.offset)

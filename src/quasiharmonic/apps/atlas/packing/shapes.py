@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from quasiharmonic.geometry.exact.triangles import triangle_signs
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, to_complex, to_points
 
 # Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
 _AS_SMALL = 1e-9
@@ -52,7 +52,7 @@ class Shape:
 
 def make_shape(uv: FloatArray, F: IntArray) -> Shape:
     """Return the shape of a chart with vertices (m, 2) and triangles (k, 3), at least one."""
-    z = np.ascontiguousarray(uv).view(np.complex128).ravel()
+    z = to_complex(uv)
     sign, _ = triangle_signs(F, uv)
     rows = np.where((sign < 0)[:, None], F[:, ::-1], F)
     tail, head = rows.ravel(), np.roll(rows, -1, axis=1).ravel()
@@ -75,7 +75,7 @@ def make_shape(uv: FloatArray, F: IntArray) -> Shape:
 def _hull(points: ComplexArray) -> ComplexArray:
     """Corners of the convex hull; all points if they are on a line."""
     try:
-        return points[ConvexHull(points.view(np.float64).reshape(-1, 2)).vertices]
+        return points[ConvexHull(to_points(points)).vertices]
     except (QhullError, ValueError):
         return points
 

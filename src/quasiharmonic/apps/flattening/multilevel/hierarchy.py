@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.disk_start import make_fans
 from quasiharmonic.geometry.coarsening.levels import coarsen
 from quasiharmonic.geometry.coarsening.prolongation import reinsertion_positions
+from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices, mark
 
 # Weight that keeps the affine map close to a similarity.
 _RIGID = 1e-2
@@ -95,11 +95,9 @@ class Hierarchy:
         """Return the mesh at a stop."""
         T = self._coarsening.F if stop == self._rounds else self._coarsening.levels[stop]
         T = T[T.max(axis=1) < self._n]
-        used = np.zeros(self._n, dtype=bool)
-        used[T] = True
+        used = mark(self._n, T)
         vertices = np.flatnonzero(used)
-        number = np.full(self._n, -1)
-        number[vertices] = np.arange(vertices.size)
+        number = invert_indices(self._n, vertices)
         F = number[T]
         return Level(stop, vertices, F, boundary_loops(F, vertices.size))
 

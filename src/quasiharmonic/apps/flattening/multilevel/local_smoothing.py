@@ -23,7 +23,7 @@ from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.coarsening.prolongation import are_positive
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, to_points
 
 # Fraction of the way to the weighted mean of its neighbours that a vertex moves.
 _STEP = 0.8
@@ -60,7 +60,7 @@ def thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
     layout = np.zeros((len(F), 3), dtype=np.complex128)
     layout[:, 1], layout[:, 2] = shapes.unit * shapes.sides[0], -shapes.unit * shapes.sides[2]
     corners = np.arange(F.size).reshape(-1, 3)
-    return DeformationEnergy(layout.view(np.float64).reshape(-1, 2), F, ReweightedDirichlet(), rest_F=corners)
+    return DeformationEnergy(to_points(layout), F, ReweightedDirichlet(), rest_F=corners)
 
 
 def _smooth_interior(V: FloatArray, F: IntArray, loops: Sequence[IntArray], w: ComplexArray) -> ComplexArray:
@@ -78,8 +78,7 @@ def _smooth_interior(V: FloatArray, F: IntArray, loops: Sequence[IntArray], w: C
         weight += 2 * [np.maximum((one.conj() * other).real / twice_area, _MIN_WEIGHT)]
     graph = csr_array((np.concatenate(weight), (np.concatenate(tail), np.concatenate(head))), shape=(n, n))
     total = graph @ np.ones(n)
-    inner = np.ones(n, dtype=bool)
-    inner[np.concatenate(loops)] = False
+    inner = ~mark(n, np.concatenate(loops))
     for _ in range(_SWEEPS):
         new = np.where(inner, w + _STEP * ((graph @ w) / total - w), w)
         back = np.zeros(n, dtype=bool)
@@ -104,8 +103,7 @@ def _descend_on_patches(
     """Descend on patches around the worst triangles, with all other vertices fixed."""
     with np.errstate(all="ignore"):
         density = energy.energy.density(energy.deform(in_units(uv, 0)))
-    loose = np.zeros(len(V), dtype=bool)
-    loose[F[density > _BAD * np.quantile(density, 0.75)]] = True
+    loose = mark(len(V), F[density > _BAD * np.quantile(density, 0.75)])
     for _ in range(_RINGS):
         loose[F[has_marked_corner(F, loose)]] = True
     patches = F[has_marked_corner(F, loose)]

@@ -24,9 +24,8 @@ from quasiharmonic.apps.flattening.scaffold.graded_points import Quadtree
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
-from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay
-from quasiharmonic.geometry.mesh.topology import edge_keys
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, names_of
+from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay, select_inside
+from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, names_of, to_complex
 
 # Side of a square of the tree, relative to the length of an edge in it.
 _SPACING = 1.4
@@ -71,7 +70,7 @@ def triangulate_air(
     positions = np.asarray(uv, dtype=np.float64)
     n, boundary = len(positions), np.concatenate(loops)
     # Scaling by a power of two is exact.
-    exponent = int(np.frexp(np.abs(positions[boundary]).max())[1])
+    exponent = find_exponent(positions[boundary])
     others = np.empty((0, 2)) if around is None else np.ldexp(np.asarray(around, dtype=np.float64), -exponent)
     outline = np.ldexp(positions[boundary], -exponent)
     start = np.cumsum([0, *(len(loop) for loop in loops)])
@@ -82,7 +81,7 @@ def triangulate_air(
     frame = _frame(corner, side, shape)
     inner = _inner_points(outline, outline[heads], corner, side, shape)
     points, triangles = _triangulate(outline, segments, frame, inner)
-    triangles = triangles[_find_outside(triangles, segments, len(points))]
+    triangles = triangles[select_inside(triangles, segments[:, ::-1], len(points))]
     points = _smooth_points(points, triangles, len(outline) + len(frame))
     # Inner points that were placed inside the surface by mistake were removed with their triangles.
     used = np.unique(triangles[triangles >= len(outline)])
@@ -172,24 +171,6 @@ def _triangulate(
             raise ValueError(_MEETS_ITSELF) from error
 
 
-def _find_outside(triangles: IntArray, segments: IntArray, n: int) -> BoolArray:
-    """Which triangles are on the right of the segments, (t,): those connected to it without crossing a segment."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    tails, heads = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
-    keys = edge_keys(tails, heads, n)
-    order = np.argsort(keys, kind="stable")
-    walls = edge_keys(segments[:, 0], segments[:, 1], n)
-    paired = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-    open_ = paired[~np.isin(keys[order[paired]], walls)]
-    graph = coo_array((np.ones(open_.size), (order[open_] // 3, order[open_ + 1] // 3)), shape=2 * (len(triangles),))
-    label = connected_components(graph, directed=False)[1]
-    directed = np.sort(segments[:, 1] * n + segments[:, 0])
-    at = np.isin(tails * n + heads, directed)
-    return np.isin(label, np.unique(label[np.flatnonzero(at) // 3]))
-
-
 def _smooth_points(points: FloatArray, triangles: IntArray, held: int) -> FloatArray:
     """Move points after the first ``held`` to the mean of their neighbours, if no triangle's shape gets worse."""
     n = len(points)
@@ -217,7 +198,7 @@ def _smooth_points(points: FloatArray, triangles: IntArray, held: int) -> FloatA
 
 def _shapes(points: FloatArray, triangles: IntArray) -> FloatArray:
     """Shape quality of triangles: 1 if equilateral, near 0 for slivers, negative if inverted; (t,) float64."""
-    w = np.ascontiguousarray(points).view(np.complex128).ravel()
+    w = to_complex(points)
     corners = w[triangles.T]
     sides = (np.abs(corners - np.roll(corners, 1, axis=0)) ** 2).sum(axis=0)
     return 4 * np.sqrt(3) * signed_areas(triangles, w) / sides

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
+from quasiharmonic.geometry.mesh.topology import edge_keys, label_components, pair_keys
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -49,7 +49,7 @@ def sides_of(state: SessionState, pairs: IntArray) -> SeamSides:
     tail, head = numbering.F.ravel(), numbering.F[:, (1, 2, 0)].ravel()
     n = len(state.mesh.V)
     key = edge_keys(numbering.origin[tail], numbering.origin[head], n)
-    wanted = edge_keys(pairs[:, 0], pairs[:, 1], n)
+    wanted = pair_keys(pairs, n)
     order = np.argsort(wanted, kind="stable")
     at = np.flatnonzero(np.isin(key, wanted))
     row = order[np.searchsorted(wanted[order], key[at])]
