@@ -256,17 +256,15 @@ class Session:
         k, vertex = self._find(frame)
         self._refuse_drawn()
         one = self.state.islands[k]
-        if one.result is None or one.fixed is None or one.target is None:
+        if one.result is None:
             raise RequestError("there is no map to drag yet: press Unwrap or Flatten first")
         if self.state.selected != (k,):
             self._history.change(replace(self.state, selected=(k,)))
-            one = self.state.islands[k]
         problem = one.problem
         share = drag_weights(vertex, problem.fixed, problem.target, problem.domain.loops, one.corners)
         # Without an injective map the drag only moves the boundary; a search follows at its end.
-        follower = None
-        if one.result is not None and one.injective and one.in_place:
-            follower = Follower(problem, one.result.uv, one.result.certificate)
+        follows = one.injective and one.in_place
+        follower = Follower(problem, one.result.uv, one.result.certificate) if follows else None
         place = problem.target[np.flatnonzero(problem.fixed == vertex)[0]]
         self._drag_state = _DragState(k, place, share, follower)
 
@@ -300,7 +298,7 @@ class Session:
         except KeyboardInterrupt:
             # The next message came before the final map. If the drag has a map, it is kept.
             if reached:
-                self._keep(operations.as_it_is(state, start, operations.saved_start(start), keep=True))
+                self._keep(operations.as_it_is(state, start, operations.saved_start(start), ("pins",)))
             else:
                 self._show()
 
@@ -351,9 +349,7 @@ class Session:
         self._tell(*frames.surface_message(state))
 
     def _send_image(self) -> None:
-        texture = self._history.texture
-        content = b"" if texture is None else texture.data
-        kind = "" if texture is None else texture.media_type
+        content, kind = (b"", "") if self.texture is None else (self.texture.data, self.texture.media_type)
         self._tell({"kind": "image", "type": kind}, {"content": np.frombuffer(content, dtype=np.uint8)})
 
     def _show(self, *, fit: bool = False) -> None:

@@ -15,7 +15,6 @@ from quasiharmonic.ui.studio.session.islands import IslandState
 from quasiharmonic.ui.studio.session.operations import (
     as_it_is,
     fix_where_it_is,
-    fixed_positions,
     flatten_islands,
     is_flattenable,
     map_in_place,
@@ -138,6 +137,10 @@ def with_start(
     """
     one = state.islands[k]
     places = [island.uv for island in state.mesh.islands]
-    places[k] = fixed_positions(one, target, uv)
+    assert one.result is not None
+    assert one.fixed is not None
+    own = (one.result.uv if uv is None else uv).copy()
+    own[one.fixed] = target
+    places[k] = own * one.sign
     moved = replace(state.with_island(k, one.with_target(target)), selected=(k,))
     return moved, state.mesh.with_places(places)
