@@ -160,8 +160,7 @@ def _render(
     side = _SIDE * _SAMPLES
     low, high = _window(points)
     place = (points - low) / (high - low) * side
-    bad = np.zeros(len(F), dtype=bool)
-    bad[inverted] = True
+    bad = np.isin(np.arange(len(F)), inverted)
 
     colors = np.zeros((side * side, 3))
     nearest = np.full(side * side, -np.inf)
