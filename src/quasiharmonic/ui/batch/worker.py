@@ -252,13 +252,7 @@ def _write_map(path: Path, mesh: io.MeshData, required: str) -> Record:
     verdict = certify(SeamedMesh(V, F, F, uv))
     bijective = verdict.bijective and not len(verdict.overlapping)
     certified = bijective if required == "bijective" else verdict.injective
-    return {
-        "outcome": required if certified else f"not {required}",
-        "certified": certified,
-        "bijective": bijective,
-        "flips_after": len(verdict.inverted),
-        "map_bytes": path.stat().st_size,
-    }
+    return metadata.describe_map(path, required, certified, bijective, len(verdict.inverted))
 
 
 def _describe_error(error: Exception) -> Record:

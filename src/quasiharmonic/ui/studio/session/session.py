@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.energies.polishing import ENERGIES
 from quasiharmonic.io.models.textures import Texture, texture_of
 from quasiharmonic.ui.studio.protocol import Array, Frame
 from quasiharmonic.ui.studio.session import frames, operations, validation
@@ -36,6 +35,7 @@ from quasiharmonic.ui.studio.session.surface import Sheet, make_first_sheet, rea
 from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.options import ENERGIES
 
 _LARGEST_TEXTURE = 16_384
 
@@ -149,18 +149,21 @@ class Session:
     def _do_seam(self, frame: Frame) -> None:
         """Add the shortest path between two vertices to the seams."""
         state, mesh = self.state, self.state.mesh
-        ends = [int(state.numbering.origin[validation.number_below(frame, n, len(state.numbering.origin))])
-                for n in ("start", "vertex")]  # fmt: skip
-        if ends[0] == ends[1]:
-            return
-        path = shortest_path(mesh.V, mesh.F, *ends)
-        self._keep(replace(state, drawn=add_edges(find_seams(state), path)))
+        start, end = self._model_vertex(frame, "start"), self._model_vertex(frame, "vertex")
+        if start != end:
+            path = shortest_path(mesh.V, mesh.F, start, end)
+            self._keep(replace(state, drawn=add_edges(find_seams(state), path)))
 
     def _do_erase(self, frame: Frame) -> None:
         """Remove the chain of seams nearest to a vertex."""
         state = self.state
-        vertex = int(state.numbering.origin[validation.vertex(frame, len(state.numbering.origin))])
+        vertex = self._model_vertex(frame, "vertex")
         self._keep(replace(state, drawn=erase_chain(find_seams(state), state.mesh.V, vertex)))
+
+    def _model_vertex(self, frame: Frame, name: str) -> int:
+        """Return the vertex of the model that a message names by its number on the page."""
+        origin = self.state.numbering.origin
+        return int(origin[validation.vertex(frame, len(origin), name)])
 
     def _do_turn(self, frame: Frame) -> None:
         self._keep(turn_over(self.state), fit=True)
