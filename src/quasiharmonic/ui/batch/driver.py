@@ -282,9 +282,8 @@ def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, p
     with writing(f"to {folder}"):
         for path in folder.glob("records*"):
             # The table of the last run must not be taken for that of this run, nor the tables of other shards.
-            if path.name in records.TABLES or (
-                shard_of(path.name) is not None and part in (WHOLE, shard_of(path.name))
-            ):
+            shard = shard_of(path.name)
+            if shard is not None and (part == WHOLE or shard in (WHOLE, part)):
                 remove_file(path)
     location = os.fspath(source) if places.is_url(source) else os.path.abspath(source)
     about = {"source": location, "settings": settings.to_dict(), "version": __version__}
