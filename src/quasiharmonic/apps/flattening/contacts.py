@@ -27,7 +27,7 @@ import numpy as np
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.geometry.exact.loops import check_loops, contacts
 from quasiharmonic.geometry.exact.predicates import box_pairs_between
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, sum_at, to_points
 
 # Reach of the barrier, relative to the local edge length of the boundary.
 _REACH = 1.0
@@ -66,7 +66,7 @@ class Contacts:
         pull = -2 * self._excess(d) * self.reach / d**2 * normal
         parts = np.concatenate([pull, -(1 - s) * pull, -s * pull])
         at = self.corners.ravel()
-        return np.bincount(at, parts.real, minlength=w.size) + 1j * np.bincount(at, parts.imag, minlength=w.size)
+        return sum_at(at, parts, w.size)
 
     def curvature(self, w: ComplexArray) -> QuadraticForm:
         """The second derivative along the current contact directions, in the derivatives that `HATS` defines."""
@@ -167,7 +167,7 @@ class Rim:
         around = 0.5 * (length + length[self._previous])
         # Most candidates are the vertex's own and neighbouring edges, so they are removed first.
         radius = (_LOOKOUT * _REACH * around)[:, None]
-        here, there = _to_rows(p), _to_rows(q)
+        here, there = to_points(p), to_points(q)
         boxes = here - radius, here + radius, np.minimum(here, there), np.maximum(here, there)
         found = [self._exclude_own_edges(*pairs) for pairs in box_pairs_between(*boxes)]
         i, j = np.concatenate(found, axis=1) if found else np.zeros((2, 0), dtype=np.int64)
@@ -200,10 +200,6 @@ class Rim:
         convex = (ahead.conj() * behind).imag > 0
         inside: BoolArray = np.where(convex, left & right, left | right)
         return inside
-
-
-def _to_rows(w: ComplexArray) -> FloatArray:
-    return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)
 
 
 def nearest_on_edges(v: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:

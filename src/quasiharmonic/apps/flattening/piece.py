@@ -27,7 +27,7 @@ from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, count_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, count_of, find_exponent, pad_to_space, scale_to_unit
 from quasiharmonic.util.options import FlattenOptions
 
 #: Surfaces with at least this number of triangles are flattened with coarse meshes.
@@ -90,9 +90,8 @@ class Piece:
                 f"the surface has {count_of('handle', 'handles', handles)} and cannot be flattened: "
                 "cut it open first (cut_open; --cut of qhm map and qhm flatten)"
             )
-        self.exponent = int(np.frexp(np.abs(domain.V).max())[1])
-        self.V = np.zeros((domain.n, 3))
-        self.V[:, : domain.V.shape[1]] = np.ldexp(domain.V, -self.exponent)
+        self.exponent = find_exponent(domain.V)
+        self.V = pad_to_space(np.ldexp(domain.V, -self.exponent))
         self.area = surface_area(self.V, self.F)
 
     @classmethod
@@ -111,9 +110,7 @@ class Piece:
     @staticmethod
     def _count_missing(domain: Domain) -> int:
         """How much the Euler characteristic is below that of a disk with as many loops: two for each handle."""
-        found = domain.edges
-        euler = domain.n - len(found.interior) - len(found.boundary) + len(domain.F)
-        return 2 - len(domain.loops) - euler
+        return 2 - len(domain.loops) - domain.euler
 
     def planar_map(self) -> FloatArray | None:
         """Return the surface itself if it is planar and does not overlap itself, as no map is better."""
@@ -319,7 +316,7 @@ class Flattening:
 
     def _fit_scale(self, uv: FloatArray) -> FloatArray:
         """Scale a map to the surface's area; if this inverts a triangle, scale exactly by a power of two."""
-        unit = np.ldexp(uv, -int(np.frexp(np.abs(uv).max())[1]))
+        unit = scale_to_unit(uv)
         centred = unit - unit.mean(axis=0)
         area = float(signed_areas(self._piece.F, in_units(centred, 0)).sum())
         factor = np.sqrt(self._piece.area / area)

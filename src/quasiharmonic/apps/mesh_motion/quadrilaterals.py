@@ -13,7 +13,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.methods.untangling import untangle
-from quasiharmonic.util.arrays import IntArray
+from quasiharmonic.util.arrays import IntArray, find_exponent, to_points
 
 # Maximum number of untangling steps; successful runs need a few dozen.
 _STEPS = 300
@@ -30,7 +30,7 @@ def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     if not before:
         return result
     run, steps = Run(), 0
-    exponent = int(np.frexp(np.abs(result.uv).max())[1])
+    exponent = find_exponent(result.uv)
     w = in_units(result.uv, exponent)
     areas = (signed_areas(problem.F, places).sum() for places in (w, in_units(problem.V, 0)))
     rest = problem.V * np.sqrt(np.divide(*areas))
@@ -38,7 +38,7 @@ def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
         w, steps = further, steps + 1
         if steps == _STEPS:
             break
-    uv = np.ldexp(w.view(np.float64).reshape(-1, 2), exponent)
+    uv = np.ldexp(to_points(w), exponent)
     uv[problem.fixed] = problem.target
     after = inverted_triangles(corners, uv).size
     name, inverted, energy = "untangling corners", (before, after), (np.inf, np.inf)

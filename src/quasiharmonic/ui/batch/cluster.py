@@ -114,9 +114,8 @@ def attend(files: ProblemFiles, orders: Orders) -> Finished | Exception:
     """
     if not (orders.output / MARKER).exists():
         return OSError(
-            f"a worker of the cluster cannot see {orders.output}: data set and output must lie on "
-            f"a file system that all "
-            "machines share, under the same paths"
+            f"a worker of the cluster cannot see {orders.output}: data set and output must lie on a file system that "
+            "all machines share, under the same paths"
         )
     try:
         supervisor = getattr(_mine, "supervisor", None)

@@ -277,20 +277,16 @@ def _check_folder(folder: Path) -> None:
         raise OutputError(f"{folder} has a {tables[0]} that belongs to no run: choose another folder for the results")
 
 
-def _absolute(source: str | os.PathLike[str]) -> str:
-    return os.fspath(source) if places.is_url(source) else os.path.abspath(source)
-
-
 def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, part: Shard) -> None:
     """Write the marker file with source, settings and version into the run's folder, and delete old tables."""
     with writing(f"to {folder}"):
         for path in folder.glob("records*"):
             # The table of the last run must not be taken for that of this run, nor the tables of other shards.
-            if path.name in records.TABLES or (
-                shard_of(path.name) is not None and part in (WHOLE, shard_of(path.name))
-            ):
+            shard = shard_of(path.name)
+            if shard is not None and (part == WHOLE or shard in (WHOLE, part)):
                 remove_file(path)
-    about = {"source": _absolute(source), "settings": settings.to_dict(), "version": __version__}
+    location = os.fspath(source) if places.is_url(source) else os.path.abspath(source)
+    about = {"source": location, "settings": settings.to_dict(), "version": __version__}
     contents = json.dumps(about, indent=2).encode() + b"\n"
     marker = folder / MARKER
     # Other shards write the same contents.

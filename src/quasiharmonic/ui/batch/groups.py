@@ -107,13 +107,8 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
         if not certificate.injective:
             continue
         record = read[k].record
-        record |= {
-            "outcome": "injective",
-            "certified": True,
-            "bijective": bool(certificate.bijective),
-            "flips_after": 0,
-        }
-        record["map_bytes"] = records.map_path(folders[k]).stat().st_size
+        path = records.map_path(folders[k])
+        record |= metadata.describe_map(path, "injective", True, bool(certificate.bijective), 0)
         with metadata.time_phase(record, "measure"):
             record |= metadata.measure(*found)
         record["peak_memory"] = metadata.peak()

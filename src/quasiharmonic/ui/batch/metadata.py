@@ -44,6 +44,17 @@ def describe_search(results: Sequence[MapResult], status: Status) -> Record:
     }
 
 
+def describe_map(path: Path, required: str, certified: bool, bijective: bool, inverted: int) -> Record:
+    """Return the exact results for a written map, which was required to be ``"injective"`` or ``"bijective"``."""
+    return {
+        "outcome": required if certified else f"not {required}",
+        "certified": certified,
+        "bijective": bijective,
+        "flips_after": inverted,
+        "map_bytes": path.stat().st_size,
+    }
+
+
 def measure(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
     """Return the distortion of a map; empty if no triangle has an area in the rest mesh."""
     found = distortion(V, F, uv)

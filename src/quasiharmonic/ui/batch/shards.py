@@ -51,6 +51,6 @@ def table_name(shard: Shard, kind: str) -> str:
 
 
 def shard_of(name: str) -> Shard | None:
-    """Return the shard of a manifest's file name; None for other files."""
-    found = re.fullmatch(r"records-([0-9]+)-of-([0-9]+)\.(?:csv|parquet)", name)
-    return None if found is None else Shard(int(found[1]), int(found[2]))
+    """Return the shard of a manifest's file name, `WHOLE` for that of the whole data set; None for other files."""
+    found = re.fullmatch(r"records(?:-([0-9]+)-of-([0-9]+))?\.(?:csv|parquet)", name)
+    return None if found is None else Shard(int(found[1] or 1), int(found[2] or 1))

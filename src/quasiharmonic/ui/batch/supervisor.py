@@ -154,12 +154,8 @@ class Supervisor:
         while True:
             answer, _ = process.answer(orders)
             if answer is None:
-                self.rest()
-                if self._closed:
-                    raise ClosedError
+                self._replace_dead()
                 return
-            if "stop" in answer:
-                raise OutputError(answer["stop"])
             if "over" in answer:
                 return
             k = answer["done"]
@@ -173,21 +169,22 @@ class Supervisor:
             answer, why = process.answer(self.orders)
             if answer is None:
                 break
-            if "stop" in answer:
-                raise OutputError(answer["stop"])
             if "outcome" in answer:
-                if answer["outcome"] == "memory":
+                starved = answer["outcome"] == "memory"
+                if starved:
                     # A failed allocation may leave the process in a bad state.
                     self.rest()
-                return Finished(
-                    record["problem"], answer["outcome"], answer["seconds"], starved=answer["outcome"] == "memory"
-                )
+                return Finished(record["problem"], answer["outcome"], answer["seconds"], starved=starved)
             record = answer["facts"]
+        self._replace_dead()
+        starved = why["outcome"] == "memory" or process.was_killed
+        return _conclude(Path(job["folder"]), record | why, time.perf_counter() - began)._replace(starved=starved)
+
+    def _replace_dead(self) -> None:
+        """Let the next job start another process; ClosedError if `close` has ended this one."""
         self.rest()
         if self._closed:
             raise ClosedError
-        starved = why["outcome"] == "memory" or process.was_killed
-        return _conclude(Path(job["folder"]), record | why, time.perf_counter() - began)._replace(starved=starved)
 
     def rest(self) -> None:
         """Kill the process, which releases its memory; the next job starts another one."""
@@ -288,7 +285,10 @@ class _Process:
             self._process.stdin.flush()
 
     def answer(self, orders: Orders) -> tuple[dict[str, Any] | None, Record]:
-        """Wait for the next answer; return None and the cause if the process was ended instead."""
+        """Wait for the next answer; return None and the cause if the process was ended instead.
+
+        OutputError if results cannot be written.
+        """
         while True:
             try:
                 line = self._answers.get(timeout=_CHECK_INTERVAL)
@@ -299,7 +299,10 @@ class _Process:
                 self.end()
                 return None, why | self._memory()
             if line is not None:
-                return json.loads(line), {}
+                answer = json.loads(line)
+                if "stop" in answer:
+                    raise OutputError(answer["stop"])
+                return answer, {}
             self.was_killed = hasattr(signal, "SIGKILL") and self._process.wait() == -signal.SIGKILL
             return None, {"outcome": "crash", "error": self._cause()} | self._memory()
 

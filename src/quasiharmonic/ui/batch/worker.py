@@ -49,6 +49,10 @@ READY = "ready"
 GRACE = 10.0
 
 
+# A function that sends a message to the supervisor.
+Tell = Callable[[dict[str, Any]], None]
+
+
 def serve() -> None:
     """Solve the jobs from standard input until it is closed; then exit at once."""
     # Ctrl-C reaches the whole process group; the parent decides when this process ends.
@@ -102,7 +106,7 @@ def _alarm(limit: float | None) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0 if limit is None else limit + GRACE)
 
 
-def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Record:
+def solve_files(job: dict[str, Any], tell: Tell) -> Record:
     """Solve one problem, write its map and its record, and return the record.
 
     The job has the paths ``mesh`` and ``fixed``, the ``folder`` for results, the ``settings`` as from
@@ -132,7 +136,7 @@ def solve_files(job: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> 
     return record
 
 
-def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callable[[dict[str, Any]], None]) -> None:
+def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -> None:
     """Read, solve, write, certify and measure a problem; each result is recorded as soon as it is known."""
     settings = job["settings"]
     with metadata.time_phase(record, "read"):
@@ -163,11 +167,7 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Callabl
 
 
 def _map_islands(
-    surface: SeamedMesh,
-    fixed: NDArray[np.signedinteger] | None,
-    settings: dict[str, Any],
-    record: Record,
-    tell: Callable[[dict[str, Any]], None],
+    surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings: dict[str, Any], record: Record, tell: Tell
 ) -> tuple[MappedAtlas, list[Refined | None]]:
     """Map a surface onto a given boundary, island by island; return the maps and the refined meshes."""
     with metadata.time_phase(record, "setup"):
@@ -215,9 +215,7 @@ def _solve_island(
         return polish_result(fine, result, PolishOptions(energy=settings["polish"], slide=slide))
 
 
-def _flatten_islands(
-    surface: SeamedMesh, settings: dict[str, Any], record: Record, tell: Callable[[dict[str, Any]], None]
-) -> MappedAtlas:
+def _flatten_islands(surface: SeamedMesh, settings: dict[str, Any], record: Record, tell: Tell) -> MappedAtlas:
     """Flatten a surface with free boundary, island by island."""
     with metadata.time_phase(record, "setup"):
         pieces = [
@@ -254,13 +252,7 @@ def _write_map(path: Path, mesh: io.MeshData, required: str) -> Record:
     verdict = certify(SeamedMesh(V, F, F, uv))
     bijective = verdict.bijective and not len(verdict.overlapping)
     certified = bijective if required == "bijective" else verdict.injective
-    return {
-        "outcome": required if certified else f"not {required}",
-        "certified": certified,
-        "bijective": bijective,
-        "flips_after": len(verdict.inverted),
-        "map_bytes": path.stat().st_size,
-    }
+    return metadata.describe_map(path, required, certified, bijective, len(verdict.inverted))
 
 
 def _describe_error(error: Exception) -> Record:

@@ -66,13 +66,13 @@ def _certificate(certificate: Certificate) -> Figure:
     ax = figure.add_axes((0.01, 0.02, 0.98, 0.88))
     uv, bad = certificate.uv, _bad(certificate)
     plot.plot_map(uv, certificate.F, uv, inverted=bad, ax=ax)
-    verdict(ax, "map", len(bad))
     for i, j, k, m in certificate.crossings.tolist():
         ax.plot(*uv[[i, j]].T, *uv[[k, m]].T, color=RED, linewidth=2.4, zorder=7)
     ax.plot(*uv[certificate.multiply_wound].T, "o", color=RED, markersize=5, zorder=7)
     if not bad.size and certificate.bijective is False:
-        figure.texts[-1].remove()
         caption(ax, "map: not bijective", RED)
+    else:
+        verdict(ax, "map", len(bad))
     return figure
 
 

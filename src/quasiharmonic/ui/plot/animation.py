@@ -125,10 +125,9 @@ def _figures(
     """Yield one figure per frame."""
     rest, F = as_mesh(V, F)
     color = view(rest, F).color
-    corners = [_extent(map_array(name, uv, len(rest))) for name, uv in frames]
-    window = _extent(np.concatenate(corners)) if corners else None
-    for name, uv in frames:
-        place = map_array(name, uv, len(rest))
+    maps = [(name, map_array(name, uv, len(rest))) for name, uv in frames]
+    window = _extent(np.concatenate([_extent(place) for _, place in maps])) if maps else None
+    for name, place in maps:
         figure = new_figure((6, 6))
         ax = figure.add_axes((0.02, 0.02, 0.96, 0.88))
         inverted = not_positive(F, place)

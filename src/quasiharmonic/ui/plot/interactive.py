@@ -64,8 +64,7 @@ def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
     unit = (plane - low) / extent
     beside = np.column_stack([(unit - 0.5) * size, np.zeros(len(unit))]) + middle + [1.3 * size, 0, 0]
 
-    inverted = np.zeros(len(F), dtype=np.bool_)
-    inverted[found.inverted] = True
+    inverted = np.isin(np.arange(len(F)), found.inverted)
     for name, points in (("surface", solid), ("map", beside)):
         if not inverted.all():
             drawn = polyscope.register_surface_mesh(name, points, F[~inverted], edge_width=0.3)

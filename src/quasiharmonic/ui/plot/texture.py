@@ -160,8 +160,7 @@ def _render(
     side = _SIDE * _SAMPLES
     low, high = _window(points)
     place = (points - low) / (high - low) * side
-    bad = np.zeros(len(F), dtype=bool)
-    bad[inverted] = True
+    bad = np.isin(np.arange(len(F)), inverted)
 
     colors = np.zeros((side * side, 3))
     nearest = np.full(side * side, -np.inf)
@@ -196,6 +195,8 @@ def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[Float
     """Return a function from texture coordinates (k, 2) to colours (k, 3) of an image that repeats with period 1."""
     with explain_missing("pictures need Pillow", "pillow"):
         from PIL import Image
+    from scipy.ndimage import map_coordinates
+
     if not isinstance(texture, Texture):
         check_path("texture", texture)
     path, image_file = ("", texture) if isinstance(texture, Texture) else (texture, read_texture(texture))
@@ -208,16 +209,11 @@ def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[Float
     # Rows from bottom to top, as v increases.
     pixels = np.asarray(Image.alpha_composite(white, glass).convert("RGB"), dtype=np.float64)[::-1] / 255
     size = np.array(pixels.shape[1::-1])
-    pixels = pixels.reshape(-1, 3)
 
     def color(coordinates: FloatArray) -> FloatArray:
-        within = (coordinates - np.floor(coordinates)) * size - 0.5
-        left = np.floor(within).astype(np.int64)
-        (x, y), (s, t) = left.T, (within - left).T[:, :, None]
-        x, right, y, up = x % size[0], (x + 1) % size[0], y % size[1] * size[0], (y + 1) % size[1] * size[0]
-        below = (1 - s) * pixels.take(y + x, axis=0) + s * pixels.take(y + right, axis=0)
-        above = (1 - s) * pixels.take(up + x, axis=0) + s * pixels.take(up + right, axis=0)
-        return np.asarray((1 - t) * below + t * above)
+        column, row = ((coordinates - np.floor(coordinates)) * size - 0.5).T
+        layers = np.moveaxis(pixels, 2, 0)
+        return np.stack([map_coordinates(one, (row, column), order=1, mode="grid-wrap") for one in layers], axis=1)
 
     return color
 

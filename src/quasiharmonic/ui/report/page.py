@@ -13,7 +13,7 @@ from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.ui.batch.records import OUTCOMES, SOLVED, Record
 from quasiharmonic.ui.batch.settings import Settings
 from quasiharmonic.ui.report import charts, statistics
-from quasiharmonic.ui.report.statistics import PHASES, Run
+from quasiharmonic.ui.report.statistics import PHASES, Run, quantile, worst
 from quasiharmonic.ui.report.style import STYLE
 from quasiharmonic.ui.report.thumbnails import thumbnail
 from quasiharmonic.util.untrusted import parse_json
@@ -115,14 +115,17 @@ def _origin(run: Run) -> str:
 
 
 def _tiles(run: Run) -> str:
-    whole = statistics.groups(run)[-1]
+    certified, problems = int(run.certified.sum()), len(run.rows)
+    stretch, mips, seconds = (run.certified_column(name) for name in ("isometric", "mips", "seconds"))
+    usual_stretch, usual_mips = (number(quantile(values, 0.5)) for values in (stretch, mips))
+    usual_time, late = (number(quantile(seconds, share), "s") for share in (0.5, 0.95))
     tiles = [
-        (percent(whole.certified, whole.problems), f"{whole.certified:,} of {whole.problems:,} certified {run.wanted}"),
-        (number(whole.stretch[0]), f"worst stretch, max(σ₁, 1/σ₂), of a triangle; median {number(whole.stretch[1])}"),
-        (number(whole.mips[0]), f"worst MIPS distortion of a map; median {number(whole.mips[1])}"),
-        (number(whole.seconds[0], "s"), f"median time of the certified; 95 % within {number(whole.seconds[1], 's')}"),
-        (number(whole.triangles), "triangles in total"),
-        (number(statistics.quantile(run.column("peak_memory"), 1.0) / 2**20, "MiB"), "maximum memory of a problem"),
+        (percent(certified, problems), f"{certified:,} of {problems:,} certified {run.wanted}"),
+        (number(worst(stretch)), f"worst stretch, max(σ₁, 1/σ₂), of a triangle; median {usual_stretch}"),
+        (number(worst(mips)), f"worst MIPS distortion of a map; median {usual_mips}"),
+        (usual_time, f"median time of the certified; 95 % within {late}"),
+        (number(float(np.nansum(run.column("triangles")))), "triangles in total"),
+        (number(quantile(run.column("peak_memory"), 1.0) / 2**20, "MiB"), "maximum memory of a problem"),
     ]
     cells = "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in tiles)
     return f'<div class="tiles">{cells}</div>'
@@ -143,20 +146,19 @@ def _groups(run: Run) -> str:
     if len(groups) == 1:
         return ""
     head = "problems", "certified", "success", "worst stretch", "worst MIPS", "median MIPS", "median", "95 %", "longest"
-    rows = [
-        (
-            shown(group.name or "(top)"),
-            *(f"{group.problems:,}", f"{group.certified:,}", percent(group.certified, group.problems)),
-            *(number(value) for value in (group.stretch[0], *group.mips)),
-            *(number(value, "s") for value in group.seconds),
-        )
-        for group in groups
-    ]
+    rows = []
+    for group in groups:
+        certified, problems = int(group.certified.sum()), len(group.rows)
+        stretch, mips, seconds = (group.certified_column(name) for name in ("isometric", "mips", "seconds"))
+        success = f"{problems:,}", f"{certified:,}", percent(certified, problems)
+        distortion = (number(value) for value in (worst(stretch), worst(mips), quantile(mips, 0.5)))
+        times = (number(quantile(seconds, share), "s") for share in (0.5, 0.95, 1.0))
+        rows.append((shown(group.name or "(top)"), *success, *distortion, *times))
     return _table(("folder", *head), rows, last_is_sum=True)
 
 
 def _distortion(run: Run, other: Run | None) -> str:
-    series = [("ours", run.column("mips")[run.certified])]
+    series = [("ours", run.certified_column("mips"))]
     legend = [("ours", run.name)]
     if other is not None:
         mips = other.column("mips")
@@ -165,7 +167,7 @@ def _distortion(run: Run, other: Run | None) -> str:
         if np.isfinite(mips).any():
             series.append(("theirs", mips))
             legend.append(("theirs", other.name))
-    medians = [number(statistics.quantile(values, 0.5)) for _, values in series]
+    medians = [number(quantile(values, 0.5)) for _, values in series]
     caption = f"Over the certified maps. Median {' against '.join(medians)}."
     return _figure(
         "Distribution of distortion",
@@ -191,7 +193,7 @@ def _comparison(run: Run, other: Run) -> str:
         words = f"No problem of {name} has a time and the name of a problem of this run."
         return f'<section class="card"><h2>Time against {name}</h2><p>{words}</p></section>'
     with np.errstate(divide="ignore"):
-        ratio = statistics.quantile(theirs / ours, 0.5)
+        ratio = quantile(theirs / ours, 0.5)
     sentence = f"median {number(ratio)} times faster" if ratio >= 1 else f"median {number(1 / ratio)} times slower"
     return _figure(
         f"Time against {name}",

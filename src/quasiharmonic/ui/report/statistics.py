@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +45,10 @@ class Run:
     def certified(self) -> NDArray[np.bool_]:
         """Mask of the records whose map is certified as requested."""
         return np.array([row.get("certified") is True for row in self.rows], dtype=np.bool_)
+
+    def certified_column(self, name: str) -> FloatArray:
+        """Return the numbers of the certified records in a column, NaN where there is none."""
+        return self.column(name)[self.certified]
 
 
 def load(source: str | os.PathLike[str]) -> Run:
@@ -87,43 +91,15 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-@dataclass(frozen=True)
-class Group:
-    """Statistics of a group of records."""
-
-    name: str
-    problems: int
-    certified: int
-    # Median, 95 % quantile and maximum of the times of certified problems; NaN if there are none
-    seconds: tuple[float, float, float]
-    # ``stretch``, ``mips``: Maximum and median of the worst stretch and of the MIPS distortion of certified problems;
-    # NaN if there are none
-    stretch: tuple[float, float]
-    mips: tuple[float, float]
-    triangles: int
-
-
-def groups(run: Run) -> list[Group]:
-    """Return the statistics by the first part of the problems' names, and of all problems."""
-    first = np.array([row["problem"].partition("/")[0] if "/" in row["problem"] else "" for row in run.rows])
-    parts = [_group(run, str(name), first == name) for name in np.unique(first)]
-    everything = _group(run, "all", np.ones(len(run.rows), dtype=np.bool_))
+def groups(run: Run) -> list[Run]:
+    """Return the records by the first part of the problems' names, and all of them, each as a run of its own."""
+    parts: dict[str, list[Record]] = {}
+    for row in run.rows:
+        folder, slash, _ = row["problem"].partition("/")
+        parts.setdefault(folder if slash else "", []).append(row)
     # More than 40 groups, for example one per problem, are not useful.
-    return [*(parts if 1 < len(parts) <= 40 else []), everything]
-
-
-def _group(run: Run, name: str, chosen: NDArray[np.bool_]) -> Group:
-    good = run.certified & chosen
-    seconds, stretch, mips, triangles = (run.column(column) for column in ("seconds", "isometric", "mips", "triangles"))
-    return Group(
-        name=name,
-        problems=int(chosen.sum()),
-        certified=int(good.sum()),
-        seconds=(quantile(seconds[good], 0.5), quantile(seconds[good], 0.95), quantile(seconds[good], 1.0)),
-        stretch=(worst(stretch[good]), quantile(stretch[good], 0.5)),
-        mips=(worst(mips[good]), quantile(mips[good], 0.5)),
-        triangles=int(np.nansum(triangles[chosen])),
-    )
+    named = sorted(parts) if 1 < len(parts) <= 40 else []
+    return [*(replace(run, name=name, rows=parts[name]) for name in named), replace(run, name="all")]
 
 
 def quantile(values: FloatArray, share: float) -> float:

@@ -35,11 +35,7 @@ def find(location: str) -> list[str]:
     if is_url(location):
         system, path = _open(location)
         return sorted(one[len(path) :].lstrip("/") for one in _retry(lambda: system.find(path), location))
-    names = []
-    for folder, folders, files in os.walk(location):
-        folders.sort()
-        names += [Path(folder, name).relative_to(location).as_posix() for name in files]
-    return sorted(names)
+    return sorted(one.relative_to(location).as_posix() for one in Path(location).rglob("*") if not one.is_dir())
 
 
 def stamp(location: str) -> str:

@@ -132,11 +132,10 @@ def _tar_samples(path: Path, limit: int) -> Iterator[Sample]:
     lists = after_damage = False  # Whether problems have lists of fixed vertices; whether damage precedes the problem
     with open_tar(os.fspath(path)) as file:
         for member in read_members(file, _is_wanted, limit):
-            damaged = isinstance(member, Damage)
-            key, extension = ("", "") if isinstance(member, Damage) else _split(member.name)
-            if sample is not None and (damaged or key != sample.key):
+            key, extension = (None, "") if isinstance(member, Damage) else _split(member.name)
+            if sample is not None and key != sample.key:
                 lists = lists or sample.fixed is not None
-                if lists and sample.fixed is None and (damaged or after_damage):
+                if lists and sample.fixed is None and (key is None or after_damage):
                     sample.error = "its list of fixed vertices may be lost, because the archive is damaged next to it"
                 yield sample
                 sample, after_damage = None, False
@@ -144,7 +143,7 @@ def _tar_samples(path: Path, limit: int) -> Iterator[Sample]:
                 after_damage = True
                 yield Sample(f"damaged-{member.start}", error=f"damaged at byte {member.start}: {member.what}")
                 continue
-            sample = sample or Sample(key)
+            sample = sample or Sample(key or "")
             if member.data is not None:
                 sample.files[extension] = member.data
         yield from () if sample is None else (sample,)

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.http11 import Request, Response
@@ -100,7 +100,7 @@ class Studio:
             ping_timeout=60,
             close_timeout=2,
         ) as server:
-            self.port = _port_of(server)
+            self.port = next(iter(server.sockets)).getsockname()[1]
             ready(self.address)
             try:
                 await server.serve_forever()
@@ -230,8 +230,3 @@ def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; char
     headers = Headers({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content)), "Connection": "close"})
     headers.update({name.title(): value for name, value in further.items()})
     return Response(status.value, status.phrase, headers, content)
-
-
-def _port_of(server: Server) -> int:
-    port: int = next(iter(server.sockets)).getsockname()[1]
-    return port

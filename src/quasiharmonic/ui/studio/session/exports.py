@@ -24,7 +24,10 @@ def list_files(state: SessionState, form: str, texture: io.Texture | None) -> di
         raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
     mesh = mapped_model(state, None if form == "ply" else texture)
     files = _write(mesh, MAP if form == "obj" else f"map.{form}")
-    return files | (list_recipe_files(state) if form == "obj" else {})
+    if form == "obj":
+        recipe = state.recipe
+        files |= recipe.texts | ({} if recipe.start is None else _write(recipe.start, START))
+    return files
 
 
 def mapped_model(state: SessionState, texture: io.Texture | None) -> io.MeshData:
@@ -33,13 +36,6 @@ def mapped_model(state: SessionState, texture: io.Texture | None) -> io.MeshData
         raise RequestError("there is no map to save yet: press Unwrap or Flatten first")
     mesh = state.sheet.mapped_file(state.mesh)
     return mesh if texture is None else replace(mesh, texture=texture)
-
-
-def list_recipe_files(state: SessionState) -> dict[str, bytes]:
-    """Return the files that command and script of a state read, besides the user's file."""
-    recipe = state.recipe
-    start = {} if recipe.start is None else _write(recipe.start, START)
-    return start | recipe.texts
 
 
 def write_model(path: Path, mesh: io.MeshData) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.ui.studio.protocol import Array
 from quasiharmonic.ui.studio.session.drag import DragMap
-from quasiharmonic.ui.studio.session.seams import find_seam_sides, sides_of
+from quasiharmonic.ui.studio.session.seams import find_seams, sides_of
 from quasiharmonic.ui.studio.session.state import SessionState, bad_triangles, verdict
 from quasiharmonic.util.arrays import FloatArray
 
@@ -120,6 +120,6 @@ def asked_boundary(state: SessionState, targets: Mapping[int, FloatArray], origi
 
 def seams_message(state: SessionState) -> Message:
     """Return the seams, each side with the number of its chain; or those that the user drew."""
-    sides = find_seam_sides(state) if state.drawn is None else sides_of(state, state.drawn)
+    sides = sides_of(state, find_seams(state))
     header = {"kind": "seams", "drawn": state.drawn is not None, "chains": int(sides.chains.max(initial=-1)) + 1}
     return header, {"edges": sides.edges.astype(np.uint32), "chain": sides.chains.astype(np.uint32)}

@@ -14,7 +14,7 @@ import numpy as np
 
 from quasiharmonic.apps.atlas import island_functions as atlas
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, mirrored_islands
-from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, each_island
+from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland, each_island
 from quasiharmonic.apps.atlas.seam_cuts import cut_along, cut_apart
 from quasiharmonic.apps.repair.fitting import find_corner_vertices, fit_boundary, fix_in_place
 from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
@@ -190,28 +190,23 @@ def pack_all(state: SessionState, resolution: int, padding: float) -> SessionSta
         f"mesh = atlas.pack(flat{recipes.arguments(**size)})",
     ]
     recipe = recipes.record_call("flatten", source, "packed.obj", size, words=words, lines=lines)
-    return as_it_is(state, mesh, recipe, keep=True)
+    return as_it_is(state, mesh, recipe, keep=("pins",))
 
 
 def move_islands(state: SessionState, by: FloatArray, turn: float) -> SessionState:
     """Move the selected islands together by a vector (2,), after a rotation by ``turn`` degrees around their centre."""
     require_map(state)
     places = [island.uv for island in state.mesh.islands]
-    low, high = (getattr(np.concatenate([places[k] for k in state.selected]), side)(axis=0) for side in ("min", "max"))
-    centre = (low + high) / 2
-    # Quarter turns are exact.
-    cos, sin = [(1, 0), (0, 1), (-1, 0), (0, -1)][int(turn // 90) % 4] if turn % 90 == 0 else _cos_sin(turn)
+    moving = np.concatenate([places[k] for k in state.selected])
+    centre = (moving.min(axis=0) + moving.max(axis=0)) / 2
+    cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    if turn % 90 == 0:  # Quarter turns are exact.
+        cos, sin = np.rint(cos), np.rint(sin)
     matrix = np.array([[cos, sin], [-sin, cos]])
     for k in state.selected:
         places[k] = (places[k] - centre) @ matrix + centre + by if turn else places[k] + by
     mesh = state.mesh.with_places(places)
-    moved = as_it_is(state, mesh, saved_start(mesh), keep=True)
-    islands = tuple(one if k in state.selected else state.islands[k] for k, one in enumerate(moved.islands))
-    return replace(moved, islands=islands)
-
-
-def _cos_sin(degrees: float) -> tuple[float, float]:
-    return float(np.cos(np.radians(degrees))), float(np.sin(np.radians(degrees)))
+    return as_it_is(state, mesh, saved_start(mesh), keep=("pins",))
 
 
 def is_flattenable(island: Island) -> bool:
@@ -233,21 +228,23 @@ def solve_smoothly(problem: Problem, callback: Callback) -> MapResult:
     return result
 
 
-def rebuild(
-    state: SessionState,
-    mapped: MappedAtlas,
-    recipe: Recipe,
-    keep: Collection[str] = (),
-) -> SessionState:
-    """Return the state after a step; islands that are the same keep the constraints named in ``keep``."""
-    changed = set(range(len(mapped.islands))) if len(mapped.islands) != len(state.islands) else set(state.selected)
+def rebuild(state: SessionState, mapped: MappedAtlas, recipe: Recipe, keep: Collection[str] = ()) -> SessionState:
+    """Return the state after a step; islands that are the same keep the constraints named in ``keep``.
+
+    Islands that were not selected and have not moved are unchanged. All islands are selected if their number changes.
+    """
+    selected = state.selected if len(mapped.islands) == len(state.islands) else tuple(range(len(mapped.islands)))
     if any(one.result.status is Status.INTERRUPTED for one in mapped.islands):
         raise KeyboardInterrupt
     islands = []
     for k, (island, one) in enumerate(zip(mapped.mesh.islands, mapped.islands, strict=True)):
         before = state.islands[k] if k < len(state.islands) else None
-        if before is not None and k not in changed and np.array_equal(island.uv, before.island.uv):
+        same = before is not None and np.array_equal(before.island.F, island.F)
+        if before is not None and same and k not in selected and np.array_equal(island.uv, before.island.uv):
             islands.append(before)
+            continue
+        if np.isnan(island.uv).any():
+            islands.append(IslandState(island))
             continue
         # The atlas may have shifted an island after it was mapped.
         result = one.result
@@ -255,25 +252,21 @@ def rebuild(
         if not np.array_equal(uv, result.uv):
             result = replace(result, uv=uv, certificate=certify(island.F, uv))
         new = IslandState(island, one.mirrored, result)
-        if before is not None and keep and np.array_equal(before.island.F, island.F):
+        if same:
             new = replace(new, **{name: getattr(before, name) for name in keep})
         islands.append(fix_where_it_is(new))
-    return _with_map(state, mapped.mesh, islands, recipe)
+    return replace(state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=selected, drawn=None)
 
 
-def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, *, keep: bool = False) -> SessionState:
-    """Return the state with the map of a mesh; with ``keep`` the islands are the same, and their pins stay."""
-    islands = []
-    for k, (island, mirrored) in enumerate(zip(mesh.islands, mirrored_islands(mesh), strict=True)):
+def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, keep: Collection[str] = ()) -> SessionState:
+    """Return the state with the map of a mesh, like `rebuild`."""
+    done = []
+    for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         uv = island.uv * MIRROR if mirrored else island.uv
-        if np.isnan(uv).any():
-            islands.append(IslandState(island))
-            continue
         found = certify(island.F, uv)
         result = MapResult(uv=uv, status=Status.INJECTIVE if found.injective else Status.STALLED, certificate=found)
-        pins = state.islands[k].pins if keep and k < len(state.islands) else ()
-        islands.append(fix_where_it_is(IslandState(island, mirrored, result, pins=pins)))
-    return _with_map(state, mesh, islands, recipe)
+        done.append(MappedIsland(island.triangles, mirrored, result))
+    return rebuild(state, MappedAtlas(mesh, tuple(done)), recipe, keep)
 
 
 def fix_where_it_is(one: IslandState) -> IslandState:
@@ -282,12 +275,6 @@ def fix_where_it_is(one: IslandState) -> IslandState:
     edge = np.unique(boundary_edges(one.island.F, len(one.island.vertices)))
     fixed = np.union1d(edge, np.array(one.pins, dtype=np.int64))
     return replace(one, fixed=fixed, target=one.result.uv[fixed])
-
-
-def _with_map(state: SessionState, mesh: SeamedMesh, islands: list[IslandState], recipe: Recipe) -> SessionState:
-    """Return the state with another map; all islands are selected if their number has changed."""
-    selected = state.selected if len(islands) == len(state.islands) else tuple(range(len(islands)))
-    return replace(state, mesh=mesh, islands=tuple(islands), recipe=recipe, selected=selected, drawn=None)
 
 
 def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> Given | None:
@@ -365,12 +352,3 @@ def require_injective(state: SessionState) -> None:
     if bad:
         which = "the map has" if len(state.islands) == 1 else f"island {bad[0]} has"
         raise RequestError(f"{which} inverted triangles: undo, or select it and press Flatten")
-
-
-def fixed_positions(one: IslandState, target: FloatArray, uv: FloatArray | None) -> FloatArray:
-    """Return positions (m, 2) of an island with its fixed vertices at a target; ``uv`` are those of the others."""
-    assert one.result is not None
-    assert one.fixed is not None
-    positions = (one.result.uv if uv is None else uv).copy()
-    positions[one.fixed] = target
-    return positions * one.sign

@@ -21,23 +21,6 @@ class SeamSides(NamedTuple):
     chains: IntArray  # (k,): the chain of each, the same on both sides; a chain ends where seams meet
 
 
-def find_seam_sides(state: SessionState) -> SeamSides:
-    """Return the sides of all seams of a state: edges at which triangles meet on the surface but not in the map."""
-    numbering = state.numbering
-    F = numbering.F
-    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
-    n = int(F.max()) + 1
-    key = edge_keys(tail, head, n)
-    _, first, times = np.unique(key, return_index=True, return_counts=True)
-    rim = first[times == 1]
-    tail, head = tail[rim], head[rim]
-    model = np.sort(np.stack([numbering.origin[tail], numbering.origin[head]], axis=1), axis=1)
-    _, of, count = np.unique(model, axis=0, return_inverse=True, return_counts=True)
-    seam = count[of.ravel()] > 1
-    pairs, which = np.unique(model[seam], axis=0, return_inverse=True)
-    return SeamSides(np.stack([tail[seam], head[seam]], axis=1), _label_chains(pairs)[which.ravel()])
-
-
 def find_seams(state: SessionState) -> IntArray:
     """Return the edges (k, 2) of the surface that the seams use, or those that the user drew."""
     return state.mesh.seams if state.drawn is None else state.drawn

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.energies.polishing import ENERGIES
 from quasiharmonic.io.models.textures import Texture, texture_of
 from quasiharmonic.ui.studio.protocol import Array, Frame
 from quasiharmonic.ui.studio.session import frames, operations, validation
@@ -36,6 +35,7 @@ from quasiharmonic.ui.studio.session.surface import Sheet, make_first_sheet, rea
 from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.options import ENERGIES
 
 _LARGEST_TEXTURE = 16_384
 
@@ -149,18 +149,21 @@ class Session:
     def _do_seam(self, frame: Frame) -> None:
         """Add the shortest path between two vertices to the seams."""
         state, mesh = self.state, self.state.mesh
-        ends = [int(state.numbering.origin[validation.number_below(frame, n, len(state.numbering.origin))])
-                for n in ("start", "vertex")]  # fmt: skip
-        if ends[0] == ends[1]:
-            return
-        path = shortest_path(mesh.V, mesh.F, *ends)
-        self._keep(replace(state, drawn=add_edges(find_seams(state), path)))
+        start, end = self._model_vertex(frame, "start"), self._model_vertex(frame, "vertex")
+        if start != end:
+            path = shortest_path(mesh.V, mesh.F, start, end)
+            self._keep(replace(state, drawn=add_edges(find_seams(state), path)))
 
     def _do_erase(self, frame: Frame) -> None:
         """Remove the chain of seams nearest to a vertex."""
         state = self.state
-        vertex = int(state.numbering.origin[validation.vertex(frame, len(state.numbering.origin))])
+        vertex = self._model_vertex(frame, "vertex")
         self._keep(replace(state, drawn=erase_chain(find_seams(state), state.mesh.V, vertex)))
+
+    def _model_vertex(self, frame: Frame, name: str) -> int:
+        """Return the vertex of the model that a message names by its number on the page."""
+        origin = self.state.numbering.origin
+        return int(origin[validation.vertex(frame, len(origin), name)])
 
     def _do_turn(self, frame: Frame) -> None:
         self._keep(turn_over(self.state), fit=True)
@@ -256,17 +259,15 @@ class Session:
         k, vertex = self._find(frame)
         self._refuse_drawn()
         one = self.state.islands[k]
-        if one.result is None or one.fixed is None or one.target is None:
+        if one.result is None:
             raise RequestError("there is no map to drag yet: press Unwrap or Flatten first")
         if self.state.selected != (k,):
             self._history.change(replace(self.state, selected=(k,)))
-            one = self.state.islands[k]
         problem = one.problem
         share = drag_weights(vertex, problem.fixed, problem.target, problem.domain.loops, one.corners)
         # Without an injective map the drag only moves the boundary; a search follows at its end.
-        follower = None
-        if one.result is not None and one.injective and one.in_place:
-            follower = Follower(problem, one.result.uv, one.result.certificate)
+        follows = one.injective and one.in_place
+        follower = Follower(problem, one.result.uv, one.result.certificate) if follows else None
         place = problem.target[np.flatnonzero(problem.fixed == vertex)[0]]
         self._drag_state = _DragState(k, place, share, follower)
 
@@ -300,7 +301,7 @@ class Session:
         except KeyboardInterrupt:
             # The next message came before the final map. If the drag has a map, it is kept.
             if reached:
-                self._keep(operations.as_it_is(state, start, operations.saved_start(start), keep=True))
+                self._keep(operations.as_it_is(state, start, operations.saved_start(start), ("pins",)))
             else:
                 self._show()
 
@@ -351,9 +352,7 @@ class Session:
         self._tell(*frames.surface_message(state))
 
     def _send_image(self) -> None:
-        texture = self._history.texture
-        content = b"" if texture is None else texture.data
-        kind = "" if texture is None else texture.media_type
+        content, kind = (b"", "") if self.texture is None else (self.texture.data, self.texture.media_type)
         self._tell({"kind": "image", "type": kind}, {"content": np.frombuffer(content, dtype=np.uint8)})
 
     def _show(self, *, fit: bool = False) -> None:

@@ -15,7 +15,6 @@ from quasiharmonic.ui.studio.session.islands import IslandState
 from quasiharmonic.ui.studio.session.operations import (
     as_it_is,
     fix_where_it_is,
-    fixed_positions,
     flatten_islands,
     is_flattenable,
     map_in_place,
@@ -37,9 +36,7 @@ MAX_AUTOMATIC = 40_000
 
 def open_without_map(sheet: Sheet) -> SessionState:
     """Return the state of a model before it has a map."""
-    mesh = sheet.initial_map()
-    if mesh.uv is not None:
-        mesh = SeamedMesh(mesh.V, mesh.F)
+    mesh = SeamedMesh(sheet.surface.V, sheet.surface.F)
     islands = tuple(IslandState(island) for island in mesh.islands)
     return SessionState(sheet, mesh, islands, Recipe(), tuple(range(len(islands))))
 
@@ -52,7 +49,7 @@ def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = No
     """
     bare = open_without_map(sheet)
     if has_complete_map(sheet.mesh) or (sheet.fixed is not None and sheet.is_file and sheet.mesh.FT is not None):
-        return _take_map(sheet, bare, callback)
+        return _take_map(sheet, callback)
     if len(bare.islands) == 1 and sheet.is_file:
         if len(bare.islands[0].loops) == 1 and is_flattenable(bare.islands[0].island):
             # Some disks have no map to a square: a boundary of three vertices, triangles with all corners on one side.
@@ -68,21 +65,19 @@ def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = No
     return bare if len(sheet.surface.F) > MAX_AUTOMATIC else unwrap_model(bare, callback)
 
 
-def _take_map(sheet: Sheet, bare: SessionState, callback: Callable[[Any], object] | None) -> SessionState:
+def _take_map(sheet: Sheet, callback: Callable[[Any], object] | None) -> SessionState:
     """Return the state with the map of the file; if it has inverted triangles, with a map of the same boundary."""
     mesh = sheet.initial_map()
-    state = replace(bare, mesh=mesh, selected=tuple(range(len(mesh.islands))))
     pins = [] if sheet.fixed is None else sheet.fixed.tolist()
     islands = tuple(_with_file_pins(IslandState(island), pins) for island in mesh.islands)
-    state = replace(state, islands=islands)
-    if sheet.fixed is None or not pins:
-        state = as_it_is(state, mesh, Recipe())
-        if state.injective:
-            return state
+    state = SessionState(sheet, mesh, islands, Recipe(), tuple(range(len(islands))))
+    found = as_it_is(state, mesh, Recipe())
+    if found.injective and not pins:
+        return found
     try:
-        return map_in_place(replace(state, islands=islands), mesh, None, callback)
+        return map_in_place(state, mesh, None, callback)
     except ValueError:
-        return as_it_is(state, mesh, Recipe())
+        return found
 
 
 def _with_file_pins(one: IslandState, pins: Sequence[int]) -> IslandState:
@@ -138,6 +133,10 @@ def with_start(
     """
     one = state.islands[k]
     places = [island.uv for island in state.mesh.islands]
-    places[k] = fixed_positions(one, target, uv)
+    assert one.result is not None
+    assert one.fixed is not None
+    own = (one.result.uv if uv is None else uv).copy()
+    own[one.fixed] = target
+    places[k] = own * one.sign
     moved = replace(state.with_island(k, one.with_target(target)), selected=(k,))
     return moved, state.mesh.with_places(places)

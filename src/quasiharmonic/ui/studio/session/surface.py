@@ -60,12 +60,10 @@ class Sheet:
 
     def initial_map(self) -> SeamedMesh:
         """Return the surface with the seams and the map of the file, without map if the file has none."""
-        if self.mesh.FT is None or self.mesh.vt is None:
+        if self.mesh.FT is None or self.mesh.vt is None or (not self.is_file and (self.mesh.FT < 0).any()):
             return SeamedMesh(self.surface.V, self.surface.F)
-        if self.cleaned is None and not self.turned:
+        if self.is_file:
             return io.seamed(self.mesh)
-        if (self.mesh.FT < 0).any():
-            return SeamedMesh(self.surface.V, self.surface.F)
         return SeamedMesh(self.surface.V, self.surface.F, self.from_file(self.mesh.FT), self.mesh.vt)
 
     def from_file(self, corners: IntArray) -> IntArray:

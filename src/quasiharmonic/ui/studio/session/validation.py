@@ -14,13 +14,8 @@ class RequestError(ValueError):
     """A request cannot be fulfilled and the page is unchanged; the message states the reason."""
 
 
-def vertex(frame: Frame, n: int) -> int:
-    """Return the vertex index, below ``n``."""
-    return number_below(frame, "vertex", n)
-
-
-def number_below(frame: Frame, name: str, n: int) -> int:
-    """Return a vertex index of another name, below ``n``."""
+def vertex(frame: Frame, n: int, name: str = "vertex") -> int:
+    """Return a vertex index, below ``n``."""
     value = number(frame, name)
     if not 0 <= value < n:
         raise RequestError(f"there is no vertex {value}: the surface has {n}, counted from 0")
