@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.fans import fans, number_fans, renumber
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -234,7 +234,7 @@ class SeamedMesh:
         pairs = index_array("edges", edges).reshape(-1, 2)
         check_range("edges", pairs, len(self.V))
         sides = edge_keys(self.F, self.F[:, (1, 2, 0)], len(self.V))
-        wanted = edge_keys(pairs[:, 0], pairs[:, 1], len(self.V))
+        wanted = pair_keys(pairs, len(self.V))
         absent = ~np.isin(wanted, sides)
         if absent.any():
             raise ValueError(f"{edge_names(pairs[absent])}: not an edge of the mesh, so it cannot be cut")

@@ -40,6 +40,7 @@ from quasiharmonic.util.arrays import (
     index_array,
     map_array,
     names_of,
+    scale_to_unit,
 )
 from quasiharmonic.util.options import HarmoniseOptions, PolishOptions
 
@@ -348,7 +349,7 @@ def _scale_to_surface(islands: Sequence[Island], surface: FloatArray) -> list[tu
 
 def _surface_areas(mesh: SeamedMesh) -> FloatArray:
     """Areas of the islands on the surface, in a unit near the surface's size."""
-    V = np.ldexp(mesh.V, -int(np.frexp(np.abs(mesh.V).max(initial=0.0))[1]))
+    V = scale_to_unit(mesh.V)
     a, b, c = V[mesh.F].swapaxes(0, 1)
     along, across = b - a, c - a
     squared = (along**2).sum(axis=1) * (across**2).sum(axis=1) - (along * across).sum(axis=1) ** 2

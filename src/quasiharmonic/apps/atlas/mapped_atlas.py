@@ -19,7 +19,7 @@ from quasiharmonic.geometry.mesh.surface_checks import manifold_edges
 from quasiharmonic.io import MeshData, refined_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.util.arrays import FloatArray, names_of
+from quasiharmonic.util.arrays import FloatArray, names_of, to_complex
 from quasiharmonic.util.outcome import Outcome
 
 
@@ -209,7 +209,7 @@ def fit_in_place(island: Island, uv: FloatArray) -> FloatArray:
 
     If rounding would invert a triangle, the map is returned unchanged.
     """
-    before, after = (np.ascontiguousarray(w).view(np.complex128).ravel() for w in (island.uv, uv))
+    before, after = (to_complex(w) for w in (island.uv, uv))
     centre, middle = before.mean(), after.mean()
     turn = np.vdot(after - middle, before - centre)
     area = [abs(float(signed_areas(island.F, w).sum())) for w in (before, after)]

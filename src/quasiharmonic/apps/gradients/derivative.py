@@ -30,6 +30,8 @@ from quasiharmonic.util.arrays import (
     map_array,
     real_array,
     target_positions,
+    to_complex,
+    to_points,
     work,
 )
 
@@ -138,7 +140,7 @@ class Gradients:
             by_places[state.gauge.pin] += self._on_pin
         by_held = by_places[state.fixed] / state.unit
         by_held[~state.follows] = 0
-        return to_rows(by_held)
+        return to_points(by_held)
 
     @cached_property
     def rest(self) -> FloatArray:
@@ -230,7 +232,7 @@ class Derivative:
         dw = held - state.inverse(load)
         if state.gauge is not None:
             dw = state.gauge.select(dw, held, more)
-        return to_rows(state.unit * dw)
+        return to_points(state.unit * dw)
 
     def vjp(self, cotangent: ArrayLike) -> Gradients:
         """Return the gradients of a function of the map with respect to the map's inputs.
@@ -276,13 +278,3 @@ def _check_mu(mu: ArrayLike, f: int) -> ComplexArray:
         )
     check_finite("mu", "triangle", "triangles", array[:, None])
     return array.astype(np.complex128)
-
-
-def to_complex(rows: FloatArray) -> ComplexArray:
-    """Return positions (n, 2) as complex numbers (n,)."""
-    return np.ascontiguousarray(rows).view(np.complex128).ravel()
-
-
-def to_rows(w: ComplexArray) -> FloatArray:
-    """Return complex numbers (n,) as positions (n, 2)."""
-    return np.ascontiguousarray(w).view(np.float64).reshape(-1, 2)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.piece import is_scale_free
-from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, Scale, to_rows
+from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, Scale
 from quasiharmonic.apps.gradients.freedom import Freedom
 from quasiharmonic.apps.gradients.gauge import Gauge
 from quasiharmonic.apps.gradients.minimum import Minimum
@@ -21,7 +21,7 @@ from quasiharmonic.energies.polishing import check_injective, find_energy
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
-from quasiharmonic.util.arrays import ComplexArray
+from quasiharmonic.util.arrays import ComplexArray, find_exponent, to_points
 from quasiharmonic.util.options import FlattenOptions, takes
 
 
@@ -88,7 +88,7 @@ def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: 
     chosen = find_energy(options.energy)
     start = check_injective(domain, uv, NOT_FOUND)
     strain = make_strain(domain)
-    exponent = int(np.frexp(np.abs(domain.V).max())[1])
+    exponent = find_exponent(domain.V)
     w = in_units(start, exponent)
     measure = DeformationEnergy(
         np.ldexp(domain.V, -exponent),
@@ -142,4 +142,4 @@ def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge
 
 
 def _overlaps(domain: Domain, w: ComplexArray) -> bool:
-    return bool(check_loops(domain.loops, to_rows(w))[1])
+    return bool(check_loops(domain.loops, to_points(w))[1])

@@ -7,7 +7,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.derivative import Derivative, Equilibrium, Scale, to_rows
+from quasiharmonic.apps.gradients.derivative import Derivative, Equilibrium, Scale
 from quasiharmonic.apps.gradients.freedom import Freedom, OnCurves
 from quasiharmonic.apps.gradients.gauge import differentiate_map_size
 from quasiharmonic.apps.gradients.minimum import Minimum
@@ -20,7 +20,7 @@ from quasiharmonic.energies.polishing import check_injective, find_energy, scale
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves, Track
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, to_points
 from quasiharmonic.util.options import PolishOptions, takes
 
 #: Error message for maps that are not injective.
@@ -146,6 +146,6 @@ def find_curve_vertices(track: Track) -> IntArray:
 
 def place_map(w: ComplexArray, exponent: int, fixed: IntArray, given: FloatArray) -> FloatArray:
     """Scale a map out of its units, with fixed vertices exactly at their given positions."""
-    uv: FloatArray = np.ldexp(to_rows(w), exponent)
+    uv: FloatArray = np.ldexp(to_points(w), exponent)
     uv[fixed] = given[fixed]
     return uv

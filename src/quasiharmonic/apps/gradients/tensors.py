@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, to_complex
+from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium
 from quasiharmonic.apps.gradients.forces import Forces, TensorForces
 from quasiharmonic.apps.gradients.strain import CorrectedStrain, RestStrain, Strain
 from quasiharmonic.energies.energies import QuadraticForm
@@ -23,7 +23,7 @@ from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH, beltrami_coefficients
-from quasiharmonic.util.arrays import ComplexArray, check_choice
+from quasiharmonic.util.arrays import ComplexArray, check_choice, to_complex
 
 
 def quasi_harmonic_derivative(

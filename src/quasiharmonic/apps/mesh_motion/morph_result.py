@@ -13,7 +13,7 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import corner_triangles, name_elements
 from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
 from quasiharmonic.problem.result import MapResult
-from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import OutcomeOf, SummarisedOutcome
 
@@ -134,8 +134,7 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
 
 def find_forbidden(F: IntArray, points: FloatArray, given: IntArray) -> IntArray:
     """Return elements inverted or degenerate at a corner whose relevant nodes all have given positions; ascending."""
-    known = np.zeros(len(points), dtype=bool)
-    known[given] = True
+    known = mark(len(points), given)
     if F.shape[1] == 6:
         x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)
         # At a corner the derivatives depend on the corners and on the midpoints of its two sides.

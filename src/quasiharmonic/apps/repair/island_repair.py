@@ -29,7 +29,7 @@ from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 from quasiharmonic.problem.diagnosis.obstruction import Obstruction
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve_problem
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, edge_names, names_of
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, edge_names, mark, names_of
 from quasiharmonic.util.options import MapOptions, PolishOptions, RepairOptions
 
 # Numbers of rings of free vertices around inverted triangles, tried in turn.
@@ -59,8 +59,7 @@ class IslandRepair:
         self.reason = ""
         self.diagnosis: Diagnosis | None = None
         self._F, self._V = island.F, V[island.vertices]
-        self._fixed = np.zeros(len(self.uv), dtype=np.bool_)
-        self._fixed[boundary_edges(self._F, len(self.uv))] = True
+        self._fixed = mark(len(self.uv), boundary_edges(self._F, len(self.uv)))
         self._fixed |= np.isin(island.vertices, fixed)
         self._options = options
         # Vertices with more inverted triangles are more likely to be misplaced, and return to their positions last.
@@ -103,8 +102,7 @@ class IslandRepair:
 
     def _around(self, triangles: IntArray, rings: int) -> BoolArray:
         """Interior vertices within a number of rings of triangles; the triangles' own vertices are the first ring."""
-        near: BoolArray = np.zeros(len(self.uv), dtype=np.bool_)
-        near[self._F[triangles]] = True
+        near: BoolArray = mark(len(self.uv), self._F[triangles])
         for _ in range(rings - 1):
             near[self._F[near[self._F].any(axis=1)]] = True
         return near & ~self._fixed
@@ -201,8 +199,7 @@ class IslandRepair:
 
         Boundary vertices are not checked, because the fixed boundary may force this.
         """
-        patch = np.zeros(len(self.uv), dtype=np.bool_)
-        patch[self._F[free[self._F].any(axis=1)]] = True
+        patch = mark(len(self.uv), self._F[free[self._F].any(axis=1)])
         around = self._F[patch[self._F].any(axis=1)]
         F, first = renumber(fans(around)[0], around)
         found = certify(F, self.uv[around.ravel()[first]])

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, invert_indices
 
 if TYPE_CHECKING:
     from scipy.sparse import bsr_array
@@ -193,8 +193,7 @@ class BlockMatrix:
     """
 
     def __init__(self, T: IntArray, n: int, free: IntArray) -> None:
-        number = np.full(n, -1)
-        number[free] = np.arange(free.size)
+        number = invert_indices(n, free)
         own = number[T]
         rows = np.concatenate([own[:, i] for i, _ in _PAIRS] + [own[:, j] for i, j in _PAIRS if i != j])
         columns = np.concatenate([own[:, j] for _, j in _PAIRS] + [own[:, i] for i, j in _PAIRS if i != j])

@@ -23,7 +23,7 @@ from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding, project
 from quasiharmonic.apps.tetrahedra.topology import FaceReport, inspect_faces
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, mark, names_of
 from quasiharmonic.util.options import TetrahedraOptions
 
 # Maximum number of crossing pairs of boundary triangles that are listed.
@@ -110,8 +110,7 @@ def place_vertices(
         begin[free] = after[free]
     certificate = certify_arrays(T, begin, faces=mesh.faces)
     sign, _ = tetrahedron_signs(T, begin)
-    is_fixed = np.zeros(len(points), dtype=np.bool_)
-    is_fixed[fixed] = True
+    is_fixed = mark(len(points), fixed)
     forbidden = np.flatnonzero((sign <= 0) & is_fixed[T].all(axis=1))
     if not certificate.positive and status is not TetrahedraStatus.CROSSING:
         obstructions = find_obstructions(T, begin, is_fixed, mesh.faces.boundary if whole else None, sign)
@@ -159,7 +158,7 @@ def make_energy(mesh: RestMesh, begin: FloatArray, whole: bool) -> tuple[ShapeEn
     X = np.zeros_like(begin)
     exponents = []
     for there, here in ((mesh.X, rest), (begin, X)):
-        exponents.append(int(np.frexp(np.abs(there[used]).max())[1]))
+        exponents.append(find_exponent(there[used]))
         here[used] = np.ldexp(there[used], -exponents[-1])
     with np.errstate(all="ignore"):
         ratio = 0.0

@@ -25,7 +25,7 @@ from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
-from quasiharmonic.util.arrays import FloatArray, IntArray, count_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import check_gifti, unpack_gzip
 
@@ -291,8 +291,7 @@ def read_patch(path: str | os.PathLike[str], surface: str | os.PathLike[str] | N
 
 def _patch_of(number: IntArray, places: FloatArray, n: int, F: IntArray) -> tuple[FloatArray, IntArray]:
     """Return positions of all ``n`` vertices of a surface, zero outside a patch, and the triangles inside it."""
-    inside = np.zeros(n, dtype=np.bool_)
-    inside[number] = True
+    inside = mark(n, number)
     V = np.zeros((n, 3))
     V[number] = places
     return V, F[inside[F].all(axis=1)]

@@ -18,7 +18,9 @@ from quasiharmonic.util.arrays import (
     check_finite,
     check_range,
     corner_rows,
+    find_exponent,
     map_array,
+    mark,
     names_of,
     pad_to_space,
     triangle_rows,
@@ -278,7 +280,7 @@ def in_plane(mesh: MeshData) -> MeshData:
 def is_planar(points: FloatArray) -> bool:
     """Return whether points (n, 3) lie in a plane z = constant, up to rounding to single precision."""
     # Scaling by a power of two avoids overflow in differences of the largest doubles.
-    exponent = int(np.frexp(np.abs(points).max())[1])
+    exponent = find_exponent(points)
     extent = np.ptp(np.ldexp(points, -exponent - 1), axis=0)
     return bool(extent[2] <= 1e-6 * extent[:2].max())
 
@@ -290,8 +292,7 @@ def has_map(mesh: MeshData) -> bool:
 
 def _is_flat(mesh: MeshData) -> bool:
     """Return whether the vertices that triangles use lie in a plane z = constant."""
-    used = np.zeros(len(mesh.V), dtype=np.bool_)
-    used[mesh.F] = True
+    used = mark(len(mesh.V), mesh.F)
     return is_planar(mesh.V) or (not used.all() and bool(used.any()) and is_planar(mesh.V[used]))
 
 

@@ -17,7 +17,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.curves import TargetCurves
 from quasiharmonic.problem.diagnosis.fixture import Fixture, Star
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, smallest_conflict, vertex_names
-from quasiharmonic.util.arrays import cyclic_pairs, edge_names, names_of
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, edge_names, names_of
 
 
 def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
@@ -31,18 +31,28 @@ def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]
 
 def inverted_fixed_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
     """Yield triangles of three fixed vertices that the target makes inverted or degenerate."""
-    triangles = np.flatnonzero(fixture.fixed[problem.F].all(axis=1))
-    corners = problem.F[triangles]
-    sign = orientation(*(fixture.positions[corners[:, k]] for k in range(3)))
-    boundary = pair_keys(problem.domain.edges.boundary, problem.n)
-    for t, abc, s in zip(triangles[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
-        sides = cyclic_pairs(abc)
+    boundary = problem.domain.edges.boundary
+    for t, abc, s, split in find_inverted_fixed(problem.F, fixture.fixed, fixture.positions, boundary):
         message = (
-            f"All vertices of {names_of('triangle', 'triangles', t[None])} are fixed, "
+            f"All vertices of {names_of('triangle', 'triangles', t)} are fixed, "
             f"and the target {'inverts' if s < 0 else 'flattens'} it."
         )
-        split = sides[~np.isin(pair_keys(sides, problem.n), boundary)]
         yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
+
+
+def find_inverted_fixed(
+    F: IntArray, fixed: BoolArray, where: FloatArray, boundary: IntArray
+) -> Iterator[tuple[IntArray, IntArray, np.int8, IntArray]]:
+    """Yield triangles (f, 3) of three fixed vertices that their positions ``where`` (n, 2) invert or flatten.
+
+    With each triangle (1,), its corners, its orientation, and its sides that are not in ``boundary`` (k, 2).
+    """
+    triangles, border = np.flatnonzero(fixed[F].all(axis=1)), pair_keys(boundary, len(fixed))
+    corners = F[triangles]
+    sign = orientation(*(where[corners[:, k]] for k in range(3)))
+    for t, abc, s in zip(triangles[sign <= 0, None], corners[sign <= 0], sign[sign <= 0], strict=True):
+        sides = cyclic_pairs(abc)
+        yield t, abc, s, sides[~np.isin(pair_keys(sides, len(fixed)), border)]
 
 
 def inverted_patches(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:

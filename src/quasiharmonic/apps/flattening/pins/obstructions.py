@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.geometry.exact.predicates import box_pairs_between, orientation
-from quasiharmonic.geometry.mesh.topology import Edges, edge_keys
+from quasiharmonic.geometry.mesh.topology import Edges
 from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
-from quasiharmonic.util.arrays import FloatArray, IntArray, edge_names, names_of
+from quasiharmonic.problem.diagnosis.defects import find_inverted_fixed
+from quasiharmonic.util.arrays import FloatArray, IntArray, edge_names, mark, names_of
 
 # Maximum number of intersecting pairs that are named.
 _MAX_PAIRS = 100
@@ -26,8 +27,7 @@ def pin_obstructions(F: IntArray, n: int, found: Edges, fixed: IntArray, target:
     that intersect others or a fixed vertex, and fixed vertices inside triangles of others. An empty diagnosis proves
     nothing.
     """
-    is_fixed = np.zeros(n, dtype=bool)
-    is_fixed[fixed] = True
+    is_fixed = mark(n, fixed)
     where = np.zeros((n, 2))
     where[fixed] = target
     obstructions = [
@@ -61,18 +61,11 @@ def _find_shared_positions(fixed: IntArray, target: FloatArray) -> Iterator[Obst
 
 
 def _find_inverted(F: IntArray, is_fixed: NDArray[np.bool_], where: FloatArray, found: Edges) -> Iterator[Obstruction]:
-    fixed_triangles = np.flatnonzero(is_fixed[F].all(axis=1))
-    corners = F[fixed_triangles]
-    sign = orientation(*(where[corners[:, k]] for k in range(3)))
-    n = len(is_fixed)
-    boundary = edge_keys(found.boundary[:, 0], found.boundary[:, 1], n)
-    for t, abc, s in zip(fixed_triangles[sign <= 0], corners[sign <= 0], sign[sign <= 0], strict=True):
-        sides = np.stack([abc, np.roll(abc, -1)], axis=1)
+    for t, abc, s, split in find_inverted_fixed(F, is_fixed, where, found.boundary):
         message = (
-            f"All vertices of {names_of('triangle', 'triangles', t[None])} are fixed, "
+            f"All vertices of {names_of('triangle', 'triangles', t)} are fixed, "
             f"and their targets {'invert' if s < 0 else 'flatten'} it."
         )
-        split = sides[~np.isin(edge_keys(sides[:, 0], sides[:, 1], n), boundary)]
         yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
 
 

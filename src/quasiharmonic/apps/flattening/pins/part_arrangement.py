@@ -27,7 +27,7 @@ from quasiharmonic.geometry.exact.loops import check_loops, winding
 from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, invert_indices
 from quasiharmonic.util.options import FlattenOptions
 
 # A surface placed at a pin fills this fraction of the free space around it.
@@ -58,8 +58,7 @@ def flatten_pinned_parts(
 
     def make_search(part: Part) -> PinSearch:
         """Return the problem of a part, in its own numbering."""
-        number = np.full(int(F.max()) + 1, -1)
-        number[part.vertices] = np.arange(part.vertices.size)
+        number = invert_indices(int(F.max()) + 1, part.vertices)
         here = number[fixed] >= 0
         own = None if weights is None else weights[part.triangles]
         return PinSearch(part.piece, number[fixed[here]], target[here], options, own)

@@ -29,7 +29,7 @@ from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descen
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.refinement import split_edges
-from quasiharmonic.geometry.mesh.topology import edge_keys, edges
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis, Kind
 from quasiharmonic.problem.result import MapResult, Status
@@ -37,7 +37,15 @@ from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.methods import RandomRestarts, Untangling, VectorAdam
 from quasiharmonic.solver.search.stages import CoarseToFine, Stages, speed
-from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, target_positions
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    find_exponent,
+    fixed_vertices,
+    mark,
+    target_positions,
+    to_complex,
+)
 from quasiharmonic.util.options import FlattenOptions
 
 # Tolerance for the map that is then moved onto the pins.
@@ -87,7 +95,7 @@ def move_onto_pins(uv: FloatArray, fixed: IntArray, target: FloatArray) -> Float
 
     Only shift it if there is one vertex, or if the best scale is zero or not finite.
     """
-    w, there = (np.ascontiguousarray(places).view(np.complex128).ravel() for places in (uv, target))
+    w, there = (to_complex(places) for places in (uv, target))
     here = w[fixed]
     a, b = here - here.mean(), there - there.mean()
     square = float(np.sum(a.real**2 + a.imag**2))
@@ -154,7 +162,7 @@ class PinSearch:
         apart = int(quarter) + 2 - piece.exponent if extent > 0 else 0
         unit = piece.exponent + apart - min(max(apart, -_APART), _APART)
         # Pins may be even farther from the origin, and the map there must also stay within the range of doubles.
-        self._larger = max(int(np.frexp(np.abs(target).max())[1]) - _LARGEST - unit, 0)
+        self._larger = max(find_exponent(target) - _LARGEST - unit, 0)
         self.exponent = unit + self._larger
         self._target = np.ldexp(target, -self.exponent)
         self._energy = piece.energy(find_energy(options.energy), weights)
@@ -259,13 +267,12 @@ class PinSearch:
         F = self._piece.F
         n = max(int(pairs.max(initial=0)) + 1, len(self._piece.V))
         own = edge_keys(F.ravel(), np.roll(F, -1, axis=1).ravel(), n)
-        return pairs[~np.isin(edge_keys(pairs[:, 0], pairs[:, 1], n), own)]
+        return pairs[~np.isin(pair_keys(pairs, n), own)]
 
     def _select_obstructions(self, diagnosis: Diagnosis) -> Diagnosis | None:
         """Return the obstructions that do not involve air or frame; None if there are none."""
         n, F = len(self._piece.V), self._piece.F
-        held = np.zeros(n, dtype=bool)
-        held[self._fixed] = True
+        held = mark(n, self._fixed)
         own = []
         for obstruction in diagnosis.obstructions:
             vertices = np.concatenate([obstruction.vertices, obstruction.edges.ravel()])
