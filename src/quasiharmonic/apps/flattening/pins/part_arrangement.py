@@ -49,7 +49,7 @@ def flatten_pinned_parts(
 ) -> MapResult:
     """Map surfaces into the plane bijectively, each with some fixed vertices and an otherwise free boundary.
 
-    ``parts`` are the surfaces that have a fixed vertex; the other arguments are those of `flatten_pinned`, for the
+    ``parts`` are the surfaces that have a fixed vertex; the other arguments are those of `PinSearch`, for the
     whole mesh. The result's ``uv`` and certificate contain only the parts, one after the other. If each part has a
     bijective map but they overlap each other, the status is ``INJECTIVE``. Ctrl-C raises KeyboardInterrupt before there
     is a bijective map of each part, with or without pins.
