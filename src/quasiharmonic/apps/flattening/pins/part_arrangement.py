@@ -89,7 +89,7 @@ def flatten_pinned_parts(
             why = None if why is None else _renumber_diagnosis(why, parts[failed[0]])
             found = replace(found, status=results[failed[0]].status, diagnosis=why)
         else:
-            found = _separate(make_search(union), union, results, found)
+            found = _push_parts_apart(make_search(union), union, results, found)
     return replace(found, seconds=time.perf_counter() - began)
 
 
@@ -100,7 +100,7 @@ def _combine(union: Part, results: Sequence[MapResult]) -> MapResult:
     return replace(MapResult.combine(results, uv, certificate), path=[], diagnosis=None)
 
 
-def _separate(run: PinSearch, union: Part, results: Sequence[MapResult], found: MapResult) -> MapResult:
+def _push_parts_apart(run: PinSearch, union: Part, results: Sequence[MapResult], found: MapResult) -> MapResult:
     """Find a bijective map of all parts, from separate maps that overlap each other."""
     unit = -run.exponent
     with np.errstate(all="ignore"):
