@@ -59,9 +59,13 @@ class FrameSearch:
                         boundary = find_longest(target - self._targets[before])
                         move = max(move, find_longest(frame.uv - self.frames[before].uv) / boundary)
                     before, last = t, frame.uv
-                if self._options.callback is not None:
-                    self._options.callback(FrameStep(t, len(self._targets), 0, move))
+                self.report(t, 0, move)
         return self.frames
+
+    def report(self, frame: int, sweep: int, move: float) -> None:
+        """Pass a `FrameStep` to the callback."""
+        if self._options.callback is not None:
+            self._options.callback(FrameStep(frame, len(self._targets), sweep, move))
 
     def search(self, target: FloatArray, start: ArrayLike | None, last: FloatArray | None = None) -> MapResult:
         """Search for the map of a target (k, 2), from an initial map.

@@ -116,16 +116,11 @@ def animate(problem: Problem, targets: Iterable[ArrayLike], **options: Unpack[An
         limit = _LIMIT if limit is None else float(limit)
         if not following.work.interrupted:
             smoothing = MotionSmoothing(problem.domain, energy, limit, checked.linear_solver)
-            energies = _smooth_frames(smoothing, following, asked, checked.callback)
+            energies = _smooth_frames(smoothing, following, asked)
     return Animation(frames, asked, bridged, energies, limit, following.work.interrupted)
 
 
-def _smooth_frames(
-    smoothing: MotionSmoothing,
-    following: FrameSearch,
-    targets: FloatArray,
-    callback: Callable[[FrameStep], object] | None,
-) -> FloatArray:
+def _smooth_frames(smoothing: MotionSmoothing, following: FrameSearch, targets: FloatArray) -> FloatArray:
     """Lower the distortion of the frames that have a map, in place; return mean energies (t,), NaN for other frames."""
     run = Run()
     frames = following.frames
@@ -134,8 +129,7 @@ def _smooth_frames(
     which: list[int] = []
 
     def report(sweep: int, t: int) -> None:
-        if callback is not None:
-            callback(FrameStep(which[t], len(frames), sweep, smoothing.largest_move()))
+        following.report(which[t], sweep, smoothing.largest_move())
 
     with following.work.until_interrupted():
         for t in range(len(frames)):

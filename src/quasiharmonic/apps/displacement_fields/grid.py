@@ -22,9 +22,10 @@ References
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -169,6 +170,23 @@ class NearestField(SummarisedOutcome):
     patches: int
     distance: float
     seconds: float
+
+    @classmethod
+    def of(cls, given: FloatArray, field: FloatArray, wrong: BoolArray, began: float, **further: Any) -> Self:
+        """Return the result for a given field, the new one, the cells that fold, and the clock at the beginning.
+
+        ``further`` are the other attributes of the class.
+        """
+        moved = np.asarray((field != given).any(axis=-1))
+        return cls(
+            field=field,
+            moved_mask=moved,
+            folds=int(np.count_nonzero(wrong)),
+            patches=int(label_patches(moved).max()),
+            distance=mean_length(field - given),
+            seconds=time.perf_counter() - began,
+            **further,
+        )
 
     @property
     def status(self) -> Status:

@@ -17,7 +17,6 @@ from quasiharmonic.apps.displacement_fields.grid import (
     find_fixed_cells,
     grow,
     label_patches,
-    mean_length,
     name_points,
 )
 from quasiharmonic.apps.displacement_fields.patch_descent import descend_patches
@@ -170,16 +169,7 @@ def nearest_invertible(
         if not is_fold_free(grid, repaired).all():
             raise RuntimeError("rounding folds the new field: its displacements are too large for its spacing")
     certificate = certify(grid.triangles(), grid.positions(repaired).reshape(-1, 2))
-    moved = (repaired != given).any(axis=2)
-    return InvertibleField(
-        field=repaired,
-        moved_mask=moved,
-        certificate=certificate,
-        folds=int(np.count_nonzero(wrong)),
-        patches=int(label_patches(moved).max()),
-        distance=mean_length(repaired - given),
-        seconds=time.perf_counter() - began,
-    )
+    return InvertibleField.of(given, repaired, wrong, began, certificate=certificate)
 
 
 def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0, interpolation: str = "linear") -> BoolArray:

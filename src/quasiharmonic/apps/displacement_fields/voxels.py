@@ -29,7 +29,6 @@ from quasiharmonic.apps.displacement_fields.grid import (
     find_points,
     grow,
     label_patches,
-    mean_length,
     name_points,
 )
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
@@ -232,16 +231,8 @@ def nearest_invertible_volume(
     repaired = np.where(moved[..., None], np.ldexp(mended, exponent), given)
     folds = find_folded_cells(grid, mended, None)
     low = find_folded_cells(grid, mended, min_jacobian) if moved.any() else wrong
-    return InvertibleVolume(
-        field=repaired,
-        moved_mask=moved,
-        folds=int(np.count_nonzero(wrong)),
-        remaining=folds | low,
-        bijective=not folds.any() and not _surface_crosses(grid, mended),
-        patches=int(label_patches(moved).max()),
-        distance=float(np.ldexp(mean_length(mended - scaled), exponent)),
-        seconds=time.perf_counter() - began,
-    )
+    bijective = not folds.any() and not _surface_crosses(grid, mended)
+    return InvertibleVolume.of(given, repaired, wrong, began, remaining=folds | low, bijective=bijective)
 
 
 def describe_fixed(remaining: BoolArray, fixed: BoolArray) -> str:

@@ -174,12 +174,13 @@ def flatten_surface(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapR
     held, free, results = list[Part](), split_parts(V, F), list[MapResult]()
     if checked.fixed is not None:
         from quasiharmonic.apps.flattening.pins.part_arrangement import flatten_pinned_parts
-        from quasiharmonic.apps.flattening.pins.pin_search import check_pins, flatten_pinned
+        from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, check_pins
 
         pins = check_pins(checked.fixed, checked.target, len(V))
         if len(free) == 1:
-            result = flatten_pinned(free[0].piece, *pins, checked, weights, given)
-            return replace(result, seconds=time.perf_counter() - began, V=V)
+            search = PinSearch(free[0].piece, *pins, checked, weights)
+            search.run(given)
+            return replace(search.result(), seconds=time.perf_counter() - began, V=V)
         has_pins = [bool(np.isin(pins[0], part.vertices).any()) for part in free]
         held = [part for part, has in zip(free, has_pins, strict=True) if has]
         free = [part for part, has in zip(free, has_pins, strict=True) if not has]

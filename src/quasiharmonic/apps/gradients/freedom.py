@@ -6,7 +6,6 @@ sliding vertex.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +15,7 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.sliding_boundary import SlidingSystem
 from quasiharmonic.geometry.curves.boundary_curves import Track
 from quasiharmonic.geometry.curves.deviation import DeviationBarrier
+from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 # Weight of the barrier that keeps the boundary near its curves, relative to the energy; as in
@@ -82,7 +82,7 @@ class Freedom:
         """Accept the positions of the last step that was evaluated."""
 
 
-class OnCurves(Freedom):
+class SlidingFreedom(Freedom):
     """Boundary vertices that slide along curves, as in `quasiharmonic.polish`; fixed vertices may be among them.
 
     A barrier keeps the boundary's edges near the curves. Its bounds and weight are those of a polish started here, and
@@ -90,18 +90,12 @@ class OnCurves(Freedom):
     """
 
     def __init__(
-        self,
-        energy: DeformationEnergy,
-        track: Track,
-        fixed: IntArray,
-        loops: Sequence[IntArray],
-        exponent: int,
-        linear_solver: str,
+        self, energy: DeformationEnergy, track: Track, domain: Domain, exponent: int, linear_solver: str
     ) -> None:
-        held = np.setdiff1d(fixed, track.vertices)
+        held = np.setdiff1d(domain.fixed, track.vertices)
         super().__init__(energy, len(track.uv), held, linear_solver, track.vertices)
         self._track, self._s, self._there = track, track.s, track.s
-        self._deviation, self._unit = DeviationBarrier(track, loops, exactly=True), 2.0**exponent
+        self._deviation, self._unit = DeviationBarrier(track, domain.loops, exactly=True), 2.0**exponent
         self._weight = _WEIGHT * energy.value(in_units(track.uv, exponent))
         self._both = (self._deviation.pairs >= 0).all(axis=1)
         self.system.couple(self._deviation.pairs[self._both])

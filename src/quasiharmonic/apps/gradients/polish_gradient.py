@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.derivative import Derivative, Equilibrium, Scale
-from quasiharmonic.apps.gradients.freedom import Freedom, OnCurves
+from quasiharmonic.apps.gradients.freedom import Freedom, SlidingFreedom
 from quasiharmonic.apps.gradients.gauge import differentiate_map_size
 from quasiharmonic.apps.gradients.minimum import Minimum
 from quasiharmonic.apps.gradients.strain import RestStrain
@@ -108,7 +108,7 @@ def differentiate_polish(domain: Domain, uv: ArrayLike, options: PolishOptions) 
         freedom = Freedom(measure, domain.n, domain.fixed, options.linear_solver)
         scale = Scale(-differentiate_map_size(w, domain.loops), by_rest)
     else:
-        freedom = OnCurves(measure, track, domain.fixed, domain.loops, exponent, options.linear_solver)
+        freedom = SlidingFreedom(measure, track, domain, exponent, options.linear_solver)
         scale = Scale(np.zeros_like(w), by_rest)
     minimum = Minimum(measure, w, freedom)
     equilibrium = Equilibrium(

@@ -49,9 +49,9 @@ def smooth_map(
     after = _smooth_interior(V, F, loops, before)
     with np.errstate(all="ignore"):
         better = energy.value(after) < energy.value(before)
-    return _descend_on_patches(
-        V, F, loops, (after if better else before).view(np.float64).reshape(-1, 2), energy, linear_solver
-    )
+    start = (after if better else before).view(np.float64).reshape(-1, 2)
+    opened = _descend_on_patches(V, F, start, energy, linear_solver)
+    return start if Rim(loops).meets_itself(opened) else opened
 
 
 def thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
@@ -93,14 +93,9 @@ def _smooth_interior(V: FloatArray, F: IntArray, loops: Sequence[IntArray], w: C
 
 
 def _descend_on_patches(
-    V: FloatArray,
-    F: IntArray,
-    loops: Sequence[IntArray],
-    uv: FloatArray,
-    energy: DeformationEnergy,
-    linear_solver: str,
+    V: FloatArray, F: IntArray, uv: FloatArray, energy: DeformationEnergy, linear_solver: str
 ) -> FloatArray:
-    """Descend on patches around the worst triangles, with all other vertices fixed."""
+    """Descend on patches around the worst triangles, with all other vertices fixed; the boundary may overlap itself."""
     with np.errstate(all="ignore"):
         density = energy.energy.density(energy.deform(in_units(uv, 0)))
     loose = mark(len(V), F[density > _BAD * np.quantile(density, 0.75)])
@@ -118,4 +113,4 @@ def _descend_on_patches(
         pass
     opened = uv.copy()
     opened[vertices] = descent.uv
-    return uv if Rim(loops).meets_itself(opened) else opened
+    return opened

@@ -49,7 +49,7 @@ def flatten_pinned_parts(
 ) -> MapResult:
     """Map surfaces into the plane bijectively, each with some fixed vertices and an otherwise free boundary.
 
-    ``parts`` are the surfaces that have a fixed vertex; the other arguments are those of `flatten_pinned`, for the
+    ``parts`` are the surfaces that have a fixed vertex; the other arguments are those of `PinSearch`, for the
     whole mesh. The result's ``uv`` and certificate contain only the parts, one after the other. If each part has a
     bijective map but they overlap each other, the status is ``INJECTIVE``. Ctrl-C raises KeyboardInterrupt before there
     is a bijective map of each part, with or without pins.
@@ -88,7 +88,7 @@ def flatten_pinned_parts(
             why = None if why is None else _renumber_diagnosis(why, parts[failed[0]])
             found = replace(found, status=results[failed[0]].status, diagnosis=why)
         else:
-            found = _separate(make_search(union), union, results, found)
+            found = _push_parts_apart(make_search(union), union, results, found)
     return replace(found, seconds=time.perf_counter() - began)
 
 
@@ -99,7 +99,7 @@ def _combine(union: Part, results: Sequence[MapResult]) -> MapResult:
     return replace(MapResult.combine(results, uv, certificate), path=[], diagnosis=None)
 
 
-def _separate(run: PinSearch, union: Part, results: Sequence[MapResult], found: MapResult) -> MapResult:
+def _push_parts_apart(run: PinSearch, union: Part, results: Sequence[MapResult], found: MapResult) -> MapResult:
     """Find a bijective map of all parts, from separate maps that overlap each other."""
     unit = -run.exponent
     with np.errstate(all="ignore"):

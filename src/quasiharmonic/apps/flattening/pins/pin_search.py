@@ -67,29 +67,6 @@ _MIN_ITERATIONS = 2000
 _MAX_SPLITS = 4
 
 
-def flatten_pinned(
-    piece: Piece,
-    fixed: IntArray,
-    target: FloatArray,
-    options: FlattenOptions,
-    weights: FloatArray | None = None,
-    start: FloatArray | None = None,
-) -> MapResult:
-    """Map a surface into the plane bijectively, with some fixed vertices and an otherwise free boundary.
-
-    ``target`` (k, 2) are the positions of ``fixed`` (k,), at least one; they may be contradictory. ``start`` (n, 2) is
-    an injective map at any scale and position. ``options`` are those of the descent that follows once the map is
-    bijective. If the result's certificate is bijective, its status reports the convergence of the distortion, as for
-    `flatten`. Otherwise the status is ``IMPOSSIBLE`` if the diagnosis proves that there is no bijective map,
-    ``INJECTIVE`` if no triangle is inverted but the surface overlaps itself, or else that of the search. Ctrl-C raises
-    KeyboardInterrupt before there is any bijective map, with or without pins. ValueError if a rest triangle has no
-    area.
-    """
-    search = PinSearch(piece, fixed, target, options, weights)
-    search.run(start)
-    return search.result()
-
-
 def move_onto_pins(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
     """Shift, rotate and scale a map so that vertices are as near to target positions as possible, by least squares.
 
@@ -138,7 +115,14 @@ _UNDECIDED = Status.INJECTIVE, Status.STALLED, Status.OUT_OF_ITERATIONS, Status.
 
 
 class PinSearch:
-    """The search for a map with fixed vertices: the current map, and its record for the result; see `flatten_pinned`.
+    """The search for a bijective map with some fixed vertices and an otherwise free boundary, with its record.
+
+    ``target`` (k, 2) are the positions of ``fixed`` (k,), at least one; they may be contradictory. ``options`` are
+    those of the descent that follows once the map is bijective. If the result's certificate is bijective, its status
+    reports the convergence of the distortion, as for `flatten`. Otherwise the status is ``IMPOSSIBLE`` if the diagnosis
+    proves that there is no bijective map, ``INJECTIVE`` if no triangle is inverted but the surface overlaps itself, or
+    else that of the search. Ctrl-C raises KeyboardInterrupt before there is any bijective map, with or without pins.
+    ValueError if a rest triangle has no area.
 
     Attributes
     ----------
@@ -177,7 +161,10 @@ class PinSearch:
         return self._fixed, self._target
 
     def run(self, start: FloatArray | None) -> None:
-        """Find a bijective map with the vertices at their target positions, and lower its distortion."""
+        """Find a bijective map with the vertices at their target positions, and lower its distortion.
+
+        ``start`` (n, 2) is an injective map at any scale and position.
+        """
         # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never accepted.
         with np.errstate(all="ignore"):
             moved = self.flatten_freely(start)
