@@ -41,6 +41,10 @@ _MEETS_ITSELF = "the boundary meets itself, so the air around it cannot be meshe
 _GOOD = 0.5
 
 
+#: Lower left corner, side and numbers of the largest squares.
+_Squares = tuple[FloatArray, float, tuple[int, int]]
+
+
 @dataclass(frozen=True, eq=False)
 class Air:
     """A triangulation of the surroundings of a flat surface with n vertices."""
@@ -77,9 +81,9 @@ def triangulate_air(
     heads = np.concatenate([np.roll(np.arange(*ends, dtype=np.int64), -1) for ends in pairwise(start.tolist())])
     segments = np.stack([np.arange(len(boundary), dtype=np.int64), heads], axis=1)
 
-    corner, side, shape = _squares(np.concatenate([outline, others]), margin)
-    frame = _frame(corner, side, shape)
-    inner = _inner_points(outline, outline[heads], corner, side, shape)
+    squares = _cover(np.concatenate([outline, others]), margin)
+    frame = _frame(*squares)
+    inner = _inner_points(outline, outline[heads], squares)
     points, triangles = _triangulate(outline, segments, frame, inner)
     triangles = triangles[select_inside(triangles, segments[:, ::-1], len(points))]
     points = _smooth_points(points, triangles, len(outline) + len(frame))
@@ -96,7 +100,7 @@ def triangulate_air(
     return air
 
 
-def _squares(points: FloatArray, margin: float) -> tuple[FloatArray, float, tuple[int, int]]:
+def _cover(points: FloatArray, margin: float) -> _Squares:
     """Corner, side and numbers of the squares that cover the points' bounding box and a margin around it."""
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     longer = float(extent.max())
@@ -121,20 +125,13 @@ def _frame(corner: FloatArray, side: float, shape: tuple[int, int]) -> FloatArra
     return np.concatenate(frame)
 
 
-def _inner_points(
-    tails: FloatArray, heads: FloatArray, corner: FloatArray, side: float, shape: tuple[int, int]
-) -> FloatArray:
+def _inner_points(tails: FloatArray, heads: FloatArray, squares: _Squares) -> FloatArray:
     """Points in the air with the density of the boundary's edges, and not too close to them; (k, 2) float64."""
     from scipy.spatial import KDTree
 
     lengths = np.hypot(*(heads - tails).T)
-    tree = Quadtree.around(
-        np.concatenate([(tails + heads) / 2, tails]),
-        _SPACING * np.concatenate([lengths, lengths]),
-        corner,
-        side,
-        shape,
-    )
+    asked = _SPACING * np.concatenate([lengths, lengths])
+    tree = Quadtree.around(np.concatenate([(tails + heads) / 2, tails]), asked, *squares)
     points, sizes = tree.points()
     # Edges are cut into pieces of at most half their squares' sides, so that the nearest centre gives the nearest
     # piece.
