@@ -21,7 +21,7 @@ from quasiharmonic.ui.batch.archives.samples import Sample, read_samples
 from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.shards import Shard
-from quasiharmonic.ui.batch.supervisor import Finished, is_valid
+from quasiharmonic.ui.batch.supervisor import Finished, find_resumed, is_valid
 
 # What messages call the folder of unpacked problems.
 _SCRATCH = "to the folder for temporary files"
@@ -191,9 +191,9 @@ class ArchivedProblems:
                 return None
             key = self.orders.settings.key_of(sample.files[mesh], b"" if fixed is None else sample.files[fixed])
             before = opened.journal.record(sample.key)
-            if before is not None and before.get("key") == key and is_valid(before, self.orders):
-                seconds = before.get("seconds") or 0.0
-                self._ready.append(Finished(names["problem"], before["outcome"], seconds, resumed=True))
+            finished = None if before is None else find_resumed(names["problem"], before, key, self.orders)
+            if finished is not None:
+                self._ready.append(finished)
                 return None
             folder = self._free.pop() if self._free else self._new_folder()
             self._extracted[names["problem"]] = _Extracted(opened, sample.key, folder)
