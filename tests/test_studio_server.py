@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import socket
 import sys
 import threading
@@ -23,6 +24,7 @@ from quasiharmonic.ui.studio.assets import assets, bundle
 from quasiharmonic.ui.studio.protocol import decode, encode
 from quasiharmonic.ui.studio.server import page_worker
 from quasiharmonic.ui.studio.server import server as served
+from quasiharmonic.util.options import ENERGIES
 from shared.studio_server import Running, children, hear, nobody_is_left
 
 
@@ -43,6 +45,11 @@ def test_files_are_served_only_with_the_token(running):
         assert status == 403
         assert b"token" in content
         assert token.encode() not in content
+
+
+def test_the_page_offers_the_energies_of_the_library():
+    offered = assets()["index.html"].content.decode().partition('id="polish-energy"')[2].partition("</select>")[0]
+    assert tuple(re.findall(r'value="([^"]*)"', offered)) == ENERGIES
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,9 @@ from quasiharmonic.io.errors import OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole, writing
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives import places
-from quasiharmonic.ui.batch.archives.archived import ArchivedProblems
+from quasiharmonic.ui.batch.archives.archived import ArchivedProblems, scratch_folder
 from quasiharmonic.ui.batch.archives.finding import find_archives
 from quasiharmonic.ui.batch.archives.outputs import Outputs
-from quasiharmonic.ui.batch.archives.scratch import scratch_folder
 from quasiharmonic.ui.batch.lock import lock_folder, lock_name
 from quasiharmonic.ui.batch.loose import LooseProblems
 from quasiharmonic.ui.batch.pool import solve_in_processes

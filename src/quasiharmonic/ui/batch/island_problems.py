@@ -69,7 +69,9 @@ def make_problems(
 
 def _onto(island: Island, k: int, corner_spec: CornerSpec | None, settings: dict[str, Any]) -> FittedProblem:
     """Map an island's boundary to the outline; island ``k`` gets a copy of the outline shifted to the right."""
-    contours = _outline(settings["to"], settings["font"], _modification_time(settings["to"]))
+    to = settings["to"]
+    # A file that has changed is read again.
+    contours = _outline(to, settings["font"], os.stat(to).st_mtime_ns if os.path.isfile(to) else 0)
     corners = None if corner_spec is None else corner_spec.within(island.vertices)
     return fit_boundary(
         island.V,
@@ -91,11 +93,6 @@ def _find_curves(to: str, fitted: FittedProblem, settings: dict[str, Any]) -> Bo
         fixed=fitted.corner_vertices,
         pieces=None if settings["pieces"] is None else Path(settings["pieces"]),
     )
-
-
-def _modification_time(to: str) -> int:
-    """Return the modification time of an outline's file, so that changed files are read again."""
-    return os.stat(to).st_mtime_ns if os.path.isfile(to) else 0
 
 
 @cache

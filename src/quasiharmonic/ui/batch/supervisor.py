@@ -109,9 +109,9 @@ class Supervisor:
         except OSError as error:
             return _conclude(folder, known | {"outcome": "invalid", "error": str(error)}, 0.0)
         before = None if again else records.read_record(folder)
-        valid = before is not None and before.get("key") == known["key"] and is_valid(before, orders)
-        if before is not None and valid and records.is_complete(folder, before):
-            return Finished(files.name, before["outcome"], before.get("seconds") or 0.0, resumed=True)
+        finished = None if before is None else find_resumed(files.name, before, known["key"], orders)
+        if before is not None and finished is not None and records.is_complete(folder, before):
+            return finished
         return {
             "mesh": str(files.mesh),
             "fixed": None if files.fixed is None else str(files.fixed),
@@ -220,6 +220,16 @@ def _conclude(folder: Path, record: Record, seconds: float) -> Finished:
         records.clear(folder)
         records.write_record(folder, record | {"seconds": seconds})
     return Finished(record["problem"], record["outcome"], seconds)
+
+
+def find_resumed(name: str, record: Record, key: str, orders: Orders) -> Finished | None:
+    """Return the report of a problem that an earlier run has finished; None if its record has not this key, or is void.
+
+    The map of the record must be complete.
+    """
+    if record.get("key") != key or not is_valid(record, orders):
+        return None
+    return Finished(name, record["outcome"], record.get("seconds") or 0.0, resumed=True)
 
 
 def is_valid(record: Record, orders: Orders) -> bool:

@@ -7,10 +7,6 @@ from html import escape
 from io import BytesIO
 from typing import TYPE_CHECKING
 
-from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
-from quasiharmonic.energies.measures import Distortion
-from quasiharmonic.geometry.exact.certificate import Certificate
-from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.display.pictures import draw
@@ -61,11 +57,7 @@ def _png(figure: Figure) -> bytes:
 
 def _triangles(shown: Displayable) -> int:
     """Return the number of triangles to draw; 0 if the surface is not known."""
-    match shown:
-        case MapResult():
-            return 0 if shown.V is None else len(shown.F)
-        case Diagnosis():
-            return 0 if shown.problem is None else len(shown.problem.F)
-        case Certificate() | Distortion() | MorphResult() | Problem():
-            return len(shown.F)
-    return 0
+    surface = shown.problem if isinstance(shown, Diagnosis) else shown
+    if isinstance(surface, MapResult) and surface.V is None:
+        return 0
+    return len(getattr(surface, "F", ()))

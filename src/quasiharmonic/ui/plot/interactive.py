@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.ui.plot.canvas import RED, as_mesh
-from quasiharmonic.util.arrays import FloatArray, map_array
+from quasiharmonic.util.arrays import FloatArray, map_array, pad_to_space
 from quasiharmonic.util.optional import explain_missing
 
 #: Measures of distortion that the window offers as colours.
@@ -58,11 +58,11 @@ def add(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> None:
     rest, F = as_mesh(V, F)
     plane = map_array("uv", uv, len(rest))
     found = distortion(rest, F, plane)
-    solid = rest if rest.shape[1] == 3 else np.column_stack([rest, np.zeros(len(rest))])
+    solid = pad_to_space(rest)
     middle, size = (solid.min(axis=0) + solid.max(axis=0)) / 2, float(np.ptp(solid, axis=0).max()) or 1.0
     low, extent = plane.min(axis=0), float(np.ptp(plane, axis=0).max()) or 1.0
     unit = (plane - low) / extent
-    beside = np.column_stack([(unit - 0.5) * size, np.zeros(len(unit))]) + middle + [1.3 * size, 0, 0]
+    beside = pad_to_space((unit - 0.5) * size) + middle + [1.3 * size, 0, 0]
 
     inverted = np.isin(np.arange(len(F)), found.inverted)
     for name, points in (("surface", solid), ("map", beside)):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from math import isfinite, isnan
+from typing import TypeAlias
 
 import numpy as np
 
@@ -24,6 +25,8 @@ _PICTURES = 12
 _FAILURES = 24
 # Maximum number of failures that are listed.
 _MAX_LISTED = 500
+# A function from a record to the ``data:`` address of its picture, or an empty string.
+Draw: TypeAlias = Callable[[Record], str]
 
 
 def write_report(
@@ -45,7 +48,14 @@ def write_report(
 
 def _page(run: Run, other: Run | None) -> str:
     title = f"Report: {shown(run.name)}"
-    pictures = _Pictures(run)
+    drawn: dict[str, str] = {}
+
+    def draw(row: Record) -> str:
+        name = row["problem"]
+        if name not in drawn:
+            drawn[name] = thumbnail(row, run.results)
+        return drawn[name]
+
     sections = [
         f"<h1>{title}</h1>",
         _origin(run),
@@ -58,10 +68,10 @@ def _page(run: Run, other: Run | None) -> str:
         *([] if other is None else [_times(run)]),
         _phases(run),
         "</div>",
-        _gallery("Highest stretch, max(σ₁, 1/σ₂), of certified maps", pictures, _worst(run, "isometric")),
-        _gallery("Highest MIPS distortion of certified maps", pictures, _worst(run, "mips")),
-        _gallery("Slowest certified maps", pictures, _worst(run, "seconds")),
-        _failures(run, pictures),
+        _gallery("Highest stretch, max(σ₁, 1/σ₂), of certified maps", draw, _worst(run, "isometric")),
+        _gallery("Highest MIPS distortion of certified maps", draw, _worst(run, "mips")),
+        _gallery("Slowest certified maps", draw, _worst(run, "seconds")),
+        _failures(run, draw),
     ]
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -221,25 +231,10 @@ def _worst(run: Run, column: str) -> list[Record]:
     return [run.rows[k] for k in order[:_PICTURES] if not np.isnan(values[k])]
 
 
-class _Pictures:
-    """Thumbnails of a run, each drawn once."""
-
-    def __init__(self, run: Run) -> None:
-        self._results = run.results
-        self._drawn: dict[str, str] = {}
-
-    def of(self, row: Record) -> str:
-        """Return the ``data:`` address of a picture, or an empty string."""
-        name = row["problem"]
-        if name not in self._drawn:
-            self._drawn[name] = thumbnail(row, self._results)
-        return self._drawn[name]
-
-
-def _gallery(title: str, pictures: _Pictures, rows: Sequence[Record]) -> str:
+def _gallery(title: str, draw: Draw, rows: Sequence[Record]) -> str:
     if not rows:
         return ""
-    return f'<h2>{title}</h2><div class="gallery">{"".join(_card(row, pictures.of(row)) for row in rows)}</div>'
+    return f'<h2>{title}</h2><div class="gallery">{"".join(_card(row, draw(row)) for row in rows)}</div>'
 
 
 def _card(row: Record, address: str) -> str:
@@ -269,11 +264,11 @@ def _reason(row: Record) -> str:
     return text if len(text) <= 400 else text[:399] + "…"
 
 
-def _failures(run: Run, pictures: _Pictures) -> str:
+def _failures(run: Run, draw: Draw) -> str:
     rows = [row for row in run.rows if row.get("certified") is not True]
     if not rows:
         return "<h2>Failed</h2><p>None.</p>"
-    parts = [_gallery(f"Failed ({len(rows):,})", pictures, rows[:_FAILURES])]
+    parts = [_gallery(f"Failed ({len(rows):,})", draw, rows[:_FAILURES])]
     rest = rows[_FAILURES:_MAX_LISTED]
     if rest:
         parts.append(_table(("problem", "triangles", "time", "reason"), [_line(row) for row in rest]))

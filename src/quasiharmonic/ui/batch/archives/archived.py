@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 import threading
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -21,10 +23,11 @@ from quasiharmonic.ui.batch.archives.samples import Sample, read_samples
 from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.shards import Shard
-from quasiharmonic.ui.batch.supervisor import Finished, is_valid
+from quasiharmonic.ui.batch.supervisor import Finished, find_resumed, is_valid
 
 # What messages call the folder of unpacked problems.
 _SCRATCH = "to the folder for temporary files"
+_PREFIX = "qhm-batch-"
 
 
 @dataclass
@@ -191,9 +194,9 @@ class ArchivedProblems:
                 return None
             key = self.orders.settings.key_of(sample.files[mesh], b"" if fixed is None else sample.files[fixed])
             before = opened.journal.record(sample.key)
-            if before is not None and before.get("key") == key and is_valid(before, self.orders):
-                seconds = before.get("seconds") or 0.0
-                self._ready.append(Finished(names["problem"], before["outcome"], seconds, resumed=True))
+            finished = None if before is None else find_resumed(names["problem"], before, key, self.orders)
+            if finished is not None:
+                self._ready.append(finished)
                 return None
             folder = self._free.pop() if self._free else self._new_folder()
             self._extracted[names["problem"]] = _Extracted(opened, sample.key, folder)
@@ -219,11 +222,9 @@ class ArchivedProblems:
             data = path.read_bytes() if record.get("map_bytes") is not None and path.exists() else None
             opened.journal.add(key, record, data)
         opened.waiting -= 1
-        try:
+        with suppress(OSError):  # in use by another program: the folder is not used again
             records.remove_results(folder)
             self._free.append(folder)
-        except OSError:
-            pass  # in use by another program: the folder is not used again
 
     def _new_folder(self) -> Path:
         folder = self._scratch / str(next(self._numbers))
@@ -243,3 +244,23 @@ class ArchivedProblems:
 def _names(archive: Archive, key: str) -> records.Record:
     """Return the columns of a record that name its problem."""
     return {"problem": f"{archive.name}/{key}", "source": f"{archive.location}/{key}"}
+
+
+@contextmanager
+def scratch_folder(output: Path, part: Shard, *, shared: bool) -> Iterator[Path]:
+    """Make a folder for the block: in the run's folder if other machines must see it, else for temporary files.
+
+    The folder of a killed run of the same shard is deleted first; a file in the run's folder has its path.
+    """
+    note = output / f"{_PREFIX}{part.label}.scratch"
+    with suppress(OSError, ValueError):
+        left = Path(note.read_text(encoding="utf-8"))
+        if left.name.startswith(_PREFIX):
+            shutil.rmtree(left, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=output if shared else None))
+    try:
+        note.write_text(str(folder), encoding="utf-8")
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        note.unlink(missing_ok=True)

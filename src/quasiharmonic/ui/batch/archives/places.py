@@ -47,10 +47,8 @@ def stamp(location: str) -> str:
     # Lists of objects are cached; another program may have replaced the object.
     system.invalidate_cache()
     info = _retry(lambda: system.info(path), location)
-    changed = [
-        info[key] for key in ("ETag", "etag", "mtime", "LastModified", "last_modified", "created") if key in info
-    ]
-    return f"{info['size']} {changed[0] if changed else ''}"
+    names = "ETag", "etag", "mtime", "LastModified", "last_modified", "created"
+    return f"{info['size']} {next((info[name] for name in names if name in info), '')}"
 
 
 def fetch(location: str, folder: Path) -> Path:

@@ -6,6 +6,7 @@ import os
 import posixpath
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -94,10 +95,8 @@ def _check(sample: Sample, seen: set[str]) -> None:
 
 
 def _unused(key: str, seen: set[str]) -> str:
-    number = 2
-    while f"{key} ({number})" in seen:
-        number += 1
-    return f"{key} ({number})"
+    """Return the name with the first number that makes it new."""
+    return next(name for number in count(2) if (name := f"{key} ({number})") not in seen)
 
 
 def _is_mesh(extension: str) -> bool:
@@ -132,10 +131,11 @@ def _tar_samples(path: Path, limit: int) -> Iterator[Sample]:
     lists = after_damage = False  # Whether problems have lists of fixed vertices; whether damage precedes the problem
     with open_tar(os.fspath(path)) as file:
         for member in read_members(file, _is_wanted, limit):
-            key, extension = (None, "") if isinstance(member, Damage) else _split(member.name)
-            if sample is not None and key != sample.key:
+            damaged = isinstance(member, Damage)
+            key, extension = ("", "") if isinstance(member, Damage) else _split(member.name)
+            if sample is not None and (damaged or key != sample.key):
                 lists = lists or sample.fixed is not None
-                if lists and sample.fixed is None and (key is None or after_damage):
+                if lists and sample.fixed is None and (damaged or after_damage):
                     sample.error = "its list of fixed vertices may be lost, because the archive is damaged next to it"
                 yield sample
                 sample, after_damage = None, False
@@ -143,7 +143,7 @@ def _tar_samples(path: Path, limit: int) -> Iterator[Sample]:
                 after_damage = True
                 yield Sample(f"damaged-{member.start}", error=f"damaged at byte {member.start}: {member.what}")
                 continue
-            sample = sample or Sample(key or "")
+            sample = sample or Sample(key)
             if member.data is not None:
                 sample.files[extension] = member.data
         yield from () if sample is None else (sample,)

@@ -11,7 +11,7 @@ from quasiharmonic.ui.studio.protocol import Array
 from quasiharmonic.ui.studio.session.drag import DragMap
 from quasiharmonic.ui.studio.session.seams import find_seams, sides_of
 from quasiharmonic.ui.studio.session.state import SessionState, bad_triangles, verdict
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, pad_to_space
 
 Message = tuple[Mapping[str, Any], Mapping[str, Array]]
 # Maximum number of islands with an entry of their own in the list of the page.
@@ -21,8 +21,7 @@ _MAX_LISTED = 400
 def surface_message(state: SessionState) -> Message:
     """Return the surface in the numbering of the page."""
     numbering, sheet = state.numbering, state.sheet
-    V = np.zeros((len(numbering.V), 3), dtype=np.float64)
-    V[:, : numbering.V.shape[1]] = numbering.V
+    V = pad_to_space(numbering.V)
     starts = numbering.starts[:-1].tolist()
     loops = [loop + start for one, start in zip(state.islands, starts, strict=True) for loop in one.loops]
     header = {
