@@ -124,13 +124,13 @@ def following(rings):
 
 def told(rings):
     """Return the CPU seconds of one movement, with the map's figures and the frame sent to the page."""
-    from quasiharmonic.ui.studio.protocol import Frame
+    from quasiharmonic.ui.studio.protocol import MessageFrame
 
     session = session_of(rings)
     corner = session.state.corners[2]
     place = session.state.result.uv[corner]
-    session.handle(Frame({"do": "grab", "vertex": corner}, {}))
-    return timed(lambda way: session.handle(Frame({"do": "drag", "seq": 1, "to": (place + way).tolist()}, {})))
+    session.handle(MessageFrame({"do": "grab", "vertex": corner}, {}))
+    return timed(lambda way: session.handle(MessageFrame({"do": "drag", "seq": 1, "to": (place + way).tolist()}, {})))
 
 
 def timed(move, count=60):

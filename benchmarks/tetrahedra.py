@@ -29,7 +29,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import cg
 
 from quasiharmonic import certify_tetrahedra, injective_tetrahedra, morph
-from quasiharmonic.apps.tetrahedra.descent import Descent
+from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
 from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, reduce_epsilon
 from quasiharmonic.apps.tetrahedra.placement import check_rest, extend_harmonically
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -242,7 +242,7 @@ def run_methods(options: argparse.Namespace) -> None:
                 start = extend_harmonically(energy, X, fixed, goal[fixed])
                 inverted = int((energy.determinants(start) <= 0).sum())
                 began = time.process_time()
-                descent = Descent(energy, free, start)
+                descent = TetrahedraDescent(energy, free, start)
                 steps = sum(1 for _ in descent.untangle(1000))
                 newton = time.process_time() - began
                 done = energy.determinants(descent.X).min() > 0

@@ -237,3 +237,16 @@ def test_every_kind_of_import_is_detected():
 def test_imports_of_missing_modules_are_errors(code):
     with pytest.raises(AssertionError):
         list(imported(ast.parse(code)))
+
+
+def test_every_class_has_a_name_of_its_own():
+    """A leading underscore makes no difference to a reader."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name.lstrip("_"), []).append(path.relative_to(ROOT).as_posix())
+    twice = {name: paths for name, paths in found.items() if len(paths) > 1}
+    assert {
+        name: paths for name, paths in twice.items() if not all("/packing/" in p or "/search/" in p for p in paths)
+    } == {}

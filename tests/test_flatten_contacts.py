@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import boundary_loops, certify
-from quasiharmonic.apps.flattening.contacts import HATS, Contacts, Rim
+from quasiharmonic.apps.flattening.contacts import HATS, Rim, RimContacts
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
@@ -96,7 +96,7 @@ def test_gradient_and_curvature(pairs):
 def test_curvature_of_one_contact():
     # A vertex directly above the middle of an edge: only its height matters.
     w = np.array([0.5 + 0.2j, 0, 1])
-    one = Contacts(np.array([[0], [1], [2]]), np.array([0.5]))
+    one = RimContacts(np.array([[0], [1], [2]]), np.array([0.5]))
     height, reach = 0.2, 0.5
     assert one.value(w) == pytest.approx((reach / height - 1) ** 2)
     form = one.curvature(w)
@@ -115,8 +115,8 @@ def test_split_edges_keep_all_contacts(pairs):
     known, strangers = found.split(found.corners[:, 2:], w.size)
     np.testing.assert_array_equal(strangers.corners, found.corners[:, :2])
     assert known.value(w) + strangers.value(w) == pytest.approx(found.value(w))
-    assert Contacts.none().split(found.corners, w.size)[0].reach.max() == 0
-    assert found.split(Contacts.none().corners, w.size)[1].reach.size == found.reach.size
+    assert RimContacts.none().split(found.corners, w.size)[0].reach.max() == 0
+    assert found.split(RimContacts.none().corners, w.size)[1].reach.size == found.reach.size
 
 
 def test_blocks_bound_the_curvature(pairs):

@@ -10,7 +10,7 @@ import numpy as np
 
 from quasiharmonic import boundary_loops, io
 from quasiharmonic.surfaces import cat
-from quasiharmonic.ui.studio.protocol import Frame, decode, encode
+from quasiharmonic.ui.studio.protocol import MessageFrame, decode, encode
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.surface import make_sheet, read_sheet
 
@@ -22,7 +22,7 @@ class Visitor:
     """
 
     def __init__(self, V=None, F=None, name="surface.obj", waiting=lambda: False, storage=None, restore=False):
-        self.frames: list[Frame] = []
+        self.frames: list[MessageFrame] = []
         self.session = Session(self._hear, waiting, storage)
         if restore:
             assert self.session.restore()
@@ -37,20 +37,20 @@ class Visitor:
         # Encode to bytes and back, as a socket would.
         self.frames.append(decode(encode(header, arrays)))
 
-    def does(self, what: str, arrays: Mapping[str, np.ndarray] | None = None, **words: Any) -> list[Frame]:
+    def does(self, what: str, arrays: Mapping[str, np.ndarray] | None = None, **words: Any) -> list[MessageFrame]:
         """Send a message; return the frames received since."""
         before = len(self.frames)
         self.session.handle(decode(encode({"do": what, **words}, arrays)))
         return self.frames[before:]
 
-    def drags(self, vertex: int, *places: tuple[float, float]) -> list[Frame]:
+    def drags(self, vertex: int, *places: tuple[float, float]) -> list[MessageFrame]:
         """Grab a vertex, drag it along positions and drop it; return the map frames in between."""
         self.does("grab", vertex=vertex)
         shown = [self.does("drag", seq=i, to=list(place))[-1] for i, place in enumerate(places)]
         self.does("drop")
         return shown
 
-    def last(self, kind: str) -> Frame:
+    def last(self, kind: str) -> MessageFrame:
         """The last received frame of a kind."""
         return next(frame for frame in reversed(self.frames) if frame.header["kind"] == kind)
 

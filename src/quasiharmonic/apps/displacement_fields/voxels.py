@@ -32,7 +32,7 @@ from quasiharmonic.apps.displacement_fields.grid import (
     name_points,
 )
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
-from quasiharmonic.apps.tetrahedra.descent import Descent
+from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
 from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, cross, dot
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import inspect_faces
@@ -287,7 +287,7 @@ def _repair_patch(
     before = rest + given[tuple(index.T)] / unit
     free = np.flatnonzero(mask[tuple(index.T)])
     energy = ShapeEnergy(T, rest, floor=min(_AIM * min_jacobian + 1e-9, 0.99))
-    descent = Descent(energy, free, before, anchor=(before, 1.0 / len(T)))
+    descent = TetrahedraDescent(energy, free, before, anchor=(before, 1.0 / len(T)))
     with np.errstate(all="ignore"):
         if not descent.make_valid(_UNTANGLING_STEPS):
             return False

@@ -39,14 +39,14 @@ HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
 
 
 @dataclass(frozen=True, eq=False)
-class Contacts:
+class RimContacts:
     """Pairs of a boundary vertex and a boundary edge that may touch."""
 
     corners: IntArray  # (3, c): vertex, and start and end of the edge
     reach: FloatArray  # (c,): distance below which they repel each other, in the map's units; 0 for pairs that do not
 
     @classmethod
-    def none(cls) -> Contacts:
+    def none(cls) -> RimContacts:
         """Return an empty set of contacts."""
         return cls(np.zeros((3, 0), dtype=np.int64), np.zeros(0))
 
@@ -99,7 +99,7 @@ class Contacts:
 
         return sum_parts(normal.real**2), sum_parts(normal.real * normal.imag), sum_parts(normal.imag**2)
 
-    def split(self, known: IntArray, n: int) -> tuple[Contacts, Contacts]:
+    def split(self, known: IntArray, n: int) -> tuple[RimContacts, RimContacts]:
         """Split into contacts in a known set (3, k), with reach 0 for its other pairs, and the remaining contacts."""
         keys, own = (pairs[0] * n + pairs[1] for pairs in (known, self.corners))
         order = np.argsort(keys)
@@ -108,13 +108,13 @@ class Contacts:
         found = keys[place] == own
         reach = np.zeros(known.shape[1])
         reach[order[place[found]]] = self.reach[found]
-        return Contacts(known, reach), Contacts(self.corners[:, ~found], self.reach[~found])
+        return RimContacts(known, reach), RimContacts(self.corners[:, ~found], self.reach[~found])
 
-    def within(self, w: ComplexArray, max_ratio: float) -> Contacts:
+    def within(self, w: ComplexArray, max_ratio: float) -> RimContacts:
         """Return the contacts whose distance is below ``max_ratio`` times their reach."""
         d, _, _ = nearest_on_edges(*w[self.corners])
         near = d < max_ratio * self.reach
-        return Contacts(self.corners[:, near], self.reach[near])
+        return RimContacts(self.corners[:, near], self.reach[near])
 
     def _stiffness(self, d: FloatArray) -> FloatArray:
         """The barriers' second derivatives with respect to the distances."""
@@ -159,7 +159,7 @@ class Rim:
         """The fraction of the boundary's vertices at intersecting edges, from the first 1,000 pairs."""
         return self.meetings(uv).size / self._vertex.size
 
-    def contacts(self, w: ComplexArray) -> Contacts:
+    def contacts(self, w: ComplexArray) -> RimContacts:
         """Return pairs that are close to each other across the outside of the surface; the map's boundary is simple."""
         p = w[self._vertex]
         q = p[self._next]
@@ -186,7 +186,7 @@ class Rim:
         kept = np.flatnonzero(faced & (self._next[i] != end) & (self._previous[i] != end))
         kept = kept[~self._within(p, i[kept], -normal[kept])]
         corners = self._vertex[np.stack([i[kept], j[kept], head[kept]])]
-        return Contacts(corners, reach[kept])
+        return RimContacts(corners, reach[kept])
 
     def _exclude_own_edges(self, i: IntArray, j: IntArray) -> IntArray:
         """Remove pairs of a vertex and one of its own edges; (2, k)."""

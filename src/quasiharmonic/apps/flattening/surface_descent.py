@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.contacts import HATS, Contacts, Rim
+from quasiharmonic.apps.flattening.contacts import HATS, Rim, RimContacts
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy, QuadraticForm
 from quasiharmonic.energies.newton.line_search import backtrack, extend
@@ -62,7 +62,7 @@ class GuardedEnergy:
     def __init__(self, surface: NewtonObjective) -> None:
         self.surface = surface
         self.F, self.g = surface.F, surface.g
-        self.contacts, self.uncoupled, self.stiffness = Contacts.none(), Contacts.none(), 0.0
+        self.contacts, self.uncoupled, self.stiffness = RimContacts.none(), RimContacts.none(), 0.0
 
     def deform(self, w: ComplexArray) -> _Evaluation:
         """Evaluate the quantities of a map that the other methods need."""
@@ -103,7 +103,7 @@ class _StepRecord(NamedTuple):
     decrease: float
     value: float
     slow: int
-    near: Contacts
+    near: RimContacts
     gap: float
 
 
@@ -138,7 +138,7 @@ class SurfaceModel(MapModel):
 
     def start(self, uv: FloatArray) -> NewtonState:
         """Return the state of a map (n, 2)."""
-        return self.evaluate(in_units(uv, 0))._replace(extra=_StepRecord(np.inf, np.inf, 0, Contacts.none(), np.inf))
+        return self.evaluate(in_units(uv, 0))._replace(extra=_StepRecord(np.inf, np.inf, 0, RimContacts.none(), np.inf))
 
     def distortion(self, state: NewtonState) -> float:
         """The value of the surface's energy, without contacts."""
@@ -209,7 +209,7 @@ class SurfaceModel(MapModel):
 class GuardedModel(SurfaceModel):
     """The model of a map whose boundary ``rim`` must not overlap itself.
 
-    Contacts of the boundary with itself repel each other. ``slack`` is a factor on the tolerance; early stages stop
+    RimContacts of the boundary with itself repel each other. ``slack`` is a factor on the tolerance; early stages stop
     sooner.
     """
 
@@ -228,7 +228,7 @@ class GuardedModel(SurfaceModel):
         self._rim = rim
         self._stages = iter(_STAGES)
         self._weight, self.slack = next(self._stages)
-        self._known = Contacts.none().corners
+        self._known = RimContacts.none().corners
 
     def start(self, uv: FloatArray) -> NewtonState:
         state = super().start(uv)

@@ -30,7 +30,7 @@ _FIRST_EPSILON = 1.0
 _MIN_EPSILON = 1e-14
 
 
-class Descent:
+class TetrahedraDescent:
     """Newton's method on the energy of a mesh with free vertices ``free`` (k,); ``X`` (n, 3) are the positions.
 
     With ``anchor``, positions (n, 3) and a weight, half the weighted sum of squared distances from them is added.

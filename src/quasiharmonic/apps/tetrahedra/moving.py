@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.certificate import space_array
-from quasiharmonic.apps.tetrahedra.descent import Descent
+from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
 from quasiharmonic.apps.tetrahedra.placement import check_rest, extend_harmonically, make_energy
 from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.sliding import find_sliding
@@ -37,7 +37,7 @@ class MovingTetrahedra:
         self._free = np.setdiff1d(np.unique(self._mesh.T), self._fixed)
         self._projections = sliding.restrict(self._free)
         self._energy, scaled, self._exponent = make_energy(self._mesh, self.points, False)
-        self._descent = Descent(self._energy, self._free, scaled, projections=self._projections)
+        self._descent = TetrahedraDescent(self._energy, self._free, scaled, projections=self._projections)
 
     @property
     def T(self) -> IntArray:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.certificate import certify_arrays, find_boundary_contacts, tetrahedron_array
 from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED
-from quasiharmonic.apps.tetrahedra.descent import Descent
+from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
 from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
 from quasiharmonic.apps.tetrahedra.obstructions import find_obstructions
 from quasiharmonic.apps.tetrahedra.result import (
@@ -105,7 +105,7 @@ def place_vertices(
             X[sliding.vertices] = here + project(sliding.projections, X[sliding.vertices] - here)
         else:
             X = extend_harmonically(energy, np.ldexp(points, -exponent), fixed, X[fixed], projections)
-        X, status, iterations = _search(Descent(energy, free, X, projections=projections), options)
+        X, status, iterations = _search(TetrahedraDescent(energy, free, X, projections=projections), options)
         after = np.ldexp(X, exponent)
         begin[free] = after[free]
     certificate = certify_arrays(T, begin, faces=mesh.faces)
@@ -218,7 +218,7 @@ def extend_harmonically(
     return there if np.isfinite(there).all() else X
 
 
-def _search(descent: Descent, options: TetrahedraOptions) -> tuple[FloatArray, TetrahedraStatus, int]:
+def _search(descent: TetrahedraDescent, options: TetrahedraOptions) -> tuple[FloatArray, TetrahedraStatus, int]:
     """Untangle and polish; return the best positions, why the search ended, and the number of steps.
 
     Ctrl-C ends the search, and a callback may raise KeyboardInterrupt.
@@ -241,7 +241,9 @@ def _search(descent: Descent, options: TetrahedraOptions) -> tuple[FloatArray, T
     return descent.X if descent.is_valid() else best[-1][1], TetrahedraStatus.INTERRUPTED, descent.iterations
 
 
-def _untangle(descent: Descent, options: TetrahedraOptions, run: Run, best: list[tuple[int, FloatArray]]) -> int:
+def _untangle(
+    descent: TetrahedraDescent, options: TetrahedraOptions, run: Run, best: list[tuple[int, FloatArray]]
+) -> int:
     """Untangle until nothing is inverted or progress ends, and keep the best mesh; return how many stay inverted."""
     energy = descent.energy
     since, least = 0, float(energy.determinants(descent.X).min())
@@ -258,7 +260,7 @@ def _untangle(descent: Descent, options: TetrahedraOptions, run: Run, best: list
     return int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
 
 
-def _polish(descent: Descent, options: TetrahedraOptions, run: Run) -> TetrahedraStatus:
+def _polish(descent: TetrahedraDescent, options: TetrahedraOptions, run: Run) -> TetrahedraStatus:
     """Lower the energy of a valid mesh; return why this ended."""
     if not options.polish or not descent.free.size:
         return TetrahedraStatus.FIRST_VALID

@@ -73,7 +73,7 @@ class _Boundary(NamedTuple):
     energy: float
 
 
-class _Frame(NamedTuple):
+class _TangentFrame(NamedTuple):
     """First derivatives at a map, and the directions in which sliding vertices may move.
 
     Attributes
@@ -200,7 +200,7 @@ class SlidingModel(MapModel):
         # A boundary that already overlaps itself may overlap further.
         self._simple = not check_loops(self._loops, track.uv)[1]
         self.weight = 0.0
-        self._frame: _Frame | None = None
+        self._frame: _TangentFrame | None = None
 
     def start(self) -> NewtonState:
         """Return the state of the track's map."""
@@ -226,8 +226,8 @@ class SlidingModel(MapModel):
         self.system.tangent = self._frame.tangent
         return self._frame.gradient
 
-    def frame(self, state: NewtonState) -> _Frame:
-        """Derivatives at a state by the unknowns; see `_Frame`."""
+    def frame(self, state: NewtonState) -> _TangentFrame:
+        """Derivatives at a state by the unknowns; see `_TangentFrame`."""
         s = state.extra.s
         pull = self.energy.gradient_of(state.derivatives, state.w.size)
         at, system = pull[self._track.vertices], self.system
@@ -245,7 +245,7 @@ class SlidingModel(MapModel):
         side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
         gradient = pull[system.free]
         gradient[system.at] = np.where(tangent == 0, 0, _along(tangent, at) + barrier_gradient)
-        return _Frame(gradient, tangent, forces * 2.0**self.coordinates.exponent, side, barrier_hessian)
+        return _TangentFrame(gradient, tangent, forces * 2.0**self.coordinates.exponent, side, barrier_hessian)
 
     def _barrier(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the barrier in units: first by the sliding vertices' lengths, second per edge (e, 2, 2)."""

@@ -49,7 +49,7 @@ class Arc:
         return Arc(centre + shift, a, b, self.first, self.last)
 
 
-class Piece(NamedTuple):
+class ArcPiece(NamedTuple):
     """Internal form of a piece of a curve.
 
     Attributes
@@ -70,7 +70,7 @@ class Piece(NamedTuple):
     continues: bool
 
 
-def split_piece(i: int, piece: ArrayLike | Arc) -> list[Piece]:
+def split_piece(i: int, piece: ArrayLike | Arc) -> list[ArcPiece]:
     """Check piece ``i`` of a curve. Split long arcs, and split Bézier curves at interior zeros of the derivative."""
     if isinstance(piece, Arc):
         rows = [real_array(f"piece {i} of the curve", x) for x in (piece.centre, piece.a, piece.b)]
@@ -85,17 +85,17 @@ def split_piece(i: int, piece: ArrayLike | Arc) -> list[Piece]:
         raise ValueError(f"piece {i} of the curve is not finite")
     if not isinstance(piece, Arc):
         return [
-            Piece(len(control) - 1, _pad(subcurve(control, *span)), ends, False)
+            ArcPiece(len(control) - 1, _pad(subcurve(control, *span)), ends, False)
             for span in pairwise([0.0, *_cusps(control), 1.0])
         ]
     four = _pad(control)
     steps = max(1, int(np.ceil(abs(ends[1] - ends[0]) / _MAX_ARC)))
     angles = np.linspace(*ends, steps + 1).tolist()
-    return [Piece(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
+    return [ArcPiece(0, four, pair, k > 0) for k, pair in enumerate(pairwise(angles))]
 
 
 def _pad(control: FloatArray) -> ComplexArray:
-    """Control points, or centre and axes (k, 2), in the format of `Piece`."""
+    """Control points, or centre and axes (k, 2), in the format of `ArcPiece`."""
     four = np.zeros(4, dtype=np.complex128)
     four[: len(control)] = to_complex(control)
     return four

@@ -47,7 +47,7 @@ _CAPACITY = 4
 
 
 @dataclass(frozen=True)
-class _Level:
+class _GridLevel:
     """The cells made by one division, and their concatenated lists."""
 
     coordinates: IntArray
@@ -59,11 +59,11 @@ class _Level:
     crowded: BoolArray
     """(k,) Whether a cell has all of the few triangles that the one had that it is a part of."""
 
-    def without(self, cells: IntArray) -> _Level:
+    def without(self, cells: IntArray) -> _GridLevel:
         """Return the level with empty lists for the given cells."""
         kept = ~mark(self.length.size, cells)
         triangle = self.triangle[repeat_each(kept, self.length)]
-        return _Level(self.coordinates, np.where(kept, self.length, 0), triangle, self.crowded)
+        return _GridLevel(self.coordinates, np.where(kept, self.length, 0), triangle, self.crowded)
 
 
 class NestedGrid:
@@ -126,7 +126,7 @@ class NestedGrid:
                 return shift
             shift += 1
 
-    def _refine(self, level: _Level, shift: int, capacity: int) -> tuple[IntArray, _Level]:
+    def _refine(self, level: _GridLevel, shift: int, capacity: int) -> tuple[IntArray, _GridLevel]:
         """Choose the cells of a level to divide; return them with their parts, of at most ``capacity`` entries."""
         split = np.flatnonzero((level.length > _LONG_LIST) & ~level.crowded)
         number = invert_indices(level.length.size, split)
@@ -144,11 +144,11 @@ class NestedGrid:
         part = np.repeat(chosen, 16)
         entry = repeat_each(part, finer.length)
         crowded = ((parts == before[:, None]) & (before <= _MAX_CROWD)[:, None])[chosen].ravel()
-        return split[chosen], _Level(finer.coordinates[part], finer.length[part], finer.triangle[entry], crowded)
+        return split[chosen], _GridLevel(finer.coordinates[part], finer.length[part], finer.triangle[entry], crowded)
 
     def _divide(
         self, triangle: IntArray, parent: IntArray, corner: IntArray, columns: int, lines: int, shift: int
-    ) -> _Level:
+    ) -> _GridLevel:
         """Divide cells into grids of ``columns`` × ``lines``.
 
         ``triangle`` and ``parent`` (e,) are the entries of the lists of cells, and the cell of each entry; they are
@@ -165,7 +165,7 @@ class NestedGrid:
                 break
         inner = np.indices((lines, columns))[::-1].reshape(2, -1).T
         coordinates = (corner[:, None, :] + inner).reshape(-1, 2)
-        return _Level(coordinates, length, listed[:capacity], np.zeros(size, dtype=np.bool_))
+        return _GridLevel(coordinates, length, listed[:capacity], np.zeros(size, dtype=np.bool_))
 
 
 @compiled

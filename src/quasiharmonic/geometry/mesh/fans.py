@@ -84,7 +84,7 @@ def number_fans(F: IntArray, split: IntArray, n: int) -> tuple[IntArray, IntArra
     return own[split], np.concatenate([np.arange(n), vertex[copies]])
 
 
-class Corners(NamedTuple):
+class FanCorners(NamedTuple):
     """Corners of the triangles of a mesh that was opened along edges.
 
     Attributes
@@ -100,7 +100,7 @@ class Corners(NamedTuple):
     origin: IntArray
 
 
-def open_along(F: IntArray, cut: IntArray, n: int) -> Corners:
+def open_along(F: IntArray, cut: IntArray, n: int) -> FanCorners:
     """Open a mesh (f, 3) int64 along edges (k, 2) int64.
 
     Boundary edges have no effect. A single edge with two interior ends opens nothing. Vertices at which triangles touch
@@ -117,7 +117,7 @@ def open_along(F: IntArray, cut: IntArray, n: int) -> Corners:
     if unknown.any():
         raise ValueError(f"{edge_names(cut[unknown])}: not an edge of the mesh")
     open_side[open_side] = np.isin(sides, wanted)
-    return Corners(*number_fans(F, fans(F, open_side)[0], n))
+    return FanCorners(*number_fans(F, fans(F, open_side)[0], n))
 
 
 def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:

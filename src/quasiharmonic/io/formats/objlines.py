@@ -27,10 +27,10 @@ _MAX_CORNERS = 1000
 
 def read_obj_lines(path: str | os.PathLike[str], data: bytes) -> MeshData:
     """Read the text of an OBJ file; `read_obj` documents the input and the errors."""
-    return _Reader(path, data).read()
+    return _ObjReader(path, data).read()
 
 
-class _Reader:
+class _ObjReader:
     """The state of reading one file; compact arrays limit memory to a few times the file size."""
 
     def __init__(self, path: str | os.PathLike[str], data: bytes) -> None:

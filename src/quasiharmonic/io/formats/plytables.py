@@ -134,7 +134,7 @@ def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Propert
     return order, declared, tuple(remarks)
 
 
-class _Reader(ABC):
+class _PlyReader(ABC):
     """Reads the tables of a file one after another."""
 
     def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
@@ -173,7 +173,7 @@ class _Reader(ABC):
         )
 
 
-class _BinaryReader(_Reader):
+class _BinaryReader(_PlyReader):
     """Reads the tables of a binary file."""
 
     def __init__(self, data: bytes, at: int, order: str) -> None:
@@ -227,7 +227,7 @@ class _BinaryReader(_Reader):
         return np.frombuffer(b"".join(parts), self._order + kind).astype(kind)
 
 
-class _TextReader(_Reader):
+class _TextReader(_PlyReader):
     """Reads the tables of a text file."""
 
     def __init__(self, text: bytes) -> None:

@@ -26,7 +26,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
-from quasiharmonic.solver.methods.local_repair import Effort, Patch, patch_around, remap_patches
+from quasiharmonic.solver.methods.local_repair import Patch, RepairEffort, patch_around, remap_patches
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer, invert_indices
 from quasiharmonic.util.progress import heartbeat
 
@@ -75,7 +75,7 @@ class LineShift(VertexDescent):
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; yields a map after every programme that reduces the number of inverted triangles."""
-        problem, effort = objective.problem, Effort(len(objective.problem.F))
+        problem, effort = objective.problem, RepairEffort(len(objective.problem.F))
         rng = np.random.default_rng(0)
 
         def attempt(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:

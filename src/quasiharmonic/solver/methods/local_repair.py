@@ -72,7 +72,7 @@ class Patch(NamedTuple):
         return cls(renumbered, vertices, stays)
 
 
-class Effort:
+class RepairEffort:
     """Cost of patch repairs, in units of iterations on the whole mesh with this number of triangles.
 
     The cost is counted in steps and triangles and not in seconds, so that a search is reproducible.
@@ -209,7 +209,7 @@ def remap_patches(
     patience: int,
     max_inverted: int | None = None,
     tries: int | None = None,
-    effort: Effort | None = None,
+    effort: RepairEffort | None = None,
 ) -> Iterator[Iterate]:
     """Accept other maps of patches, one after another, if they do not increase the number of inverted triangles.
 
@@ -228,7 +228,7 @@ def remap_patches(
         Maximum number of inverted triangles.
     tries : int, optional
         Maximum number of patches.
-    effort : Effort, optional
+    effort : RepairEffort, optional
         Cost account of ``attempt``.
 
     Yields
@@ -237,7 +237,7 @@ def remap_patches(
         A map after every patch that reduces the number of inverted triangles. The last such map (or that of ``w``) is
         yielded again for every iteration that the cost amounts to.
     """
-    problem, effort = objective.problem, effort or Effort(len(objective.problem.F))
+    problem, effort = objective.problem, effort or RepairEffort(len(objective.problem.F))
     first, here = w, None
     failures, done = 0, 0
     while left.size and (max_inverted is None or left.size <= max_inverted) and failures < patience and done != tries:
@@ -265,7 +265,7 @@ def untangle_fully(
     grading: float,
     linear_solver: str,
     weights: FloatArray | None = None,
-    effort: Effort | None = None,
+    effort: RepairEffort | None = None,
 ) -> ComplexArray:
     """Untangle a map of a patch (v,) complex128 with fixed vertices (v,) bool and weights (p,); return the last map."""
     last, steps = w, 1

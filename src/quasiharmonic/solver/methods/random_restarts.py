@@ -32,8 +32,8 @@ from quasiharmonic.solver.methods.base import Iterates, Patience, VertexDescent
 from quasiharmonic.solver.methods.local_repair import (
     MAX_INVERTED,
     MAX_TRIANGLES,
-    Effort,
     Patch,
+    RepairEffort,
     patch_around,
     remap_patches,
     untangle_fully,
@@ -100,7 +100,7 @@ class RandomRestarts(VertexDescent):
                 if mesh_patience.is_over(here.inverted, here.value):
                     return True
             left = inverted_triangles(problem.F, problem.positions(w))
-        patience, effort = self.max_failures, Effort(len(problem.F))
+        patience, effort = self.max_failures, RepairEffort(len(problem.F))
         if 0 < left.size <= MAX_INVERTED and objective.of_map(w).energy < _PROMISING_ENERGY:
             patience *= _MORE_TRIES
 
@@ -121,7 +121,7 @@ class RandomRestarts(VertexDescent):
 
 
 def _restart(
-    rng: Generator, problem: Problem, patch: Patch, w: ComplexArray, solver: str, effort: Effort
+    rng: Generator, problem: Problem, patch: Patch, w: ComplexArray, solver: str, effort: RepairEffort
 ) -> ComplexArray:
     """Return another map of a patch, found from a random start."""
     if rng.random() < _REWEIGHTED:

@@ -93,7 +93,7 @@ def place_inverted(
     """Fill in the results of `relocate_each`; ``free`` (n,) marks the free vertices."""
     w[:] = given
     fewest, failures = np.full(untangled.size, len(F) + 1), np.zeros(untangled.size, dtype=np.int64)
-    vertices, groups = np.empty(0, dtype=np.int64), list[_Stars]()
+    vertices, groups = np.empty(0, dtype=np.int64), list[_VertexStars]()
     T, of, active = F, mesh, np.ones(fewest.size, dtype=bool)
     for sweep in range(_SWEEPS + 1):
         left = np.flatnonzero(~(signed_areas(T, w) > 0))
@@ -125,13 +125,13 @@ def place_inverted(
         w[:] = there
 
 
-def _relocate_groups(w: ComplexArray, groups: list[_Stars]) -> None:
+def _relocate_groups(w: ComplexArray, groups: list[_VertexStars]) -> None:
     """Relocate vertices in place, group by group."""
     for some in groups:
         w[some.vertices] = highest_positions(w[some.vertices], w[some.tails], w[some.heads])
 
 
-class _Stars(NamedTuple):
+class _VertexStars(NamedTuple):
     """Vertices (m,) and the opposite edges of their triangles, two (m, k) int64; short rows repeat their last edge."""
 
     vertices: IntArray
@@ -139,7 +139,7 @@ class _Stars(NamedTuple):
     heads: IntArray
 
 
-def _divide(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
+def _divide(F: IntArray, vertices: IntArray, n: int) -> list[_VertexStars]:
     """Divide interior vertices, in ascending order, into groups whose vertices share no triangle."""
     number = invert_indices(n, vertices)
     around = F[any_corner(number[F] >= 0)]
@@ -161,7 +161,7 @@ def _divide(F: IntArray, vertices: IntArray, n: int) -> list[_Stars]:
         group[vertex] = ~taken & (taken + 1)
     bit, groups = np.array(group[:-1]), range(max(group).bit_length())
     return [
-        _Stars(vertices[alike], tails[rows], heads[rows])
+        _VertexStars(vertices[alike], tails[rows], heads[rows])
         for k in groups
         for alike in _divide_by_size(np.flatnonzero(bit == 1 << k), count)
         for rows in [first[alike, None] + np.minimum(np.arange(count[alike].max()), count[alike, None] - 1)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.solver.methods.local_repair import Effort, Patch, untangle_fully
+from quasiharmonic.solver.methods.local_repair import Patch, RepairEffort, untangle_fully
 from quasiharmonic.solver.methods.untangling import GRADINGS
 from quasiharmonic.util.arrays import ComplexArray
 
@@ -26,7 +26,7 @@ _MAX_EXTRA = 15
 
 
 def reweight(
-    rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str, effort: Effort | None = None
+    rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str, effort: RepairEffort | None = None
 ) -> ComplexArray:
     """Return another map of a patch, found by weighting its inverted triangles.
 

@@ -94,7 +94,7 @@ def run_first_stage(
     searches = [Search(problem, options) for problem in problems]
     for problem, search in zip(problems, searches, strict=True):
         run = search.begin_in_batch(descent)
-        members.append(_Member(run, descent.objective(problem, options.linear_solver), RetrySchedule()))
+        members.append(_BatchMember(run, descent.objective(problem, options.linear_solver), RetrySchedule()))
     end, batches = descent.iterations + 1, []
     for first, last in _divide([len(problem.F) for problem in problems]):
         xi = np.zeros(sum(len(problem.F) for problem in problems[first:last]), dtype=np.complex128)
@@ -116,7 +116,7 @@ def run_first_stage(
     return found
 
 
-class _Member(NamedTuple):
+class _BatchMember(NamedTuple):
     """One search of a batch, its objective, and its schedule of relocation."""
 
     run: StageRun
@@ -141,7 +141,12 @@ class _BatchDescent:
     """
 
     def __init__(
-        self, members: Sequence[_Member], xi: ComplexArray, adam: AdamState, descent: VectorAdam, patterns: Patterns
+        self,
+        members: Sequence[_BatchMember],
+        xi: ComplexArray,
+        adam: AdamState,
+        descent: VectorAdam,
+        patterns: Patterns,
     ) -> None:
         self.members, self.xi, self.adam, self.descent, self.patterns = members, xi, adam, descent, patterns
 
@@ -233,7 +238,7 @@ def _join(batches: Sequence[_BatchDescent]) -> list[_BatchDescent]:
     return joined
 
 
-def _have_one_mesh(members: Sequence[_Member]) -> bool:
+def _have_one_mesh(members: Sequence[_BatchMember]) -> bool:
     """Whether all members have the same domain."""
     return len({member.objective.problem.domain for member in members}) == 1
 

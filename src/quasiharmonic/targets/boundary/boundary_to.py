@@ -20,7 +20,7 @@ from quasiharmonic.targets.boundary.chords import chords_of
 from quasiharmonic.targets.boundary.corner_pins import Corners, Pins, pins_by_angle
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, project_loop
 from quasiharmonic.targets.boundary.holes import choose_least_stretch, match_holes
-from quasiharmonic.targets.boundary.placement import Placement
+from quasiharmonic.targets.boundary.placement import CornerPlacement
 from quasiharmonic.targets.boundary.turning import boundary_turning, in_space, outermost
 from quasiharmonic.targets.outlines.contours import from_corner, in_unit
 from quasiharmonic.targets.outlines.nesting import NestedContour, arrange, filled
@@ -119,12 +119,14 @@ def boundary_to(
     outer = next(i for i, contour in to.items() if contour == 0)
     flat = project_loop(space[loops[outer]], contours[0])
 
-    def placement(i: int) -> Placement:
+    def placement(i: int) -> CornerPlacement:
         chords = chords_of(loops[i], surface.edges.interior, count)
         given_pins = pins.along(i, to[i])
         if by_angle and i == outer:
             given_pins = pins_by_angle(boundary_turning(surface.V, surface.F)[i], flat, contours[0], corner_angle)
-        return Placement(arc_parameters(space[loops[i]]), contours[to[i]], given_pins, chords, loops[i], corner_angle)
+        return CornerPlacement(
+            arc_parameters(space[loops[i]]), contours[to[i]], given_pins, chords, loops[i], corner_angle
+        )
 
     positions = {outer: placement(outer).fit(flat)}
     if len(loops) > 1:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.targets.boundary.correspondence import Held, Stretch, arc_parameters, stretches
+from quasiharmonic.targets.boundary.correspondence import BoundaryStretch, Held, arc_parameters, stretches
 from quasiharmonic.targets.outlines.contours import corners, turns
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
@@ -59,7 +59,7 @@ class ChordConditions:
     farthest: float  # Maximum distance of a vertex from the corner that it takes
 
 
-def reach(stretch: Stretch, chords: IntArray, n: int) -> IntArray:
+def reach(stretch: BoundaryStretch, chords: IntArray, n: int) -> IntArray:
     """Compute `ChordConditions.reach` for a stretch of a loop with ``n`` vertices; c + 1 where no chord is left."""
     count = len(stretch.run) - 1
     # Chords in both directions around the loop; those that leave the stretch are ignored.

@@ -109,7 +109,7 @@ def places_along(
 
 
 @dataclass(frozen=True)
-class Stretch:
+class BoundaryStretch:
     """The part of a loop from one pin to the next, both included."""
 
     run: IntArray  # (c + 1,): vertices of the loop
@@ -125,7 +125,7 @@ class Stretch:
         return some[order], local[order]
 
 
-def stretches(s: FloatArray, pins: Held) -> Iterator[Stretch]:
+def stretches(s: FloatArray, pins: Held) -> Iterator[BoundaryStretch]:
     """Split a loop at its pins."""
     n = len(s)
     for (first, begin), (last, end) in zip(pins, [*pins[1:], pins[0]], strict=True):
@@ -133,7 +133,7 @@ def stretches(s: FloatArray, pins: Held) -> Iterator[Stretch]:
         along = (s[run] - s[first]) % 1.0
         # With a single pin, the stretch is the whole loop, not empty.
         along[-1] = along[-1] or 1.0
-        yield Stretch(run, along / along[-1], begin, (end - begin) % 1.0 or 1.0)
+        yield BoundaryStretch(run, along / along[-1], begin, (end - begin) % 1.0 or 1.0)
 
 
 def _too_few(first: int, last: int, free: int, wanted: int) -> ValueError:

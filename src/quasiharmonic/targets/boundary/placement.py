@@ -21,7 +21,7 @@ _ALLOWED_DEVIATION = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
+class CornerPlacement:
     """One boundary loop and its contour."""
 
     s: FloatArray  # (n,): parameters of the vertices along the loop

@@ -79,7 +79,7 @@ def _read_glyph(character: str, file: FilePath) -> list[Pieces]:
     from fontTools.pens.basePen import BasePen
     from fontTools.ttLib import TTFont
 
-    class Pen(BasePen):  # type: ignore[misc]
+    class OutlinePen(BasePen):  # type: ignore[misc]
         """Collect the pieces of each contour, without lines of length zero."""
 
         def __init__(self, glyphs: Any) -> None:
@@ -108,7 +108,7 @@ def _read_glyph(character: str, file: FilePath) -> list[Pieces]:
     try:
         with file.open("rb") as data, TTFont(data, fontNumber=0, lazy=True) as face:
             name = (face.getBestCmap() or {}).get(ord(character))
-            pen = Pen(glyphs := face.getGlyphSet())
+            pen = OutlinePen(glyphs := face.getGlyphSet())
             if name is not None:
                 glyphs[name].draw(pen)
             em = face["head"].unitsPerEm

@@ -51,7 +51,7 @@ class _SingleIsland(NamedTuple):
     mapped: Callable[[FloatArray], io.MeshData]
 
 
-class _WrittenMap(NamedTuple):
+class _GroupMap(NamedTuple):
     """Written map, as read back from its file."""
 
     V: FloatArray
@@ -85,7 +85,7 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
             if len(one.mesh.F) <= SMALL:
                 read[k] = one
     posed = _find_single_islands(read, settings)
-    written: dict[int, _WrittenMap] = {}
+    written: dict[int, _GroupMap] = {}
     for k, result in _solve_first_stage({k: one.problem for k, one in posed.items()}, settings):
         record = read[k].record
         record |= metadata.sizes([posed[k].problem]) | metadata.describe_search([result], result.status)
@@ -177,11 +177,11 @@ def _solve_first_stage(problems: dict[int, Problem], settings: dict[str, Any]) -
                 yield k, result
 
 
-def _read_map(mesh: io.MeshData) -> _WrittenMap:
+def _read_map(mesh: io.MeshData) -> _GroupMap:
     """Return the mesh and the map of a file."""
     if mesh.vt is not None and len(mesh.vt) == len(mesh.V) and mesh.FT is not None and np.array_equal(mesh.FT, mesh.F):
-        return _WrittenMap(mesh.V, mesh.F, mesh.vt)
-    return _WrittenMap(*io.cut_at_seams(mesh))
+        return _GroupMap(mesh.V, mesh.F, mesh.vt)
+    return _GroupMap(*io.cut_at_seams(mesh))
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from quasiharmonic.targets.boundary.corner_spec import CornerSpec, read_corners
 from quasiharmonic.targets.boundary.sliding_curves import find_sliding_curves
 
 
-class IslandProblem(NamedTuple):
+class BatchIsland(NamedTuple):
     """Problem of one island."""
 
     fitted: FittedProblem
@@ -40,7 +40,7 @@ def make_surface(mesh: io.MeshData, settings: dict[str, Any]) -> SeamedMesh:
 
 def make_problems(
     surface: SeamedMesh, fixed: NDArray[np.signedinteger] | None, settings: dict[str, Any]
-) -> list[IslandProblem]:
+) -> list[BatchIsland]:
     """Return the problem of every island, in order; ValueError if the input does not define one.
 
     ``fixed`` are the mesh's vertices that are fixed at their positions in the file's map; the boundaries if None.
@@ -63,7 +63,7 @@ def make_problems(
             if slide:
                 slide = slide if to is None else _find_curves(to, fitted, settings)
                 fitted = replace(fitted, problem=move_onto(slide, fitted.problem))
-        found.append(IslandProblem(fitted, slide))
+        found.append(BatchIsland(fitted, slide))
     return found
 
 

@@ -24,14 +24,14 @@ def solve_in_processes(groups: Iterator[list[ProblemFiles]], orders: Orders, job
     The problems of a group may be solved together. A problem whose process ran out of memory is solved again in a new
     process while no other is solved; only the result of that is yielded.
     """
-    workers = _Workers(groups, orders, jobs)
+    workers = _WorkerPool(groups, orders, jobs)
     try:
         yield from workers.finished()
     finally:
         workers.close()
 
 
-class _Workers:
+class _WorkerPool:
     """Threads that each supervise one process."""
 
     def __init__(self, groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> None:

@@ -18,10 +18,10 @@ from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.studio.assets import bundle
-from quasiharmonic.ui.studio.protocol import Array, Frame, ProtocolError, decode, encode
+from quasiharmonic.ui.studio.protocol import Array, MessageFrame, ProtocolError, decode, encode
 from quasiharmonic.ui.studio.session.exports import mapped_model, write_model
 from quasiharmonic.ui.studio.session.session import Session
-from quasiharmonic.ui.studio.session.surface import Sheet, make_sheet, read_sheet
+from quasiharmonic.ui.studio.session.surface import PageSurface, make_sheet, read_sheet
 from quasiharmonic.util.arrays import IntArray, describe
 from quasiharmonic.util.optional import explain_missing
 
@@ -163,7 +163,7 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
     def _ask(self, header: dict[str, Any], arrays: Mapping[str, Array] | None = None) -> None:
         """Handle a message as if from the view; raise ValueError with the message that the view would show."""
         self._note = ""
-        self._session.handle(Frame(header, dict(arrays or {})))
+        self._session.handle(MessageFrame(header, dict(arrays or {})))
         self._count()
         if self._note:
             raise ValueError(self._note)
@@ -204,7 +204,7 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         self.send({"kind": kind}, [data])
 
 
-def _sheet(surface: Any, F: ArrayLike | None) -> Sheet:
+def _sheet(surface: Any, F: ArrayLike | None) -> PageSurface:
     """Return the sheet that a session opens."""
     if F is not None:
         return make_sheet(MeshData(np.asarray(surface), np.asarray(F)), "mesh")

@@ -48,7 +48,7 @@ LABELS = {
 
 
 @dataclass(frozen=True, eq=False)
-class _Scale:
+class _ColourScale:
     """Colour scale of one measure."""
 
     label: str
@@ -152,7 +152,7 @@ def save_distortion_figure(
 _LAYOUT = ((0.005, 0.02, 0.29, 0.88), (0.30, 0.02, 0.29, 0.88), (0.72, 0.14, 0.265, 0.74))
 
 
-def _scale(measure: str, values: FloatArray, share: FloatArray) -> _Scale:
+def _scale(measure: str, values: FloatArray, share: FloatArray) -> _ColourScale:
     """Choose the colour scale of a measure for the given values; raise ValueError if no value is usable."""
     from matplotlib.colors import AsinhNorm, LogNorm, Normalize
 
@@ -162,16 +162,16 @@ def _scale(measure: str, values: FloatArray, share: FloatArray) -> _Scale:
         raise ValueError(f"{measure} has no finite value on any triangle that is not inverted")
     low, high = _between(values[usable], share[usable], 0.01, 0.99)
     if kind == "linear":
-        return _Scale(label, Normalize(0.0, max(min(high, 1.0), 1e-3)), "viridis")
+        return _ColourScale(label, Normalize(0.0, max(min(high, 1.0), 1e-3)), "viridis")
     if kind == "asinh":
         top = max(high, 1e-3)
-        return _Scale(label, AsinhNorm(linear_width=min(1.0, top), vmin=0.0, vmax=top), "viridis")
+        return _ColourScale(label, AsinhNorm(linear_width=min(1.0, top), vmin=0.0, vmax=top), "viridis")
     if kind == "both ways":
         reach = max(high, 1 / low, 1.1)
-        return _Scale(label, LogNorm(1 / reach, reach), "PuOr", "both")
+        return _ColourScale(label, LogNorm(1 / reach, reach), "PuOr", "both")
     if perfect is None:
-        return _Scale(label, LogNorm(low, max(high, 1.01 * low)), "viridis", "both")
-    return _Scale(label, LogNorm(perfect, max(high, 1.01 * perfect)), "viridis")
+        return _ColourScale(label, LogNorm(low, max(high, 1.01 * low)), "viridis", "both")
+    return _ColourScale(label, LogNorm(perfect, max(high, 1.01 * perfect)), "viridis")
 
 
 def _between(values: FloatArray, share: FloatArray, low: float, high: float) -> tuple[float, float]:
@@ -183,7 +183,7 @@ def _between(values: FloatArray, share: FloatArray, low: float, high: float) -> 
     return float(first), float(last)
 
 
-def _bar(figure: Figure, scale: _Scale) -> None:
+def _bar(figure: Figure, scale: _ColourScale) -> None:
     """Draw the colour bar between the map and the histogram."""
     from matplotlib.cm import ScalarMappable
 
@@ -194,7 +194,7 @@ def _bar(figure: Figure, scale: _Scale) -> None:
     bar.ax.minorticks_off()
 
 
-def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, scale: _Scale) -> None:
+def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, scale: _ColourScale) -> None:
     """Draw the histogram of the measure over the surface's area, in equal steps of the colours."""
     import matplotlib
 

@@ -14,7 +14,7 @@ from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.ui.batch.records import OUTCOMES, SOLVED, Record
 from quasiharmonic.ui.batch.settings import Settings
 from quasiharmonic.ui.report import charts, statistics
-from quasiharmonic.ui.report.statistics import PHASES, Run, quantile, worst
+from quasiharmonic.ui.report.statistics import PHASES, BatchRun, quantile, worst
 from quasiharmonic.ui.report.style import STYLE
 from quasiharmonic.ui.report.thumbnails import thumbnail
 from quasiharmonic.util.untrusted import parse_json
@@ -46,7 +46,7 @@ def write_report(
     write_whole(path, _page(run, other).encode())
 
 
-def _page(run: Run, other: Run | None) -> str:
+def _page(run: BatchRun, other: BatchRun | None) -> str:
     title = f"Report: {shown(run.name)}"
     drawn: dict[str, str] = {}
 
@@ -108,7 +108,7 @@ def percent(part: int, total: int) -> str:
     return "100 %" if part == total else f"{min(share, 99.99):.2f} %" if share >= 99 else f"{share:.1f} %"
 
 
-def _origin(run: Run) -> str:
+def _origin(run: BatchRun) -> str:
     words = []
     if run.about.get("source"):
         words.append(f"Problems of <code>{shown(run.about['source'])}</code>.")
@@ -124,7 +124,7 @@ def _origin(run: Run) -> str:
     return f'<p class="quiet">{" ".join(words)}</p>' if words else ""
 
 
-def _tiles(run: Run) -> str:
+def _tiles(run: BatchRun) -> str:
     certified, problems = int(run.certified.sum()), len(run.rows)
     stretch, mips, seconds = (run.certified_column(name) for name in ("isometric", "mips", "seconds"))
     usual_stretch, usual_mips = (number(quantile(values, 0.5)) for values in (stretch, mips))
@@ -141,7 +141,7 @@ def _tiles(run: Run) -> str:
     return f'<div class="tiles">{cells}</div>'
 
 
-def _outcomes(run: Run) -> str:
+def _outcomes(run: BatchRun) -> str:
     counted = statistics.outcomes(run)
     css = {**dict.fromkeys(SOLVED, "good"), "not injective": "bad", "not bijective": "bad"}
     bar = "".join(f'<i class="{css.get(name, "broken")}" style="flex:{count}"></i>' for name, count in counted)
@@ -151,7 +151,7 @@ def _outcomes(run: Run) -> str:
     return f'<div class="bar">{bar}</div><p class="quiet">{words}</p>'
 
 
-def _groups(run: Run) -> str:
+def _groups(run: BatchRun) -> str:
     groups = statistics.groups(run)
     if len(groups) == 1:
         return ""
@@ -167,7 +167,7 @@ def _groups(run: Run) -> str:
     return _table(("folder", *head), rows, last_is_sum=True)
 
 
-def _distortion(run: Run, other: Run | None) -> str:
+def _distortion(run: BatchRun, other: BatchRun | None) -> str:
     series = [("ours", run.certified_column("mips"))]
     legend = [("ours", run.name)]
     if other is not None:
@@ -187,7 +187,7 @@ def _distortion(run: Run, other: Run | None) -> str:
     )
 
 
-def _times(run: Run) -> str:
+def _times(run: BatchRun) -> str:
     good = run.certified
     size, seconds = run.column("triangles"), run.column("seconds")
     series = [("ours", size[good], seconds[good]), ("failed", size[~good], seconds[~good])]
@@ -196,7 +196,7 @@ def _times(run: Run) -> str:
     return _figure("Time and size", charts.scatter(series, "triangles", "seconds"), legend, caption)
 
 
-def _comparison(run: Run, other: Run) -> str:
+def _comparison(run: BatchRun, other: BatchRun) -> str:
     ours, theirs = statistics.match_column(run, other, "seconds")
     name = shown(other.name)
     if not ours.size:
@@ -213,7 +213,7 @@ def _comparison(run: Run, other: Run) -> str:
     )
 
 
-def _phases(run: Run) -> str:
+def _phases(run: BatchRun) -> str:
     totals = [(phase, float(np.nansum(run.column(f"seconds_{phase}")))) for phase in PHASES]
     whole = sum(total for _, total in totals)
     if not whole:
@@ -224,7 +224,7 @@ def _phases(run: Run) -> str:
     return f'<section class="card"><h2>Time by phase</h2>{table}</section>'
 
 
-def _worst(run: Run, column: str) -> list[Record]:
+def _worst(run: BatchRun, column: str) -> list[Record]:
     """Return the certified records with the highest values in a column, in decreasing order."""
     values = np.where(run.certified, run.column(column), np.nan)
     order = np.argsort(-values, kind="stable")
@@ -264,7 +264,7 @@ def _reason(row: Record) -> str:
     return text if len(text) <= 400 else text[:399] + "…"
 
 
-def _failures(run: Run, draw: Draw) -> str:
+def _failures(run: BatchRun, draw: Draw) -> str:
     rows = [row for row in run.rows if row.get("certified") is not True]
     if not rows:
         return "<h2>Failed</h2><p>None.</p>"

@@ -22,7 +22,7 @@ PHASES = "read", "setup", "map", "polish", "write", "measure"
 
 
 @dataclass(frozen=True)
-class Run:
+class BatchRun:
     """Records of a run, or of another program on the same problems."""
 
     name: str  # Name on the page
@@ -51,7 +51,7 @@ class Run:
         return self.column(name)[self.certified]
 
 
-def load(source: str | os.PathLike[str]) -> Run:
+def load(source: str | os.PathLike[str]) -> BatchRun:
     """Read the records of a run from its folder or a table; ValueError if there are none or they cannot be read."""
     path = Path(source)
     if not path.exists():
@@ -66,7 +66,7 @@ def load(source: str | os.PathLike[str]) -> Run:
     if not rows:
         raise ValueError(f"there are no records in {source}: give the folder of a run or a table of records")
     results = folder / "results"
-    return Run(path.resolve().name, rows, results if results.is_dir() else None, _about(folder))
+    return BatchRun(path.resolve().name, rows, results if results.is_dir() else None, _about(folder))
 
 
 def _about(folder: Path) -> Record:
@@ -91,7 +91,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def groups(run: Run) -> list[Run]:
+def groups(run: BatchRun) -> list[BatchRun]:
     """Return the records by the first part of the problems' names, and all of them, each as a run of its own."""
     parts: dict[str, list[Record]] = {}
     for row in run.rows:
@@ -114,7 +114,7 @@ def worst(values: FloatArray) -> float:
     return float(known.max()) if known.size else float("nan")
 
 
-def outcomes(run: Run) -> list[tuple[str, int]]:
+def outcomes(run: BatchRun) -> list[tuple[str, int]]:
     """Return the number of records per outcome, in the order of `records.OUTCOMES`; unknown outcomes come last."""
     counted = Counter(str(row.get("outcome") or _guess(row)) for row in run.rows)
     order = [*records.OUTCOMES, *sorted(set(counted) - set(records.OUTCOMES))]
@@ -125,7 +125,7 @@ def _guess(row: Record) -> str:
     return "injective" if row.get("certified") is True else "not injective"
 
 
-def match_column(run: Run, other: Run, column: str) -> tuple[FloatArray, FloatArray]:
+def match_column(run: BatchRun, other: BatchRun, column: str) -> tuple[FloatArray, FloatArray]:
     """Return a column of both runs for the problems that both contain."""
     theirs = {row["problem"]: row.get(column) for row in other.rows}
     pairs = [

@@ -31,7 +31,7 @@ class ProtocolError(ValueError):
     """A message is malformed."""
 
 
-class Frame(NamedTuple):
+class MessageFrame(NamedTuple):
     """Message."""
 
     # Plain JSON; ``kind`` is the type of a message to the page, ``do`` the command of a message from the page
@@ -53,7 +53,7 @@ def encode(header: Mapping[str, Any], arrays: Mapping[str, Array] | None = None)
     return b"".join([len(text).to_bytes(4, "little"), text, *parts])
 
 
-def decode(data: bytes) -> Frame:
+def decode(data: bytes) -> MessageFrame:
     """Decode a buffer from an untrusted source; ProtocolError if it is malformed."""
     length = int.from_bytes(data[:4], "little")
     if len(data) < 4 or length > min(_LONGEST, len(data) - 4):
@@ -65,7 +65,7 @@ def decode(data: bytes) -> Frame:
         arrays = {str(name): _array(data, 4 + length, *about) for name, about in header.pop("arrays", {}).items()}
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ProtocolError(f"a message cannot be read: {error}") from None
-    return Frame(header, arrays)
+    return MessageFrame(header, arrays)
 
 
 def _array(data: bytes, start: int, kind: str, shape: list[int], offset: int) -> Array:

@@ -32,7 +32,7 @@ _SOFTENING = 0.3
 _BARRIER_WEIGHT = 3e-3
 
 
-class _Evaluation(NamedTuple):
+class _DistanceValues(NamedTuple):
     """The evaluation of a map by the energy."""
 
     deformation: Deformation
@@ -102,23 +102,23 @@ class DistanceEnergy:
         sums: FloatArray = self._share @ values
         return sums
 
-    def deform(self, w: ComplexArray) -> _Evaluation:
+    def deform(self, w: ComplexArray) -> _DistanceValues:
         """Evaluate the quantities of a map that the other methods need."""
         apart = self.differences(w)
-        return _Evaluation(self.barrier.deform(w), apart, np.abs(apart) / self._length - 1)
+        return _DistanceValues(self.barrier.deform(w), apart, np.abs(apart) / self._length - 1)
 
-    def value_of(self, evaluation: _Evaluation) -> float:
+    def value_of(self, evaluation: _DistanceValues) -> float:
         """The mean softened error plus the weighted barrier."""
         error = float(np.mean(np.hypot(evaluation.off, _SOFTENING))) - _SOFTENING
         return error + _BARRIER_WEIGHT * self.barrier.value_of(evaluation.deformation)
 
-    def gradient_of(self, evaluation: _Evaluation, n: int) -> ComplexArray:
+    def gradient_of(self, evaluation: _DistanceValues, n: int) -> ComplexArray:
         """The derivative with respect to ``n`` positions; (n,) complex128."""
         slope = evaluation.off / np.hypot(evaluation.off, _SOFTENING) / (self._length * evaluation.off.size)
         pull = slope * evaluation.apart / np.abs(evaluation.apart)
         return self.gather(pull) + _BARRIER_WEIGHT * self.barrier.gradient_of(evaluation.deformation, n)
 
-    def curvature_of(self, evaluation: _Evaluation, *, negative: float = 0.0) -> QuadraticForm:
+    def curvature_of(self, evaluation: _DistanceValues, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivatives of the weighted barrier on the triangles."""
         form = self.barrier.curvature_of(evaluation.deformation, negative=negative)
         return form.scaled(np.full(len(self.F), _BARRIER_WEIGHT))

@@ -65,7 +65,7 @@ def read_members(
         Regular files, and parts that cannot be read: damaged and too large ones. After a damaged header the next valid
         one is searched.
     """
-    reader = _Reader(file)
+    reader = _TarReader(file)
     try:
         yield from reader.members(wanted, limit)
     except _ShortReadError:
@@ -74,7 +74,7 @@ def read_members(
         yield Damage(reader.start, f"the compressed archive is damaged: {error}")
 
 
-class _Reader:
+class _TarReader:
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self._offset = 0

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.ui.studio.protocol import Array, Frame, decode, encode
+from quasiharmonic.ui.studio.protocol import Array, MessageFrame, decode, encode
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import read_sheet
@@ -72,7 +72,7 @@ class Inbox:
     """
 
     def __init__(self, source: BinaryIO) -> None:
-        self._messages: deque[tuple[Frame, int]] = deque()
+        self._messages: deque[tuple[MessageFrame, int]] = deque()
         self._bytes = 0
         self._changed = threading.Condition()
         threading.Thread(target=self._listen, args=(source,), daemon=True).start()
@@ -84,7 +84,7 @@ class Inbox:
         # The page is gone, so the current computation is not needed.
         os._exit(0)
 
-    def _put(self, frame: Frame, size: int) -> None:
+    def _put(self, frame: MessageFrame, size: int) -> None:
         """Add a message as soon as the queue has space for it."""
         with self._changed:
             last = self._messages[-1][0].header.get("do") if self._messages else None
@@ -96,7 +96,7 @@ class Inbox:
             self._bytes += size
             self._changed.notify()
 
-    def take(self) -> Frame:
+    def take(self) -> MessageFrame:
         """Return the next message; wait for it if necessary."""
         with self._changed:
             while not self._messages:

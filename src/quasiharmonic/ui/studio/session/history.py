@@ -7,7 +7,7 @@ from typing import Any
 
 from quasiharmonic.io.models.textures import Texture
 from quasiharmonic.ui.studio.session.state import SessionState
-from quasiharmonic.ui.studio.session.storage import Snapshot, Storage
+from quasiharmonic.ui.studio.session.storage import Storage, StoredSession
 
 #: Maximum number of states for undo.
 MAX_STATES = 40
@@ -78,7 +78,7 @@ class History:
         count = max(2, _MAX_STORED // max(len(self.state.mesh.F), 1))
         low = max(0, self._at + 1 - count)
         states = dict(self._states[low : low + count])
-        self._storage.write(Snapshot(states, self._at - low, self.texture, self._saved))
+        self._storage.write(StoredSession(states, self._at - low, self.texture, self._saved))
 
     def restore(self) -> bool:
         """Take over the stored states; return whether there are any."""

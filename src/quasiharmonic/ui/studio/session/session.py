@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.io.models.textures import Texture, texture_of
-from quasiharmonic.ui.studio.protocol import Array, Frame
+from quasiharmonic.ui.studio.protocol import Array, MessageFrame
 from quasiharmonic.ui.studio.session import frames, operations, validation
 from quasiharmonic.ui.studio.session.drag import DragMap, Follower
 from quasiharmonic.ui.studio.session.exports import list_files
@@ -31,7 +31,7 @@ from quasiharmonic.ui.studio.session.setup import (
 )
 from quasiharmonic.ui.studio.session.state import DistortionMonitor, SessionState, describe_obstructions
 from quasiharmonic.ui.studio.session.storage import Storage
-from quasiharmonic.ui.studio.session.surface import Sheet, make_first_sheet, read_upload
+from quasiharmonic.ui.studio.session.surface import PageSurface, make_first_sheet, read_upload
 from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
@@ -80,7 +80,7 @@ class Session:
         """The image on the surface."""
         return self._history.texture
 
-    def open(self, sheet: Sheet | None = None) -> None:
+    def open(self, sheet: PageSurface | None = None) -> None:
         """Open a model, by default a built-in one; its surface is shown before there is a map.
 
         ValueError if the model cannot be opened; the page then keeps its previous one.
@@ -106,7 +106,7 @@ class Session:
         self._send_image()
         return True
 
-    def handle(self, frame: Frame) -> None:
+    def handle(self, frame: MessageFrame) -> None:
         """Execute the command of a message by the method ``_do_COMMAND``.
 
         Errors of any type are sent to the page, and the state stays.
@@ -130,10 +130,10 @@ class Session:
 
     # --- models, selection and seams ---------------------------------------------------------------------------------
 
-    def _do_load(self, frame: Frame) -> None:
+    def _do_load(self, frame: MessageFrame) -> None:
         self.open(read_upload(validation.text(frame, "name"), validation.content(frame)))
 
-    def _do_image(self, frame: Frame) -> None:
+    def _do_image(self, frame: MessageFrame) -> None:
         texture = texture_of(validation.content(frame))
         if texture is None:
             raise RequestError("this file is not a PNG or JPEG image")
@@ -141,12 +141,12 @@ class Session:
         self._history.write()
         self._send_image()
 
-    def _do_select(self, frame: Frame) -> None:
+    def _do_select(self, frame: MessageFrame) -> None:
         chosen = validation.indices(frame, "islands", len(self.state.islands))
         self._history.change(replace(self.state, selected=tuple(chosen or range(len(self.state.islands)))))
         self._show()
 
-    def _do_seam(self, frame: Frame) -> None:
+    def _do_seam(self, frame: MessageFrame) -> None:
         """Add the shortest path between two vertices to the seams."""
         state, mesh = self.state, self.state.mesh
         start, end = self._model_vertex(frame, "start"), self._model_vertex(frame, "vertex")
@@ -154,29 +154,29 @@ class Session:
             path = shortest_path(mesh.V, mesh.F, start, end)
             self._keep(replace(state, drawn=add_edges(find_seams(state), path)))
 
-    def _do_erase(self, frame: Frame) -> None:
+    def _do_erase(self, frame: MessageFrame) -> None:
         """Remove the chain of seams nearest to a vertex."""
         state = self.state
         vertex = self._model_vertex(frame, "vertex")
         self._keep(replace(state, drawn=erase_chain(find_seams(state), state.mesh.V, vertex)))
 
-    def _model_vertex(self, frame: Frame, name: str) -> int:
+    def _model_vertex(self, frame: MessageFrame, name: str) -> int:
         """Return the vertex of the model that a message names by its number on the page."""
         origin = self.state.numbering.origin
         return int(origin[validation.vertex(frame, len(origin), name)])
 
-    def _do_turn(self, frame: Frame) -> None:
+    def _do_turn(self, frame: MessageFrame) -> None:
         self._keep(turn_over(self.state), fit=True)
 
     # --- new maps ----------------------------------------------------------------------------------------------------
 
-    def _do_outline(self, frame: Frame) -> None:
+    def _do_outline(self, frame: MessageFrame) -> None:
         self._map_to(make_outline(frame.header.get("to")))
 
-    def _do_drawing(self, frame: Frame) -> None:
+    def _do_drawing(self, frame: MessageFrame) -> None:
         self._map_to(read_drawing(validation.text(frame, "name"), validation.content(frame)))
 
-    def _do_polygon(self, frame: Frame) -> None:
+    def _do_polygon(self, frame: MessageFrame) -> None:
         self._map_to(make_polygon(validation.points(frame)))
 
     def _map_to(self, outline: Outline, corners: Any = ()) -> None:
@@ -184,29 +184,29 @@ class Session:
         self._busy("finding the map")
         self._keep(operations.map_to_outline(self.state, outline, corners, self._step), fit=True)
 
-    def _do_corner(self, frame: Frame) -> None:
+    def _do_corner(self, frame: MessageFrame) -> None:
         k, vertex = self._find(frame)
         self._busy("finding the map")
         self._keep(with_corner(self.state, k, vertex, self._step))
 
-    def _do_corners(self, frame: Frame) -> None:
+    def _do_corners(self, frame: MessageFrame) -> None:
         outline = self.state.active.outline
         if outline is None:
             raise RequestError("corners need an outline: choose one under Boundary first")
         self._map_to(outline, "auto")
 
-    def _do_flatten(self, frame: Frame) -> None:
+    def _do_flatten(self, frame: MessageFrame) -> None:
         self._busy("flattening")
         self._keep(operations.flatten_islands(self.state, self._step), fit=True)
 
-    def _do_unwrap(self, frame: Frame) -> None:
+    def _do_unwrap(self, frame: MessageFrame) -> None:
         max_stretch, size = float(validation.amount(frame, "max_stretch", 1, 10, 1.5)), _read_size(frame, 2048)
         keep_seams = frame.header.get("keep_seams") is True
         self._busy("unwrapping")
         after = unwrap_model(self.state, self._step, max_stretch=max_stretch, keep_seams=keep_seams, **size)
         self._keep(after, fit=True)
 
-    def _do_place(self, frame: Frame) -> None:
+    def _do_place(self, frame: MessageFrame) -> None:
         """Move or rotate the selected islands."""
         by, turn = validation.place(frame), validation.amount(frame, "turn", -360, 360, 0)
         # The page has already moved them.
@@ -214,14 +214,14 @@ class Session:
         self._refuse_drawn()
         self._keep(operations.move_islands(self.state, by, float(turn)))
 
-    def _do_pack(self, frame: Frame) -> None:
+    def _do_pack(self, frame: MessageFrame) -> None:
         self._refuse_drawn()
         operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
         size = _read_size(frame, 1024)
         self._busy("packing")
         self._keep(operations.pack_all(self.state, **size), fit=True)
 
-    def _do_polish(self, frame: Frame) -> None:
+    def _do_polish(self, frame: MessageFrame) -> None:
         energy, slide = validation.text(frame, "energy"), frame.header.get("slide") is True
         if energy not in ENERGIES:
             raise RequestError(f"unknown energy {energy[:40]!r}: use {', '.join(ENERGIES)}")
@@ -236,7 +236,7 @@ class Session:
 
     # --- drags and pins ----------------------------------------------------------------------------------------------
 
-    def _do_pin(self, frame: Frame) -> None:
+    def _do_pin(self, frame: MessageFrame) -> None:
         k, vertex = self._find(frame)
         one = self.state.islands[k]
         if any(vertex in loop for loop in one.loops):
@@ -246,16 +246,16 @@ class Session:
         if vertex not in one.pins:
             self._keep(pin_vertices(self.state, k, [*one.pins, vertex]))
 
-    def _find(self, frame: Frame) -> tuple[int, int]:
+    def _find(self, frame: MessageFrame) -> tuple[int, int]:
         """Return island and own number of the vertex that a message names."""
         numbering = self.state.numbering
         return numbering.find(validation.vertex(frame, len(numbering.origin)))
 
-    def _do_unpin(self, frame: Frame) -> None:
+    def _do_unpin(self, frame: MessageFrame) -> None:
         k, vertex = self._find(frame)
         self._keep(pin_vertices(self.state, k, [v for v in self.state.islands[k].pins if v != vertex]))
 
-    def _do_grab(self, frame: Frame) -> None:
+    def _do_grab(self, frame: MessageFrame) -> None:
         k, vertex = self._find(frame)
         self._refuse_drawn()
         one = self.state.islands[k]
@@ -271,7 +271,7 @@ class Session:
         place = problem.target[np.flatnonzero(problem.fixed == vertex)[0]]
         self._drag_state = _DragState(k, place, share, follower)
 
-    def _do_drag(self, frame: Frame) -> None:
+    def _do_drag(self, frame: MessageFrame) -> None:
         to, seq = validation.place(frame), validation.number(frame, "seq")
         drag = self._drag_state
         if drag is None:
@@ -288,7 +288,7 @@ class Session:
         fields = {"state": "following", "reached": shown.reached}
         self._tell_map(fields, seq=seq, shown=shown, asked=asked)
 
-    def _do_drop(self, frame: Frame) -> None:
+    def _do_drop(self, frame: MessageFrame) -> None:
         drag, self._drag_state = self._drag_state, None
         if drag is None or drag.goal is None:
             return
@@ -307,10 +307,10 @@ class Session:
 
     # --- history and files -------------------------------------------------------------------------------------------
 
-    def _do_undo(self, frame: Frame) -> None:
+    def _do_undo(self, frame: MessageFrame) -> None:
         self._go(-1)
 
-    def _do_redo(self, frame: Frame) -> None:
+    def _do_redo(self, frame: MessageFrame) -> None:
         self._go(1)
 
     def _go(self, step: int) -> None:
@@ -318,11 +318,11 @@ class Session:
         self._history.go(step)
         self._show(fit=True)
 
-    def _do_stop(self, frame: Frame) -> None:
+    def _do_stop(self, frame: MessageFrame) -> None:
         """Show the state again; the arrival of this message has already stopped the computation."""
         self._show()
 
-    def _do_save(self, frame: Frame) -> None:
+    def _do_save(self, frame: MessageFrame) -> None:
         form = frame.header.get("format", "obj")
         files = list_files(self.state, form if isinstance(form, str) else "", self._history.texture)
         for name, content in files.items():
@@ -398,7 +398,7 @@ class Session:
         self._tell({"kind": "busy", "what": what}, {})
 
 
-def _read_size(frame: Frame, resolution: int) -> dict[str, Any]:
+def _read_size(frame: MessageFrame, resolution: int) -> dict[str, Any]:
     """Return resolution, by default the given one, and padding of a texture."""
     return {
         "resolution": int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, resolution)),

@@ -24,7 +24,7 @@ from quasiharmonic.ui.studio.session.operations import (
 from quasiharmonic.ui.studio.session.outlines import make_outline
 from quasiharmonic.ui.studio.session.recipes import Recipe
 from quasiharmonic.ui.studio.session.state import SessionState
-from quasiharmonic.ui.studio.session.surface import Sheet, has_complete_map
+from quasiharmonic.ui.studio.session.surface import PageSurface, has_complete_map
 from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
@@ -34,14 +34,14 @@ _FIRST_OUTLINE = "rect:1x1"
 MAX_AUTOMATIC = 40_000
 
 
-def open_without_map(sheet: Sheet) -> SessionState:
+def open_without_map(sheet: PageSurface) -> SessionState:
     """Return the state of a model before it has a map."""
     mesh = SeamedMesh(sheet.surface.V, sheet.surface.F)
     islands = tuple(IslandState(island) for island in mesh.islands)
     return SessionState(sheet, mesh, islands, Recipe(), tuple(range(len(islands))))
 
 
-def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = None) -> SessionState:
+def make_first_state(sheet: PageSurface, callback: Callable[[Any], object] | None = None) -> SessionState:
     """Return the initial state of a model: with the map of the file; otherwise a square, a flat map, or charts.
 
     A disk is mapped to a square if possible. Another connected surface is flattened, and cut before if necessary. Any
@@ -65,7 +65,7 @@ def make_first_state(sheet: Sheet, callback: Callable[[Any], object] | None = No
     return bare if len(sheet.surface.F) > MAX_AUTOMATIC else unwrap_model(bare, callback)
 
 
-def _take_map(sheet: Sheet, callback: Callable[[Any], object] | None) -> SessionState:
+def _take_map(sheet: PageSurface, callback: Callable[[Any], object] | None) -> SessionState:
     """Return the state with the map of the file; if it has inverted triangles, with a map of the same boundary."""
     mesh = sheet.initial_map()
     pins = [] if sheet.fixed is None else sheet.fixed.tolist()

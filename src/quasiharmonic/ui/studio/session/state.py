@@ -18,7 +18,7 @@ from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.studio.protocol import Array
 from quasiharmonic.ui.studio.session.islands import IslandState, Numbering
 from quasiharmonic.ui.studio.session.recipes import Recipe
-from quasiharmonic.ui.studio.session.surface import Sheet
+from quasiharmonic.ui.studio.session.surface import PageSurface
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 #: Maximum numbers of obstructions and of elements per obstruction that are sent to the page.
@@ -32,7 +32,7 @@ _MAX_CHECKED = 2000
 class SessionState:
     """State of a page."""
 
-    sheet: Sheet
+    sheet: PageSurface
     mesh: SeamedMesh  # The surface with its seams and its map
     islands: tuple[IslandState, ...]  # Those of the mesh, in its order
     recipe: Recipe  # How the map was computed

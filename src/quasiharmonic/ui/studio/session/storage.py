@@ -13,7 +13,7 @@ from quasiharmonic.io.models.textures import Texture
 _INDEX = "index"
 
 
-class Snapshot(NamedTuple):
+class StoredSession(NamedTuple):
     """Contents of a session."""
 
     states: dict[int, Any]  # The undo history, by the numbers of the states, which name their files
@@ -32,7 +32,7 @@ class Storage:
         self.folder = folder
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
-    def write(self, snapshot: Snapshot) -> None:
+    def write(self, snapshot: StoredSession) -> None:
         """Write a snapshot; states that are no longer part of it are removed."""
         kept = set()
         for number, state in snapshot.states.items():
@@ -47,11 +47,11 @@ class Storage:
             if path.name.startswith(("state-", "sheet-")) and path.name not in kept:
                 path.unlink(missing_ok=True)
 
-    def read(self) -> Snapshot | None:
+    def read(self) -> StoredSession | None:
         """Return the last snapshot; None if there is none, or it is damaged."""
         sheet = cache(lambda key: self._load(f"sheet-{key}"))
         try:
-            index: Snapshot = self._load(_INDEX)
+            index: StoredSession = self._load(_INDEX)
             stored = {number: self._load(f"state-{number}") for number in index.states}
             return index._replace(states={k: replace(state, sheet=sheet(key)) for k, (state, key) in stored.items()})
         except Exception:  # A damaged pickle can raise anything; the session then starts anew.

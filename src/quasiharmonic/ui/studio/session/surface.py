@@ -27,7 +27,7 @@ _HARMLESS = {"vertices without triangle", "vertices where surfaces touch"}
 
 
 @dataclass(frozen=True, eq=False)
-class Sheet:
+class PageSurface:
     """Model of a page.
 
     The functions that map accept only surfaces. So a model with defects is cleaned first, and the cleaned surface is
@@ -80,18 +80,18 @@ class Sheet:
             FT = self.cleaned.restore_corners(FT)
         return divide_polygons(replace(self.mesh, vt=mesh.uv, FT=FT))[0]
 
-    def turn_over(self) -> Sheet:
+    def turn_over(self) -> PageSurface:
         """Return the model with the triangles of its surface reversed."""
         surface = io.MeshData(self.surface.V, self.surface.F[:, (0, 2, 1)], source=self.mesh.source)
         return replace(self, surface=surface, turned=not self.turned)
 
 
-def make_first_sheet() -> Sheet:
+def make_first_sheet() -> PageSurface:
     """Return the built-in surface: a cat's head."""
     return make_sheet(io.MeshData(*cat(40), source="cat.obj"), "cat.obj")
 
 
-def read_sheet(path: Path) -> Sheet:
+def read_sheet(path: Path) -> PageSurface:
     """Read the model given to the command: a file, or a folder with ``input.obj`` and perhaps ``handles.txt``.
 
     ValueError or OSError if the file is not a model.
@@ -102,7 +102,7 @@ def read_sheet(path: Path) -> Sheet:
     return make_sheet(mesh, mesh_path.name, fixed)
 
 
-def read_upload(name: str, content: bytes) -> Sheet:
+def read_upload(name: str, content: bytes) -> PageSurface:
     """Read an uploaded model; of its name on the user's side only the suffix matters.
 
     ValueError if the file is not a valid model. The message names the user's file, not a path of this machine.
@@ -119,7 +119,7 @@ def read_upload(name: str, content: bytes) -> Sheet:
     return replace(sheet, mesh=replace(sheet.mesh, source=shown))
 
 
-def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> Sheet:
+def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> PageSurface:
     """Return the sheet of a mesh; ValueError if it has no triangles, too many, or only degenerate ones."""
     if len(mesh.F) > MAX_TRIANGLES:
         raise ValueError(
@@ -135,11 +135,11 @@ def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> S
     sound = not any(found.size for what, found in report.defects.items() if what not in _HARMLESS)
     texture = io.own_texture(mesh) if mesh.source else None
     if sound:
-        return Sheet(name, mesh, mesh, report, fixed=fixed, texture=texture)
+        return PageSurface(name, mesh, mesh, report, fixed=fixed, texture=texture)
     cleaned = clean(mesh.V, mesh.F)
     surface = io.MeshData(cleaned.V, cleaned.F, source=mesh.source)
     own = None if fixed is None else np.flatnonzero(np.isin(cleaned.vertices, fixed))
-    return Sheet(name, mesh, surface, report, cleaned, fixed=own, texture=texture)
+    return PageSurface(name, mesh, surface, report, cleaned, fixed=own, texture=texture)
 
 
 def has_complete_map(mesh: io.MeshData) -> bool:

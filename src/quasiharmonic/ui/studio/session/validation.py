@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from quasiharmonic.ui.studio.protocol import Frame
+from quasiharmonic.ui.studio.protocol import MessageFrame
 from quasiharmonic.util.arrays import FloatArray
 
 
@@ -14,7 +14,7 @@ class RequestError(ValueError):
     """A request cannot be fulfilled and the page is unchanged; the message states the reason."""
 
 
-def vertex(frame: Frame, n: int, name: str = "vertex") -> int:
+def vertex(frame: MessageFrame, n: int, name: str = "vertex") -> int:
     """Return a vertex index, below ``n``."""
     value = number(frame, name)
     if not 0 <= value < n:
@@ -22,7 +22,7 @@ def vertex(frame: Frame, n: int, name: str = "vertex") -> int:
     return value
 
 
-def number(frame: Frame, name: str) -> int:
+def number(frame: MessageFrame, name: str) -> int:
     """Return an integer."""
     value = frame.header.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or abs(value) >= 2**53:
@@ -30,7 +30,7 @@ def number(frame: Frame, name: str) -> int:
     return value
 
 
-def place(frame: Frame) -> FloatArray:
+def place(frame: MessageFrame) -> FloatArray:
     """Return the target position of a drag, (2,) float64."""
     value = frame.header.get("to")
     if not isinstance(value, list) or len(value) != 2:
@@ -41,7 +41,7 @@ def place(frame: Frame) -> FloatArray:
     return np.array(value, dtype=np.float64)
 
 
-def text(frame: Frame, name: str) -> str:
+def text(frame: MessageFrame, name: str) -> str:
     """Return a string of at most 200 characters."""
     value = frame.header.get(name)
     if not isinstance(value, str) or len(value) > 200:
@@ -49,7 +49,7 @@ def text(frame: Frame, name: str) -> str:
     return value
 
 
-def content(frame: Frame) -> bytes:
+def content(frame: MessageFrame) -> bytes:
     """Return the bytes of a file."""
     array = frame.arrays.get("content")
     if array is None or array.dtype != np.uint8:
@@ -57,7 +57,7 @@ def content(frame: Frame) -> bytes:
     return array.tobytes()
 
 
-def points(frame: Frame) -> FloatArray:
+def points(frame: MessageFrame) -> FloatArray:
     """Return points in the plane, (k, 2) float64."""
     array = frame.arrays.get("points")
     if array is None or array.dtype != np.float64 or array.size % 2:
@@ -65,7 +65,7 @@ def points(frame: Frame) -> FloatArray:
     return array.reshape(-1, 2)
 
 
-def amount(frame: Frame, name: str, low: float, high: float, default: float) -> float:
+def amount(frame: MessageFrame, name: str, low: float, high: float, default: float) -> float:
     """Return a number between two bounds, ``default`` if there is none."""
     value = frame.header.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
@@ -73,7 +73,7 @@ def amount(frame: Frame, name: str, low: float, high: float, default: float) -> 
     return value
 
 
-def indices(frame: Frame, name: str, n: int) -> list[int]:
+def indices(frame: MessageFrame, name: str, n: int) -> list[int]:
     """Return a list of different indices below ``n``, ascending."""
     values = frame.header.get(name)
     if not isinstance(values, list) or not all(type(value) is int and 0 <= value < n for value in values):
