@@ -12,6 +12,7 @@ from quasiharmonic import polish
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
 from quasiharmonic.surfaces import disk
+from quasiharmonic.util.progress import heartbeat, time_limit
 
 SOURCE = Path(__file__).parent.parent / "src/quasiharmonic"
 
@@ -76,13 +77,28 @@ def test_other_exceptions_are_not_interrupts():
 
 
 def test_a_time_limit_ends_the_run_like_an_interrupt():
-    run = Run(time_limit=0.0)
-    with run.until_interrupted():
+    run = Run()
+    with time_limit(0.0) as limit, run.until_interrupted():
         run.record(0, 1.0)
         run.record(0, 0.5)
+    assert limit.reached
     assert run.interrupted
     assert len(run.history) == 1
-    Run(time_limit=60.0).record(0, 1.0)
+    # Outside the block, and within a block after its limit, work continues.
+    run.record(0, 0.5)
+    with time_limit(0.0), run.until_interrupted():
+        with run.until_interrupted():
+            heartbeat()
+        heartbeat()
+        run.record(0, 0.25)
+    assert len(run.history) == 3
+
+
+def test_the_first_of_two_time_limits_counts():
+    run = Run()
+    with time_limit(0.0) as outer, time_limit(60.0) as inner, run.until_interrupted():
+        heartbeat()
+    assert (outer.reached, inner.reached, run.interrupted) == (True, False, True)
 
 
 def test_stages_follow_one_another_without_a_gap():

@@ -30,7 +30,7 @@ from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.problem.run import Run
+from quasiharmonic.problem.run import Run, run_within
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe, find_exponent, map_array, names_of
 from quasiharmonic.util.options import MapOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
@@ -59,6 +59,7 @@ class PolishKeywords(TypedDict, total=False):
     tol: float
     linear_solver: str
     callback: Callable[[Step], object] | None
+    time_limit: float | None
     slide: bool | BoundaryCurves
 
 
@@ -105,6 +106,9 @@ def polish(
     callback : callable, optional
         Called with a `Step` at the start and after every step; ``Step.energy`` is the mean energy. Between steps it is
         called with the last `Step` again at least every half second, but not during a single factorisation.
+    time_limit : float, optional
+        Seconds after which the call returns the best map so far with status ``TIME_LIMIT``. It is checked as often as
+        the callback is called. The result then depends on the speed of the machine.
     slide : bool or BoundaryCurves
         Let boundary vertices slide along the outline, in their order, with fixed corners. With True, they slide along
         the boundary polygon of ``uv``, whose corners turn by 20° or more. With
@@ -129,6 +133,8 @@ def polish(
         - When the energy is unknown, is not a barrier or has no second derivatives, or when another option is invalid.
         - When a user-defined energy or one of its derivatives is NaN or infinite, so that no step is possible; the
           message lists which, and the triangles.
+    TimeoutError
+        If the time limit is over before the first step.
 
     Examples
     --------
@@ -158,6 +164,11 @@ def polish_map(
     are measured in place of the domain's triangles. They must be positive in ``uv`` and stay so. They may overlap, but
     must cover the surface evenly.
     """
+    return run_within(options.time_limit, lambda: _polish(domain, uv, options, triangles))
+
+
+def _polish(domain: Domain, uv: ArrayLike, options: PolishOptions, triangles: IntArray | None) -> MapResult:
+    """Polish a map; see `polish_map`."""
     chosen, linear_solver = find_energy(options.energy), options.linear_solver
     run = Run(options.callback)
     start = check_injective(domain, uv, "polish needs an injective map")

@@ -42,6 +42,7 @@ class Status(Enum):
         "The energy was still falling: allow more iterations."
     )
     INTERRUPTED = "Interrupted. This is the best map so far."
+    TIME_LIMIT = "The time limit ended the work. This is the best map so far: allow more time to improve it."
     ROUNDED = (
         "The map is injective in the solver's own coordinates, but its smallest triangles invert when the "
         "positions are rounded to double precision at the target's offset. Move the target nearer to the origin."
@@ -111,6 +112,7 @@ class Status(Enum):
 
 _MOST_SEVERE_FIRST = (
     Status.INTERRUPTED,
+    Status.TIME_LIMIT,
     # Search and refinement without an injective map.
     Status.IMPOSSIBLE,
     Status.TOO_MANY_SPLITS,

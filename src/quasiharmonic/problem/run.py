@@ -16,6 +16,7 @@ from typing import Any
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat, time_limit
 
 
 class Run:
@@ -29,8 +30,6 @@ class Run:
         Keep the map of every ``record_every``-th step; none if 0.
     first : int
         Number of the first step.
-    time_limit : float, optional
-        Seconds after which the next step ends the run as Ctrl-C does.
 
     Attributes
     ----------
@@ -38,7 +37,7 @@ class Run:
     path : list of Snapshot
     stages : list of Stage
     interrupted : bool
-        Whether Ctrl-C, the callback or the time limit ended a block of `until_interrupted`.
+        Whether Ctrl-C, the callback or a time limit ended a block of `until_interrupted`.
     """
 
     def __init__(
@@ -47,9 +46,8 @@ class Run:
         record_every: int = 0,
         *,
         first: int = 0,
-        time_limit: float | None = None,
     ) -> None:
-        self._callback, self._record_every, self._first, self._time_limit = callback, record_every, first, time_limit
+        self._callback, self._record_every, self._first = callback, record_every, first
         self._began = self._stage_began = time.perf_counter()
         self.history: list[Step] = []
         self.path: list[Snapshot] = []
@@ -70,15 +68,14 @@ class Run:
             self.interrupted = True
 
     def record(self, inverted: int, energy: float, uv: Callable[[], FloatArray] | None = None) -> None:
-        """Record a step; ``uv`` returns its map (n, 2), for ``path``. Raise KeyboardInterrupt after the time limit."""
+        """Record a step; ``uv`` returns its map (n, 2), for ``path``. Raise KeyboardInterrupt after a time limit."""
         step = Step(self._first + len(self.history), inverted, energy)
         self.history.append(step)
         if uv is not None and self._record_every and step.iteration % self._record_every == 0:
             self.path.append(Snapshot(step.iteration, uv()))
         if self._callback is not None:
             self._callback(step)
-        if self._time_limit is not None and self.seconds > self._time_limit:
-            raise KeyboardInterrupt
+        heartbeat()
 
     def add_stage(
         self,
@@ -136,3 +133,22 @@ class Run:
             seconds=self.seconds,
             **further,
         )
+
+
+def run_within(seconds: float | None, compute: Callable[[], MapResult]) -> MapResult:
+    """Return the result of a computation that ends after a time limit, if there is one, with the best map so far.
+
+    Its status is then ``TIME_LIMIT``. Raise TimeoutError if there is no map yet.
+    """
+    if seconds is None:
+        return compute()
+    with time_limit(seconds) as limit:
+        result = None
+        with Run().until_interrupted():
+            result = compute()
+    if result is None:
+        if limit.reached:
+            raise TimeoutError(f"there is no map after the time limit of {seconds:g} s: allow more time")
+        raise KeyboardInterrupt
+    interrupted = limit.reached and result.status is Status.INTERRUPTED
+    return replace(result, status=Status.TIME_LIMIT) if interrupted else result

@@ -20,6 +20,7 @@ from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.run import run_within
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH, beltrami_coefficients
 from quasiharmonic.solver.search.search import search_map
@@ -43,6 +44,7 @@ class MapKeywords(TypedDict, total=False):
     linear_solver: str
     callback: Callable[[Step], object] | None
     record_every: int
+    time_limit: float | None
     slide: bool | BoundaryCurves
     refine: bool
 
@@ -93,6 +95,9 @@ def injective_map(
         `KeyboardInterrupt`, for instance after a time limit, which ends the search as Ctrl-C does.
     record_every : int
         Keep every ``record_every``-th map in the result's ``path``. Default: 0, keep no maps.
+    time_limit : float, optional
+        Seconds after which the call returns the best map so far with status ``TIME_LIMIT``. It is checked as often as
+        the callback is called. The result then depends on the speed of the machine.
     slide : bool or BoundaryCurves
         Let boundary vertices slide along their outline during polishing, with fixed corners; see
         `quasiharmonic.polish`. If the boundary of ``target`` is off the curves by a chord, it is moved onto them first.
@@ -145,7 +150,7 @@ def solve(problem: Problem, **options: Unpack[MapKeywords]) -> MapResult:
     ----------
     problem : Problem
         It also names the reference triangles. The call changes only its caches, which make later solves faster.
-    strategy, polish, start, max_iterations, linear_solver, callback, record_every, slide, refine
+    strategy, polish, start, max_iterations, linear_solver, callback, record_every, time_limit, slide, refine
         See `injective_map`. With ``refine``, ``start`` and ``record_every`` apply to the given mesh.
 
     Returns
@@ -161,7 +166,8 @@ def solve(problem: Problem, **options: Unpack[MapKeywords]) -> MapResult:
         If the named linear solver is not installed.
     """
     check_problem("solve", problem, ": use injective_map for the arrays V, F, fixed and target")
-    return solve_problem(problem, MapOptions(**options))
+    checked = MapOptions(**options)
+    return run_within(checked.time_limit, lambda: solve_problem(problem, checked))
 
 
 def solve_problem(problem: Problem, options: MapOptions) -> MapResult:

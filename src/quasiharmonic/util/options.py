@@ -70,6 +70,12 @@ def positive_number(name: str, value: Any) -> None:
     check_positive(**{name: value})
 
 
+def seconds(name: str, value: Any) -> None:
+    """Check a positive number of seconds, or None."""
+    if value is not None:
+        positive_number(name, value)
+
+
 def switch(name: str, value: Any) -> None:
     """Check a boolean."""
     from quasiharmonic.util.arrays import check_bool
@@ -153,6 +159,9 @@ class SolverOptions(Options):
     callback: Callable[[Any], object] | None = option(None, check=function)
 
 
+_TIME_LIMIT = "end the computation of each island after this many seconds, and keep the best map"
+
+
 @dataclass(frozen=True, kw_only=True)
 class MapOptions(SolverOptions):
     """Options of `quasiharmonic.injective_map` and `quasiharmonic.solve`."""
@@ -166,6 +175,7 @@ class MapOptions(SolverOptions):
     start: Any = option(None)
     max_iterations: int = option(MAX_ITERATIONS, "(default: 2000)", check=positive)
     record_every: int = option(0, check=count)
+    time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     slide: Any = option(False)
     refine: bool = option(
         False, "if no map exists, split as few inner edges as necessary (adds vertices at the end)", check=switch
@@ -180,6 +190,7 @@ class PolishOptions(SolverOptions):
     weights: Any = option(None)
     max_iterations: int = option(200, "(default: 200)", check=count)
     tol: float = option(1e-4, check=tolerance)
+    time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     slide: Any = option(False)
 
 
@@ -225,6 +236,7 @@ class FlattenOptions(DistanceOptions):
     target: Any = option(None)
     weights: Any = option(None)
     start: Any = option(None)
+    time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     unit_square: bool = option(False, "scale the map evenly into the unit square", check=switch)
     gap: float = option(0.0, check=tolerance)
 

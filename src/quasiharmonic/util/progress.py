@@ -2,13 +2,14 @@
 
 A public function with a callback is decorated with `reports_progress` and calls the callback at every step. Code that
 may run long between two steps calls `heartbeat` regularly. If no step was reported for `INTERVAL`, `heartbeat` reports
-the last step again.
+the last step again. After a time limit, `heartbeat` ends the work like Ctrl-C.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, cast
@@ -73,11 +74,44 @@ def reports_progress(function: Callable[P, R]) -> Callable[P, R]:
     return report_progress
 
 
+class TimeLimit:
+    """A time limit of some work; ``reached`` tells whether it has ended the work."""
+
+    def __init__(self, seconds: float, outer: TimeLimit | None) -> None:
+        self._end, self._outer = time.monotonic() + seconds, outer
+        self.reached = False
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt, once, if this limit or an outer one is over."""
+        if not self.reached and time.monotonic() >= self._end:
+            self.reached = True
+            raise KeyboardInterrupt
+        if self._outer is not None:
+            self._outer.check()
+
+
+_TIME_LIMIT: ContextVar[TimeLimit | None] = ContextVar("time limit", default=None)
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[TimeLimit]:
+    """Let `heartbeat` raise KeyboardInterrupt, once, when the block has taken this many seconds."""
+    limit = TimeLimit(seconds, _TIME_LIMIT.get())
+    token = _TIME_LIMIT.set(limit)
+    try:
+        yield limit
+    finally:
+        _TIME_LIMIT.reset(token)
+
+
 def heartbeat() -> None:
     """Report that work continues; long loops call this at least every tenth of a second.
 
-    Exceptions raised by the callback propagate to the caller.
+    Exceptions raised by the callback propagate to the caller. KeyboardInterrupt is raised after a time limit.
     """
+    limit = _TIME_LIMIT.get()
+    if limit is not None:
+        limit.check()
     reporter = _REPORTER.get()
     if reporter is not None:
         reporter.repeat_if_due()

@@ -12,6 +12,7 @@ import numpy as np
 
 from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -22,7 +23,7 @@ def map_to_disk(
     """Map a surface into a disk of its area, with its longest loop on the circle by arc length.
 
     ``V`` (n, 3) is of about unit size, and the surface is connected and has no handles. Return a bijective map (n, 2),
-    or None if none was found in double precision.
+    or None if none was found in double precision. Ctrl-C raises KeyboardInterrupt.
     """
     lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
     longest = int(np.argmax([length.sum() for length in lengths]))
@@ -41,6 +42,8 @@ def map_to_disk(
         reference="equilateral",
     )
     result = solve(problem, linear_solver=linear_solver, max_iterations=200)
+    if result.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
     return result.uv[: len(V)] if result.injective else None
 
 

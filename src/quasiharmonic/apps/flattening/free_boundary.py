@@ -36,7 +36,7 @@ from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.problem.run import Run
+from quasiharmonic.problem.run import Run, run_within
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -70,6 +70,7 @@ class FlattenKeywords(TypedDict, total=False):
     linear_solver: str
     callback: Callable[[Step], object] | None
     record_every: int
+    time_limit: float | None
 
 
 @accepts_mesh
@@ -124,6 +125,9 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
     record_every : int
         Keep the map of every ``record_every``-th step in the result's ``path``, before layout. With 0, the default,
         or with several pieces, no maps are kept.
+    time_limit : float, optional
+        Seconds after which the call returns the best map so far with status ``TIME_LIMIT``. It is checked as often as
+        the callback is called. The result then depends on the speed of the machine.
 
     Returns
     -------
@@ -147,6 +151,8 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
         ``start`` is not injective; the message names the elements. Also if the map exceeds the range of doubles.
     KeyboardInterrupt
         If Ctrl-C comes before a bijective map exists.
+    TimeoutError
+        If there is no bijective map within the time limit.
 
     Examples
     --------
@@ -166,6 +172,11 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
 
 def flatten_surface(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
     """Map a surface into the plane bijectively with a free boundary; see `flatten`."""
+    return run_within(checked.time_limit, lambda: _flatten(V, F, checked))
+
+
+def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
+    """Map a surface; see `flatten`."""
     began = time.perf_counter()
     _check_combination(checked)
     V, F = vertex_array(V), triangle_rows(F)
