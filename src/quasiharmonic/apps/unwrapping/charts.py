@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_cuts import UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
+from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
 from quasiharmonic.apps.unwrapping.unfolding import unfold
 from quasiharmonic.energies.deformation import signed_areas
@@ -26,52 +28,8 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_ea
 MAX_STRETCH = 1.5
 # Minimum gain of the first cuts; see `find_cuts`.
 _MIN_GAIN = 0.1
-# Closed components of at most this number of triangles are unfolded without stretch.
-_SMALL = 24
-
-
-@dataclass(frozen=True, eq=False)
-class Chart:
-    """A part of a surface with a bijective map into the plane.
-
-    Attributes
-    ----------
-    triangles : (k,) int64
-        Rows of the mesh's triangles, ascending.
-    F : (k, 3) int64
-        The same triangles, by the chart's own vertices.
-    vertices : (m,) int64
-        Vertices of the mesh. A vertex on a cut can occur several times.
-    uv : (m, 2) float64
-        Positions in the surface's unit of length; the chart has the area of its part of the surface.
-    stretch : (k,) float64
-        The larger of σ₁ and 1/σ₂ of each triangle.
-    misses : float
-        How much the chart exceeds the bound on stretch; 0 if all charts together keep it. It is the larger of two
-        differences: between the 99 % quantile by area and ``max_stretch``, and between the largest stretch and 3.
-    """
-
-    triangles: IntArray
-    F: IntArray
-    vertices: IntArray
-    uv: FloatArray
-    stretch: FloatArray
-    misses: float
-
-    def open(self, V: FloatArray, cost: FloatArray) -> WorkingChart:
-        """Return the chart for further cuts, given positions (n, 3) and costs (f, 3) of the whole mesh."""
-        rows = self.triangles
-        working = WorkingChart(rows, self.vertices, V[self.vertices], self.F, cost[rows])
-        working.uv, working.stretch = np.ldexp(self.uv, -working.piece.exponent), self.stretch
-        return working
-
-    def part(self, working: WorkingChart, bound: float) -> Chart:
-        """Return a part of the chart, which was cut off with its map."""
-        assert working.uv is not None
-        stretch = self.stretch[np.searchsorted(self.triangles, working.triangles)]
-        uv = np.ldexp(working.uv, working.piece.exponent)
-        missed = self.misses if (stretch > bound).any() else 0.0
-        return Chart(working.triangles, working.F, working.vertices, uv, stretch, missed)
+# Closed components of at most this number of triangles, with at most this share of the area, become one chart each.
+_SMALL, _SMALL_SHARE = 24, 0.01
 
 
 def find_charts(
@@ -127,11 +85,12 @@ def find_charts(
     workers = Workers(jobs, callback)
     cost = np.ones(F.shape) if edge_costs is None else np.asarray(edge_costs, dtype=np.float64)
     given = np.empty((0, 2), dtype=np.int64) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
-    flat, charts = _lay_flat(V, F, given)
-    small, unfolded = _unfold_small(V, F, np.flatnonzero(~flat), given, cost >= UNDIVIDED_COST)
-    charts += unfolded
-    rest = np.flatnonzero(~flat & ~small)
-    working, rest = ([], rest) if uv_cuts is None else _keep_parts(V, F, rest, given, cost, uv)
+    if uv_cuts is None:
+        exact, charts, cost = _develop(V, F, cost, max_charts, workers)
+        working, rest = list[WorkingChart](), np.flatnonzero(~exact)
+    else:
+        exact, charts = _lay_flat(V, F, given)
+        working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
     cut = partial(_cut, V, F, given=given, cost=cost)
     working += [chart for some in workers.map("cut", cut, [rest] if rest.size else []) for chart in some]
     areas = [chart.surface_area for chart in working]
@@ -141,6 +100,29 @@ def find_charts(
         working, max_stretch, max_charts=divisible, total_area=total, joinable=uv_cuts is None, workers=workers
     )
     return sorted(charts + _finish(found, max_stretch, total), key=lambda chart: int(chart.triangles[0]))
+
+
+def _develop(
+    V: FloatArray, F: IntArray, cost: FloatArray, max_charts: int | None, workers: Workers
+) -> tuple[BoolArray, list[Chart], FloatArray]:
+    """Make charts of the developable parts; return a mask (f,) of their triangles, the charts, and costs (f, 3).
+
+    The costs keep flat faces together.
+    """
+    undivided = cost >= UNDIVIDED_COST
+    mask, charts = _unfold_small(V, F, undivided)
+    rows = np.flatnonzero(~mask)
+    if not rows.size:
+        return mask, charts, cost
+    developed, more, flat = develop_charts(V, F[rows], cost[rows], undivided[rows], workers.check_wanted)
+    cost = cost.copy()
+    cost[rows] = np.where(flat, np.maximum(cost[rows], UNDIVIDED_COST), cost[rows])
+    others = rows[~developed]
+    apart = int(fans(F[others])[1].max(initial=-1)) + 1
+    if max_charts is None or len(charts) + len(more) + apart <= max_charts:
+        charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]
+        mask[rows[developed]] = True
+    return mask, charts, cost
 
 
 def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:
@@ -161,20 +143,16 @@ def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, lis
     return mask, charts
 
 
-def _unfold_small(
-    V: FloatArray, F: IntArray, rows: IntArray, cut: IntArray, undivided: BoolArray
-) -> tuple[BoolArray, list[Chart]]:
+def _unfold_small(V: FloatArray, F: IntArray, undivided: BoolArray) -> tuple[BoolArray, list[Chart]]:
     """Unfold small closed components without cuts; return a mask (f,) of their triangles, and their charts."""
     mask, charts = np.zeros(len(F), dtype=bool), list[Chart]()
-    if not rows.size:
-        return mask, charts
-    component = fans(F[rows])[1]
-    sides = edge_keys(F[rows], F[rows][:, (1, 2, 0)], len(V))
+    component = fans(F)[1]
+    sides = edge_keys(F, F[:, (1, 2, 0)], len(V))
     _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
-    chosen = np.bincount(component) <= _SMALL
+    area = np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
+    chosen = (np.bincount(component) <= _SMALL) & (np.bincount(component, area) <= _SMALL_SHARE * area.sum())
     chosen[component[(times[edge].reshape(sides.shape) < 2).any(axis=1)]] = False
-    chosen[component[np.isin(sides, pair_keys(cut, len(V))).any(axis=1)]] = False
-    rows = rows[chosen[component]]
+    rows = np.flatnonzero(chosen[component])
     if not rows.size:
         return mask, charts
     split, component, uv, good = unfold(V, F[rows], undivided[rows])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.unwrapping.charts import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.rounding import round_positions
 from quasiharmonic.geometry.mesh.topology import edge_keys

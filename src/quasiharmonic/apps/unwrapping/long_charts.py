@@ -6,15 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.packing.shapes import find_smallest_box, make_shape
+from quasiharmonic.apps.atlas.packing.shapes import make_shape
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
-from quasiharmonic.apps.unwrapping.charts import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.util.arrays import FloatArray
 
 # Share of the texture that charts are expected to cover.
 _EXPECTED = 0.6
 # Longest chart in sides of the texture at this scale, and longest chart that covers less than a share of its box.
 _LONGEST, _LONGEST_LOOSE, _LOOSE = 0.85, 0.7, 0.6
+# The same for charts without stretch.
+_LONGEST_ISOMETRIC = 1.25
 
 
 def divide_long_charts(
@@ -78,6 +80,8 @@ def _area(chart: Chart) -> float:
 def _is_too_long(chart: Chart, side: float) -> bool:
     """Whether a chart prevents a scale at which the texture has this side."""
     shape = make_shape(chart.uv, chart.F)
-    width, height = shape.extent(find_smallest_box(shape))
+    if chart.isometric:
+        return max(shape.extent(shape.direction)) > _LONGEST_ISOMETRIC * side
+    width, height = shape.extent(shape.direction)
     loose = shape.area < _LOOSE * width * height
     return max(width, height) > side * (_LONGEST_LOOSE if loose else _LONGEST)

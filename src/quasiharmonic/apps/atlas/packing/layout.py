@@ -11,7 +11,7 @@ import numpy as np
 from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw
 from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board
 from quasiharmonic.apps.atlas.packing.contact import Spot
-from quasiharmonic.apps.atlas.packing.shapes import Shape, find_smallest_box
+from quasiharmonic.apps.atlas.packing.shapes import Shape
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
@@ -116,7 +116,7 @@ def find_layout(
 def _may_fit(shapes: Sequence[Shape], size: tuple[int, int], tiles: int, scale: float) -> bool:
     """Whether neither the areas nor a length of shapes exclude that they fit into tiles at a scale."""
     area = sum(shape.area for shape in shapes) * scale * scale
-    longest = max(max(shape.extent(find_smallest_box(shape))) for shape in shapes) * scale
+    longest = max(max(shape.extent(shape.direction)) for shape in shapes) * scale
     return area <= tiles * size[0] * size[1] and longest <= hypot(*size)
 
 
@@ -131,11 +131,12 @@ def _place_one(shape: Shape, size: tuple[int, int], padding: float) -> Layout | 
 
     if room.min() <= 0:
         return None
-    box = np.angle(find_smallest_box(shape))
     width = pi / _ANGLES
-    angles = np.concatenate([box + pi / 2 * np.arange(2), width * np.arange(_ANGLES)])
+    angles = np.angle(shape.direction) + pi / 2 * np.arange(2)
+    if not shape.straight:
+        angles = np.concatenate([angles, width * np.arange(_ANGLES)])
     best = float(angles[np.argmax(scales(angles))])
-    while width > _ANGLE_PRECISION:
+    while not shape.straight and width > _ANGLE_PRECISION:
         near = best + width * np.linspace(-1, 1, 9)[[4, 0, 1, 2, 3, 5, 6, 7, 8]]
         best, width = float(near[np.argmax(scales(near))]), width / 4
     scale, least = float(scales(np.array([best]))[0]), least_scale([shape])
@@ -183,7 +184,7 @@ def _place_boxes(
 
 def least_scale(shapes: Sequence[Shape]) -> float:
     """Scale at which the longest side of all boxes is one texel."""
-    return 1 / (max(max(shape.extent(find_smallest_box(shape))) for shape in shapes) or 1.0)
+    return 1 / (max(max(shape.extent(shape.direction)) for shape in shapes) or 1.0)
 
 
 def _expected_scale(shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int) -> float:
@@ -248,7 +249,7 @@ class _Search:
     def _draw(self, shape: Shape, turns: ComplexArray, radius: float) -> Bitmaps:
         """Draw a shape with each of its sides up, after each of several rotations of its smallest box."""
         directions, cells = [], []
-        for direction in find_smallest_box(shape) * turns:
+        for direction in shape.direction * (turns[:1] if shape.straight else turns):
             bitmap = draw(shape, direction, 1 / self._cell, radius)
             for quarters in range(4):
                 directions.append(direction * 1j**quarters)
@@ -350,6 +351,6 @@ class _Search:
 
 def _find_lying(shape: Shape) -> complex:
     """Direction of the longer side of the smallest box."""
-    direction = find_smallest_box(shape)
+    direction = shape.direction
     width, height = shape.extent(direction)
     return direction if width >= height else direction * 1j

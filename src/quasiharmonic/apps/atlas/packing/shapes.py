@@ -12,6 +12,8 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat
 
 # Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
 _AS_SMALL = 1e-9
+# A shape is straight if at least this share of its outline lies along two perpendicular directions, up to this angle.
+_STRAIGHT, _SKEW = 0.4, np.pi / 180
 # Positions of hull points computed per block.
 _BLOCK = 1 << 20
 
@@ -32,12 +34,19 @@ class Shape:
         Corners of the convex hull, or all points if they are on a line.
     area : float
         Area of the triangles.
+    direction : complex
+        Unit vector along a side of the shape's box: along most of the outline if the shape is straight, otherwise that
+        of the smallest box. It is rotated by at most 45° from the x-axis.
+    straight : bool
+        Whether most of the outline lies along two perpendicular directions. Such a shape is turned by right angles only.
     """
 
     tails: ComplexArray
     heads: ComplexArray
     hull: ComplexArray
     area: float
+    direction: complex
+    straight: bool
 
     def extent(self, direction: complex) -> tuple[float, float]:
         """Width and height of the shape's box with a side along a unit vector."""
@@ -69,10 +78,13 @@ def make_shape(uv: FloatArray, F: IntArray) -> Shape:
         first, second = np.concatenate([first, tail, head]), np.concatenate([second, head, tail])
     corners = z[F]
     across = ((corners[:, 1] - corners[:, 0]).conj() * (corners[:, 2] - corners[:, 0])).imag
-    return Shape(z[first], z[second], _hull(z[np.unique(first)]), float(np.abs(across).sum() / 2))
+    tails, heads, hull = z[first], z[second], convex_hull(z[np.unique(first)])
+    along = _find_straight_direction(heads - tails)
+    direction = find_smallest_box(hull) if along is None else along
+    return Shape(tails, heads, hull, float(np.abs(across).sum() / 2), direction, along is not None)
 
 
-def _hull(points: ComplexArray) -> ComplexArray:
+def convex_hull(points: ComplexArray) -> ComplexArray:
     """Corners of the convex hull; all points if they are on a line."""
     try:
         return points[ConvexHull(to_points(points)).vertices]
@@ -80,13 +92,35 @@ def _hull(points: ComplexArray) -> ComplexArray:
         return points
 
 
-def find_smallest_box(shape: Shape) -> complex:
-    """Unit vector along a side of the box of smallest area, rotated by at most 45° from the x-axis."""
-    along = _side_directions(shape.hull)
+def _find_straight_direction(sides: ComplexArray) -> complex | None:
+    """Unit vector along which, or across which, most of some sides lie; None if there is no such direction."""
+    length = np.abs(sides)
+    total = length.sum()
+    # The fourth power is equal for directions that differ by right angles.
+    angle = np.angle(sides[length > 0] ** 4) / 4
+    length = length[length > 0]
+    order = np.argsort(angle, kind="stable")
+    angle = np.concatenate([angle[order], angle[order] + np.pi / 2])
+    length = np.concatenate([length[order], length[order]])
+    below = np.concatenate([[0.0], np.cumsum(length)])
+    last = np.searchsorted(angle, angle[: len(order)] + _SKEW, side="right")
+    share = below[last] - below[: len(order)]
+    if not order.size or share.max() < _STRAIGHT * total:
+        return None
+    best = int(np.argmax(share))
+    # Long sides count most, because short ones are less accurate.
+    some = slice(best, last[best])
+    mean = float(np.average(angle[some], weights=length[some] ** 2))
+    return _turn_to_axis(np.exp(1j * np.array([mean])))[0]
+
+
+def find_smallest_box(hull: ComplexArray) -> complex:
+    """Unit vector along a side of the box of smallest area around a convex hull (h,), at most 45° from the x-axis."""
+    along = _side_directions(hull)
     boxes = [
         np.ptp(seen.real, axis=1) * np.ptp(seen.imag, axis=1)
-        for some in np.array_split(along, 1 + along.size * shape.hull.size // _BLOCK)
-        for seen in (shape.hull[None, :] * some.conj()[:, None],)
+        for some in np.array_split(along, 1 + along.size * hull.size // _BLOCK)
+        for seen in (hull[None, :] * some.conj()[:, None],)
     ]
     return _least_rotated(along, np.concatenate(boxes))
 
@@ -94,9 +128,13 @@ def find_smallest_box(shape: Shape) -> complex:
 def _side_directions(hull: ComplexArray) -> ComplexArray:
     """Directions of the hull's sides as unit vectors, rotated by multiples of 90° to at most 45° from the x-axis."""
     sides = np.roll(hull, -1) - hull
-    along = np.concatenate([[1 + 0j], sides[sides != 0] / np.abs(sides[sides != 0])])
-    along = along * np.array([1, -1j, -1, 1j])[np.rint(np.angle(along) / (np.pi / 2)).astype(np.int64) % 4]
-    return np.asarray(along)
+    return _turn_to_axis(np.concatenate([[1 + 0j], sides[sides != 0] / np.abs(sides[sides != 0])]))
+
+
+def _turn_to_axis(along: ComplexArray) -> ComplexArray:
+    """Rotate unit vectors by multiples of 90° to at most 45° from the x-axis."""
+    turn = np.array([1, -1j, -1, 1j])[np.rint(np.angle(along) / (np.pi / 2)).astype(np.int64) % 4]
+    return np.asarray(along * turn)
 
 
 def _least_rotated(along: ComplexArray, size: FloatArray) -> complex:

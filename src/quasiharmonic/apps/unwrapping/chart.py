@@ -1,0 +1,59 @@
+"""A chart: a part of a surface with a bijective map into the plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A part of a surface with a bijective map into the plane.
+
+    Attributes
+    ----------
+    triangles : (k,) int64
+        Rows of the mesh's triangles, ascending.
+    F : (k, 3) int64
+        The same triangles, by the chart's own vertices.
+    vertices : (m,) int64
+        Vertices of the mesh. A vertex on a cut can occur several times.
+    uv : (m, 2) float64
+        Positions in the surface's unit of length; the chart has the area of its part of the surface.
+    stretch : (k,) float64
+        The larger of σ₁ and 1/σ₂ of each triangle.
+    misses : float
+        How much the chart exceeds the bound on stretch; 0 if all charts together keep it. It is the larger of two
+        differences: between the 99 % quantile by area and ``max_stretch``, and between the largest stretch and 3.
+    """
+
+    triangles: IntArray
+    F: IntArray
+    vertices: IntArray
+    uv: FloatArray
+    stretch: FloatArray
+    misses: float
+
+    @property
+    def isometric(self) -> bool:
+        """Whether the chart has no stretch."""
+        return bool((self.stretch == 1).all())
+
+    def open(self, V: FloatArray, cost: FloatArray) -> WorkingChart:
+        """Return the chart for further cuts, given positions (n, 3) and costs (f, 3) of the whole mesh."""
+        rows = self.triangles
+        working = WorkingChart(rows, self.vertices, V[self.vertices], self.F, cost[rows])
+        working.uv, working.stretch = np.ldexp(self.uv, -working.piece.exponent), self.stretch
+        return working
+
+    def part(self, working: WorkingChart, bound: float) -> Chart:
+        """Return a part of the chart, which was cut off with its map."""
+        assert working.uv is not None
+        stretch = self.stretch[np.searchsorted(self.triangles, working.triangles)]
+        uv = np.ldexp(working.uv, working.piece.exponent)
+        missed = self.misses if (stretch > bound).any() else 0.0
+        return Chart(working.triangles, working.F, working.vertices, uv, stretch, missed)

@@ -1,0 +1,63 @@
+"""Charts of the developable pieces of a surface: unrolled, and joined like a paper model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.hinges import find_hinges
+from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
+from quasiharmonic.apps.unwrapping.pieces import find_pieces
+from quasiharmonic.geometry.mesh.fans import renumber
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
+
+# By which fraction the box of joined pieces may exceed their boxes together.
+_LOSS = 0.02
+
+
+def develop_charts(
+    V: FloatArray, F: IntArray, cost: FloatArray, undivided: BoolArray, check_wanted: Callable[[], object]
+) -> tuple[BoolArray, list[Chart], BoolArray]:
+    """Unroll the developable pieces of a surface, and join them to charts without stretch.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+    F : (f, 3) int64
+    cost : (f, 3) float64
+        Factor on the cost of cutting each side of each triangle.
+    undivided : (f, 3) bool
+        Sides across which pieces are joined unless they overlap.
+    check_wanted : callable
+        Called now and then; may raise an exception.
+
+    Returns
+    -------
+    developed : (f,) bool
+        The triangles of these charts.
+    charts : list of Chart
+        By rows of ``F``.
+    flat : (f, 3) bool
+        Sides inside flat faces.
+    """
+    hinges = find_hinges(V, F)
+    pieces = find_pieces(V, F, hinges, np.zeros(hinges.one.size, dtype=bool), cost)
+    flat = hinges.mark_sides(hinges.flat, len(F))
+    if not pieces.count:
+        return pieces.label >= 0, [], flat
+    corners = V[F]
+    area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
+    model = PaperModel(F, hinges, pieces, area / 2, _LOSS)
+    weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other]) / 2
+    together = undivided.ravel()[hinges.one] | undivided.ravel()[hinges.other]
+    model.join(np.ones(weight.size, dtype=bool), weight, together, check_wanted)
+    order = np.argsort(pieces.label, kind="stable")
+    order = order[pieces.label[order] >= 0]
+    charts = []
+    for rows in np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1):
+        own, corner = renumber(model.split(rows), F[rows])
+        uv = to_points(pieces.place[rows].ravel()[corner])
+        charts.append(Chart(rows, own, F[rows].ravel()[corner], uv, np.ones(rows.size), 0.0))
+    return pieces.label >= 0, charts, flat

@@ -1,0 +1,89 @@
+"""Hinges: interior edges of a surface, where two triangles can be joined in the plane as in a paper model.
+
+A side is an edge of one triangle. Side ``3 t + k`` runs from corner ``k`` of triangle ``t`` to the next corner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+
+# Two triangles lie in one plane if no corner of one is farther from the plane of the other than this, relative to the
+# diagonal of the model's box. Files with six decimal digits store flat faces with such errors.
+FLAT = 2e-6
+# No two triangles with a larger angle between them, in radians, count as flat, however small they are.
+_FLAT_ANGLE = np.pi / 180
+
+
+@dataclass(frozen=True, eq=False)
+class Hinges:
+    """The interior edges (e,) of a surface.
+
+    Attributes
+    ----------
+    one, other : (e,) int64
+        Their two sides.
+    angle : (e,) float64
+        Angle between the normals of the two triangles in radians; negative where the surface is concave.
+    length : (e,) float64
+    flat : (e,) bool
+        Whether both triangles lie in one plane.
+    """
+
+    one: IntArray
+    other: IntArray
+    angle: FloatArray
+    length: FloatArray
+    flat: BoolArray
+
+    @property
+    def first(self) -> IntArray:
+        """The triangles (e,) of the sides ``one``."""
+        return self.one // 3
+
+    @property
+    def second(self) -> IntArray:
+        """The triangles (e,) of the sides ``other``."""
+        return self.other // 3
+
+    def mark_sides(self, chosen: BoolArray, count: int) -> BoolArray:
+        """Return a mask (count, 3) of the sides of chosen hinges (e,), given the number of triangles."""
+        marked = np.zeros(3 * count, dtype=np.bool_)
+        marked[self.one[chosen]] = marked[self.other[chosen]] = True
+        return marked.reshape(-1, 3)
+
+
+def find_pairs(F: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the two sides of each interior edge of a surface (f, 3), the smaller first, in order of the first ones."""
+    key = edge_keys(F.ravel(), F[:, (1, 2, 0)].ravel(), int(F.max(initial=-1)) + 1)
+    order = np.argsort(key, kind="stable")
+    at = np.flatnonzero(np.diff(key[order]) == 0)
+    pairs = np.stack([order[at], order[at + 1]], axis=1)
+    one, other = pairs[np.argsort(pairs[:, 0])].T
+    return one, other
+
+
+def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
+    """Return the hinges of a surface with positions (n, 3) and triangles (f, 3) that are not degenerate."""
+    one, other = find_pairs(F)
+    size = float(np.linalg.norm(np.ptp(V, axis=0)))
+    P = V[F] / size
+    normal = np.cross(P[:, 1] - P[:, 0], P[:, 2] - P[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]
+    flat_P = P.reshape(-1, 3)
+    ahead = np.roll(np.arange(F.size).reshape(-1, 3), -1, axis=1).ravel()
+    apex = np.roll(np.arange(F.size).reshape(-1, 3), -2, axis=1).ravel()
+    start = flat_P[one]
+    along = flat_P[ahead[one]] - start
+    length = np.linalg.norm(along, axis=1)
+    a, b = normal[one // 3], normal[other // 3]
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    angle = np.arctan2(sine, (a * b).sum(axis=1))
+    above = ((flat_P[apex[other]] - start) * a).sum(axis=1)
+    height = np.maximum(np.abs(above), np.abs(((flat_P[apex[one]] - start) * b).sum(axis=1)))
+    flat = (height <= FLAT) & (angle <= _FLAT_ANGLE)
+    return Hinges(one, other, np.where(above > 0, -angle, angle), length * size, flat)

@@ -1,0 +1,179 @@
+"""Join developable pieces across creases, like the parts of a paper model, while the texture is used as well as before.
+
+Two pieces are joined if their union does not overlap itself, is not too long for the texture, and its box is hardly
+larger than the boxes of both. Longest edges come first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from heapq import heapify, heappop, heappush
+
+import numpy as np
+
+from quasiharmonic.apps.atlas.packing.shapes import convex_hull, find_smallest_box
+from quasiharmonic.apps.unwrapping.hinges import Hinges
+from quasiharmonic.apps.unwrapping.pieces import Pieces
+from quasiharmonic.geometry.exact.loops import check_loops
+from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_points
+
+# Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
+_SAME = 1e-3
+# Share of the texture that charts are expected to cover, and the longest union in sides of this texture.
+_EXPECTED, _LONGEST = 0.7, 0.8
+# Boundaries that are closer than this multiple of the root of the area count as touching.
+_GAP = 2.0**-20
+# Edges between two pieces that are compared, longest first.
+_TRIES = 64
+
+
+class _Chart:
+    """Triangles (k,) that are laid out together, the convex hull of their corners, and the area of its smallest box."""
+
+    def __init__(self, triangles: IntArray, place: ComplexArray) -> None:
+        self.triangles = triangles
+        self.hull = convex_hull(place)
+        seen = self.hull * find_smallest_box(self.hull).conjugate()
+        self.width, self.height = float(np.ptp(seen.real)), float(np.ptp(seen.imag))
+
+    @property
+    def box(self) -> float:
+        return self.width * self.height
+
+    @property
+    def longest(self) -> float:
+        return max(self.width, self.height)
+
+
+class PaperModel:
+    """Pieces in the plane, some of which are joined.
+
+    Parameters
+    ----------
+    F : (f, 3) int64
+    hinges : Hinges
+    pieces : Pieces
+        Changed: joined pieces get one label and one frame.
+    area : float
+        Area of the whole surface.
+    loss : float
+        By which fraction the box of a union may be larger than the boxes of its parts.
+    """
+
+    def __init__(self, F: IntArray, hinges: Hinges, pieces: Pieces, area: float, loss: float) -> None:
+        self._F, self._hinges, self._pieces, self._loss = F, hinges, pieces, loss
+        self._joined_sides = hinges.mark_sides(pieces.glued, len(F)).ravel()
+        self._side = np.sqrt(area / _EXPECTED)
+        self._unit = _GAP * np.sqrt(area)
+        order = np.argsort(pieces.label, kind="stable")
+        order = order[pieces.label[order] >= 0]
+        parts = np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1) if order.size else []
+        self._charts = {k: _Chart(rows, pieces.place[rows].ravel()) for k, rows in enumerate(parts)}
+        # Hinges between two charts, and how often each chart has changed.
+        self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
+        self._version = dict.fromkeys(self._charts, 0)
+
+    def join(self, may_join: BoolArray, weight: FloatArray, undivided: BoolArray, check: Callable[[], object]) -> None:
+        """Join charts at hinges (e,) where that is permitted, largest sum of weights first.
+
+        At ``undivided`` hinges (e,) only overlaps matter. ``check`` is called before each attempt and may raise an
+        exception.
+        """
+        label, hinges = self._pieces.label, self._hinges
+        one, other = label[hinges.first], label[hinges.second]
+        between = np.flatnonzero(may_join & (one >= 0) & (other >= 0) & (one != other))
+        low, high = np.minimum(one, other)[between], np.maximum(one, other)[between]
+        order = np.lexsort((high, low))
+        starts = np.flatnonzero(np.diff(low[order] * len(self._charts) + high[order], prepend=-1))
+        for group in np.split(order, starts[1:]) if order.size else []:
+            a, b = int(low[group[0]]), int(high[group[0]])
+            self._contacts[a][b] = self._contacts[b][a] = between[group]
+        queue = [self._entry(a, b, weight) for a in self._contacts for b in self._contacts[a] if a < b]
+        heapify(queue)
+        while queue:
+            check()
+            _, a, b, *versions = heappop(queue)
+            if versions != [self._version.get(a), self._version.get(b)]:
+                continue
+            if self._try(a, b, weight, bool(undivided[self._contacts[a][b]].any())):
+                for c in self._contacts[a]:
+                    heappush(queue, self._entry(min(a, c), max(a, c), weight))
+
+    def _entry(self, a: int, b: int, weight: FloatArray) -> tuple[float, int, int, int, int]:
+        return (-float(weight[self._contacts[a][b]].sum()), a, b, self._version[a], self._version[b])
+
+    def _try(self, a: int, b: int, weight: FloatArray, forced: bool) -> bool:
+        """Move chart ``b`` to chart ``a`` and join them, if their union is good."""
+        motion = self._find_motion(a, b, weight)
+        one, other = self._charts[a], self._charts[b]
+        place = self._pieces.place
+        moved = motion[0] * place[other.triangles] + motion[1]
+        union = _Chart(
+            np.concatenate([one.triangles, other.triangles]),
+            np.concatenate([one.hull, motion[0] * other.hull + motion[1]]),
+        )
+        if not forced:
+            if union.box > (1 + self._loss) * (one.box + other.box):
+                return False
+            if union.longest > max(_LONGEST * self._side, one.longest, other.longest):
+                return False
+        before = place[other.triangles]
+        place[other.triangles] = moved
+        contact = self._contacts[a][b]
+        glued = contact[self._meet(contact)]
+        glued_sides = np.concatenate([self._hinges.one[glued], self._hinges.other[glued]])
+        self._joined_sides[glued_sides] = True
+        if not self._is_simple(union.triangles):
+            place[other.triangles] = before
+            self._joined_sides[glued_sides] = False
+            return False
+        self._pieces.glued[glued] = True
+        self._pieces.label[other.triangles] = a
+        self._charts[a] = union
+        self._version[a] += 1
+        del self._charts[b], self._version[b]
+        mine, theirs = self._contacts[a], self._contacts.pop(b)
+        del mine[b], theirs[a]
+        for c, more in theirs.items():
+            del self._contacts[c][b]
+            mine[c] = np.concatenate([mine[c], more]) if c in mine else more
+            self._contacts[c][a] = mine[c]
+        return True
+
+    def _find_motion(self, a: int, b: int, weight: FloatArray) -> tuple[complex, complex]:
+        """Rotation and shift of chart ``b`` at which most of the common edges, by weight, meet."""
+        hinges, contact = self._hinges, self._contacts[a][b]
+        contact = contact[np.argsort(-weight[contact], kind="stable")[:_TRIES]]
+        z, ahead = self._pieces.place.ravel(), np.roll(self._pieces.place, -1, axis=1).ravel()
+        swapped = self._pieces.label[hinges.first[contact]] != a
+        mine = np.where(swapped, hinges.other[contact], hinges.one[contact])
+        theirs = np.where(swapped, hinges.one[contact], hinges.other[contact])
+        turn = (ahead[mine] - z[mine]) / (z[theirs] - ahead[theirs])
+        turn /= np.abs(turn)
+        shift = z[mine] - turn * ahead[theirs]
+        moved = turn[:, None] * z[theirs] + shift[:, None], turn[:, None] * ahead[theirs] + shift[:, None]
+        apart = np.maximum(np.abs(moved[0] - ahead[mine]), np.abs(moved[1] - z[mine]))
+        met = (apart <= _SAME * hinges.length[contact]) @ weight[contact]
+        best = int(np.argmax(met))
+        return complex(turn[best]), complex(shift[best])
+
+    def _meet(self, contact: IntArray) -> BoolArray:
+        """Return which hinges have both sides at one place."""
+        z, ahead = self._pieces.place.ravel(), np.roll(self._pieces.place, -1, axis=1).ravel()
+        one, other = self._hinges.one[contact], self._hinges.other[contact]
+        apart = np.maximum(np.abs(z[one] - ahead[other]), np.abs(ahead[one] - z[other]))
+        same: BoolArray = apart <= _SAME * self._hinges.length[contact]
+        return same
+
+    def _is_simple(self, rows: IntArray) -> bool:
+        """Whether some triangles, joined at the glued hinges, have boundaries that stay apart."""
+        own = self.split(rows)
+        uv = np.empty((int(own.max()) + 1, 2))
+        uv[own] = to_points(self._pieces.place[rows].ravel()).reshape(-1, 3, 2)
+        return not check_loops(boundary_loops(own, len(uv)), np.rint(uv / self._unit) * self._unit)[1]
+
+    def split(self, rows: IntArray) -> IntArray:
+        """Return some triangles (k, 3) by vertices of their own, joined at the glued hinges only."""
+        return fans(self._F[rows], ~self._joined_sides.reshape(-1, 3)[rows])[0]

@@ -1,0 +1,263 @@
+"""Developable pieces of a surface: flat faces, prisms, tubes, cones and fillets, unrolled without stretch.
+
+A surface is divided at its creases. A part without curvature inside is a piece. Parts with curvature are divided at
+smaller angles, down to a few degrees; there, only large and compact parts are pieces. What is left is curved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from quasiharmonic.apps.unwrapping.flat_parts import covers_once
+from quasiharmonic.apps.unwrapping.hinges import Hinges
+from quasiharmonic.apps.unwrapping.unrolling import lay_along, meet, spanning_links
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
+
+#: Edges with a larger angle between the normals are creases.
+CREASE = np.pi / 6
+# Smaller angles at which curved parts are divided.
+_ANGLES = np.deg2rad([20.0, 13.0, 9.0, 6.0, 4.0])
+# There, a piece has at least this share of the area, and its squared perimeter is at most this multiple of its own area.
+_LEAST_SHARE, _LONGEST = 0.05, 40.0
+# Between creases, a piece with at least this share of the area is kept in any case. Smaller ones are kept unless half of
+# their corners belong to many pieces, as on a rough scan.
+_LARGE_SHARE, _ROUGH, _MANY = 0.01, 0.5, 5
+# Largest angle defect of a vertex of a developable piece, and of all its vertices together, in radians.
+_DEFECT, _ALL_DEFECTS = 1e-3, 0.1
+# A piece may have this number of vertices with larger defects, such as the apex of a cone. They are cut open.
+_APEXES = 2
+# Factor on the cost of cutting a flat face.
+_FLAT_COST = 1e3
+# Largest stretch of an unrolled piece.
+_STRETCH = 1.001
+# Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
+_SAME = 1e-3
+
+
+@dataclass(eq=False)
+class Pieces:
+    """Developable pieces of a surface.
+
+    Attributes
+    ----------
+    label : (f,) int64
+        Piece of each triangle, from 0; -1 for curved parts.
+    place : (f, 3) complex128
+        Position of each corner in the plane, isometric; each piece has its own frame. 0 for curved parts.
+    glued : (e,) bool
+        Hinges at which two triangles of one piece are joined.
+    """
+
+    label: IntArray
+    place: ComplexArray
+    glued: BoolArray
+
+    @property
+    def count(self) -> int:
+        """Number of pieces."""
+        return int(self.label.max(initial=-1)) + 1
+
+
+class _Parts:
+    """Parts of a surface (f, 3) whose triangles are connected by joined hinges (e,)."""
+
+    def __init__(self, F: IntArray, hinges: Hinges, joined: BoolArray, angles: FloatArray, area: FloatArray) -> None:
+        self.joined = joined
+        open_sides = ~hinges.mark_sides(joined, len(F))
+        self.split, self.component = fans(F, open_sides)
+        self.count = int(self.component.max(initial=-1)) + 1
+        number = int(self.split.max(initial=-1)) + 1
+        self.area = np.bincount(self.component, area, self.count)
+        part = np.zeros(number, dtype=np.int64)
+        part[self.split] = self.component[:, None]
+        rim = mark(number, self.split[open_sides])
+        rim[np.roll(self.split, -1, axis=1)[open_sides]] = True
+        total = np.bincount(self.split.ravel(), angles.ravel(), number)
+        defect = np.where(rim, 0.0, np.abs(2 * np.pi - total))
+        self.apexes = np.flatnonzero(defect > _DEFECT)
+        few = np.bincount(part[self.apexes], minlength=self.count) <= _APEXES
+        curved = np.bincount(part, np.where(defect > _DEFECT, 0.0, defect), self.count) > _ALL_DEFECTS
+        self.developable = mark(self.count, part[rim]) & few & ~curved
+        # The number of parts around a vertex, at each vertex of a part's rim.
+        at = np.zeros(number, dtype=np.int64)
+        at[self.split] = F
+        around = np.bincount(at)[at]
+        corner = rim & (around >= 3)
+        rough = np.bincount(part[corner], around[corner] >= _MANY, self.count)
+        self.rough = rough > _ROUGH * np.bincount(part[corner], minlength=self.count)
+
+    def find_cut(self, hinges: Hinges, k: int, here: IntArray, cost: FloatArray) -> IntArray:
+        """Return which of the hinges ``here`` of part ``k`` to cut so that it becomes a disk without apex inside."""
+        rows = np.flatnonzero(self.component == k)
+        names, own = np.unique(self.split[rows], return_inverse=True)
+        loops = boundary_loops(own.reshape(-1, 3), len(names))
+        terminal = np.full(len(names), -1)
+        for number, loop in enumerate(loops):
+            terminal[loop] = number
+        side = hinges.one[here]
+        ends = np.stack([self.split.ravel()[side], np.roll(self.split, -1, axis=1).ravel()[side]], axis=1)
+        dear = hinges.length[here] * (cost.ravel()[side] + cost.ravel()[hinges.other[here]])
+        # A cut along an edge inside a flat face would end there.
+        dear[hinges.flat[here]] *= _FLAT_COST
+        apexes = np.searchsorted(names, np.intersect1d(self.apexes, names))
+        return _find_cut(np.searchsorted(names, ends), dear, terminal, apexes)
+
+
+def _drop_scattered(hinges: Hinges, parts: _Parts, chosen: BoolArray, rim: FloatArray) -> BoolArray:
+    """Return the chosen parts (c,) without the small ones that mostly border on parts that are not chosen."""
+    one, other = parts.component[hinges.first], parts.component[hinges.second]
+    apart = one != other
+    one, other, length = one[apart], other[apart], hinges.length[apart]
+    large = parts.area >= _LARGE_SHARE
+    single = np.bincount(parts.component, minlength=parts.count) == 1
+    while True:
+        firm = chosen & ~single
+        shared = np.bincount(one, length * ~firm[other], parts.count)
+        shared += np.bincount(other, length * ~firm[one], parts.count)
+        kept = chosen & (large | (shared <= rim / 2))
+        if np.array_equal(kept, chosen):
+            return kept
+        chosen = kept
+
+
+def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, cost: FloatArray) -> Pieces:
+    """Find developable pieces and unroll them.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+    F : (f, 3) int64
+    hinges : Hinges
+    apart : (e,) bool
+        Hinges that separate pieces.
+    cost : (f, 3) float64
+        Factor on the cost of cutting each side, for the cuts of tubes.
+    """
+    shapes = rest_shapes(V, F)
+    area = shapes.m / shapes.m.sum()
+    angles = np.stack([np.abs(np.angle(-shapes.sides[k - 1].conj() * shapes.sides[k])) for k in range(3)], axis=1)
+    doubled = np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
+    length = np.linalg.norm(V[F] - V[np.roll(F, -1, axis=1)], axis=2)
+    found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
+    for angle in (CREASE, *_ANGLES):
+        rest = found.label < 0
+        within = ~apart & rest[hinges.first] & rest[hinges.second]
+        joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat)
+        parts = _Parts(F, hinges, joined, angles, area)
+        chosen = parts.developable & mark(parts.count, parts.component[rest])
+        outline = np.where(hinges.mark_sides(joined, len(F)), 0.0, length)
+        rim: FloatArray = np.bincount(parts.component, outline.sum(axis=1), parts.count).astype(np.float64)
+        if angle == CREASE:
+            chosen &= ~parts.rough | (parts.area >= _LARGE_SHARE)
+            chosen = _drop_scattered(hinges, parts, chosen, rim)
+        else:
+            chosen &= (parts.area >= _LEAST_SHARE) & (rim**2 <= _LONGEST * parts.area * doubled.sum() / 2)
+        if chosen.any():
+            _unroll(V, F, hinges, parts, chosen, cost, found)
+        if (found.label >= 0).all():
+            break
+    return found
+
+
+def _unroll(
+    V: FloatArray, F: IntArray, hinges: Hinges, parts: _Parts, chosen: BoolArray, cost: FloatArray, found: Pieces
+) -> None:
+    """Unroll the chosen parts (c,) and add those that do not overlap themselves to the pieces."""
+    inside = parts.joined & chosen[parts.component[hinges.first]]
+    place = _lay(V, F, hinges, inside)
+    met = meet(place, hinges, inside, _SAME)
+    wrong = mark(parts.count, parts.component[hinges.first[inside & ~met]])
+    cut = np.zeros(inside.size, dtype=bool)
+    for k in np.flatnonzero(wrong).tolist():
+        here = np.flatnonzero(inside & (parts.component[hinges.first] == k))
+        cut[here[parts.find_cut(hinges, k, here, cost)]] = True
+    if cut.any():
+        place = _lay(V, F, hinges, inside & ~cut)
+        # Cuts to holes that need none close again.
+        met = meet(place, hinges, inside, _SAME)
+    split, component = fans(F, ~hinges.mark_sides(met, len(F)))
+    rows = np.flatnonzero(chosen[parts.component])
+    names, own = np.unique(split[rows], return_inverse=True)
+    own = own.reshape(-1, 3)
+    count = np.bincount(own.ravel())
+    z = np.bincount(own.ravel(), place[rows].real.ravel()) + 1j * np.bincount(own.ravel(), place[rows].imag.ravel())
+    z /= count
+    uv = np.stack([z.real, z.imag], axis=1)
+    origin = np.empty(len(names), dtype=np.int64)
+    origin[own] = F[rows]
+    kinds, which = np.unique(component[rows], return_inverse=True)
+    good = covers_once(own, uv, which, np.ones(len(kinds), dtype=bool))
+    # Several fans may belong to one part if unglued hinges divide it; such a part is curved.
+    part = np.empty(len(kinds), dtype=np.int64)
+    part[which] = parts.component[rows]
+    good &= np.bincount(part, minlength=parts.count)[part] == 1
+    good &= np.bincount(which, weights=_is_stretched(V[origin], own, uv), minlength=len(kinds)) == 0
+    accepted = rows[good[which]]
+    found.place[accepted] = z[own][good[which]]
+    numbers = np.cumsum(good) - 1 + found.count
+    found.label[accepted] = numbers[which[good[which]]]
+    glue = met.copy()
+    glue[met] = mark(len(F), accepted)[hinges.first[met]]
+    found.glued |= glue
+
+
+def _is_stretched(V: FloatArray, F: IntArray, uv: FloatArray) -> BoolArray:
+    """Return which triangles (k,) are stretched or inverted by a map that should be isometric."""
+    measured = distortion(V, F, uv)
+    with np.errstate(all="ignore"):
+        high, low = measured.sigma1, measured.sigma2
+        middle = np.median(high)
+        return ~(np.maximum(high / middle, middle / low) <= _STRETCH)
+
+
+def _lay(V: FloatArray, F: IntArray, hinges: Hinges, inside: BoolArray) -> ComplexArray:
+    """Return the positions (f, 3) of triangles that are laid out along some hinges, flat and long ones first."""
+    number = np.flatnonzero(inside)
+    rank = np.empty(number.size)
+    rank[np.lexsort((-hinges.length[number], ~hinges.flat[number]))] = np.arange(1, number.size + 1)
+    linked = np.zeros(inside.size, dtype=bool)
+    linked[number] = spanning_links(hinges.first[number], hinges.second[number], rank, len(F))
+    component = fans(F, ~hinges.mark_sides(linked, len(F)))[1]
+    return lay_along(V, F, hinges.one[linked], hinges.other[linked], component)
+
+
+def _find_cut(ends: IntArray, cost: FloatArray, terminal: IntArray, apexes: IntArray) -> IntArray:
+    """Return the edges that connect all boundary loops and apexes of a part, nearest first; a part of a shortest tree.
+
+    Parameters
+    ----------
+    ends : (e, 2) int64
+        Ends of the interior edges.
+    cost : (e,) float64
+        Cost of cutting each.
+    terminal : (n,) int64
+        Boundary loop of each vertex, from 0; -1 inside.
+    apexes : (k,) int64
+        Vertices inside.
+    """
+    n = len(terminal)
+    goal = terminal.copy()
+    goal[apexes] = terminal.max() + 1 + np.arange(apexes.size)
+    tail, head = ends.astype(np.int32).T
+    graph = csr_array((np.tile(cost, 2), (np.concatenate([tail, head]), np.concatenate([head, tail]))), shape=(n, n))
+    number = {(a, b): k for k, (a, b) in enumerate(np.sort(ends, axis=1).tolist())}
+    reached, path = goal == 0, list[int]()
+    while (waiting := np.flatnonzero((goal >= 0) & ~reached)).size:
+        distance, before, _ = dijkstra(graph, indices=np.flatnonzero(reached), min_only=True, return_predecessors=True)
+        here = int(waiting[np.argmin(distance[waiting])])
+        if not np.isfinite(distance[here]):
+            break
+        reached |= goal == goal[here]
+        while before[here] >= 0:
+            there = int(before[here])
+            path.append(number[min(here, there), max(here, there)])
+            reached[here], here = True, there
+    return np.array(path, dtype=np.int64)
