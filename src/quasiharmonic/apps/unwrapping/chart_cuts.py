@@ -7,6 +7,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
@@ -31,8 +32,6 @@ _MAX_BAND = 30_000
 # Number of boundary positions between which a dividing line is sought, and what a balanced line is worth.
 _SAMPLES = 256
 _BALANCE = 0.2
-#: Triangles on the two sides of an edge with at least this cost factor stay together, such as those of a polygon.
-UNDIVIDED_COST = 1e3
 # A part with a smaller share of the triangles is a mere corner.
 _LEAST_PART = 0.004
 # Cost factor of boundary edges for a dividing line, and what a line costs at least, relative to the boundary's length.

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.unwrapping.chart import Chart
-from quasiharmonic.apps.unwrapping.chart_cuts import UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
 from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
+from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.unfolding import unfold
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
@@ -41,6 +42,7 @@ def find_charts(
     edge_costs: FloatArray | None = None,
     uv_cuts: ArrayLike | None = None,
     uv: FloatArray | None = None,
+    choose: Callable[[list[list[Chart]]], list[Chart]] | None = None,
     seed: int = 0,
     callback: Callable[[str, int, int], object] | None = None,
     jobs: int | None = None,
@@ -70,6 +72,8 @@ def find_charts(
     uv : (f, 3, 2) float64, optional
         Existing texture coordinates of the corners, with ``uv_cuts`` as seams; NaN where there are none. A part of them
         that is bijective, with stretches up to 3, is the initial map of its chart.
+    choose : callable, optional
+        Chooses from several lists of charts of the developable parts, whose number decreases; by default the last one.
     seed : int
         Unused: the search has no random choices.
     callback : callable, optional
@@ -86,7 +90,7 @@ def find_charts(
     cost = np.ones(F.shape) if edge_costs is None else np.asarray(edge_costs, dtype=np.float64)
     given = np.empty((0, 2), dtype=np.int64) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
     if uv_cuts is None:
-        exact, charts, cost = _develop(V, F, cost, max_charts, workers)
+        exact, charts = _develop(V, F, cost, max_charts, choose, workers)
         working, rest = list[WorkingChart](), np.flatnonzero(~exact)
     else:
         exact, charts = _lay_flat(V, F, given)
@@ -103,26 +107,27 @@ def find_charts(
 
 
 def _develop(
-    V: FloatArray, F: IntArray, cost: FloatArray, max_charts: int | None, workers: Workers
-) -> tuple[BoolArray, list[Chart], FloatArray]:
-    """Make charts of the developable parts; return a mask (f,) of their triangles, the charts, and costs (f, 3).
-
-    The costs keep flat faces together.
-    """
+    V: FloatArray,
+    F: IntArray,
+    cost: FloatArray,
+    max_charts: int | None,
+    choose: Callable[[list[list[Chart]]], list[Chart]] | None,
+    workers: Workers,
+) -> tuple[BoolArray, list[Chart]]:
+    """Make charts of the developable parts; return a mask (f,) of their triangles, and the charts."""
     undivided = cost >= UNDIVIDED_COST
     mask, charts = _unfold_small(V, F, undivided)
     rows = np.flatnonzero(~mask)
     if not rows.size:
-        return mask, charts, cost
-    developed, more, flat = develop_charts(V, F[rows], cost[rows], undivided[rows], workers.check_wanted)
-    cost = cost.copy()
-    cost[rows] = np.where(flat, np.maximum(cost[rows], UNDIVIDED_COST), cost[rows])
-    others = rows[~developed]
-    apart = int(fans(F[others])[1].max(initial=-1)) + 1
+        return mask, charts
+    developed, more = develop_charts(
+        V, F[rows], cost[rows], undivided[rows], choose or itemgetter(-1), workers.check_wanted
+    )
+    apart = int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1
     if max_charts is None or len(charts) + len(more) + apart <= max_charts:
         charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]
         mask[rows[developed]] = True
-    return mask, charts, cost
+    return mask, charts
 
 
 def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:

@@ -9,17 +9,23 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.hinges import find_hinges
 from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
-from quasiharmonic.apps.unwrapping.pieces import find_pieces
+from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.geometry.mesh.fans import renumber
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
 
-# By which fraction the box of joined pieces may exceed their boxes together.
-_LOSS = 0.02
+# Pieces are joined in several rounds. In each, unions are at most so long, in sides of the texture, and their boxes may
+# exceed those of their parts by a fraction.
+_ROUNDS = ((0.25, 0.02), (0.45, 0.02), (0.8, 0.02))
 
 
 def develop_charts(
-    V: FloatArray, F: IntArray, cost: FloatArray, undivided: BoolArray, check_wanted: Callable[[], object]
-) -> tuple[BoolArray, list[Chart], BoolArray]:
+    V: FloatArray,
+    F: IntArray,
+    cost: FloatArray,
+    undivided: BoolArray,
+    choose: Callable[[list[list[Chart]]], list[Chart]],
+    check_wanted: Callable[[], object],
+) -> tuple[BoolArray, list[Chart]]:
     """Unroll the developable pieces of a surface, and join them to charts without stretch.
 
     Parameters
@@ -30,6 +36,8 @@ def develop_charts(
         Factor on the cost of cutting each side of each triangle.
     undivided : (f, 3) bool
         Sides across which pieces are joined unless they overlap.
+    choose : callable
+        Chooses from several lists of charts, whose number decreases.
     check_wanted : callable
         Called now and then; may raise an exception.
 
@@ -39,20 +47,26 @@ def develop_charts(
         The triangles of these charts.
     charts : list of Chart
         By rows of ``F``.
-    flat : (f, 3) bool
-        Sides inside flat faces.
     """
     hinges = find_hinges(V, F)
     pieces = find_pieces(V, F, hinges, np.zeros(hinges.one.size, dtype=bool), cost)
-    flat = hinges.mark_sides(hinges.flat, len(F))
     if not pieces.count:
-        return pieces.label >= 0, [], flat
+        return pieces.label >= 0, []
     corners = V[F]
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
-    model = PaperModel(F, hinges, pieces, area / 2, _LOSS)
+    model = PaperModel(F, hinges, pieces, area / 2)
     weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other]) / 2
     together = undivided.ravel()[hinges.one] | undivided.ravel()[hinges.other]
-    model.join(np.ones(weight.size, dtype=bool), weight, together, check_wanted)
+    model.list_contacts(np.ones(weight.size, dtype=bool))
+    found = [_list_charts(F, model, pieces)]
+    for longest, loss in _ROUNDS:
+        model.join(weight, together, longest, loss, check_wanted)
+        found.append(_list_charts(F, model, pieces))
+    return pieces.label >= 0, choose(found)
+
+
+def _list_charts(F: IntArray, model: PaperModel, pieces: Pieces) -> list[Chart]:
+    """Return the joined pieces as charts."""
     order = np.argsort(pieces.label, kind="stable")
     order = order[pieces.label[order] >= 0]
     charts = []
@@ -60,4 +74,4 @@ def develop_charts(
         own, corner = renumber(model.split(rows), F[rows])
         uv = to_points(pieces.place[rows].ravel()[corner])
         charts.append(Chart(rows, own, F[rows].ravel()[corner], uv, np.ones(rows.size), 0.0))
-    return pieces.label >= 0, charts, flat
+    return charts

@@ -12,6 +12,8 @@ import numpy as np
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
+#: Triangles on the two sides of an edge with at least this cost factor stay together, such as those of a polygon.
+UNDIVIDED_COST = 1e3
 # Two triangles lie in one plane if no corner of one is farther from the plane of the other than this, relative to the
 # diagonal of the model's box. Files with six decimal digits store flat faces with such errors.
 FLAT = 2e-6
@@ -87,3 +89,9 @@ def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
     height = np.maximum(np.abs(above), np.abs(((flat_P[apex[one]] - start) * b).sum(axis=1)))
     flat = (height <= FLAT) & (angle <= _FLAT_ANGLE)
     return Hinges(one, other, np.where(above > 0, -angle, angle), length * size, flat)
+
+
+def keep_flat_faces(V: FloatArray, F: IntArray, cost: FloatArray) -> FloatArray:
+    """Return costs (f, 3) of cutting the sides of triangles that keep flat faces together where possible."""
+    hinges = find_hinges(V, F)
+    return np.where(hinges.mark_sides(hinges.flat, len(F)), np.maximum(cost, UNDIVIDED_COST), cost)

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from quasiharmonic.apps.atlas.packing.layout import estimate_use
 from quasiharmonic.apps.atlas.packing.pack import Packing
+from quasiharmonic.apps.atlas.packing.shapes import make_shape
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.rounding import round_positions
@@ -40,6 +42,26 @@ class ChartLayout:
     def F(self) -> IntArray:
         """The triangles (k, 3), reversed in mirrored charts."""
         return np.where(self.mirrored[:, None], self.rows[:, ::-1], self.rows)
+
+
+# More charts are not packed for comparison. A layout that uses this share of the texture is good enough.
+_MOST_COMPARED, _GOOD_USE = 150, 0.83
+
+
+def choose_packed(
+    found: list[list[Chart]], *, size: tuple[int, int], padding: float, tiles: int, rotate: bool, loss: float
+) -> list[Chart]:
+    """Return the last of several lists of charts that uses the texture at most by ``loss`` worse than the best one."""
+    use = [0.0] * len(found)
+    for k in reversed(range(len(found))):
+        if k + 1 < len(found) and len(found[k]) == len(found[k + 1]):
+            use[k] = use[k + 1]
+        elif len(found[k]) <= _MOST_COMPARED:
+            shapes = [make_shape(chart.uv, chart.F) for chart in found[k]]
+            use[k] = estimate_use(shapes, size, padding, tiles, rotate=rotate)
+        if use[k] >= _GOOD_USE - loss:
+            break
+    return found[int(np.flatnonzero(np.array(use) >= max(use) - loss)[-1])]
 
 
 def join_charts(charts: Sequence[Chart], packing: Packing, count: int) -> ChartLayout:

@@ -15,8 +15,9 @@ from quasiharmonic.util.arrays import FloatArray
 _EXPECTED = 0.6
 # Longest chart in sides of the texture at this scale, and longest chart that covers less than a share of its box.
 _LONGEST, _LONGEST_LOOSE, _LOOSE = 0.85, 0.7, 0.6
-# The same for charts without stretch.
-_LONGEST_ISOMETRIC = 1.25
+# The same for charts without stretch. Each part of one must be this much shorter.
+_LONGEST_ISOMETRIC = 1.1
+_SHORTER = 0.85
 
 
 def divide_long_charts(
@@ -66,10 +67,14 @@ def divide_long_charts(
             done.append(chart)
             continue
         working = chart.open(V, cost)
-        if is_undivided(working):
-            done.append(chart)
+        parts = [] if is_undivided(working) else [chart.part(part, bound) for part in divide(working, bound)]
+        if chart.isometric and parts and max(map(_length, parts)) > _SHORTER * _length(chart):
+            # Only flat faces could be cut.
+            parts = []
+        if parts:
+            waiting += parts
         else:
-            waiting += [chart.part(part, bound) for part in divide(working, bound)]
+            done.append(chart)
     return sorted(done, key=lambda chart: int(chart.triangles[0]))
 
 
@@ -79,9 +84,15 @@ def _area(chart: Chart) -> float:
 
 def _is_too_long(chart: Chart, side: float) -> bool:
     """Whether a chart prevents a scale at which the texture has this side."""
-    shape = make_shape(chart.uv, chart.F)
     if chart.isometric:
-        return max(shape.extent(shape.direction)) > _LONGEST_ISOMETRIC * side
+        return _length(chart) > _LONGEST_ISOMETRIC * side
+    shape = make_shape(chart.uv, chart.F)
     width, height = shape.extent(shape.direction)
     loose = shape.area < _LOOSE * width * height
     return max(width, height) > side * (_LONGEST_LOOSE if loose else _LONGEST)
+
+
+def _length(chart: Chart) -> float:
+    """Longer side of a chart's box."""
+    shape = make_shape(chart.uv, chart.F)
+    return max(shape.extent(shape.direction))

@@ -21,8 +21,8 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 
 # Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
 _SAME = 1e-3
-# Share of the texture that charts are expected to cover, and the longest union in sides of this texture.
-_EXPECTED, _LONGEST = 0.7, 0.8
+# Share of the texture that charts are expected to cover.
+_EXPECTED = 0.7
 # Boundaries that are closer than this multiple of the root of the area count as touching.
 _GAP = 2.0**-20
 # Edges between two pieces that are compared, longest first.
@@ -58,12 +58,10 @@ class PaperModel:
         Changed: joined pieces get one label and one frame.
     area : float
         Area of the whole surface.
-    loss : float
-        By which fraction the box of a union may be larger than the boxes of its parts.
     """
 
-    def __init__(self, F: IntArray, hinges: Hinges, pieces: Pieces, area: float, loss: float) -> None:
-        self._F, self._hinges, self._pieces, self._loss = F, hinges, pieces, loss
+    def __init__(self, F: IntArray, hinges: Hinges, pieces: Pieces, area: float) -> None:
+        self._F, self._hinges, self._pieces = F, hinges, pieces
         self._joined_sides = hinges.mark_sides(pieces.glued, len(F)).ravel()
         self._side = np.sqrt(area / _EXPECTED)
         self._unit = _GAP * np.sqrt(area)
@@ -75,12 +73,8 @@ class PaperModel:
         self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
         self._version = dict.fromkeys(self._charts, 0)
 
-    def join(self, may_join: BoolArray, weight: FloatArray, undivided: BoolArray, check: Callable[[], object]) -> None:
-        """Join charts at hinges (e,) where that is permitted, largest sum of weights first.
-
-        At ``undivided`` hinges (e,) only overlaps matter. ``check`` is called before each attempt and may raise an
-        exception.
-        """
+    def list_contacts(self, may_join: BoolArray) -> None:
+        """Find where charts may be joined, given a mask of hinges (e,)."""
         label, hinges = self._pieces.label, self._hinges
         one, other = label[hinges.first], label[hinges.second]
         between = np.flatnonzero(may_join & (one >= 0) & (other >= 0) & (one != other))
@@ -90,6 +84,25 @@ class PaperModel:
         for group in np.split(order, starts[1:]) if order.size else []:
             a, b = int(low[group[0]]), int(high[group[0]])
             self._contacts[a][b] = self._contacts[b][a] = between[group]
+
+    def join(
+        self, weight: FloatArray, undivided: BoolArray, longest: float, loss: float, check: Callable[[], object]
+    ) -> None:
+        """Join charts, largest sum of the hinges' weights (e,) first.
+
+        Parameters
+        ----------
+        weight : (e,) float64
+        undivided : (e,) bool
+            Hinges at which only overlaps matter.
+        longest : float
+            Largest length of a union, in sides of the expected texture.
+        loss : float
+            By which fraction the box of a union may be larger than the boxes of its parts.
+        check : callable
+            Called before each attempt; may raise an exception.
+        """
+        limits = longest * self._side, 1 + loss
         queue = [self._entry(a, b, weight) for a in self._contacts for b in self._contacts[a] if a < b]
         heapify(queue)
         while queue:
@@ -97,14 +110,15 @@ class PaperModel:
             _, a, b, *versions = heappop(queue)
             if versions != [self._version.get(a), self._version.get(b)]:
                 continue
-            if self._try(a, b, weight, bool(undivided[self._contacts[a][b]].any())):
+            forced = bool(undivided[self._contacts[a][b]].any())
+            if self._try(a, b, weight, (np.inf, np.inf) if forced else limits):
                 for c in self._contacts[a]:
                     heappush(queue, self._entry(min(a, c), max(a, c), weight))
 
     def _entry(self, a: int, b: int, weight: FloatArray) -> tuple[float, int, int, int, int]:
         return (-float(weight[self._contacts[a][b]].sum()), a, b, self._version[a], self._version[b])
 
-    def _try(self, a: int, b: int, weight: FloatArray, forced: bool) -> bool:
+    def _try(self, a: int, b: int, weight: FloatArray, limits: tuple[float, float]) -> bool:
         """Move chart ``b`` to chart ``a`` and join them, if their union is good."""
         motion = self._find_motion(a, b, weight)
         one, other = self._charts[a], self._charts[b]
@@ -114,11 +128,9 @@ class PaperModel:
             np.concatenate([one.triangles, other.triangles]),
             np.concatenate([one.hull, motion[0] * other.hull + motion[1]]),
         )
-        if not forced:
-            if union.box > (1 + self._loss) * (one.box + other.box):
-                return False
-            if union.longest > max(_LONGEST * self._side, one.longest, other.longest):
-                return False
+        longest, boxes = limits
+        if union.box > boxes * (one.box + other.box) or union.longest > max(longest, one.longest, other.longest):
+            return False
         before = place[other.triangles]
         place[other.triangles] = moved
         contact = self._contacts[a][b]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from numbers import Real
 
 import numpy as np
@@ -12,7 +13,8 @@ from quasiharmonic.apps.atlas.packing.pack import check_texture, pack_charts
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import MAX_STRETCH, find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
-from quasiharmonic.apps.unwrapping.layout import ChartLayout, find_differing_sides, find_seams, join_charts
+from quasiharmonic.apps.unwrapping.hinges import keep_flat_faces
+from quasiharmonic.apps.unwrapping.layout import ChartLayout, choose_packed, find_differing_sides, find_seams, join_charts
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
@@ -32,6 +34,8 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.progress import reports_progress
 
+# XX
+_LOSS = 0.02
 # Positions beyond this power of two, or all below its reciprocal, are scaled.
 _MAX_EXPONENT = 300
 
@@ -144,6 +148,8 @@ def unwrap(
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)
     kept_uv = None if corner_uv is None else _turn_corners(corner_uv, cleaned)
+    if kept_uv is None:
+        cost = keep_flat_faces(points, cleaned.F, cost)
     charts = find_charts(
         points,
         cleaned.F,
@@ -152,6 +158,7 @@ def unwrap(
         edge_costs=cost,
         uv_cuts=None if kept_uv is None else _find_uv_cuts(kept_uv, cleaned),
         uv=kept_uv,
+        choose=partial(choose_packed, size=size, padding=float(padding), tiles=tiles, rotate=rotate, loss=_LOSS),
         seed=seed,
         callback=report,
         jobs=jobs,

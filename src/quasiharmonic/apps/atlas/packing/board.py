@@ -22,7 +22,7 @@ _SMALLER = 0.8
 
 
 class Bitmaps:
-    """Bitmaps of a shape in several directions.
+    """Bitmaps of a shape in several directions. Of equal bitmaps, only the first is kept.
 
     Attributes
     ----------
@@ -36,8 +36,10 @@ class Bitmaps:
     """
 
     def __init__(self, directions: ComplexArray, cells: list[BoolArray]) -> None:
-        self.directions, self.cells = directions, cells
-        self.runs = list_runs(cells)
+        first = {(bitmap.shape, bitmap.tobytes()): k for k, bitmap in reversed(list(enumerate(cells)))}
+        kept = sorted(first.values())
+        self.directions, self.cells = directions[kept], [cells[k] for k in kept]
+        self.runs = list_runs(self.cells)
         self.side = max(max(bitmap.shape) for bitmap in cells)
         self.count = min(int(bitmap.sum()) for bitmap in cells)
 

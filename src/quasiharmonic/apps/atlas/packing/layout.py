@@ -113,6 +113,16 @@ def find_layout(
     return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
 
 
+def estimate_use(shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool) -> float:
+    """Part of the tiles that shapes cover if they are placed quickly; 0 if they do not fit well."""
+    expected = _expected_scale(shapes, size, padding, tiles)
+    if expected <= least_scale(shapes):
+        return 0.0
+    search = _Search(shapes, size, padding, tiles, expected, rotate=rotate, skewed=False)
+    layout = search.enlarge_coarsely()
+    return 0.0 if layout is None else sum(search.areas) * layout.scale**2 / (tiles * size[0] * size[1])
+
+
 def _may_fit(shapes: Sequence[Shape], size: tuple[int, int], tiles: int, scale: float) -> bool:
     """Whether neither the areas nor a length of shapes exclude that they fit into tiles at a scale."""
     area = sum(shape.area for shape in shapes) * scale * scale
@@ -216,6 +226,7 @@ class _Search:
         rotate: bool,
         bitmaps: int = _BITMAPS,
         given: ComplexArray | None = None,
+        skewed: bool = True,
     ) -> None:
         self._size, self._tiles, self._padding = size, tiles, padding
         few = len(shapes) <= _MANY
@@ -226,12 +237,12 @@ class _Search:
         self._cell = max(size) / self.cells / scale
         radius = _MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
         self._windows = not few
-        self._areas = np.array([shape.area for shape in shapes])
-        self._order = np.argsort(-self._areas, kind="stable")
+        self.areas = np.array([shape.area for shape in shapes])
+        self._order = np.argsort(-self.areas, kind="stable")
         self._few = bitmaps
         large, small = self._order[:bitmaps], self._order[bitmaps:]
         turns = np.exp(0.125j * pi * (np.arange(4) if len(shapes) <= _MOST_DIRECTIONS else np.arange(0, 4, 2)))
-        turns = turns if few else turns[:1]
+        turns = turns if few and skewed else turns[:1]
         self._bitmaps = {}
         # Where the last of several shapes was placed, by the number of cells and the order of these shapes.
         self._spots: dict[tuple[int, ...], tuple[int, Spot] | None] = {}
@@ -256,7 +267,7 @@ class _Search:
                 cells.append(np.rot90(bitmap, quarters))
         return Bitmaps(np.array(directions), cells)
 
-    def enlarge(self) -> tuple[Layout, IntArray] | None:
+    def enlarge(self, trials: int = _TRIALS) -> tuple[Layout, IntArray] | None:
         """Find the smallest board on which few bitmaps fit; the layout on it, and the order of the shapes."""
         low, high = int(_FEWEST_CELLS * self.cells), int(_MORE_CELLS * self.cells)
         best = self.place_in(high)
@@ -267,8 +278,8 @@ class _Search:
             found = self.place_in(middle)
             low, high, best = (middle, high, best) if found is None else (low, middle, found)
         generator, best_order = np.random.default_rng(0), self._order
-        for _ in range(_TRIALS // len(self._areas)):
-            order = np.argsort(-self._areas * np.exp(generator.normal(0, _SPREAD, len(self._areas))), kind="stable")
+        for _ in range(trials // len(self.areas)):
+            order = np.argsort(-self.areas * np.exp(generator.normal(0, _SPREAD, len(self.areas))), kind="stable")
             while (found := self.place_in(high - 1, order)) is not None:
                 high, best, best_order = high - 1, found, order
         return best, best_order
@@ -311,7 +322,7 @@ class _Search:
             spot = open_board().find(bitmaps) if len(boards) < self._tiles else None
             return None if spot is None else (len(boards) - 1, spot)
 
-        n = len(self._areas)
+        n = len(self.areas)
         directions, centres, tiles = np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64)
         placed: tuple[int, ...] = (cells,)
         for i in (self._order[: self._few] if order is None else order).tolist():
