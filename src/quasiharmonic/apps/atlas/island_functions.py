@@ -198,6 +198,8 @@ def flatten(
         and the others keep their centre, direction and area.
     """
     mesh = as_seamed_mesh(mesh)
+    if "weld" in rest:
+        raise ValueError("islands are not welded one by one: omit weld, and weld the mesh first (SeamedMesh.weld)")
     check_bool("start", start)
     check_bool("unit_square", unit_square)
     check_non_negative("gap", gap)
