@@ -261,14 +261,12 @@ def describe_soup(close: IntArray) -> str:
     """Return a sentence on close vertices of a soup of triangles, with a remedy."""
     return (
         f"Most components have one or two triangles, and {count_of('vertex is', 'vertices are', len(close))} within "
-        f"{_CLOSE:g} of the mesh's size from another vertex. Merge these vertices first, for example with "
-        "merge_vertices of trimesh or with Merge by Distance of Blender."
+        f"{_CLOSE:g} of the mesh's size from another vertex. Weld these vertices with weld={_CLOSE:g} "
+        f"(--weld {_CLOSE:g})."
     )
 
 
-def _defects(
-    V: FloatArray, F: IntArray, collapsed: BoolArray, split: IntArray, kept: BoolArray
-) -> dict[str, IntArray]:
+def _defects(V: FloatArray, F: IntArray, collapsed: BoolArray, split: IntArray, kept: BoolArray) -> dict[str, IntArray]:
     """Return the elements of every class of defects.
 
     ``split`` are the fans of the triangles that are not collapsed, ``kept`` (n,) the vertices that are not welded.

@@ -33,8 +33,7 @@ from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
-from quasiharmonic.geometry.mesh.topology import are_collapsed
-from quasiharmonic.geometry.mesh.welding import find_representatives
+from quasiharmonic.geometry.mesh.welding import weld_triangles
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem.result import MapResult, Status, Step
@@ -190,7 +189,8 @@ def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
     began = time.perf_counter()
     _check_combination(checked)
     V, F = vertex_array(V), triangle_rows(F)
-    F, joint = _weld(V, F, checked.weld)
+    check_range("F", F, len(V))
+    F, joint = weld_triangles(V, F, checked.weld)
     weights = None if checked.weights is None else positive_weights(checked.weights, len(F))
     given = None if checked.start is None else _check_start(checked.start, V, F)
     kept = joint == np.arange(len(V))
@@ -218,19 +218,6 @@ def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
     # Only a single part has recorded maps.
     path = [replace(step, uv=step.uv[(np.cumsum(kept) - 1)[joint]]) for step in result.path]
     return replace(result, path=path, seconds=time.perf_counter() - began, V=V)
-
-
-def _weld(V: FloatArray, F: IntArray, weld: bool | float) -> tuple[IntArray, IntArray]:
-    """Return triangles that refer to the representatives of their vertices, and the representative of each vertex."""
-    check_range("F", F, len(V))
-    joint = find_representatives(V, F, weld)
-    collapsed = np.flatnonzero(are_collapsed(joint[F]) & ~are_collapsed(F))
-    if collapsed.size:
-        raise ValueError(
-            f"welding at distance {float(weld):g} merges corners of {names_of('triangle', 'triangles', collapsed)}, "
-            "which then have no area: choose a smaller distance, or remove these triangles (quasiharmonic.clean)"
-        )
-    return joint[F], joint
 
 
 def _weld_pins(joint: IntArray, fixed: IntArray, target: FloatArray) -> tuple[IntArray, FloatArray]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.util.arrays import FloatArray, IntArray, mark, scale_to_unit
+from quasiharmonic.geometry.mesh.topology import are_collapsed
+from quasiharmonic.util.arrays import FloatArray, IntArray, mark, names_of, scale_to_unit
 
 
 def find_representatives(V: FloatArray, F: IntArray, weld: bool | float) -> IntArray:
@@ -41,6 +42,21 @@ def find_representatives(V: FloatArray, F: IntArray, weld: bool | float) -> IntA
         first = distinct[close][np.searchsorted(distinct, first)]
     joint[used] = used[first]
     return joint
+
+
+def weld_triangles(V: FloatArray, F: IntArray, weld: bool | float) -> tuple[IntArray, IntArray]:
+    """Return triangles (f, 3) of the representatives of their vertices, and these (n,); see `find_representatives`.
+
+    ValueError if welding merges corners of a triangle; the message names the triangles.
+    """
+    joint = find_representatives(V, F, weld)
+    collapsed = np.flatnonzero(are_collapsed(joint[F]) & ~are_collapsed(F))
+    if collapsed.size:
+        raise ValueError(
+            f"welding at distance {float(weld):g} merges corners of {names_of('triangle', 'triangles', collapsed)}: "
+            "choose a smaller distance, or remove these triangles"
+        )
+    return joint[F], joint
 
 
 def _find_equal(V: FloatArray) -> IntArray:
