@@ -6,7 +6,6 @@ functions raise a ValueError that names the argument and the first elements that
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Collection, Iterable
 from numbers import Integral, Number, Real
 from os import PathLike, fspath
@@ -402,7 +401,7 @@ def check_bool(name: str, value: Any) -> None:
 
 def check_weld(value: Any) -> None:
     """Raise a ValueError unless the value is a boolean or a finite number of at least zero, a relative distance."""
-    if not isinstance(value, bool | np.bool_ | Real) or not 0 <= cast(float, value) <= sys.float_info.max:
+    if not isinstance(value, bool | np.bool_ | Real) or not 0 <= float(value) < np.inf:
         raise ValueError(
             "weld must be True, False, or a distance relative to the diagonal of the bounding box, a finite number of "
             f"at least 0, not {describe(value)}"
