@@ -261,6 +261,7 @@ def test_flatten_welds_fixed_vertices_and_the_start():
     result = flatten(S, G, weld=1e-6, fixed=[one, far, other], target=target, start=start)
     assert result.certificate.bijective
     assert np.array_equal(result.uv[[one, far, other]], target)
+    assert not flatten(S, G, weld=1e-6, fixed=[one, far], target=target[:2], record_every=1).path
     with pytest.raises(ValueError, match=rf"fixed vertex {other} welded to a fixed vertex with another"):
         flatten(S, G, weld=1e-6, fixed=[one, far, other], target=np.array([[0.0, 0], [1, 1], [0, 0.1]]))
 
@@ -289,11 +290,13 @@ def test_seams_stay_seams_if_a_map_is_welded():
 
 
 def test_cuts_of_a_mesh_without_map_are_not_welded():
-    V, F = bowl()
-    mesh = atlas.SeamedMesh(V, F)
+    S, G = noisy_soup(*bowl())
+    mesh = atlas.SeamedMesh(S, G)
     assert len(mesh.weld(1e-6).islands) == 1
+    cut = mesh.weld(1e-6).cut(mesh.weld(1e-6).F[:, :2])
+    assert cut.weld(1e-6) is cut
     with pytest.raises(ValueError, match="weld it first"):
-        mesh.cut(F[:, :2]).weld(1e-6)
+        atlas.SeamedMesh(S, G, G[::-1]).weld(1e-6)
     for function in (atlas.flatten, atlas.polish):
         with pytest.raises(ValueError, match="weld the mesh first"):
             function(mesh, weld=1e-6)

@@ -228,7 +228,7 @@ class SeamedMesh:
         Returns
         -------
         SeamedMesh
-            Mesh with the same ``V``, ``uv`` and, if it has a map, ``FT``.
+            Mesh with the same ``V``, ``uv`` and, if it has a map, ``FT``. The mesh itself if no vertices are welded.
 
         Raises
         ------
@@ -237,6 +237,8 @@ class SeamedMesh:
         """
         check_weld(weld)
         F = find_representatives(self.V, self.F, weld)[self.F]
+        if np.array_equal(F, self.F):
+            return self
         if self.uv is None and not np.array_equal(self.F, self.FT):
             raise ValueError("the mesh is cut and has no map, so its cuts are unknown after welding: weld it first")
         return SeamedMesh(self.V, F, F if self.uv is None else self.FT, self.uv)

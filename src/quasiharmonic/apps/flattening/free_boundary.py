@@ -132,7 +132,7 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
         callback may raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
     record_every : int
         Keep the map of every ``record_every``-th step in the result's ``path``, before layout. With 0, the default,
-        or with several pieces, no maps are kept.
+        with several pieces, or with fixed vertices if ``weld`` merges vertices, no maps are kept.
     time_limit : float, optional
         Seconds after which the call returns the best map so far with status ``TIME_LIMIT``. It is checked as often as
         the callback is called. The result then depends on the speed of the machine.
@@ -215,9 +215,12 @@ def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
         results.append(_flatten_part(part, given, weights, checked))
     uv = _place(len(V), held, free, results, checked.gap)[joint]
     result = _combine(F, fit_unit_square(uv) if checked.unit_square else uv, held, free, results)
-    # Only a single part has recorded maps.
-    path = [replace(step, uv=step.uv[(np.cumsum(kept) - 1)[joint]]) for step in result.path]
-    return replace(result, path=path, seconds=time.perf_counter() - began, V=V)
+    if not kept.all():
+        # Recorded maps are those of a single part, in its numbering.
+        number = (np.cumsum(kept) - 1)[joint]
+        path = [] if held else [replace(step, uv=step.uv[number]) for step in result.path]
+        result = replace(result, path=path)
+    return replace(result, seconds=time.perf_counter() - began, V=V)
 
 
 def _weld_pins(joint: IntArray, fixed: IntArray, target: FloatArray) -> tuple[IntArray, FloatArray]:
