@@ -261,8 +261,7 @@ def describe_soup(close: IntArray) -> str:
     """Return a sentence on close vertices of a soup of triangles, with a remedy."""
     return (
         f"Most components have one or two triangles, and {count_of('vertex is', 'vertices are', len(close))} within "
-        f"{_CLOSE:g} of the mesh's size from another vertex. Weld these vertices with weld={_CLOSE:g} "
-        f"(--weld {_CLOSE:g})."
+        f"{_CLOSE:g} of the mesh's size from another vertex. Weld these vertices with weld={_CLOSE:g}."
     )
 
 
