@@ -362,9 +362,9 @@ def test_bad_input_is_named(V, F, message):
         clean(V, F)
 
 
-@pytest.mark.parametrize("name", ["outward", "weld"])
-def test_options_are_checked(name):
-    with pytest.raises(ValueError, match=f"{name} must be True or False"):
+@pytest.mark.parametrize(("name", "words"), [("outward", "True or False"), ("weld", "True, False, or a distance")])
+def test_options_are_checked(name, words):
+    with pytest.raises(ValueError, match=f"{name} must be {words}"):
         clean(*cube(), **{name: "no"})
 
 

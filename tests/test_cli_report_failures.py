@@ -64,7 +64,7 @@ class TestReportFailures:
         def interrupt(mesh):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("quasiharmonic.io.cut_at_seams", interrupt)
+        monkeypatch.setattr("quasiharmonic.io.mapped", interrupt)
         assert run("map", star, "-o", tmp_path / "o.obj") == 3
         assert "o.obj is written; interrupted" in capsys.readouterr().err
         assert (tmp_path / "o.obj").exists()

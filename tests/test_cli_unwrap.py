@@ -195,10 +195,10 @@ def test_a_soup_is_reported_with_a_remedy(tmp_path, capsys):
         path.write_text("".join([*lines, *("f {} {} {}\n".format(*row) for row in (own + 1).tolist())]))
         assert run("unwrap", path, "-o", tmp_path / "out.obj", "--resolution", 256, "--json", tmp_path / "r.json") == 0
         # Vertices at the same position are merged.
-        assert ("Merge these vertices" in capsys.readouterr().out) == close
+        assert ("Weld these vertices with --weld 1e-06." in capsys.readouterr().out) == close
         assert bool(json.loads((tmp_path / "r.json").read_text())["close_vertices"]) == close
         run("flatten", path, "-o", tmp_path / "out.obj", "--max-iterations", 1)
-        assert "Merge these vertices" in capsys.readouterr().err
+        assert "Weld these vertices" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -212,7 +212,7 @@ def test_close_vertices_of_a_soup_are_listed_with_a_remedy(exponent):
     times = np.bincount(F.ravel())
     assert soup.close.tolist() == np.flatnonzero(times[F.ravel()] > 1).tolist()
     assert f"{soup.close.size} vertices are within 1e-06" in soup.summary()
-    assert "Merge" in soup.summary()
+    assert "Weld these vertices with weld=1e-06." in soup.summary()
     assert not inspect_mesh(V, F).close.size
 
 

@@ -17,12 +17,14 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.fans import fans, number_fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.welding import find_representatives
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
     as_offsets,
     check_range,
+    check_weld,
     corner_rows,
     count_of,
     edge_names,
@@ -211,6 +213,35 @@ class SeamedMesh:
             uv = np.full((len(origin), 2), np.nan)
             uv[FT] = self.uv[self.FT]
         return SeamedMesh(self.V[origin], FT, FT, uv)
+
+    def weld(self, weld: bool | float) -> SeamedMesh:
+        """Return the mesh with close vertices welded: its triangles refer to their representatives.
+
+        Corners at different positions in the plane stay apart, so seams stay seams.
+
+        Parameters
+        ----------
+        weld : bool or float
+            Whether to weld vertices at equal positions, or a distance relative to the diagonal of the bounding box
+            within which vertices are welded; see `clean`.
+
+        Returns
+        -------
+        SeamedMesh
+            Mesh with the same ``V``, ``uv`` and, if it has a map, ``FT``. The mesh itself if no vertices are welded.
+
+        Raises
+        ------
+        ValueError
+            If ``weld`` is negative or not finite, or the mesh is cut and has no map.
+        """
+        check_weld(weld)
+        F = find_representatives(self.V, self.F, weld)[self.F]
+        if np.array_equal(F, self.F):
+            return self
+        if self.uv is None and not np.array_equal(self.F, self.FT):
+            raise ValueError("the mesh is cut and has no map, so its cuts are unknown after welding: weld it first")
+        return SeamedMesh(self.V, F, F if self.uv is None else self.FT, self.uv)
 
     def cut(self, edges: ArrayLike) -> SeamedMesh:
         """Return the mesh with further edges cut, without positions.

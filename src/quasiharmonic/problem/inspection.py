@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.mesh.fans import fans
 from quasiharmonic.geometry.mesh.reference import flat_triangles
 from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, boundary_edges, edges, find_twins, trace_loops
+from quasiharmonic.geometry.mesh.welding import find_representatives
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_triangles
 from quasiharmonic.util.arrays import (
@@ -19,6 +20,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_integer,
     check_range,
+    check_weld,
     count_of,
     mark,
     repeat_each,
@@ -62,6 +64,8 @@ class MeshReport:
     close : (k,) int64
         If most components have one or two triangles, the vertices that are close to another one; otherwise empty. See
         `find_close_vertices`.
+    welded : (k,) int64
+        Vertices that are welded to an earlier vertex. Then topology and defects are those of the welded mesh.
     """
 
     vertices: int
@@ -74,6 +78,7 @@ class MeshReport:
     defects: dict[str, IntArray]
     coincident: IntArray
     close: IntArray
+    welded: IntArray
 
     def __repr__(self) -> str:
         return f"<MeshReport: {self.summary().partition(chr(10))[0]}>"
@@ -93,6 +98,11 @@ class MeshReport:
         if self.inward:
             inward = count_of("closed component", "closed components", self.inward)
             lines.append(f"{inward} with triangles facing inwards")
+        if self.welded.size:
+            lines.append(
+                f"{count_of('vertex', 'vertices', self.welded.size)} welded to an earlier vertex, "
+                f"first {_first(self.welded)}"
+            )
         if self.coincident.size:
             lines.append(
                 f"{count_of('vertex', 'vertices', self.coincident.size)} at the position of an earlier vertex, "
@@ -112,6 +122,7 @@ class MeshReport:
             "boundary_loops": self.loops,
             "genus": self.genus,
             "inward_components": self.inward,
+            "welded_vertices": self.welded.tolist(),
             "coincident_vertices": self.coincident.tolist(),
             "close_vertices": self.close.tolist(),
             "defects": {name: found.tolist() for name, found in self.defects.items()},
@@ -159,7 +170,7 @@ def boundary_loops(F: ArrayLike | MeshLike, n: int | None = None) -> list[IntArr
 
 
 @accepts_mesh
-def inspect_mesh(V: ArrayLike, F: ArrayLike) -> MeshReport:
+def inspect_mesh(V: ArrayLike, F: ArrayLike, *, weld: bool | float = False) -> MeshReport:
     """Return topology and defects of any triangles; nothing is rejected but malformed arrays.
 
     Parameters
@@ -168,6 +179,9 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike) -> MeshReport:
         Positions.
     F : (f, 3) array of int
         Triangles.
+    weld : bool or float
+        Weld vertices at equal positions first, or within a distance relative to the diagonal of the bounding box; see
+        `clean`. The numbering stays that of the input.
 
     Returns
     -------
@@ -177,6 +191,7 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike) -> MeshReport:
     ------
     ValueError
         If an array has the wrong shape, a position is not finite, an index is out of range, or there are no triangles.
+        Also if ``weld`` is negative or not finite.
 
     Examples
     --------
@@ -187,10 +202,14 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike) -> MeshReport:
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
+    check_weld(weld)
+    joint = find_representatives(V, F, weld)
+    kept = joint == np.arange(len(V))
+    welded, F = np.flatnonzero(~kept), joint[F]
     collapsed = are_collapsed(F)
     surface = F[~collapsed]
     split, part = fans(surface)
-    defects = _defects(V, F, collapsed, split)
+    defects = _defects(V, F, collapsed, split, kept)
     rim = edges(split, surface.size).boundary
     loops = trace_loops(rim)
     closed = np.ones(int(part.max(initial=-1)) + 1, dtype=bool)
@@ -209,8 +228,9 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike) -> MeshReport:
         genus=genus,
         inward=int(np.count_nonzero(inward)),
         defects=defects,
-        coincident=_coincident(V),
-        close=find_close_vertices(V, np.bincount(part)),
+        coincident=np.setdiff1d(_coincident(V), welded),
+        close=np.flatnonzero(kept)[find_close_vertices(V[kept], np.bincount(part))],
+        welded=welded,
     )
 
 
@@ -241,13 +261,15 @@ def describe_soup(close: IntArray) -> str:
     """Return a sentence on close vertices of a soup of triangles, with a remedy."""
     return (
         f"Most components have one or two triangles, and {count_of('vertex is', 'vertices are', len(close))} within "
-        f"{_CLOSE:g} of the mesh's size from another vertex. Merge these vertices first, for example with "
-        "merge_vertices of trimesh or with Merge by Distance of Blender."
+        f"{_CLOSE:g} of the mesh's size from another vertex. Weld these vertices with weld={_CLOSE:g}."
     )
 
 
-def _defects(V: FloatArray, F: IntArray, collapsed: BoolArray, split: IntArray) -> dict[str, IntArray]:
-    """Return the elements of every class of defects; ``split`` are the fans of the triangles that are not collapsed."""
+def _defects(V: FloatArray, F: IntArray, collapsed: BoolArray, split: IntArray, kept: BoolArray) -> dict[str, IntArray]:
+    """Return the elements of every class of defects.
+
+    ``split`` are the fans of the triangles that are not collapsed, ``kept`` (n,) the vertices that are not welded.
+    """
     repeated = np.flatnonzero((find_twins(F) < np.arange(len(F))) & ~collapsed)
     flat = flat_triangles(V, F)
     found = edges(F, len(V))
@@ -259,7 +281,7 @@ def _defects(V: FloatArray, F: IntArray, collapsed: BoolArray, split: IntArray) 
         "edges of three or more triangles": found.nonmanifold,
         "edges with mixed winding": found.inconsistent[found.inconsistent[:, 0] != found.inconsistent[:, 1]],
         "vertices where surfaces touch": _touching(F[~collapsed], split, len(V), found),
-        "vertices without triangle": np.flatnonzero(~used),
+        "vertices without triangle": np.flatnonzero(kept & ~used),
     }
 
 

@@ -399,6 +399,15 @@ def check_bool(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be True or False, not {describe(value)}")
 
 
+def check_weld(value: Any) -> None:
+    """Raise a ValueError unless the value is a boolean or a finite number of at least zero, a relative distance."""
+    if not isinstance(value, bool | np.bool_ | Real) or not 0 <= float(value) < np.inf:
+        raise ValueError(
+            "weld must be True, False, or a distance relative to the diagonal of the bounding box, a finite number of "
+            f"at least 0, not {describe(value)}"
+        )
+
+
 def check_non_negative(name: str, value: Any) -> None:
     """Raise a ValueError unless the value is a finite number of at least zero."""
     if not isinstance(value, Real) or not 0 <= float(value) < np.inf:

@@ -83,6 +83,13 @@ def switch(name: str, value: Any) -> None:
     check_bool(name, value)
 
 
+def welding(name: str, value: Any) -> None:
+    """Check which vertices are welded: a boolean or a relative distance."""
+    from quasiharmonic.util.arrays import check_weld
+
+    check_weld(value)
+
+
 def function(name: str, value: Any) -> None:
     """Check a callback or None."""
     from quasiharmonic.util.arrays import check_callback
@@ -239,6 +246,7 @@ class FlattenOptions(DistanceOptions):
     time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     unit_square: bool = option(False, "scale the map evenly into the unit square", check=switch)
     gap: float = option(0.0, check=tolerance)
+    weld: Any = option(False, check=welding)
 
 
 @dataclass(frozen=True, kw_only=True)

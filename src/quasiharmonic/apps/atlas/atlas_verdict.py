@@ -164,17 +164,25 @@ class AtlasVerdict(Verdict):
         }
 
 
-def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
+def certify(mesh: SeamedMesh | MeshLike, *, weld: bool | float = False) -> AtlasVerdict:
     """Certify a map with seams exactly, island by island.
 
     Parameters
     ----------
     mesh : SeamedMesh, or a mesh or path that stands for one
         Triangles without a position belong to no island and are not certified.
+    weld : bool or float
+        Whether vertices at equal positions count as one where they are at one position in the plane, or a distance
+        relative to the diagonal of the bounding box within which they do; see `SeamedMesh.weld`.
 
     Returns
     -------
     AtlasVerdict
+
+    Raises
+    ------
+    ValueError
+        If ``weld`` is negative or not finite.
 
     Examples
     --------
@@ -183,7 +191,7 @@ def certify(mesh: SeamedMesh | MeshLike) -> AtlasVerdict:
     >>> print(certify(SeamedMesh(V, F, uv=V)).summary())
     1 island: 1 injective, 1 bijective.
     """
-    mesh = as_seamed_mesh(mesh)
+    mesh = as_seamed_mesh(mesh).weld(weld)
     judged = []
     for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
         found = certificate.certify(island.F[:, ::-1] if mirrored else island.F, island.uv)

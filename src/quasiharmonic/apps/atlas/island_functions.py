@@ -83,6 +83,7 @@ def polish(
         If an island is not injective or not a surface; the message names its first triangle.
     """
     mesh = as_seamed_mesh(mesh)
+    _reject_weld(rest)
     check_bool("free", free)
     weights = None if weights is None else positive_weights(weights, len(mesh.F))
     if free and fixed is not None:
@@ -198,6 +199,7 @@ def flatten(
         and the others keep their centre, direction and area.
     """
     mesh = as_seamed_mesh(mesh)
+    _reject_weld(rest)
     check_bool("start", start)
     check_bool("unit_square", unit_square)
     check_non_negative("gap", gap)
@@ -240,6 +242,12 @@ def flatten(
         sizes = np.cumsum([len(places) for places in uv])[:-1]
         uv = np.split(fit_unit_square(np.concatenate(uv)), sizes)
     return replace(mapped, mesh=mesh.with_places(uv))
+
+
+def _reject_weld(rest: dict[str, Any]) -> None:
+    """Raise ValueError for ``weld``, which would close the seams inside islands."""
+    if "weld" in rest:
+        raise ValueError("islands are not welded one by one: omit weld, and weld the mesh first (SeamedMesh.weld)")
 
 
 def _flatten_together(

@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.geometry.mesh.topology import components
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_range
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range
 
 
 class Part(NamedTuple):
@@ -28,15 +28,21 @@ class Part(NamedTuple):
         return [self.vertices[loop] for loop in self.piece.loops]
 
 
-def split_parts(V: FloatArray, F: IntArray) -> list[Part]:
-    """Return the connected surfaces of a mesh, the one with most triangles first; ValueError as `Piece`."""
+def split_parts(V: FloatArray, F: IntArray, kept: BoolArray | None = None) -> list[Part]:
+    """Return the connected surfaces of a mesh, the one with most triangles first; ValueError as `Piece`.
+
+    ``kept`` (n,) are the vertices of the mesh, by default all; triangles use no others.
+    """
     everything = np.arange(len(V)), np.arange(len(F))
     if V.ndim != 2 or F.ndim != 2 or F.shape[1] != 3 or not F.size:
         return [Part(Piece(V, F), *everything)]
     check_range("F", F, len(V))
     label = components(F, len(V))
-    if not label.any() or np.bincount(F.ravel(), minlength=len(V)).min() == 0:
-        # `Piece` reports vertices without triangles together with other errors.
+    used = np.bincount(F.ravel(), minlength=len(V)) > 0
+    # `Piece` reports vertices without triangles together with other errors.
+    if kept is not None and not used[kept].all():
+        return [_make_part(V, F, np.flatnonzero(kept), everything[1])]
+    if not label.any() or (kept is None and not used.all()):
         return [Part(Piece(V, F), *everything)]
     of_triangle = label[F[:, 0]]
     labels, count = np.unique(of_triangle, return_counts=True)

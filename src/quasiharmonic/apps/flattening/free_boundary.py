@@ -33,6 +33,7 @@ from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.geometry.mesh.welding import weld_triangles
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem.result import MapResult, Status, Step
@@ -40,6 +41,7 @@ from quasiharmonic.problem.run import Run, run_within
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
+    check_range,
     map_array,
     names_of,
     triangle_rows,
@@ -65,6 +67,7 @@ class FlattenKeywords(TypedDict, total=False):
     unit_square: bool
     rings: int
     gap: float
+    weld: bool | float
     max_iterations: int
     tol: float
     linear_solver: str
@@ -109,6 +112,11 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
     gap : float
         Minimum space between the bounding boxes of several pieces, in the surface's unit; not negative. The space is
         always at least a twentieth of the longest box side.
+    weld : bool or float
+        Weld vertices at equal positions first, or within a distance relative to the diagonal of the bounding box; see
+        `clean`. ``uv`` has the numbering of the input, and welded vertices have equal positions. The triangles
+        ``F`` of the result, which the certificate covers, refer to the welded vertices. Of several welded vertices,
+        ``start`` of the first one is used.
     max_iterations : int
         Maximum number of Newton steps on each connected piece. The count starts again when an overlap restarts the
         descent, and for distances. With 0 the map is the initial map. With fixed vertices, each of the two attempts
@@ -124,7 +132,7 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
         callback may raise `KeyboardInterrupt`, which ends the descent as Ctrl-C does.
     record_every : int
         Keep the map of every ``record_every``-th step in the result's ``path``, before layout. With 0, the default,
-        or with several pieces, no maps are kept.
+        with several pieces, or with fixed vertices if ``weld`` merges vertices, no maps are kept.
     time_limit : float, optional
         Seconds after which the call returns the best map so far with status ``TIME_LIMIT``. It is checked as often as
         the callback is called. The result then depends on the speed of the machine.
@@ -148,7 +156,8 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
     ------
     ValueError
         If the input is malformed (see `Problem`), a surface is closed or has handles, a rest triangle has no area, or
-        ``start`` is not injective; the message names the elements. Also if the map exceeds the range of doubles.
+        ``start`` is not injective; the message names the elements. Also if welding merges corners of a triangle, or
+        the map exceeds the range of doubles.
     KeyboardInterrupt
         If Ctrl-C comes before a bijective map exists.
     TimeoutError
@@ -180,15 +189,18 @@ def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
     began = time.perf_counter()
     _check_combination(checked)
     V, F = vertex_array(V), triangle_rows(F)
+    check_range("F", F, len(V))
+    F, joint = weld_triangles(V, F, checked.weld)
     weights = None if checked.weights is None else positive_weights(checked.weights, len(F))
     given = None if checked.start is None else _check_start(checked.start, V, F)
-    held, free, results = list[Part](), split_parts(V, F), list[MapResult]()
+    kept = joint == np.arange(len(V))
+    held, free, results = list[Part](), split_parts(V, F, None if kept.all() else kept), list[MapResult]()
     if checked.fixed is not None:
         from quasiharmonic.apps.flattening.pins.part_arrangement import flatten_pinned_parts
         from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, check_pins
 
-        pins = check_pins(checked.fixed, checked.target, len(V))
-        if len(free) == 1:
+        pins = _weld_pins(joint, *check_pins(checked.fixed, checked.target, len(V)))
+        if len(free) == 1 and kept.all():
             search = PinSearch(free[0].piece, *pins, checked, weights)
             search.run(given)
             return replace(search.result(), seconds=time.perf_counter() - began, V=V)
@@ -201,9 +213,27 @@ def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
             # The other pieces still need a position, so they get their initial maps.
             checked = replace(checked, max_iterations=0, callback=None)
         results.append(_flatten_part(part, given, weights, checked))
-    uv = _place(len(V), held, free, results, checked.gap)
+    uv = _place(len(V), held, free, results, checked.gap)[joint]
     result = _combine(F, fit_unit_square(uv) if checked.unit_square else uv, held, free, results)
+    if not kept.all():
+        # Recorded maps are those of a single part, in its numbering.
+        number = (np.cumsum(kept) - 1)[joint]
+        path = [] if held else [replace(step, uv=step.uv[number]) for step in result.path]
+        result = replace(result, path=path)
     return replace(result, seconds=time.perf_counter() - began, V=V)
+
+
+def _weld_pins(joint: IntArray, fixed: IntArray, target: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return fixed vertices and their target positions after welding; ValueError if a vertex gets several targets."""
+    _, first, group = np.unique(joint[fixed], return_index=True, return_inverse=True)
+    differs = (target != target[first[group]]).any(axis=1)
+    if differs.any():
+        raise ValueError(
+            f"{names_of('fixed vertex', 'fixed vertices', fixed[differs])} welded to a fixed vertex with another "
+            "target position: give both the same target, or choose a smaller distance"
+        )
+    first = np.sort(first)
+    return joint[fixed[first]], target[first]
 
 
 def _check_combination(options: FlattenOptions) -> None:

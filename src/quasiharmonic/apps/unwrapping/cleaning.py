@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.apps.unwrapping.exclusion import exclude
 from quasiharmonic.apps.unwrapping.sheets import join_sheets
 from quasiharmonic.apps.unwrapping.widening import widen
-from quasiharmonic.geometry.mesh.topology import boundary_edges, components, edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.topology import are_collapsed, boundary_edges, components, edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.welding import find_representatives
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.inspection import MeshReport, find_close_vertices, inspect_mesh, tabulate_elements
 from quasiharmonic.util.arrays import (
@@ -20,6 +21,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     Scalar,
     check_bool,
+    check_weld,
     count_of,
     triangle_array,
     vertex_array,
@@ -44,7 +46,7 @@ class CleanedMesh:
         Triangles, in the order of the model. A triangle whose orientation is reversed has its last two corners
         exchanged.
     vertices : (n',) int64
-        One vertex of the model for each vertex, ascending.
+        One vertex of the model for each vertex, ascending. ``V`` has the position of its representative.
     triangles : (f',) int64
         The triangle of the model for each row of ``F``, ascending.
     corners : (f', 3) int64
@@ -67,6 +69,8 @@ class CleanedMesh:
         Triangles of the model that were left out, ascending.
     repeated : (k,) bool
         Whether the excluded triangle has the positions of an earlier one. The others are degenerate.
+    collapsed : (k,) int64
+        Degenerate triangles that were excluded because welding merged corners at different positions, ascending.
     substitutes : (k,) int64
         For each excluded triangle the row of ``F`` whose texture coordinates it takes.
     substitute_corners : (k, 3) int64
@@ -78,6 +82,8 @@ class CleanedMesh:
     close : (k,) int64
         Vertices of the model, after merging, that are close to another one if most components have one or two
         triangles; see `MeshReport`.
+    representatives : (n,) int64
+        For each vertex of the model the one with which it was merged, which has the lowest index; otherwise itself.
     """
 
     V: FloatArray
@@ -92,11 +98,13 @@ class CleanedMesh:
     facing: IntArray
     excluded: IntArray
     repeated: BoolArray
+    collapsed: IntArray
     substitutes: IntArray
     substitute_corners: IntArray
     seams: IntArray
     report: MeshReport
     close: IntArray
+    representatives: IntArray
 
     def __repr__(self) -> str:
         return f"<CleanedMesh: {self._size()}, {count_of('triangle', 'triangles', self.excluded.size)} excluded>"
@@ -113,6 +121,7 @@ class CleanedMesh:
         """For each class of changes the indices of its elements in the model, ascending."""
         return {
             "degenerate triangles excluded": self.excluded[~self.repeated],
+            "triangles collapsed by welding": self.collapsed,
             "repeated triangles excluded": self.excluded[self.repeated],
             "thin triangles widened": self.triangles[self.widened],
             "triangles reversed": self.triangles[self.flipped],
@@ -158,7 +167,7 @@ class CleanedMesh:
 
 
 @accepts_mesh
-def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = True) -> CleanedMesh:
+def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool | float = True) -> CleanedMesh:
     """Return the surfaces that any triangles form; every defect is cut open, oriented or listed.
 
     Degenerate and repeated triangles are excluded. Each gets a substitute, so that no triangle of the model lacks
@@ -177,8 +186,11 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
         Triangles.
     outward : bool
         Reverse closed components whose triangles face inwards.
-    weld : bool
-        Join triangles whose vertices have exactly the same positions, as at the seams of a glTF file.
+    weld : bool or float
+        Join triangles whose vertices have exactly the same positions, as at the seams of a glTF file. A number is a
+        distance relative to the diagonal of the bounding box; 0 means equal positions. Each vertex is merged with the
+        vertex of the lowest index within this distance that is not merged itself, and takes its position. Triangles
+        whose corners are merged are degenerate.
 
     Returns
     -------
@@ -188,7 +200,7 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
     ------
     ValueError
         If an array has the wrong shape, a position is not finite, an index is out of range, there are no triangles, or
-        all triangles are degenerate.
+        all triangles are degenerate. Also if ``weld`` is negative or not finite.
 
     Examples
     --------
@@ -202,23 +214,28 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
     V = vertex_array(V)
     F = triangle_array(F, len(V))
     check_bool("outward", outward)
-    check_bool("weld", weld)
+    check_weld(weld)
     report = inspect_mesh(V, F)
     exponent = math.frexp(float(np.abs(V).max()))[1]
-    joint = _merge(V) if weld and report.coincident.size else np.arange(len(V))
+    joint = find_representatives(V, F, weld)
     # In this unit, products neither overflow nor underflow.
     points = np.pad(np.ldexp(V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     points, moved, thin, degenerate, area = widen(points, joint[F], V.shape[1])
+    # Triangles with corners at equal positions are degenerate without welding, too.
+    apart = (V[F] != V[F[:, (1, 2, 0)]]).any(axis=2).all(axis=1)
+    collapsed = np.flatnonzero(are_collapsed(joint[F]) & apart)
     if degenerate.all():
+        merged = f"; welding at distance {weld:g} merges corners of {collapsed.size}, choose a smaller distance"
         raise ValueError(
             f"all {count_of('triangle', 'triangles', len(F))} are degenerate: each uses a vertex twice or has no area"
+            + merged * bool(collapsed.size)
         )
     exclusion = exclude(points, joint[F], degenerate)
     rows = exclusion.triangles
     sheets = join_sheets(points, joint[F[rows]], F[rows], area[rows], thin[rows])
     corners = F[rows]
     number, vertices = _number(sheets.fan, corners)
-    positions, moved = V[vertices], moved[joint[vertices]]
+    positions, moved = V[joint[vertices]], moved[joint[vertices]]
     positions[moved] = np.ldexp(points[joint[vertices[moved]], : V.shape[1]], exponent)
     component, facing = _orientations(points[joint[vertices]], _turn(number, sheets.turned))
     flipped = sheets.turned
@@ -240,23 +257,15 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool = Tru
         facing=facing,
         excluded=exclusion.excluded,
         repeated=exclusion.repeated,
+        collapsed=collapsed,
         substitutes=exclusion.substitutes,
         # Reversing a triangle exchanges its corners 1 and 2.
         substitute_corners=np.where(flipped[exclusion.substitutes, None], -matched % 3, matched),
         seams=_find_edges(joint[corners], corners, sheets.seams),
         report=report,
         close=distinct[find_close_vertices(V[distinct], np.bincount(component))],
+        representatives=joint,
     )
-
-
-def _merge(V: FloatArray) -> IntArray:
-    """Return for each vertex the first one at the same position."""
-    order = np.lexsort(V.T)
-    starts = np.ones(len(V), dtype=bool)
-    starts[1:] = (V[order[1:]] != V[order[:-1]]).any(axis=1)
-    first = np.empty(len(V), dtype=np.int64)
-    first[order] = order[starts][np.cumsum(starts) - 1]
-    return first
 
 
 def _number(fan: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:

@@ -78,19 +78,16 @@ def join_charts(charts: Sequence[Chart], packing: Packing, count: int) -> ChartL
     return ChartLayout(rows, round_positions(layout.F, layout.uv), chart, mirrored)
 
 
-def find_seams(cleaned: CleanedMesh, layout: ChartLayout, V: FloatArray) -> IntArray:
+def find_seams(cleaned: CleanedMesh, layout: ChartLayout) -> IntArray:
     """Return the model's edges (s, 2) at which triangles meet that are not joined in the texture, ascending.
 
-    Of several edges at the same positions ``V`` (n, d), the first one is listed.
+    Of several edges whose vertices were merged, the first one is listed.
     """
     side = find_differing_sides(cleaned.F, layout.rows, len(cleaned.V))
     cut = np.stack([cleaned.corners.ravel()[side], cleaned.corners[:, (1, 2, 0)].ravel()[side]], axis=1)
     found = np.unique(np.sort(np.concatenate([cut, cleaned.seams]), axis=1), axis=0)
-    if not cleaned.report.coincident.size:
-        return found
-    # Adding zero gives -0.0 and 0.0 the same bits.
-    place = np.unique(V[found].reshape(-1, V.shape[1]) + 0.0, axis=0, return_inverse=True)[1].reshape(-1, 2)
-    return found[np.sort(np.unique(np.sort(place, axis=1), axis=0, return_index=True)[1])]
+    joint = np.sort(cleaned.representatives[found], axis=1)
+    return found[np.sort(np.unique(joint, axis=0, return_index=True)[1])]
 
 
 def find_differing_sides(F: IntArray, rows: IntArray, n: int) -> IntArray:

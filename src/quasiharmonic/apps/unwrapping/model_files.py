@@ -42,10 +42,10 @@ def corner_positions(mesh: MeshData) -> FloatArray:
 def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:
     """Return the mesh with its map, and the number of polygons that are divided into triangles along seams.
 
-    Vertices at the same position share texture coordinates where no seam separates them.
+    Vertices that were merged share texture coordinates where no seam separates them.
     """
     vt, FT = result.uvs, result.indices
-    if result.cleaned.report.coincident.size:
+    if (result.cleaned.representatives < np.arange(len(mesh.V))).any():
         chart = np.empty(len(vt))
         chart[FT] = result.charts[:, None]
         _, first, which = np.unique(np.column_stack([chart, vt]), axis=0, return_index=True, return_inverse=True)

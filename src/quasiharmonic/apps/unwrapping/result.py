@@ -12,7 +12,7 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.io.adapters.trimesh import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
-from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, find_exponent
+from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, find_exponent, names_of
 from quasiharmonic.util.outcome import Outcome
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class UnwrapResult(Outcome):
         Chart of each triangle, from 0.
     seams : (s, 2) int64
         Edges of the model along which the map is cut, by vertices, smaller vertex first, ascending. Of several edges
-        at the same positions, the first one is listed.
+        whose vertices were merged, the first one is listed.
     certificate : UnwrapCertificate
         The exact verdict on ``uvs``.
     triangle_stretch : (f,) float64
@@ -186,6 +186,9 @@ class UnwrapResult(Outcome):
             shown = ", ".join(f"chart {miss.chart} by {miss.excess:.3g}" for miss in self.misses[:_LISTED])
             more = f", … ({len(self.misses)} charts)" if len(self.misses) > _LISTED else ""
             lines.append(f"beyond the bound on the stretch: {shown}{more}")
+        if (collapsed := self.cleaned.collapsed).size:
+            where = names_of("triangle", "triangles", collapsed)
+            lines.append(f"collapsed by welding, with texture coordinates of a neighbour: {where}")
         if self.cleaned.close.size:
             lines.append(describe_soup(self.cleaned.close))
         return "\n".join(lines)
@@ -207,6 +210,7 @@ class UnwrapResult(Outcome):
             "certificate": self.certificate.to_dict(),
             "reversed": int(self.cleaned.flipped.sum()),
             "excluded": self.cleaned.excluded.tolist(),
+            "collapsed": self.cleaned.collapsed.tolist(),
             "close_vertices": self.cleaned.close.tolist(),
             "mesh": self.cleaned.report.to_dict(),
         }

@@ -55,6 +55,7 @@ def unwrap(
     rotate: bool = True,
     stack: bool = False,
     outward: bool = False,
+    weld: bool | float = True,
     edge_costs: ArrayLike | None = None,
     uv: ArrayLike | None = None,
     seed: int = 0,
@@ -91,6 +92,9 @@ def unwrap(
     outward : bool
         Whether closed components that are inside out are treated as turned outward. Their texture is then mirrored
         relative to the triangles of the input.
+    weld : bool or float
+        Whether vertices at equal positions count as one, or a distance relative to the diagonal of the bounding box
+        within which they do; see `clean`. The result has the numbering of the input.
     edge_costs : (f, 3) array, optional
         Positive factor on the cost of a seam at each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
         Large values keep seams away from visible parts. Values of at least 1,000 keep two triangles together where
@@ -141,7 +145,7 @@ def unwrap(
             callback(UnwrapStep(phase, done, total))
 
     report("clean")
-    cleaned = clean(V, F, outward)
+    cleaned = clean(V, F, outward, weld=weld)
     # In this unit, areas neither overflow nor underflow.
     exponent = find_exponent(cleaned.V)
     exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
@@ -204,7 +208,7 @@ def unwrap(
         indices=indices.reshape(-1, 3),
         uvs=layout.uv[row],
         charts=cleaned.restore_corners(np.repeat(layout.chart[:, None], 3, axis=1))[:, 0],
-        seams=find_seams(cleaned, layout, V),
+        seams=find_seams(cleaned, layout),
         certificate=certificate,
         triangle_stretch=every,
         stretch=_summarise(stretch, area),

@@ -143,6 +143,29 @@ def byte_count(text: str) -> int:
     return int(value)
 
 
+def welding(text: str) -> bool | float:
+    """Convert yes, no or a distance; for argparse."""
+    if text in ("yes", "no"):
+        return text == "yes"
+    try:
+        distance = float(text)
+    except ValueError:
+        distance = -1.0
+    if not 0 <= distance < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is neither yes, no, nor a finite distance of at least 0")
+    # Distance 0 is equality.
+    return distance or True
+
+
+def weld(default: str) -> Option:
+    """Return the option of welding with this default."""
+    words = (
+        "weld vertices: yes, at equal positions; no; or a distance relative to the diagonal of the bounding box, such "
+        "as 1e-6 (default: %(default)s)"
+    )
+    return number(welding, words, metavar="WHICH", default=default)
+
+
 def degrees(text: str) -> float:
     """Convert text to an angle in degrees, 0 to 180; for argparse."""
     angle = float(text)

@@ -29,7 +29,13 @@ def check(options: argparse.Namespace) -> int:
     from quasiharmonic.problem.inspection import inspect_mesh
     from quasiharmonic.util.arrays import count_of
 
-    _reject(options, ("precision", "--as"), ("any_triangulation", "--any-triangulation"), ("fixed", "--fixed"))
+    names = (
+        ("precision", "--as"),
+        ("any_triangulation", "--any-triangulation"),
+        ("fixed", "--fixed"),
+        ("weld", "--weld"),
+    )
+    _reject(options, *names)
     volume = read_volume(options.input)
     if len(volume.F):
         return _check_volume(options, volume)

@@ -45,9 +45,12 @@ def check_options(options: argparse.Namespace) -> None:
         raise ValueError(f"--seams {options.seams}: neither 'file' nor 'none', and no file of that name")
 
 
-def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> SeamedSurface:
+def surface(
+    options: argparse.Namespace, mesh: MeshData, *, disks_too: bool, joint: NDArray[np.int64] | None = None
+) -> SeamedSurface:
     """Return the surface of a file with the seams that the options request.
 
+    If the mesh is welded, ``joint`` (n,) has the representative of each vertex, which the list of edges may name.
     ValueError or OSError as `find_cuts`. Also if only some faces have texture coordinates although there are seams, or
     a line of the list of edges is wrong.
     """
@@ -68,6 +71,7 @@ def surface(options: argparse.Namespace, mesh: MeshData, *, disks_too: bool) -> 
             from quasiharmonic.apps.atlas.seam_cuts import cut_along
 
             edges = read_edges(Path(options.seams), len(mesh.V))
+            edges = edges if joint is None else joint[edges]
             found = SeamedSurface(cut_along(SeamedMesh(mesh.V, mesh.F), edges, polygons=mesh.polygons))
         if options.cut:
             # Imported here because the import takes longer than the work for a small mesh.

@@ -83,8 +83,11 @@ class WrittenMap:
         }
 
 
-def certify_map(mesh: MeshData, *, precision: str = "float64") -> WrittenMap:
-    """Certify the map of a file, optionally rounded to ``precision`` "float32"."""
+def certify_map(mesh: MeshData, *, precision: str = "float64", weld: bool | float = False) -> WrittenMap:
+    """Certify the map of a file, optionally rounded to ``precision`` "float32".
+
+    ``weld`` is as in `SeamedMesh.weld`: vertices are welded where they are at one position in the plane.
+    """
     import numpy as np
 
     from quasiharmonic import io
@@ -93,7 +96,10 @@ def certify_map(mesh: MeshData, *, precision: str = "float64") -> WrittenMap:
     from quasiharmonic.geometry.mesh.topology import components
     from quasiharmonic.io.seamed_mesh import SeamedMesh
 
-    V, F, uv = io.cut_at_seams(mesh)
+    joined = io.mapped(mesh).weld(weld)
+    opened = joined.opened()
+    V, F, uv = opened.V, opened.F, opened.uv
+    assert uv is not None
     if precision == "float32":
         with np.errstate(over="ignore"):
             uv = uv.astype(np.float32).astype(np.float64)
@@ -106,7 +112,7 @@ def certify_map(mesh: MeshData, *, precision: str = "float64") -> WrittenMap:
         return found
     from quasiharmonic.apps.unwrapping.defective_charts import certify_defective
 
-    charts = certify_defective(mesh.V, mesh.F, uv[F])
+    charts = certify_defective(mesh.V, joined.F, uv[F])
     return found if charts is None else replace(found, verdict=charts[0], set_apart=charts[1])
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import boundary_report, finite_elements, pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, flag
+from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, flag, weld
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem.diagnosis import Diagnosis
+    from quasiharmonic.problem.inspection import MeshReport
     from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.ui.cli.written_map import WrittenMap
 
@@ -54,6 +55,7 @@ def add_parser(commands: Commands) -> None:
         any_triangulation=flag(
             "also require that every face is convex in the plane, so that the result holds for any triangulation"
         ),
+        weld=weld("no"),
         boundary=flag("only list the boundary of the surface: its loops, and corners for qhm map --corners"),
         plot=file("draw the boundary that --boundary lists", metavar="IMAGE"),
     )
@@ -65,9 +67,11 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.problem.inspection import inspect_mesh
 
-    if options.boundary and (options.precision or options.any_triangulation or options.fixed):
-        raise ValueError("--boundary verifies no map: omit --as, --any-triangulation and --fixed")
+    if options.boundary and (options.precision or options.any_triangulation or options.fixed or options.weld):
+        raise ValueError("--boundary verifies no map: omit --as, --any-triangulation, --fixed and --weld")
     options.input, options.fixed = io.problem_files(options.input, options.fixed)
+    if options.weld and options.fixed is not None:
+        raise ValueError("the fixed vertices are those of the file: omit --weld, or give the mesh without --fixed")
     report.check_new({}, options.json, inputs=(options.input, options.fixed))
     if options.boundary:
         return boundary_report.run(options)
@@ -78,39 +82,40 @@ def run(options: argparse.Namespace) -> int:
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     with report.about(options.input):
-        found = inspect_mesh(mesh.V, mesh.F)
+        found = inspect_mesh(mesh.V, mesh.F, weld=options.weld)
     facts: dict[str, Any] = {"input": str(options.input), "mesh": found.to_dict()}
     lines = [f"{options.input}: {found.summary()}"]
     if not io.has_map(mesh):
         if options.precision is not None or options.any_triangulation:
             raise ValueError(f"{options.input} has no map: omit --as and --any-triangulation")
         if not found.clean:
-            facts["changes"], table = _clean(mesh)
+            facts["changes"], table = _clean(mesh, options.weld)
             lines.append(table)
         lines.append("The file has no map: no texture coordinates, and the mesh is not planar.")
         return pipeline.conclude(options, pipeline.Account({**facts, "injective": None}, lines, found.clean))
-    good, more, text = _verify(mesh, options, fixed)
+    good, more, text = _verify(mesh, options, fixed, found)
     return pipeline.conclude(options, pipeline.Account({**facts, **more}, [*lines, *text], good))
 
 
-def _clean(mesh: MeshData) -> tuple[dict[str, Any], str]:
+def _clean(mesh: MeshData, weld: bool | float) -> tuple[dict[str, Any], str]:
     """Return the changes that ``qhm unwrap`` makes to a mesh with defects, and a table of them."""
     from quasiharmonic.apps.unwrapping.cleaning import clean
 
+    command = "qhm unwrap" if isinstance(weld, bool) else f"qhm unwrap --weld {weld:g}"
     try:
-        cleaned = clean(mesh.V, mesh.F)
+        cleaned = clean(mesh.V, mesh.F, weld=weld or True)
     except ValueError as error:  # All triangles are degenerate.
-        return {}, f"qhm unwrap rejects the mesh: {error}"
+        return {}, f"{command} rejects the mesh: {error}"
     changes = {name: elements.tolist() for name, elements in cleaned.changes.items()}
-    return changes, f"qhm unwrap uses this mesh with these changes:\n{cleaned.tabulate_changes()}"
+    return changes, f"{command} uses this mesh with these changes:\n{cleaned.tabulate_changes()}"
 
 
 def _verify(
-    mesh: MeshData, options: argparse.Namespace, fixed: NDArray[np.int64] | None
+    mesh: MeshData, options: argparse.Namespace, fixed: NDArray[np.int64] | None, found: MeshReport
 ) -> tuple[bool, dict[str, Any], list[str]]:
     """Certify the map of a mesh; return whether it passes, the entries of the report, and its text."""
     precision = options.precision or "float64"
-    certified = written_map.certify_map(mesh, precision=precision)
+    certified = written_map.certify_map(mesh, precision=precision, weld=options.weld)
     further = len(certified.V) - len(mesh.V)
     good = certified.injective
     facts = {
@@ -127,7 +132,8 @@ def _verify(
         facts["not_convex"] = bent.tolist()
         good = good and not bent.size
         lines.append(text)
-    diagnosis = None if good else _diagnose(mesh, fixed)
+    # The diagnosis would name vertices of the mesh without welding.
+    diagnosis = None if good or len(found.welded) else _diagnose(mesh, fixed)
     facts["diagnosis"] = None if diagnosis is None else diagnosis.to_dict()
     return good, facts, lines if diagnosis is None else [*lines, diagnosis.summary()]
 

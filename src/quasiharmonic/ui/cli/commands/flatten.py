@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ from quasiharmonic.ui.cli.arguments import (
     number,
     pick,
     set_default,
+    weld,
 )
 from quasiharmonic.util.options import FlattenOptions
 
@@ -61,6 +63,7 @@ def add_parser(commands: Commands) -> None:
     add_options(
         parser,
         *("cut", "seams", "islands", "pack", "resolution", "padding"),
+        weld=weld("no"),
         pattern=file("also draw the outline true to scale, as .svg or .dxf"),
         unit=choice(("mm", "cm", "m", "in"), "length unit of the surface, for --pattern (default: mm)"),
         allowance=number(
@@ -94,7 +97,9 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
     from quasiharmonic.apps.atlas import island_functions as atlas
     from quasiharmonic.apps.flattening.patterns import write_pattern
     from quasiharmonic.energies.measures import distortion
+    from quasiharmonic.geometry.mesh.welding import weld_triangles
     from quasiharmonic.problem.inspection import describe_soup, find_close_vertices
+    from quasiharmonic.util.arrays import count_of
 
     given: dict[str, Any] = {}
     if options.start or options.fixed is not None:
@@ -102,20 +107,23 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
             raise ValueError("--start and --fixed need the input's map, which new seams discard: omit them")
         # Raises an error that names the missing part of the map.
         io.mapped(mesh)
+    with report.about(options.input):
+        F, joint = weld_triangles(mesh.V, mesh.F, options.weld)
     if options.fixed is not None:
-        given["fixed"] = io.read_handles(options.fixed, len(mesh.V))
+        given["fixed"] = np.unique(joint[io.read_handles(options.fixed, len(mesh.V))])
     if options.weights is not None:
         given["weights"] = _weights(options.weights)
-    found = seam_options.surface(options, mesh, disks_too=True)
+    found = seam_options.surface(options, replace(mesh, F=F), disks_too=True, joint=joint)
     triangles = np.array([len(island.F) for island in found.mesh.islands])
-    if (close := find_close_vertices(mesh.V, triangles)).size:
+    kept = np.flatnonzero(joint == np.arange(len(mesh.V)))
+    if (close := kept[find_close_vertices(mesh.V[kept], triangles)]).size:
         streams.tell(describe_soup(close))
     given |= pick(options, "start", "rings", "islands", *declared(FlattenOptions))
     with pipeline.working(options.input) as show:
         mapped = atlas.flatten(found.mesh, gap=_PIECE_GAP * options.allowance, callback=show, **given)
 
     def describe(written: MeshData) -> pipeline.Account:
-        certified = written_map.certify_map(written)
+        certified = written_map.certify_map(written, weld=options.weld)
         # Some formats hold the map alone; their vertices have the numbers of the surface's.
         V = mesh.V if len(mesh.V) == len(certified.V) else certified.V
         flat = io.without_idle(V, certified.F, certified.uv)
@@ -125,6 +133,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
             **certified.to_dict(),
             "vertices": len(mesh.V),
             "triangles": len(mesh.F),
+            "welded_vertices": len(mesh.V) - len(kept),
             **found.facts,
             "energy": options.energy,
             # Each island has its own energy, so there is no value for several islands.
@@ -140,6 +149,8 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
         ]
         if measured.distances is not None:
             lines.append(measured.distances.summary())
+        if len(kept) < len(mesh.V):
+            lines.append(f"{count_of('vertex', 'vertices', len(mesh.V) - len(kept))} welded to an earlier vertex")
         if options.pattern is not None:
             facts["pattern"] = str(options.pattern)
             write_pattern(options.pattern, *flat[1:], unit=options.unit, allowance=options.allowance)

@@ -33,6 +33,7 @@ from quasiharmonic.ui.cli.arguments import (
     number,
     pick,
     steps,
+    weld,
 )
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ def add_parser(commands: Commands) -> None:
         no_rotate=flag("do not rotate charts to fit better"),
         stack=flag("let identical and mirrored components share their texture coordinates"),
         outward=flag("treat closed components that are inside out as turned outward"),
+        weld=weld("yes"),
         keep_seams=flag("keep the seams of the input's texture coordinates (vt), and add seams only where necessary"),
         edge_costs=file(
             "file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line"
@@ -105,7 +107,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
     from quasiharmonic.util.arrays import count_of
 
     size = pick(options, "max_stretch", "max_charts", "resolution", "padding", "texels_per_unit", "tiles")
-    given = pick(options, "stack", "outward", "seed", "jobs")
+    given = pick(options, "stack", "outward", "weld", "seed", "jobs")
     with pipeline.working(options.input, _words) as show:
         result = unwrap(
             mesh.V,
@@ -209,6 +211,7 @@ def _is_written(written: MeshData, result: UnwrapResult) -> bool:
 def _cleaning(result: UnwrapResult) -> list[str]:
     """Return lines on what was cleaned."""
     cleaned = result.cleaned
-    if cleaned.report.clean and not cleaned.flipped.any():
+    moved = (result.V[cleaned.representatives] != result.V).any()
+    if cleaned.report.clean and not cleaned.flipped.any() and not moved:
         return []
     return cleaned.summary().splitlines()
