@@ -120,9 +120,7 @@ def _develop(
     rows = np.flatnonzero(~mask)
     if not rows.size:
         return mask, charts
-    developed, more = develop_charts(
-        V, F[rows], cost[rows], undivided[rows], choose or itemgetter(-1), workers.check_wanted
-    )
+    developed, more = develop_charts(V, F[rows], cost[rows], choose or itemgetter(-1), workers.check_wanted)
     apart = int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1
     if max_charts is None or len(charts) + len(more) + apart <= max_charts:
         charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
-from quasiharmonic.apps.unwrapping.hinges import find_hinges
+from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, find_hinges
 from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.geometry.mesh.fans import renumber
@@ -22,7 +22,6 @@ def develop_charts(
     V: FloatArray,
     F: IntArray,
     cost: FloatArray,
-    undivided: BoolArray,
     choose: Callable[[list[list[Chart]]], list[Chart]],
     check_wanted: Callable[[], object],
 ) -> tuple[BoolArray, list[Chart]]:
@@ -33,9 +32,8 @@ def develop_charts(
     V : (n, 3) float64
     F : (f, 3) int64
     cost : (f, 3) float64
-        Factor on the cost of cutting each side of each triangle.
-    undivided : (f, 3) bool
-        Sides across which pieces are joined unless they overlap.
+        Factor on the cost of cutting each side of each triangle. Pieces are joined across sides with factors of at
+        least `UNDIVIDED_COST` unless they overlap.
     choose : callable
         Chooses from several lists of charts, whose number decreases.
     check_wanted : callable
@@ -56,7 +54,7 @@ def develop_charts(
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
     model = PaperModel(F, hinges, pieces, area / 2)
     weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other]) / 2
-    together = undivided.ravel()[hinges.one] | undivided.ravel()[hinges.other]
+    together = (cost.ravel()[hinges.one] >= UNDIVIDED_COST) | (cost.ravel()[hinges.other] >= UNDIVIDED_COST)
     model.list_contacts(np.ones(weight.size, dtype=bool))
     found = [_list_charts(F, model, pieces)]
     for longest, loss in _ROUNDS:

@@ -66,16 +66,24 @@ def divide_long_charts(
         if full or len(chart.F) < 2 or not _is_too_long(chart, side):
             done.append(chart)
             continue
-        working = chart.open(V, cost)
-        parts = [] if is_undivided(working) else [chart.part(part, bound) for part in divide(working, bound)]
-        if chart.isometric and parts and max(map(_length, parts)) > _SHORTER * _length(chart):
-            # Only flat faces could be cut.
-            parts = []
+        parts = _divide(chart, V, cost, bound)
+        if chart.isometric and not parts:
+            # Flat faces are cut only where they are too long themselves.
+            parts = _divide(chart, V, np.ones(cost.shape), bound)
         if parts:
             waiting += parts
         else:
             done.append(chart)
     return sorted(done, key=lambda chart: int(chart.triangles[0]))
+
+
+def _divide(chart: Chart, V: FloatArray, cost: FloatArray, bound: float) -> list[Chart]:
+    """Divide a chart across its middle; return no parts if it should stay whole, or if they would be hardly shorter."""
+    working = chart.open(V, cost)
+    if is_undivided(working):
+        return []
+    parts = [chart.part(part, bound) for part in divide(working, bound)]
+    return [] if chart.isometric and max(map(_length, parts)) > _SHORTER * _length(chart) else parts
 
 
 def _area(chart: Chart) -> float:

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.apps.unwrapping.flat_parts import covers_once
-from quasiharmonic.apps.unwrapping.hinges import Hinges
+from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, meet, spanning_links
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.fans import fans
@@ -27,9 +27,13 @@ CREASE = np.pi / 6
 _ANGLES = np.deg2rad([20.0, 13.0, 9.0, 6.0, 4.0])
 # There, a piece has at least this share of the area, and its squared perimeter is at most this multiple of its own area.
 _LEAST_SHARE, _LONGEST = 0.05, 40.0
-# Between creases, a piece with at least this share of the area is kept in any case. Smaller ones are kept unless half of
-# their corners belong to many pieces, as on a rough scan.
-_LARGE_SHARE, _ROUGH, _MANY = 0.01, 0.5, 5
+# Between creases, a piece with at least this share of the area is kept in any case.
+_LARGE_SHARE = 0.05
+# Smaller ones are kept unless at half of their corners many pieces meet, as on a rough scan, or four pieces with little
+# curvature in radians, as on a coarse sphere.
+_ROUGH, _MANY, _ROUND = 0.5, 5, 0.7
+# Pieces with a smaller share of the area are dropped if they mostly border on curved parts.
+_SMALL_SHARE = 0.01
 # Largest angle defect of a vertex of a developable piece, and of all its vertices together, in radians.
 _DEFECT, _ALL_DEFECTS = 1e-3, 0.1
 # A piece may have this number of vertices with larger defects, such as the apex of a cone. They are cut open.
@@ -90,8 +94,10 @@ class _Parts:
         at = np.zeros(number, dtype=np.int64)
         at[self.split] = F
         around = np.bincount(at)[at]
+        curvature = np.abs(2 * np.pi - np.bincount(at, total))[at]
+        rounded = (around == _MANY - 1) & (curvature > _DEFECT) & (curvature < _ROUND)
         corner = rim & (around >= 3)
-        rough = np.bincount(part[corner], around[corner] >= _MANY, self.count)
+        rough = np.bincount(part[corner], (rounded | (around >= _MANY))[corner], self.count)
         self.rough = rough > _ROUGH * np.bincount(part[corner], minlength=self.count)
 
     def find_cut(self, hinges: Hinges, k: int, here: IntArray, cost: FloatArray) -> IntArray:
@@ -116,7 +122,7 @@ def _drop_scattered(hinges: Hinges, parts: _Parts, chosen: BoolArray, rim: Float
     one, other = parts.component[hinges.first], parts.component[hinges.second]
     apart = one != other
     one, other, length = one[apart], other[apart], hinges.length[apart]
-    large = parts.area >= _LARGE_SHARE
+    large = parts.area >= _SMALL_SHARE
     single = np.bincount(parts.component, minlength=parts.count) == 1
     while True:
         firm = chosen & ~single
@@ -139,8 +145,9 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, co
     apart : (e,) bool
         Hinges that separate pieces.
     cost : (f, 3) float64
-        Factor on the cost of cutting each side, for the cuts of tubes.
+        Factor on the cost of cutting each side. Triangles stay together at factors of at least `UNDIVIDED_COST`.
     """
+    together = (cost.ravel()[hinges.one] >= UNDIVIDED_COST) | (cost.ravel()[hinges.other] >= UNDIVIDED_COST)
     shapes = rest_shapes(V, F)
     area = shapes.m / shapes.m.sum()
     angles = np.stack([np.abs(np.angle(-shapes.sides[k - 1].conj() * shapes.sides[k])) for k in range(3)], axis=1)
@@ -150,7 +157,7 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, co
     for angle in (CREASE, *_ANGLES):
         rest = found.label < 0
         within = ~apart & rest[hinges.first] & rest[hinges.second]
-        joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat)
+        joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat | together)
         parts = _Parts(F, hinges, joined, angles, area)
         chosen = parts.developable & mark(parts.count, parts.component[rest])
         outline = np.where(hinges.mark_sides(joined, len(F)), 0.0, length)
