@@ -10,7 +10,7 @@ import pytest
 
 import quasiharmonic as qh
 from quasiharmonic import Problem, atlas, results
-from quasiharmonic.surfaces import disk, grid
+from quasiharmonic.surfaces import disk, grid, starfish
 from quasiharmonic.util.outcome import Outcome, Verdict
 
 
@@ -60,6 +60,10 @@ def make_warp():
     return qh.warp_by_landmarks(np.zeros((20, 20)), [[10, 10]], [[12, 10]], resolution=8)
 
 
+def make_unwrap():
+    return qh.unwrap(*starfish(3, 12))
+
+
 MAKERS = {
     "MapResult": make_map,
     "MappedAtlas": make_atlas,
@@ -70,6 +74,7 @@ MAKERS = {
     "InvertibleField": lambda: make_field(9, 9),
     "InvertibleVolume": lambda: make_field(5, 5, 5),
     "WarpResult": make_warp,
+    "UnwrapResult": make_unwrap,
 }
 NAMES = {"success", "status", "message", "n_iterations", "seconds", "certificate"}
 
@@ -83,8 +88,17 @@ def made(request):
 
 def test_every_result_that_is_listed_is_of_the_family():
     listed = {name for name in results.__all__ if issubclass(getattr(results, name), Outcome)}
-    # A refined problem is no map.
-    assert listed - {"RefinedProblem", "UnwrapResult"} == set(MAKERS)
+    assert listed == set(MAKERS)
+
+
+def test_a_refined_problem_is_no_map():
+    V, F = disk(4)
+    (loop,) = qh.boundary_loops(F, len(V))
+    refined = qh.refine_problem(Problem(V, F, loop, V[loop]))
+    assert refined
+    assert refined.success
+    assert repr(refined) == f"<RefinedProblem: {refined.message.splitlines()[0]}>"
+    assert not any(hasattr(refined, name) for name in ("status", "certificate", "n_iterations", "to_dict"))
 
 
 def test_results_share_their_attributes(made):

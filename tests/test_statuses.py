@@ -12,10 +12,12 @@ import pytest
 import quasiharmonic as qh
 from quasiharmonic import MapResult, Status, atlas
 from quasiharmonic.results import UnwrapStatus
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import BaseOutcome
 
 PAGE = (Path(__file__).parent.parent / "docs" / "reference" / "statuses.md").read_text(encoding="utf-8")
-ROWS = re.findall(r"^\| `(\w+)` \| (yes|no|yes or no) \| (yes|no|yes or no) \| (yes|no) \| (.+) \|$", PAGE, re.MULTILINE)
+ROWS = re.findall(
+    r"^\| `(\w+)` \| (yes|no|yes or no) \| (yes|no|yes or no) \| (yes|no) \| (.+) \|$", PAGE, re.MULTILINE
+)
 F = np.array([[0, 1, 2]])
 POSITIVE = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
 
@@ -39,7 +41,7 @@ def test_the_message_of_a_status_says_whether_its_maps_are_injective():
     assert positive == {name for name, injective, *_ in ROWS if injective == "yes"}
 
 
-def classes(of=Outcome):
+def classes(of=BaseOutcome):
     """Return the names of all classes of results."""
     return {of.__name__}.union(*(classes(sub) for sub in of.__subclasses__()))
 
