@@ -265,7 +265,9 @@ class _NodeSearch:
             problem = move_onto(curves, problem)
         start, iterations = None if begin is None else begin[used], self.options.max_iterations
         result = solve(problem, start=start, max_iterations=iterations, linear_solver=linear_solver, callback=callback)
-        if corners is not None and result.status is not Status.INTERRUPTED:
+        if result.status is Status.INTERRUPTED:
+            energy = None
+        elif corners is not None:
             result = make_convex(problem, result, corners, linear_solver=linear_solver)
         if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
             polishing = PolishOptions(
