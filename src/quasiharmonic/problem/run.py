@@ -11,12 +11,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat, time_limit
+
+T = TypeVar("T")
 
 
 class Run:
@@ -121,18 +123,33 @@ class Run:
     def result(
         self, uv: FloatArray, F: IntArray, status: Status, *, loops: list[IntArray] | None = None, **further: Any
     ) -> MapResult:
-        """Certify a map and return it as the result; ``further`` are other fields of `MapResult`."""
-        certificate = certify(F, uv, loops=loops)
+        """Certify a map and return it as the result; ``further`` are other fields of `MapResult`.
+
+        If that is interrupted, the status is ``INTERRUPTED``.
+        """
+        certificate, interrupted = finish(lambda: certify(F, uv, loops=loops))
+        self.interrupted |= interrupted
         return MapResult(
             uv=uv,
-            status=status,
+            status=Status.INTERRUPTED if interrupted else status,
             certificate=certificate,
-            stages=self.stages,
-            history=self.history,
-            path=self.path,
+            stages=[*self.stages],
+            history=[*self.history],
+            path=[*self.path],
             seconds=self.seconds,
             **further,
         )
+
+
+def finish(compute: Callable[[], T]) -> tuple[T, bool]:
+    """Return what a computation returns that no result can do without, and whether an interrupt has repeated it.
+
+    A second interrupt propagates.
+    """
+    run = Run()
+    with run.until_interrupted():
+        return compute(), False
+    return compute(), True
 
 
 def run_within(seconds: float | None, compute: Callable[[], MapResult]) -> MapResult:

@@ -16,6 +16,7 @@ from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status
+from quasiharmonic.problem.run import finish
 from quasiharmonic.solver.methods import Descent, LineShift, LocalRepair, Newton, Untangling, VectorAdam
 from quasiharmonic.solver.methods.base import SearchState
 from quasiharmonic.solver.methods.local_repair import MAX_INVERTED
@@ -258,7 +259,9 @@ def finish_search(search: Search, strategy: str | Stages, spent: float = 0.0) ->
     began = time.perf_counter()
     search.run(stages_of(strategy, search.problem))
     uv = search.problem.positions(search.best_map)
-    certificate = certify(search.problem.F, uv, loops=search.problem.domain.loops)
+    certificate, interrupted = finish(lambda: certify(search.problem.F, uv, loops=search.problem.domain.loops))
+    if interrupted:
+        search.status = Status.INTERRUPTED
     mu = None if search.best_field is None else search.best_field.mu
     return result_of(search, uv, certificate, mu, spent + time.perf_counter() - began)
 
