@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from enum import Enum
 
 import numpy as np
@@ -116,6 +117,17 @@ def test_the_report_has_what_all_results_share(made):
     # An atlas of one island reports as its island does.
     assert report.keys() >= NAMES
     assert report["success"] is True
+
+
+def test_results_can_be_pickled(made):
+    again = pickle.loads(pickle.dumps(made))
+    assert again.to_dict() == made.to_dict()
+    assert again.summary() == made.summary()
+
+
+def test_the_drift_of_a_pickled_morph_is_the_same():
+    morphed = make_morph()
+    assert pickle.loads(pickle.dumps(morphed)).drift() == morphed.drift()
 
 
 def test_certificates_share_their_attributes(made):
