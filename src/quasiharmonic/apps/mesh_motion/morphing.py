@@ -189,9 +189,8 @@ def morph(
     inverted = inverted_elements(F, after)
     forbidden = np.intersect1d(inverted, find_forbidden(F, after, fixed))
     before, now = element_quality(F, points), element_quality(F, after)
-    return MorphResult(
-        after, F, inverted, forbidden, result, before, now, points.copy(), partial(alone.place_at_once, after[fixed])
-    )
+    one_step = partial(alone.place_at_once, after[fixed])
+    return MorphResult(after, F, inverted, forbidden, result, before, now, points.copy(), one_step)
 
 
 @dataclass(frozen=True)
