@@ -117,6 +117,10 @@ def test_the_report_has_what_all_results_share(made):
     # An atlas of one island reports as its island does.
     assert report.keys() >= NAMES
     assert report["success"] is True
+    assert report["status"] == made.status.name.lower()
+    assert report["n_iterations"] == made.n_iterations
+    assert report["certificate"]["valid"] is made.certificate.valid
+    assert report["certificate"]["bijective"] is made.certificate.bijective
 
 
 def test_results_can_be_pickled(made):
@@ -147,3 +151,23 @@ def test_a_failure_is_a_failure_everywhere():
     assert not found
     assert found.certificate.valid is found.certificate.injective is False
     assert not results.AtlasVerdict((), np.empty((0, 2), dtype=np.int64)).valid
+
+
+def test_an_animation_without_frames_is_certified_as_nothing():
+    empty = results.Animation([], np.empty((0, 3, 2)), np.zeros(0, dtype=bool), np.zeros(0), interrupted=True)
+    assert not empty
+    assert not empty.certificate.valid
+    assert not empty.certificate.bijective
+    assert empty.to_dict()["statuses"] == []
+
+
+def test_the_frames_of_an_animation_have_a_status_each():
+    animation = make_animation()
+    assert animation.to_dict()["statuses"] == [frame.status.name.lower() for frame in animation]
+
+
+def test_a_repair_counts_its_iterations():
+    repaired = make_repair()
+    assert repaired.n_iterations == sum(island.n_iterations for island in repaired.islands) > 0
+    V, F = disk(4)
+    assert qh.repair(V, F, V).n_iterations == 0

@@ -26,7 +26,7 @@ class Verdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
-        raise NotImplementedError
+        return {"valid": self.valid, "bijective": self.bijective}
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.summary().partition(chr(10))[0]}>"
