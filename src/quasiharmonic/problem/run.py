@@ -106,19 +106,22 @@ class Run:
         it had none. The stage is added even if the steps raise an exception.
         """
         done, first, status = len(self.history), energy(), Status.STILL_FALLING
+        last = first
         try:
             self.record(0, first, uv)
             for outcome in steps:
-                status = outcome or status
-                self.record(0, energy(), uv)
+                status, last = outcome or status, energy()
+                self.record(0, last, uv)
         finally:
+            # Compute nothing here: an exception would hide that of the steps.
             taken = max(len(self.history) - done - 1, 0)
-            self.add_stage(name, n_iterations=taken, energy=(first, energy()))
+            self.add_stage(name, n_iterations=taken, energy=(first, last))
         return status
 
     def judge_last_stage(self, kept: bool) -> None:
-        """Replace whether the result of the last stage was kept."""
-        self.stages[-1] = replace(self.stages[-1], kept=kept)
+        """Replace whether the result of the last stage was kept; there is none if the call ended before it."""
+        if self.stages:
+            self.stages[-1] = replace(self.stages[-1], kept=kept)
 
     def result(
         self, uv: FloatArray, F: IntArray, status: Status, *, loops: list[IntArray] | None = None, **further: Any

@@ -83,7 +83,8 @@ def _declare(one: Field[Any]) -> Option:
         return flag(words)
     if choices:
         return choice(choices, words, default=one.default)
-    return number({options.positive: count, options.count: steps}.get(check, float), words, default=one.default)
+    integer = {options.positive: count, options.count: steps}.get(check, int)
+    return number(integer if one.type in ("int", "int | None") else float, words, default=one.default)
 
 
 def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option) -> None:
@@ -118,17 +119,21 @@ def set_default(options: argparse.Namespace, name: str, default: object, *, aske
 
 def steps(text: str) -> int:
     """Convert text to a nonnegative integer; for argparse."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
+    return _integer(text, 0)
 
 
 def count(text: str) -> int:
     """Convert text to a positive integer; for argparse."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return _integer(text, 1)
+
+
+def _integer(text: str, least: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        raise argparse.ArgumentTypeError(f"{text} is not an integer of at least {least}")
     return value
 
 
@@ -145,7 +150,10 @@ def byte_count(text: str) -> int:
 
 def degrees(text: str) -> float:
     """Convert text to an angle in degrees, 0 to 180; for argparse."""
-    angle = float(text)
+    try:
+        angle = float(text)
+    except ValueError:
+        angle = -1.0
     if not 0 <= angle <= 180:
         raise argparse.ArgumentTypeError(f"{text} degrees: an angle from 0 to 180 is needed")
     return angle
