@@ -67,14 +67,18 @@ def choice(choices: Sequence[str], words: str, **rest: Any) -> Option:
     return {"choices": choices, "help": words, **rest}
 
 
-def number(kind: Callable[[str], Any], words: str, *, metavar: str = "N", **rest: Any) -> Option:
+def number(kind: Callable[[str], Any], words: str, *, metavar: str | tuple[str, ...] = "N", **rest: Any) -> Option:
     """Return an option with a number that ``kind`` converts."""
     return {"type": kind, "metavar": metavar, "help": words, **rest}
 
 
 def declared(operation: type[Options]) -> dict[str, Option]:
-    """Return the options of an operation: the fields of its class that have a help text."""
-    return {one.name: _declare(one) for one in fields(operation) if one.metadata["help"]}
+    """Return the options of an operation: the fields that its class itself declares with a help text, in their order.
+
+    Options of base classes are shared, and commands list these last.
+    """
+    known = {one.name: one for one in fields(operation)}
+    return {name: _declare(known[name]) for name in operation.__annotations__ if known[name].metadata["help"]}
 
 
 def _declare(one: Field[Any]) -> Option:
@@ -84,7 +88,9 @@ def _declare(one: Field[Any]) -> Option:
     if choices:
         return choice(choices, words, default=one.default)
     integer = {options.positive: count, options.count: steps}.get(check, int)
-    return number(integer if one.type in ("int", "int | None") else float, words, default=one.default)
+    if one.type in ("int", "int | None"):
+        return number(integer, words, default=one.default)
+    return number(float, words, metavar="SECONDS" if check is options.seconds else "X", default=one.default)
 
 
 def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option) -> None:
@@ -93,10 +99,12 @@ def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option)
         parser.add_argument("--" + name.replace("_", "-"), **option)
 
 
-def add_files(parser: argparse.ArgumentParser, source: str, output: str, metavar: str = "INPUT") -> None:
-    """Add the input, and ``--output``, with these help texts."""
-    parser.add_argument("input", type=Path, metavar=metavar, help=source)
-    parser.add_argument("-o", "--output", type=Path, required=True, help=output)
+def add_files(
+    parser: argparse.ArgumentParser, source: str, output: str, *, metavar: tuple[str, str] = ("INPUT", "OUTPUT")
+) -> None:
+    """Add the input, and ``--output``, with these help texts and names."""
+    parser.add_argument("input", type=Path, metavar=metavar[0], help=source)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar=metavar[1], help=output)
 
 
 def pick(given: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -169,6 +177,7 @@ def _island_list(text: str) -> list[int]:
 
 #: The options that several commands take with the same meaning.
 SHARED: dict[str, Option] = {
+    **declared(options.SolverOptions),
     **declared(options.MapOptions),
     "fixed": file("file of fixed vertices, 0-based, one per line (default: the boundary)"),
     "font": text("FONT", "for letters and words: a font file or the name of a font"),
