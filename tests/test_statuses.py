@@ -41,6 +41,18 @@ def test_the_message_of_a_status_says_whether_its_maps_are_injective():
     assert positive == {name for name, injective, *_ in ROWS if injective == "yes"}
 
 
+def test_the_table_of_what_ends_a_search_names_statuses():
+    text = (Path(__file__).parent.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text.split("## When the search stops\n")[1].split("\n## ")[0]
+    ends = [line.split(" | ")[-1] for line in table.splitlines() if line.startswith("| ")][1:]
+    named = [re.findall(r"`([A-Z_]+)`", end) for end in ends]
+    assert all(named)
+    # The other statuses are those of descents among injective maps.
+    assert {name for names in named for name in names} == set(Status.__members__) - {
+        *("POLISHED", "STILL_FALLING", "EXHAUSTED", "COLLAPSED", "NEARBY", "UNIMPROVED"),
+    }
+
+
 def classes(of=BaseOutcome):
     """Return the names of all classes of results."""
     return {of.__name__}.union(*(classes(sub) for sub in of.__subclasses__()))
