@@ -57,6 +57,7 @@ def test_every_field_of_the_certificate_of_one_triangle(triangle, kind, further,
     if positive:
         said += "the boundary does not meet itself, and no point is covered twice."
     assert c.to_dict() == {
+        "valid": positive,
         "injective": positive,
         "bijective": positive,
         "triangles": 1,

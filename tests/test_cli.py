@@ -247,6 +247,43 @@ class TestDemo:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "order"),
+    [
+        ("flatten", ["--energy", "--max-iterations", "--time-limit", "--weights", "--rings", "--pack"]),
+        ("polish", ["--fixed", "--energy", "--max-iterations", "--time-limit", "--free", "--slide", "--pack"]),
+        ("harmonise", ["--fixed", "--energy", "--max-iterations", "--eta", "--unscaled", "--pack"]),
+        ("map", ["--fixed", "--to", "--strategy", "--max-iterations", "--time-limit", "--refine", "--reference"]),
+        ("morph", ["--positions", "--energy", "--slide", "--slide-plane", "--rest", "--max-iterations"]),
+    ],
+)
+def test_help_lists_own_options_before_shared_ones(command, order, capsys):
+    with pytest.raises(SystemExit):
+        run(command, "--help")
+    described = re.findall(r"^  (?:-\w \S+, )?(--[\w-]+)", capsys.readouterr().out, re.MULTILINE)
+    shared = ["--linear-solver"] if command == "map" else ["--linear-solver", "--json"]
+    assert [name for name in described if name in (*order, *shared)] == [*order, *shared]
+
+
+def test_help_names_what_an_option_takes(capsys):
+    for command, parts in (
+        ("morph", ["MESH\n", "-o MESH, --output MESH"]),
+        ("flatten", ["-o OUTPUT, --output OUTPUT", "--time-limit SECONDS"]),
+        ("batch", ["for --to: boundary vertices", "for --to: how far"]),
+    ):
+        with pytest.raises(SystemExit):
+            run(command, "--help")
+        said = capsys.readouterr().out
+        assert [part for part in parts if part not in said] == []
+
+
+def test_polish_has_a_time_limit(star, tmp_path, capsys):
+    assert run("map", star, "-o", tmp_path / "map.obj") == 0
+    assert run("polish", tmp_path / "map.obj", "-o", tmp_path / "out.obj", "--time-limit", "1e-9") == 2
+    assert "no map after the time limit of 1e-09 s" in capsys.readouterr().err
+    assert run("polish", tmp_path / "map.obj", "-o", tmp_path / "out.obj", "--time-limit", "60", "--free") == 0
+
+
 def test_help_imports_no_numerics():
     """`qhm --help` must not import NumPy."""
     code = (

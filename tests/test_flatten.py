@@ -263,7 +263,7 @@ class TestOptions:
     @pytest.mark.parametrize(
         ("options", "words"),
         [
-            ({"energy": "bending"}, "energy must be one of"),
+            ({"energy": "bending"}, "energy must be one of .*, arap-barrier, distances, not 'bending'"),
             ({"weights": [1.0]}, "weights must have shape"),
             ({"weights": np.zeros(32)}, "the weight is not positive at triangles 0, 1, 2"),
             ({"start": [[0, 0]]}, "start must have shape"),

@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import subprocess
 import sys
-from dataclasses import FrozenInstanceError, fields
+from dataclasses import FrozenInstanceError, dataclass, fields
 from typing import TypedDict, Unpack
 
+import numpy as np
 import pytest
 
 import quasiharmonic
 from quasiharmonic import flatten, harmonise, injective_map, injective_maps, keep_distances, morph, polish, solve
+from quasiharmonic.apps.gradients.layers import SolvedOptions
 from quasiharmonic.energies import polishing
 from quasiharmonic.linsolve import BACKENDS
 from quasiharmonic.solver.search import harmonising, stages
+from quasiharmonic.ui.cli.arguments import add_options, declared
 from quasiharmonic.util import options
 from quasiharmonic.util.options import (
+    AnimationOptions,
     DistanceOptions,
     FlattenOptions,
     HarmoniseOptions,
     MapOptions,
     MorphOptions,
+    MovingOptions,
     Options,
     PolishOptions,
+    RepairOptions,
     TetrahedraOptions,
     option,
     positive,
@@ -72,6 +79,8 @@ def test_an_unknown_option_is_an_error(function, of):
     [
         (MapOptions, {"max_iterations": 0}),
         (MapOptions, {"max_iterations": 1.5}),
+        (MapOptions, {"max_iterations": True}),
+        (MapOptions, {"record_every": True}),
         (MapOptions, {"record_every": -1}),
         (MapOptions, {"refine": "yes"}),
         (MapOptions, {"callback": 3}),
@@ -88,6 +97,33 @@ def test_an_unknown_option_is_an_error(function, of):
 def test_a_wrong_value_is_an_error_that_names_the_option(of, wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         of(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("of", "arrays"),
+    [
+        (MapOptions, ("start",)),
+        (PolishOptions, ("weights",)),
+        (HarmoniseOptions, ("weights", "eta")),
+        (FlattenOptions, ("fixed", "target", "weights", "start")),
+        (TetrahedraOptions, ("start",)),
+        (MorphOptions, ("rest", "start", "slide")),
+        (RepairOptions, ("fixed",)),
+        (AnimationOptions, ("start",)),
+        (MovingOptions, ("slide",)),
+        (SolvedOptions, ("start",)),
+    ],
+)
+def test_options_with_arrays_are_compared_and_hashed(of, arrays):
+    one, other = (of(**{name: np.ones(3) for name in arrays}) for _ in range(2))
+    assert one == one
+    assert one != other
+    assert len({one, one, other}) == 2
+
+
+def test_an_unknown_option_of_a_class_names_the_class():
+    with pytest.raises(TypeError, match=r"^MovingMesh\(\) got an unexpected keyword argument 'setle'"):
+        quasiharmonic.MovingMesh([], [], [], setle=1)
 
 
 def test_options_are_frozen():
@@ -110,8 +146,6 @@ def test_a_new_option_needs_a_field_and_a_type():
     class Depth(Options):
         pass
 
-    from dataclasses import dataclass
-
     @dataclass(frozen=True, kw_only=True)
     class Dive(Depth):
         depth: int = option(3, check=positive)
@@ -125,6 +159,29 @@ def test_a_new_option_needs_a_field_and_a_type():
     assert str(inspect.signature(dive)).startswith("(place: 'str', *, depth: 'int' = 3)")
     with pytest.raises(ValueError, match="depth"):
         dive("sea", depth=0)
+
+
+def test_numbers_of_the_command_line_have_the_type_of_their_field():
+    @dataclass(frozen=True, kw_only=True)
+    class Dive(Options):
+        depth: int = option(3, "how deep", check=positive)
+        stops: int = option(0, "how many", check=options.count)
+        divers: int | None = option(None, "how many", check=lambda name, value: None)
+        speed: float | None = option(None, "how fast", check=options.seconds)
+
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    add_options(parser, **declared(Dive))
+    given = parser.parse_args(["--depth", "2", "--stops", "0", "--divers", "4", "--speed", "5"])
+    assert [type(value) for value in vars(given).values()] == [int, int, int, float]
+    assert parser.parse_args([]).divers is None
+    for wrong, message in (
+        (("--depth", "0"), "0 is not an integer of at least 1"),
+        (("--depth", "x"), "x is not an integer of at least 1"),
+        (("--stops", "1.5"), "1.5 is not an integer of at least 0"),
+        (("--divers", "1.5"), "invalid int value: '1.5'"),
+    ):
+        with pytest.raises(argparse.ArgumentError, match=f"{message}$"):
+            parser.parse_args(wrong)
 
 
 def test_the_options_import_nothing_heavy():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from enum import Enum
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 import quasiharmonic as qh
 from quasiharmonic import Problem, atlas, results
-from quasiharmonic.surfaces import disk, grid
+from quasiharmonic.surfaces import disk, grid, starfish
 from quasiharmonic.util.outcome import Outcome, Verdict
 
 
@@ -60,6 +61,10 @@ def make_warp():
     return qh.warp_by_landmarks(np.zeros((20, 20)), [[10, 10]], [[12, 10]], resolution=8)
 
 
+def make_unwrap():
+    return qh.unwrap(*starfish(3, 12))
+
+
 MAKERS = {
     "MapResult": make_map,
     "MappedAtlas": make_atlas,
@@ -70,6 +75,7 @@ MAKERS = {
     "InvertibleField": lambda: make_field(9, 9),
     "InvertibleVolume": lambda: make_field(5, 5, 5),
     "WarpResult": make_warp,
+    "UnwrapResult": make_unwrap,
 }
 NAMES = {"success", "status", "message", "n_iterations", "seconds", "certificate"}
 
@@ -83,8 +89,17 @@ def made(request):
 
 def test_every_result_that_is_listed_is_of_the_family():
     listed = {name for name in results.__all__ if issubclass(getattr(results, name), Outcome)}
-    # A refined problem is no map.
-    assert listed - {"RefinedProblem", "UnwrapResult"} == set(MAKERS)
+    assert listed == set(MAKERS)
+
+
+def test_a_refined_problem_is_no_map():
+    V, F = disk(4)
+    (loop,) = qh.boundary_loops(F, len(V))
+    refined = qh.refine_problem(Problem(V, F, loop, V[loop]))
+    assert refined
+    assert refined.success
+    assert repr(refined) == f"<RefinedProblem: {refined.message.splitlines()[0]}>"
+    assert not any(hasattr(refined, name) for name in ("status", "certificate", "n_iterations", "to_dict"))
 
 
 def test_results_share_their_attributes(made):
@@ -102,6 +117,21 @@ def test_the_report_has_what_all_results_share(made):
     # An atlas of one island reports as its island does.
     assert report.keys() >= NAMES
     assert report["success"] is True
+    assert report["status"] == made.status.name.lower()
+    assert report["n_iterations"] == made.n_iterations
+    assert report["certificate"]["valid"] is made.certificate.valid
+    assert report["certificate"]["bijective"] is made.certificate.bijective
+
+
+def test_results_can_be_pickled(made):
+    again = pickle.loads(pickle.dumps(made))
+    assert again.to_dict() == made.to_dict()
+    assert again.summary() == made.summary()
+
+
+def test_the_drift_of_a_pickled_morph_is_the_same():
+    morphed = make_morph()
+    assert pickle.loads(pickle.dumps(morphed)).drift() == morphed.drift()
 
 
 def test_certificates_share_their_attributes(made):
@@ -121,3 +151,23 @@ def test_a_failure_is_a_failure_everywhere():
     assert not found
     assert found.certificate.valid is found.certificate.injective is False
     assert not results.AtlasVerdict((), np.empty((0, 2), dtype=np.int64)).valid
+
+
+def test_an_animation_without_frames_is_certified_as_nothing():
+    empty = results.Animation([], np.empty((0, 3, 2)), np.zeros(0, dtype=bool), np.zeros(0), interrupted=True)
+    assert not empty
+    assert not empty.certificate.valid
+    assert not empty.certificate.bijective
+    assert empty.to_dict()["statuses"] == []
+
+
+def test_the_frames_of_an_animation_have_a_status_each():
+    animation = make_animation()
+    assert animation.to_dict()["statuses"] == [frame.status.name.lower() for frame in animation]
+
+
+def test_a_repair_counts_its_iterations():
+    repaired = make_repair()
+    assert repaired.n_iterations == sum(island.n_iterations for island in repaired.islands) > 0
+    V, F = disk(4)
+    assert qh.repair(V, F, V).n_iterations == 0

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pickle
+import re
 import sys
 from dataclasses import replace
+from inspect import isfunction, signature
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from quasiharmonic import Problem, Status, distortion, io, results
 from quasiharmonic.atlas import SeamedMesh, as_seamed_mesh
 from quasiharmonic.atlas import flatten as flatten_islands
 from quasiharmonic.surfaces import cat, disk
+from quasiharmonic.util.outcome import Verdict
 from shared.polygons import circle
 
 
@@ -239,6 +242,20 @@ def test_every_name_of_the_results_module_exists():
     shared = set(results.__all__) & set(qh.__all__)
     assert "MapResult" in shared
     assert all(getattr(results, name) is getattr(qh, name) for name in shared)
+
+
+def test_the_results_module_has_every_class_that_a_function_returns():
+    returned = set()
+    for module in (qh, qh.atlas):
+        functions = [one for name in module.__all__ if isfunction(one := getattr(module, name))]
+        returned |= {name for one in functions for name in re.findall(r"\w+", signature(one).return_annotation)}
+    modules = results, qh, qh.atlas
+    classes = {name for name in returned if any(isinstance(getattr(one, name, None), type) for one in modules)}
+    # A mesh is no result.
+    classes -= {"SeamedMesh"}
+    assert {"MapResult", "Derivative", "Distortion", "InverseVolume", "AtlasVerdict"} <= classes
+    assert classes <= set(results.__all__)
+    assert {one.__name__ for one in Verdict.__subclasses__()} <= set(results.__all__)
 
 
 def test_a_circle_is_its_own_map():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -67,6 +68,37 @@ def test_an_interrupt_keeps_the_stage_and_the_work_so_far():
     assert status is Status.INTERRUPTED
     assert [stage.n_iterations for stage in run.stages] == [1]
     assert run.stages[0].energy == (4.0, 2.0)
+
+
+def test_an_exception_of_a_step_is_not_hidden():
+    def steps():
+        yield None
+        state.clear()
+        raise ZeroDivisionError
+
+    run, state = Run(), [4.0]
+    with pytest.raises(ZeroDivisionError) as caught:
+        run.descend("descent", steps(), lambda: state[0])
+    assert caught.value.__context__ is None
+    assert [(stage.n_iterations, stage.energy) for stage in run.stages] == [(1, (4.0, 4.0))]
+
+
+def test_without_a_stage_there_is_nothing_to_judge():
+    run = Run()
+    with run.until_interrupted():
+        run.descend("descent", [], Mock(side_effect=KeyboardInterrupt))
+    run.judge_last_stage(kept=False)
+    assert run.stages == []
+
+
+def test_a_result_does_not_change_when_the_run_goes_on():
+    V, F = disk(3)
+    run = Run(record_every=1)
+    results = []
+    for _ in range(2):
+        run.descend("descent", [None], lambda: 1.0, lambda: V)
+        results.append(run.result(V, F, Status.STILL_FALLING))
+    assert [(len(one.stages), len(one.history), len(one.path)) for one in results] == [(1, 2, 2), (2, 4, 4)]
 
 
 def test_other_exceptions_are_not_interrupts():

@@ -12,10 +12,12 @@ import pytest
 import quasiharmonic as qh
 from quasiharmonic import MapResult, Status, atlas
 from quasiharmonic.results import UnwrapStatus
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import BaseOutcome
 
 PAGE = (Path(__file__).parent.parent / "docs" / "reference" / "statuses.md").read_text(encoding="utf-8")
-ROWS = re.findall(r"^\| `(\w+)` \| (yes|no|yes or no) \| (yes|no) \| (yes|no) \| (.+) \|$", PAGE, re.MULTILINE)
+ROWS = re.findall(
+    r"^\| `(\w+)` \| (yes|no|yes or no) \| (yes|no|yes or no) \| (yes|no) \| (.+) \|$", PAGE, re.MULTILINE
+)
 F = np.array([[0, 1, 2]])
 POSITIVE = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
 
@@ -28,7 +30,9 @@ def test_every_status_has_a_row_in_the_order_of_the_code():
 def test_row_states_success_and_convergence(name, injective, success, converged, why):
     maps = {"yes": [POSITIVE], "no": [POSITIVE[::-1]], "yes or no": [POSITIVE, POSITIVE[::-1]]}[injective]
     results = [MapResult(uv=uv, status=Status[name], certificate=qh.certify(F, uv)) for uv in maps]
-    assert {result.success for result in results} == {success == "yes"}
+    # "yes or no" in both columns: a success if the map is injective.
+    expected = [True, False] if success == "yes or no" else len(maps) * [success == "yes"]
+    assert [result.success for result in results] == expected
     assert {result.converged for result in results} == {converged == "yes"}
 
 
@@ -37,7 +41,19 @@ def test_the_message_of_a_status_says_whether_its_maps_are_injective():
     assert positive == {name for name, injective, *_ in ROWS if injective == "yes"}
 
 
-def classes(of=Outcome):
+def test_the_table_of_what_ends_a_search_names_statuses():
+    text = (Path(__file__).parent.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text.split("## When the search stops\n")[1].split("\n## ")[0]
+    ends = [line.split(" | ")[-1] for line in table.splitlines() if line.startswith("| ")][1:]
+    named = [re.findall(r"`([A-Z_]+)`", end) for end in ends]
+    assert all(named)
+    # The other statuses are those of descents among injective maps.
+    assert {name for names in named for name in names} == set(Status.__members__) - {
+        *("POLISHED", "STILL_FALLING", "EXHAUSTED", "COLLAPSED", "NEARBY", "UNIMPROVED"),
+    }
+
+
+def classes(of=BaseOutcome):
     """Return the names of all classes of results."""
     return {of.__name__}.union(*(classes(sub) for sub in of.__subclasses__()))
 

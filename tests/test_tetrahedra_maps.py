@@ -236,7 +236,7 @@ def test_a_tetrahedron_of_fixed_vertices_is_named():
     assert result.status is TetrahedraStatus.IMPOSSIBLE
     assert result.forbidden.tolist() == [3]
     assert "its four vertices are fixed" in result.summary()
-    assert result.to_dict()["status"] == "IMPOSSIBLE"
+    assert result.to_dict()["status"] == "impossible"
 
 
 @pytest.mark.slow

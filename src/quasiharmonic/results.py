@@ -5,12 +5,15 @@ Every result has ``success``, ``status``, ``message``, ``n_iterations``, ``secon
 """
 
 from quasiharmonic.apps.air_mesh.airmesh import AirMeshState
-from quasiharmonic.apps.animation.frames import Animation, FrameStep
+from quasiharmonic.apps.animation.frames import Animation, AnimationVerdict, FrameStep
 from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
+from quasiharmonic.apps.atlas.packing.pack import Packing
 from quasiharmonic.apps.atlas.seam_cuts import CutMesh
+from quasiharmonic.apps.displacement_fields.field_inversion import InverseField
 from quasiharmonic.apps.displacement_fields.nearest import InvertibleField
-from quasiharmonic.apps.displacement_fields.voxels import InvertibleVolume
+from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, InvertibleVolume, VoxelVerdict
+from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.inverse.inverse_map import SurfacePoints
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
 from quasiharmonic.apps.repair.uv_repair import RepairedIsland, RepairResult
@@ -21,31 +24,40 @@ from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
 from quasiharmonic.apps.warping.image_warp import WarpResult
 from quasiharmonic.energies.distances import DistanceError
-from quasiharmonic.energies.measures import Statistics
+from quasiharmonic.energies.measures import Distortion, Statistics
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.mesh.refinement import Refined
-from quasiharmonic.problem.diagnosis import Forbids, Kind, Obstruction
+from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
+from quasiharmonic.problem.inspection import MeshReport
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Snapshot, Stage, Status, Step
 from quasiharmonic.solver.refine.refining import RefinedProblem
 
 __all__ = [
     "AirMeshState",
     "Animation",
+    "AnimationVerdict",
     "AtlasVerdict",
     "Certificate",
     "CleanedMesh",
     "CutMesh",
+    "Derivative",
+    "Diagnosis",
     "DistanceError",
+    "Distortion",
     "Forbids",
     "FrameStep",
+    "InverseField",
+    "InverseVolume",
     "InvertibleField",
     "InvertibleVolume",
     "Kind",
     "MapResult",
     "MappedAtlas",
+    "MeshReport",
     "Miss",
     "MorphResult",
     "Obstruction",
+    "Packing",
     "Refined",
     "RefinedProblem",
     "RefinementAttempt",
@@ -65,5 +77,6 @@ __all__ = [
     "UnwrapResult",
     "UnwrapStatus",
     "UnwrapStep",
+    "VoxelVerdict",
     "WarpResult",
 ]

@@ -11,12 +11,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.problem.result import MapResult, Snapshot, Stage, Status, Step
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat, time_limit
+
+T = TypeVar("T")
 
 
 class Run:
@@ -104,35 +106,53 @@ class Run:
         it had none. The stage is added even if the steps raise an exception.
         """
         done, first, status = len(self.history), energy(), Status.STILL_FALLING
+        last = first
         try:
             self.record(0, first, uv)
             for outcome in steps:
-                status = outcome or status
-                self.record(0, energy(), uv)
+                status, last = outcome or status, energy()
+                self.record(0, last, uv)
         finally:
+            # Compute nothing here: an exception would hide that of the steps.
             taken = max(len(self.history) - done - 1, 0)
-            self.add_stage(name, n_iterations=taken, energy=(first, energy()))
+            self.add_stage(name, n_iterations=taken, energy=(first, last))
         return status
 
     def judge_last_stage(self, kept: bool) -> None:
-        """Replace whether the result of the last stage was kept."""
-        self.stages[-1] = replace(self.stages[-1], kept=kept)
+        """Replace whether the result of the last stage was kept; there is none if the call ended before it."""
+        if self.stages:
+            self.stages[-1] = replace(self.stages[-1], kept=kept)
 
     def result(
         self, uv: FloatArray, F: IntArray, status: Status, *, loops: list[IntArray] | None = None, **further: Any
     ) -> MapResult:
-        """Certify a map and return it as the result; ``further`` are other fields of `MapResult`."""
-        certificate = certify(F, uv, loops=loops)
+        """Certify a map and return it as the result; ``further`` are other fields of `MapResult`.
+
+        If that is interrupted, the status is ``INTERRUPTED``.
+        """
+        certificate, interrupted = finish(lambda: certify(F, uv, loops=loops))
+        self.interrupted |= interrupted
         return MapResult(
             uv=uv,
-            status=status,
+            status=Status.INTERRUPTED if interrupted else status,
             certificate=certificate,
-            stages=self.stages,
-            history=self.history,
-            path=self.path,
+            stages=[*self.stages],
+            history=[*self.history],
+            path=[*self.path],
             seconds=self.seconds,
             **further,
         )
+
+
+def finish(compute: Callable[[], T]) -> tuple[T, bool]:
+    """Return what a computation returns that no result can do without, and whether an interrupt has repeated it.
+
+    A second interrupt propagates.
+    """
+    run = Run()
+    with run.until_interrupted():
+        return compute(), False
+    return compute(), True
 
 
 def run_within(seconds: float | None, compute: Callable[[], MapResult]) -> MapResult:

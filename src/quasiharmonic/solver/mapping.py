@@ -20,7 +20,7 @@ from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.problem.run import run_within
+from quasiharmonic.problem.run import Run, run_within
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.field.tensor import TANH, beltrami_coefficients
 from quasiharmonic.solver.search.search import search_map
@@ -187,7 +187,11 @@ def solve_problem(problem: Problem, options: MapOptions) -> MapResult:
     else:
         result = search_map(problem, options)
     if polishing is not None and result.status is Status.INJECTIVE:
-        result = polish_result(problem, result, polishing)
+        run = Run()
+        with run.until_interrupted():
+            result = polish_result(problem, result, polishing)
+        if run.interrupted:
+            result = replace(result, status=Status.INTERRUPTED)
     return replace(result, seconds=time.perf_counter() - began)
 
 

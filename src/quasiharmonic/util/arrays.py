@@ -389,7 +389,7 @@ def _with_article(name: str) -> str:
 
 def check_integer(name: str, value: Any, *, minimum: int) -> None:
     """Raise a ValueError unless the value is an integer of at least ``minimum``."""
-    if not isinstance(value, Integral) or value < minimum:
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < minimum:
         raise ValueError(f"{name} must be an integer of at least {minimum}, not {describe(value)}")
 
 

@@ -110,9 +110,11 @@ def reference_name(name: str, value: Any) -> None:
     check_choice(name, value, REFERENCES)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Options:
     """Base of the options of an operation; an instance has checked its values.
+
+    Classes with arrays need ``eq=False``; two instances are then equal only if they are the same.
 
     Raises
     ------
@@ -144,12 +146,14 @@ def takes(options: type[Options], keywords: type) -> Callable[[F], F]:
         signature = inspect.signature(function)
         own = [one for one in signature.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
         known = {one.name for one in [*own, *shown]}
+        # Users call a class, not its method.
+        called = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
         @wraps(function)
         def call(*args: Any, **given: Any) -> Any:
             for name in given:
                 if name not in known:
-                    raise TypeError(f"{function.__name__}() got an unexpected keyword argument {name!r}")
+                    raise TypeError(f"{called}() got an unexpected keyword argument {name!r}")
             return function(*args, **given)
 
         call.__signature__ = signature.replace(parameters=[*own, *shown])  # type: ignore[attr-defined]
@@ -158,7 +162,7 @@ def takes(options: type[Options], keywords: type) -> Callable[[F], F]:
     return decorate
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SolverOptions(Options):
     """Options of every operation that solves linear systems step by step."""
 
@@ -169,7 +173,7 @@ class SolverOptions(Options):
 _TIME_LIMIT = "end the computation of each island after this many seconds, and keep the best map"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class MapOptions(SolverOptions):
     """Options of `quasiharmonic.injective_map` and `quasiharmonic.solve`."""
 
@@ -189,7 +193,7 @@ class MapOptions(SolverOptions):
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PolishOptions(SolverOptions):
     """Options of `quasiharmonic.polish`."""
 
@@ -201,7 +205,7 @@ class PolishOptions(SolverOptions):
     slide: Any = option(False)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class HarmoniseOptions(SolverOptions):
     """Options of `quasiharmonic.harmonise`."""
 
@@ -215,7 +219,7 @@ class HarmoniseOptions(SolverOptions):
     reference: str = option("rest", check=reference_name)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class DistanceOptions(SolverOptions):
     """Options of `quasiharmonic.keep_distances`."""
 
@@ -225,7 +229,7 @@ class DistanceOptions(SolverOptions):
     record_every: int = option(0, check=count)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FlattenOptions(DistanceOptions):
     """Options of `quasiharmonic.flatten`."""
 
@@ -249,7 +253,7 @@ class FlattenOptions(DistanceOptions):
     weld: Any = option(False, check=welding)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TetrahedraOptions(Options):
     """Options of `quasiharmonic.injective_tetrahedra`."""
 
@@ -260,7 +264,7 @@ class TetrahedraOptions(Options):
     callback: Callable[[Any], object] | None = option(None, check=function)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class MorphOptions(SolverOptions):
     """Options of `quasiharmonic.morph`; its two kinds of mesh check ``max_iterations`` and ``tol``."""
 
@@ -272,7 +276,7 @@ class MorphOptions(SolverOptions):
     tol: float = option(1e-8)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class MovingOptions(Options):
     """Options of `quasiharmonic.MovingMesh`; a sliding boundary in the plane needs ``settle`` of at least 1."""
 
@@ -282,7 +286,7 @@ class MovingOptions(Options):
     linear_solver: str = option("auto", choices=LINEAR_SOLVERS)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RepairOptions(SolverOptions):
     """Options of `quasiharmonic.repair`."""
 
@@ -292,7 +296,7 @@ class RepairOptions(SolverOptions):
     max_iterations: int = option(MAX_ITERATIONS, check=positive)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AnimationOptions(SolverOptions):
     """Options of `quasiharmonic.animate`."""
 

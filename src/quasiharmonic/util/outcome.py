@@ -26,17 +26,37 @@ class Verdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
-        raise NotImplementedError
+        return {"valid": self.valid, "bijective": self.bijective}
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.summary().partition(chr(10))[0]}>"
 
 
-class Outcome:
-    """Base of results.
+class BaseOutcome:
+    """Base of results that succeed or fail; ``bool(result)`` is `success`."""
+
+    @property
+    def success(self) -> bool:
+        """Whether the call did what it promises."""
+        raise NotImplementedError
+
+    @property
+    def message(self) -> str:
+        """The outcome in one or two sentences, and what to do if it is not a success."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.message.partition(chr(10))[0]}>"
+
+    def __bool__(self) -> bool:
+        """Return `success`."""
+        return self.success
+
+
+class Outcome(BaseOutcome):
+    """Base of results with a status and a certificate.
 
     A result has a ``status``, whose value is a message for the user, a ``certificate``, and the wall time ``seconds``.
-    ``bool(result)`` is `success`.
     """
 
     if TYPE_CHECKING:
@@ -49,11 +69,6 @@ class Outcome:
 
         @property
         def seconds(self) -> float: ...
-
-    @property
-    def success(self) -> bool:
-        """Whether the call did what it promises: the map is certified injective, has not collapsed, and is complete."""
-        raise NotImplementedError
 
     @property
     def message(self) -> str:
@@ -79,13 +94,6 @@ class Outcome:
             "seconds": self.seconds,
             "certificate": self.certificate.to_dict(),
         }
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__}: {self.message.partition(chr(10))[0]}>"
-
-    def __bool__(self) -> bool:
-        """Return `success`."""
-        return self.success
 
 
 class OutcomeOf(Outcome):

@@ -58,13 +58,13 @@ class AnimationVerdict(Verdict):
 
     @property
     def valid(self) -> bool:
-        """Whether every triangle of every frame is strictly positive."""
-        return all(frame.valid for frame in self.frames)
+        """Whether there are frames and every triangle of every frame is strictly positive."""
+        return bool(self.frames) and all(frame.valid for frame in self.frames)
 
     @property
     def bijective(self) -> bool:
-        """Whether every frame is bijective."""
-        return all(frame.bijective for frame in self.frames)
+        """Whether there are frames and every frame is bijective."""
+        return bool(self.frames) and all(frame.bijective for frame in self.frames)
 
     def summary(self) -> str:
         """Describe the verdict in one sentence."""
@@ -73,7 +73,7 @@ class AnimationVerdict(Verdict):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
-        return {"valid": self.valid, "bijective": self.bijective, "summary": self.summary()}
+        return {**super().to_dict(), "summary": self.summary()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +234,7 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
             "largest_move": self.largest_move,
             "moves": [None if np.isnan(move) else float(move) for move in self.moves],
             "mean_energies": [None if np.isnan(energy) else float(energy) for energy in self.energies],
-            "status": [frame.status.name.lower() for frame in self.frames],
+            "statuses": [frame.status.name.lower() for frame in self.frames],
             "diagnoses": {
                 int(t): frame.diagnosis.to_dict()
                 for t, frame in enumerate(self.frames)

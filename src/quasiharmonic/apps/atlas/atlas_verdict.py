@@ -157,8 +157,8 @@ class AtlasVerdict(Verdict):
     def to_dict(self) -> dict[str, Any]:
         """The verdict for JSON."""
         return {
+            **super().to_dict(),
             "injective": self.injective,
-            "bijective": self.bijective,
             "islands": [island.to_dict() for island in self.islands],
             "overlapping": self.overlapping.tolist(),
         }

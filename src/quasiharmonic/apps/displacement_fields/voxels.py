@@ -79,7 +79,7 @@ class VoxelVerdict(Verdict):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
-        return {"valid": self.valid, "bijective": self.bijective, "remaining": int(np.count_nonzero(self.remaining))}
+        return {**super().to_dict(), "remaining": int(np.count_nonzero(self.remaining))}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

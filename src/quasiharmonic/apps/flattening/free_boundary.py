@@ -41,13 +41,14 @@ from quasiharmonic.problem.run import Run, run_within
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
+    check_choice,
     check_range,
     map_array,
     names_of,
     triangle_rows,
     vertex_array,
 )
-from quasiharmonic.util.options import FlattenOptions, takes
+from quasiharmonic.util.options import FLATTENED, FlattenOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
 # Distances are sampled, so their descent converges at a tolerance larger by this factor.
@@ -243,6 +244,8 @@ def _check_combination(options: FlattenOptions) -> None:
     if options.fixed is not None and options.unit_square:
         raise ValueError("fixed vertices determine the size of the map: omit unit_square")
     check_name(options.linear_solver)
+    if isinstance(options.energy, str):
+        check_choice("energy", options.energy, FLATTENED)
     if not _keeps_distances(options):
         find_energy(options.energy)
     elif options.fixed is not None or options.weights is not None:

@@ -60,7 +60,7 @@ class FlattenedKeywords(FlattenDerivativeKeywords, total=False):
     start: ArrayLike | None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SolvedOptions(MapOptions):
     """Options of `quasiharmonic.solve` with a polish."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -183,16 +184,12 @@ def morph(
     fixed, goal = _find_fixed(points, F, moved_vertices, target)
     search = _NodeSearch(F, first, fixed, nets_of(F), checked)
     after, result = search.place(points, goal, begin, (curves, np.asarray(moved_vertices)))
-
-    def one_step() -> FloatArray:
-        # Fix the boundary at the positions to which it has slid.
-        alone = replace(search, options=replace(checked, callback=None))
-        whole, _ = alone.place(first, after[fixed], None, (False, fixed))
-        return np.full_like(whole, np.nan) if inverted_elements(F, whole).size else whole
-
+    # Fix the boundary at the positions to which it has slid.
+    alone = replace(search, options=replace(checked, callback=None, slide=False, rest=None, start=None))
     inverted = inverted_elements(F, after)
     forbidden = np.intersect1d(inverted, find_forbidden(F, after, fixed))
     before, now = element_quality(F, points), element_quality(F, after)
+    one_step = partial(alone.place_at_once, after[fixed])
     return MorphResult(after, F, inverted, forbidden, result, before, now, points.copy(), one_step)
 
 
@@ -239,10 +236,15 @@ class _NodeSearch:
             left = inverted_elements(F, after).size
             if left < least:
                 best, least = (after, result), left
-            if not left:
+            if not left or result.status is Status.INTERRUPTED:
                 break
         assert best is not None
         return best
+
+    def place_at_once(self, target: FloatArray) -> FloatArray:
+        """Return the positions (n, 2) after one step from the rest mesh; NaN if an element is inverted."""
+        whole, _ = self.place(self.rest, target, None, (False, self.fixed))
+        return np.full_like(whole, np.nan) if inverted_elements(self.F, whole).size else whole
 
     def _search(
         self, triangles: IntArray, points: FloatArray, target: FloatArray, begin: FloatArray | None, slide: _Slide
@@ -265,7 +267,9 @@ class _NodeSearch:
             problem = move_onto(curves, problem)
         start, iterations = None if begin is None else begin[used], self.options.max_iterations
         result = solve(problem, start=start, max_iterations=iterations, linear_solver=linear_solver, callback=callback)
-        if corners is not None and result.status is not Status.INTERRUPTED:
+        if result.status is Status.INTERRUPTED:
+            energy = None
+        elif corners is not None:
             result = make_convex(problem, result, corners, linear_solver=linear_solver)
         if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
             polishing = PolishOptions(

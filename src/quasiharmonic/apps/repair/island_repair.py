@@ -51,6 +51,8 @@ class IslandRepair:
         Why triangles are still inverted; empty before this is known.
     diagnosis : Diagnosis or None
         The obstruction to a map, in the mesh's numbering.
+    n_iterations : int
+        Iterations of all searches and descents so far.
     """
 
     def __init__(self, V: FloatArray, island: Island, fixed: IntArray, options: RepairOptions) -> None:
@@ -58,6 +60,7 @@ class IslandRepair:
         self.uv = island.uv.copy()
         self.reason = ""
         self.diagnosis: Diagnosis | None = None
+        self.n_iterations = 0
         self._F, self._V = island.F, V[island.vertices]
         self._fixed = mark(len(self.uv), boundary_edges(self._F, len(self.uv)))
         self._fixed |= np.isin(island.vertices, fixed)
@@ -146,7 +149,7 @@ class IslandRepair:
                 max_iterations=allowed, linear_solver=self._options.linear_solver, callback=self._options.callback
             )
             result = solve_problem(problem, options)
-            if _check_interrupt(result).injective:
+            if self._count(result).injective:
                 self._use_map(free, vertices, result.uv, keep)
                 return
             self.reason = result.status.value
@@ -192,7 +195,14 @@ class IslandRepair:
             if not rest_shapes(problem.V, problem.F).flat.size:
                 options = PolishOptions(linear_solver=self._options.linear_solver, callback=self._options.callback)
                 polished = polish_map(problem.domain, self.uv[vertices], options)
-                self.uv[vertices] = _check_interrupt(polished).uv
+                self.uv[vertices] = self._count(polished).uv
+
+    def _count(self, result: MapResult) -> MapResult:
+        """Count a result's iterations and return it; if Ctrl-C ended it, raise KeyboardInterrupt to end the repair."""
+        if result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        self.n_iterations += result.n_iterations
+        return result
 
     def _is_multiply_wound(self, free: BoolArray) -> bool:
         """Whether triangles wind more than once around an interior vertex of the patch; positive triangles can do so.
@@ -231,13 +241,6 @@ class IslandRepair:
         )
         if found.forbids_injective:
             self.reason = self.diagnosis.summary()
-
-
-def _check_interrupt(result: MapResult) -> MapResult:
-    """Return the result; if Ctrl-C ended the search, raise KeyboardInterrupt to end the whole repair."""
-    if result.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
-    return result
 
 
 def _renumber(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obstruction:

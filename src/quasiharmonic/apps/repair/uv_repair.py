@@ -55,6 +55,8 @@ class RepairedIsland(IslandReport):
         Why triangles are still inverted; empty if there are none.
     diagnosis : Diagnosis or None
         The obstruction to a map with this boundary, computed if triangles are still inverted.
+    n_iterations : int
+        Iterations of all searches and descents.
     """
 
     inverted_before: IntArray
@@ -63,6 +65,7 @@ class RepairedIsland(IslandReport):
     bijective: bool
     reason: str = ""
     diagnosis: Diagnosis | None = None
+    n_iterations: int = 0
 
     @property
     def injective(self) -> bool:
@@ -142,6 +145,11 @@ class RepairResult(SummarisedOutcome):
     def injective(self) -> bool:
         """Whether there is an island, and every triangle of every island is strictly positive."""
         return bool(self.islands) and all(island.injective for island in self.islands)
+
+    @property
+    def n_iterations(self) -> int:
+        """Iterations over all islands."""
+        return sum(island.n_iterations for island in self.islands)
 
     @property
     def moved_vertices(self) -> IntArray:
@@ -281,6 +289,7 @@ def _repair_island(
         bijective=bool(certificate.bijective),
         reason="" if certificate.injective else one.reason,
         diagnosis=None if certificate.injective else one.diagnosis,
+        n_iterations=one.n_iterations,
     )
 
 

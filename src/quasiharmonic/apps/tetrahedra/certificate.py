@@ -162,6 +162,7 @@ class TetrahedraCertificate(ReadOnly, Verdict):
     def to_dict(self) -> dict[str, Any]:
         """Return the certificate in plain Python types, fit for JSON; boundary triangles by their vertices."""
         return {
+            **super().to_dict(),
             "injective": self.injective,
             "positive": self.positive,
             "tetrahedra": self.tetrahedra,

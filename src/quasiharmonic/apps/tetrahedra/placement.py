@@ -108,18 +108,26 @@ def place_vertices(
         X, status, iterations = _search(TetrahedraDescent(energy, free, X, projections=projections), options)
         after = np.ldexp(X, exponent)
         begin[free] = after[free]
-    certificate = certify_arrays(T, begin, faces=mesh.faces)
+    run = Run()
+    with run.until_interrupted():
+        certificate = certify_arrays(T, begin, faces=mesh.faces)
+    if run.interrupted:
+        # Keep the mesh that was found, and leave its boundary unchecked.
+        certificate = certify_arrays(T, begin, boundary=False, faces=mesh.faces)
     sign, _ = tetrahedron_signs(T, begin)
     is_fixed = mark(len(points), fixed)
     forbidden = np.flatnonzero((sign <= 0) & is_fixed[T].all(axis=1))
     if not certificate.positive and status is not TetrahedraStatus.CROSSING:
-        obstructions = find_obstructions(T, begin, is_fixed, mesh.faces.boundary if whole else None, sign)
+        with run.until_interrupted():
+            obstructions = find_obstructions(T, begin, is_fixed, mesh.faces.boundary if whole else None, sign)
         if obstructions:
             status = TetrahedraStatus.IMPOSSIBLE
         elif status not in (TetrahedraStatus.OUT_OF_ITERATIONS, TetrahedraStatus.INTERRUPTED):
             status = TetrahedraStatus.STALLED
     elif certificate.positive and not certificate.injective and status is not TetrahedraStatus.INTERRUPTED:
         status = TetrahedraStatus.OVERLAPPING
+    if run.interrupted and not obstructions:
+        status = TetrahedraStatus.INTERRUPTED
     return TetrahedraResult(
         points=begin,
         T=T,

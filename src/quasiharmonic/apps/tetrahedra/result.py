@@ -122,7 +122,6 @@ class TetrahedraResult(Outcome):
         return {
             **super().to_dict(),
             "valid": self.valid,
-            "status": self.status.name,
             "forbidden": self.forbidden.tolist(),
             "obstructions": [{"text": o.text, "vertices": list(o.vertices)} for o in self.obstructions],
             "iterations": self.iterations,

@@ -83,7 +83,7 @@ class UnwrapCertificate(Verdict):
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
         return {
-            "bijective": self.bijective,
+            **super().to_dict(),
             "injective": self.injective,
             "disjoint": self.disjoint,
             "not_bijective_charts": np.flatnonzero(~self.bijective_charts).tolist(),

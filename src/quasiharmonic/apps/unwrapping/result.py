@@ -121,6 +121,8 @@ class UnwrapResult(Outcome):
         Texels per unit of length of the model.
     V : (n, 2) or (n, 3) float64
         Positions of the model's vertices.
+    seconds : float
+        Wall time of the call.
     """
 
     vmapping: IntArray
@@ -138,6 +140,7 @@ class UnwrapResult(Outcome):
     resolution: tuple[int, int]
     texels_per_unit: float
     V: FloatArray
+    seconds: float
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.vmapping, self.indices, self.uvs))
@@ -146,11 +149,6 @@ class UnwrapResult(Outcome):
     def success(self) -> bool:
         """Whether every chart is bijective and no two charts overlap; charts may still exceed the bound (`misses`)."""
         return self.certificate.bijective
-
-    @property
-    def message(self) -> str:
-        """The message of `status`."""
-        return self.status.value
 
     @property
     def n_charts(self) -> int:
@@ -196,9 +194,7 @@ class UnwrapResult(Outcome):
     def to_dict(self) -> dict[str, Any]:
         """Return the report for JSON, without the arrays."""
         return {
-            "success": self.success,
-            "status": self.status.name.lower(),
-            "message": self.message,
+            **super().to_dict(),
             "charts": self.n_charts,
             "seam_edges": len(self.seams),
             "seam_length": self.seam_length,
@@ -207,7 +203,6 @@ class UnwrapResult(Outcome):
             "utilisation": self.utilisation,
             "texels_per_unit": self.texels_per_unit,
             "resolution": list(self.resolution),
-            "certificate": self.certificate.to_dict(),
             "reversed": int(self.cleaned.flipped.sum()),
             "excluded": self.cleaned.excluded.tolist(),
             "collapsed": self.cleaned.collapsed.tolist(),

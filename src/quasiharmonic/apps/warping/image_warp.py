@@ -21,7 +21,7 @@ from quasiharmonic.energies.bending import Pull, bend_map
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.problem import Domain
-from quasiharmonic.problem.result import MapResult
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import injective_map
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, check_non_negative, index_array, map_array
 from quasiharmonic.util.outcome import OutcomeOf
@@ -111,6 +111,8 @@ def warp_by_landmarks(
         the same position, a number is out of its range, or the moved border intersects itself.
     RuntimeError
         If no injective warp was found.
+    KeyboardInterrupt
+        If Ctrl-C ends the search before there is an injective warp. After that, the result is the best warp so far.
 
     Examples
     --------
@@ -142,6 +144,9 @@ def warp_by_landmarks(
     fixed = np.concatenate([border, own[hard]])
     # Landmarks can pass each other. The corrected reference spreads the resulting distortion from the start.
     result = injective_map(points, F, fixed, target, reference="corrected", polish=None if length else energy)
+    interrupted = result.status is Status.INTERRUPTED
+    if interrupted and not result.injective:
+        raise KeyboardInterrupt
     if result.certificate.crossings.size:
         raise ValueError("target: the border, moved by the landmarks on it, crosses itself")
     if not result.injective:
@@ -149,7 +154,7 @@ def warp_by_landmarks(
             "no warp without folds was found: landmarks may move too far past each other or past the border. "
             f"Move them less, or give more landmarks between them. ({result.status.value})"
         )
-    if length:
+    if length and not interrupted:
         pull = Pull(own[~hard], after[~hard], given.weights[~hard])
         result = bend_map(Domain(points, F, fixed), result, energy=energy, length=length, pull=pull)
     return WarpResult(warp_along(pixels, points, F, result.uv), points, F, result.uv, result)

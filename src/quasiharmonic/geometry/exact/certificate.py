@@ -162,8 +162,8 @@ class Certificate(ReadOnly, Displayable, Verdict):
     def to_dict(self) -> dict[str, Any]:
         """Return the certificate in plain Python types, fit for JSON; each loop as its first vertex and its length."""
         return {
+            **super().to_dict(),
             "injective": self.injective,
-            "bijective": self.bijective,
             "triangles": self.triangles,
             "inverted": self.inverted.tolist(),
             "degenerate": self.degenerate.tolist(),

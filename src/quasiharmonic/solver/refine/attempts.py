@@ -109,7 +109,9 @@ class _Refinement:
             return replace(self._run_attempts(start, budget), refinement_attempts=self._attempts)
         if self._last is None or self._best is None:
             raise KeyboardInterrupt
-        best = self._use_construction(self._best) if self._best.stages[-1].name == CONSTRUCTED else self._best
+        best = self._best
+        if best.stages and best.stages[-1].name == CONSTRUCTED:
+            best = self._use_construction(best)
         best = replace(best, stages=self._last.stages, history=self._last.history)
         return replace(best, status=Status.INTERRUPTED, refinement_attempts=self._attempts)
 

@@ -11,11 +11,11 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 from quasiharmonic.util.arrays import check_integer
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import BaseOutcome
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RefinedProblem(Outcome):
+class RefinedProblem(BaseOutcome):
     """A problem on a refined mesh.
 
     Attributes

@@ -51,7 +51,7 @@ class HarmonicDescent:
     uv : (n, 2) float64
         Initial map.
     run : Run
-        Records every map and every round.
+        Records every map and every round. The caller records the initial map, whose state is ``best``.
 
     Attributes
     ----------
@@ -77,7 +77,6 @@ class HarmonicDescent:
         inverted = inverted_triangles(self._problem.F, uv).size
         distortion = self._measure.distortion if inverted else self._measure.distortion_of_map
         self.best = inverted, distortion(self._last)
-        run.record(*self.best)
 
     def return_to_best(self) -> None:
         """Return to the best map."""

@@ -209,6 +209,7 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
         descent = HarmonicDescent(objective, descend, start, run)
         first, status = descent.best, Status.STILL_FALLING
         with run.until_interrupted():
+            run.record(*first)
             for values in (schedule, len(schedule) * schedule[-1:]):
                 for value in values:
                     stage = f"harmonise, {name}, η = {value:g}"

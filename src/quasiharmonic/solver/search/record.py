@@ -111,12 +111,13 @@ class SearchRecord:
         If ``tensors``, it comes from a tensor descent.
         """
         self.rounded |= inverted > here.inverted == 0
-        self.work.record(inverted, here.energy, lambda: self.problem.positions(here.w))
         if (inverted, here.energy) < self.best:
             self.best = inverted, here.energy
             self.best_map, self.best_field, self.best_reference = here.w, here.field, here.objective.reference
         if tensors and (self.lowest_energy is None or here.energy < self.lowest_energy.energy):
             self.lowest_energy = here
+        # Last, because the callback may end the search.
+        self.work.record(inverted, here.energy, lambda: self.problem.positions(here.w))
 
     def replace_best(self, w: ComplexArray, inverted: int) -> None:
         """Replace the best map by ``w`` with its own tensors."""

@@ -16,6 +16,7 @@ from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status
+from quasiharmonic.problem.run import finish
 from quasiharmonic.solver.methods import Descent, LineShift, LocalRepair, Newton, Untangling, VectorAdam
 from quasiharmonic.solver.methods.base import SearchState
 from quasiharmonic.solver.methods.local_repair import MAX_INVERTED
@@ -168,25 +169,28 @@ class Search(SearchRecord):
             linear_solver=self._solver_name,
             callback=lambda step: self.work.record(step.inverted, step.energy),
         )
-        status, uv, inverted, self.linear_solver = search_coarse(problem, first, options)
-        is_final = status in (Status.INJECTIVE, Status.INTERRUPTED)
-        if is_final or (status is not Status.IMPOSSIBLE and inverted <= MAX_INVERTED):
-            w = coarse.prolong(problem.frame.inward(uv))
-            (inverted,) = count_not_positive([(self.problem, w)])
-            if is_final or inverted <= min(MAX_INVERTED, self.best[0] - 1):
-                self.replace_best(w, inverted)
-                self.rounded |= status is Status.INJECTIVE and inverted > 0
-                self.work.record(*self.best)
-        self.work.stages.append(
-            Stage(
-                name=f"{name}, {len(problem.F)} triangles",
-                n_iterations=len(self.work.history) - done,
-                seconds=time.perf_counter() - began,
-                inverted=(before.best[0], self.best[0]),
-                energy=(before.best[1], self.best[1]),
-                kept=self.best != before.best,
+        try:
+            status, uv, inverted, self.linear_solver = search_coarse(problem, first, options)
+            is_final = status in (Status.INJECTIVE, Status.INTERRUPTED)
+            if is_final or (status is not Status.IMPOSSIBLE and inverted <= MAX_INVERTED):
+                w = coarse.prolong(problem.frame.inward(uv))
+                (inverted,) = count_not_positive([(self.problem, w)])
+                if is_final or inverted <= min(MAX_INVERTED, self.best[0] - 1):
+                    self.replace_best(w, inverted)
+                    self.rounded |= status is Status.INJECTIVE and inverted > 0
+                    if status is not Status.INTERRUPTED:
+                        self.work.record(*self.best)
+        finally:
+            self.work.stages.append(
+                Stage(
+                    name=f"{name}, {len(problem.F)} triangles",
+                    n_iterations=max(len(self.work.history) - done, 0),
+                    seconds=time.perf_counter() - began,
+                    inverted=(before.best[0], self.best[0]),
+                    energy=(before.best[1], self.best[1]),
+                    kept=self.best != before.best,
+                )
             )
-        )
         if status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         if self.best != before.best and self.best[0]:
@@ -234,10 +238,11 @@ def search_coarse(problem: Problem, first: Descent, options: MapOptions) -> tupl
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
         # Fine vertices crowd in thin coarse triangles. A few polishing steps avoid much later work.
-        polish = polish_map(
-            problem.domain, uv, PolishOptions(energy="mips", max_iterations=10, linear_solver=options.linear_solver)
-        )
-        uv = polish.uv
+        polishing = PolishOptions(energy="mips", max_iterations=10, linear_solver=options.linear_solver)
+        status = Status.INTERRUPTED
+        with search.work.until_interrupted():
+            polish = polish_map(problem.domain, uv, polishing)
+            uv, status = polish.uv, Status.INTERRUPTED if polish.status is Status.INTERRUPTED else Status.INJECTIVE
     return status, uv, search.best[0], search.linear_solver
 
 
@@ -254,7 +259,9 @@ def finish_search(search: Search, strategy: str | Stages, spent: float = 0.0) ->
     began = time.perf_counter()
     search.run(stages_of(strategy, search.problem))
     uv = search.problem.positions(search.best_map)
-    certificate = certify(search.problem.F, uv, loops=search.problem.domain.loops)
+    certificate, interrupted = finish(lambda: certify(search.problem.F, uv, loops=search.problem.domain.loops))
+    if interrupted:
+        search.status = Status.INTERRUPTED
     mu = None if search.best_field is None else search.best_field.mu
     return result_of(search, uv, certificate, mu, spent + time.perf_counter() - began)
 
@@ -262,10 +269,14 @@ def finish_search(search: Search, strategy: str | Stages, spent: float = 0.0) ->
 def result_of(
     search: SearchRecord, uv: FloatArray, certificate: Certificate, mu: ComplexArray | None, seconds: float
 ) -> MapResult:
-    """Return the result of a search from its map (n, 2), the map's certificate and its tensors' μ (f,)."""
+    """Return the result of a search from its map (n, 2), the map's certificate and its tensors' μ (f,).
+
+    An interrupted search stays so even if its map is injective: what follows a search does not begin then.
+    """
+    found = certificate.injective and search.status is not Status.INTERRUPTED
     return MapResult(
         uv=uv,
-        status=Status.INJECTIVE if certificate.injective else search.status,
+        status=Status.INJECTIVE if found else search.status,
         certificate=certificate,
         stages=search.work.stages,
         history=search.work.history,

@@ -67,14 +67,18 @@ def choice(choices: Sequence[str], words: str, **rest: Any) -> Option:
     return {"choices": choices, "help": words, **rest}
 
 
-def number(kind: Callable[[str], Any], words: str, *, metavar: str = "N", **rest: Any) -> Option:
+def number(kind: Callable[[str], Any], words: str, *, metavar: str | tuple[str, ...] = "N", **rest: Any) -> Option:
     """Return an option with a number that ``kind`` converts."""
     return {"type": kind, "metavar": metavar, "help": words, **rest}
 
 
 def declared(operation: type[Options]) -> dict[str, Option]:
-    """Return the options of an operation: the fields of its class that have a help text."""
-    return {one.name: _declare(one) for one in fields(operation) if one.metadata["help"]}
+    """Return the options of an operation: the fields that its class itself declares with a help text, in their order.
+
+    Options of base classes are shared, and commands list these last.
+    """
+    known = {one.name: one for one in fields(operation)}
+    return {name: _declare(known[name]) for name in operation.__annotations__ if known[name].metadata["help"]}
 
 
 def _declare(one: Field[Any]) -> Option:
@@ -83,7 +87,10 @@ def _declare(one: Field[Any]) -> Option:
         return flag(words)
     if choices:
         return choice(choices, words, default=one.default)
-    return number({options.positive: count, options.count: steps}.get(check, float), words, default=one.default)
+    integer = {options.positive: count, options.count: steps}.get(check, int)
+    if one.type in ("int", "int | None"):
+        return number(integer, words, default=one.default)
+    return number(float, words, metavar="SECONDS" if check is options.seconds else "X", default=one.default)
 
 
 def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option) -> None:
@@ -92,10 +99,12 @@ def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option)
         parser.add_argument("--" + name.replace("_", "-"), **option)
 
 
-def add_files(parser: argparse.ArgumentParser, source: str, output: str, metavar: str = "INPUT") -> None:
-    """Add the input, and ``--output``, with these help texts."""
-    parser.add_argument("input", type=Path, metavar=metavar, help=source)
-    parser.add_argument("-o", "--output", type=Path, required=True, help=output)
+def add_files(
+    parser: argparse.ArgumentParser, source: str, output: str, *, metavar: tuple[str, str] = ("INPUT", "OUTPUT")
+) -> None:
+    """Add the input, and ``--output``, with these help texts and names."""
+    parser.add_argument("input", type=Path, metavar=metavar[0], help=source)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar=metavar[1], help=output)
 
 
 def pick(given: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -118,17 +127,21 @@ def set_default(options: argparse.Namespace, name: str, default: object, *, aske
 
 def steps(text: str) -> int:
     """Convert text to a nonnegative integer; for argparse."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
+    return _integer(text, 0)
 
 
 def count(text: str) -> int:
     """Convert text to a positive integer; for argparse."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return _integer(text, 1)
+
+
+def _integer(text: str, least: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        raise argparse.ArgumentTypeError(f"{text} is not an integer of at least {least}")
     return value
 
 
@@ -168,7 +181,10 @@ def weld(default: str) -> Option:
 
 def degrees(text: str) -> float:
     """Convert text to an angle in degrees, 0 to 180; for argparse."""
-    angle = float(text)
+    try:
+        angle = float(text)
+    except ValueError:
+        angle = -1.0
     if not 0 <= angle <= 180:
         raise argparse.ArgumentTypeError(f"{text} degrees: an angle from 0 to 180 is needed")
     return angle
@@ -184,6 +200,7 @@ def _island_list(text: str) -> list[int]:
 
 #: The options that several commands take with the same meaning.
 SHARED: dict[str, Option] = {
+    **declared(options.SolverOptions),
     **declared(options.MapOptions),
     "fixed": file("file of fixed vertices, 0-based, one per line (default: the boundary)"),
     "font": text("FONT", "for letters and words: a font file or the name of a font"),

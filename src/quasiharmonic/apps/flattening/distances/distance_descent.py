@@ -98,7 +98,8 @@ def keep_distances(V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[
     MapResult
         ``uv`` is certified as bijective, and in the surface's unit of length, at the scale that fits distances best.
         The status is ``POLISHED`` if converged, ``STILL_FALLING`` after ``max_iterations``, ``EXHAUSTED`` if no better
-        bijective map was found, or ``INTERRUPTED`` by Ctrl-C, with the best map so far.
+        bijective map was found, or ``INTERRUPTED`` by Ctrl-C, with the best map so far: ``uv`` unchanged if the descent
+        has not begun.
 
     Raises
     ------
@@ -130,11 +131,13 @@ def keep_distances(V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[
     certificate = certify(piece.F, positions, loops=piece.loops)
     if not certificate.bijective:
         raise ValueError(f"uv is not bijective: the descent needs a bijective map. {certificate.summary()}")
-    result = lower_distance_error(piece, positions, checked)
-    uv = to_given_unit(result.uv, piece.exponent)
-    certificate = certify(piece.F, uv, loops=piece.loops)
+    result = MapResult(uv=positions, status=Status.INTERRUPTED, certificate=certificate)
+    with Run().until_interrupted():
+        lowered = lower_distance_error(piece, positions, checked)
+        uv = to_given_unit(lowered.uv, piece.exponent)
+        result = replace(lowered, uv=uv, certificate=certify(piece.F, uv, loops=piece.loops))
     rest = np.ldexp(piece.V, piece.exponent)
-    return replace(result, uv=uv, certificate=certificate, seconds=time.perf_counter() - began, V=rest)
+    return replace(result, seconds=time.perf_counter() - began, V=rest)
 
 
 def lower_distance_error(piece: Piece, uv: FloatArray, options: DistanceOptions, *, first: int = 0) -> MapResult:

@@ -121,11 +121,12 @@ def add_parser(commands: Commands) -> None:
             "let boundary vertices slide along the outline while --polish lowers distortion; corners stay fixed"
         ),
     )
-    add_options(
-        solver,
-        *("font", "corners", "corner_angle", "refine", "pieces", "reference", "max_iterations", "linear_solver"),
-        strategy=SHARED["strategy"] | {"default": None},
-    )
+    of_outlines = {
+        name: SHARED[name] | {"help": f"for --to: {SHARED[name]['help']}"} for name in ("corners", "corner_angle")
+    }
+    add_options(solver, "font", **of_outlines)
+    add_options(solver, "pieces", "refine", strategy=SHARED["strategy"] | {"default": None})
+    add_options(solver, "reference", "max_iterations", "linear_solver")
 
 
 def run(options: argparse.Namespace) -> int:

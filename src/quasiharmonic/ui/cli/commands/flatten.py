@@ -54,7 +54,6 @@ def add_parser(commands: Commands) -> None:
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map')} file to write")
     add_options(
         parser,
-        "rings",
         **declared(FlattenOptions),
         weights=file("file of triangle weights, one positive number per line"),
         start=flag("start from the map in the input's texture coordinates (vt)"),
@@ -62,7 +61,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_options(
         parser,
-        *("cut", "seams", "islands", "pack", "resolution", "padding"),
+        *("rings", "cut", "seams", "islands", "pack", "resolution", "padding"),
         weld=weld("no"),
         pattern=file("also draw the outline true to scale, as .svg or .dxf"),
         unit=choice(("mm", "cm", "m", "in"), "length unit of the surface, for --pattern (default: mm)"),
@@ -70,7 +69,7 @@ def add_parser(commands: Commands) -> None:
             float, "distance of the cutting line outside the outline, in that unit", metavar="WIDTH", default=0.0
         ),
     )
-    add_options(parser, "texture", "json", "surface")
+    add_options(parser, "linear_solver", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -118,7 +117,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
     kept = np.flatnonzero(joint == np.arange(len(mesh.V)))
     if (close := kept[find_close_vertices(mesh.V[kept], triangles)]).size:
         streams.tell(describe_soup(close))
-    given |= pick(options, "start", "rings", "islands", *declared(FlattenOptions))
+    given |= pick(options, "start", "rings", "islands", "linear_solver", *declared(FlattenOptions))
     with pipeline.working(options.input) as show:
         mapped = atlas.flatten(found.mesh, gap=_PIECE_GAP * options.allowance, callback=show, **given)
 

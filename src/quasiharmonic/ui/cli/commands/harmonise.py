@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
         ),
         unscaled=flag("compare lengths and areas without first scaling the map to the surface's area"),
     )
-    add_options(parser, "pack", "resolution", "padding", "texture", "json", "surface")
+    add_options(parser, "pack", "resolution", "padding", "linear_solver", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -76,7 +76,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_options(parser, "slide", "pieces")
     solver = parser.add_argument_group("solution")
-    add_options(solver, "reference", *declared(MapOptions))
+    add_options(solver, *declared(MapOptions), "reference", "linear_solver")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -124,7 +124,7 @@ def _map(
         one = targets.make_problem(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
-        given = pick(options, "polish", *declared(MapOptions))
+        given = pick(options, "polish", "linear_solver", *declared(MapOptions))
         slide = one.slide if options.polish else False
         with progress_line.line() as show:
             result = solve(problem, slide=slide, callback=show, **given)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, file, flag, text
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, file, flag, number, text
 from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:
@@ -50,8 +50,10 @@ def add_parser(commands: Commands) -> None:
         parser,
         f"{format_names('read_elements')} file, text or binary",
         "mesh to write, in the same format",
-        metavar="MESH",
+        metavar=("MESH", "MESH"),
     )
+    # Before Python 3.14, argparse takes -1e-9 for an option.
+    parser._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
     add_options(
         parser.add_mutually_exclusive_group(required=True),
         positions=file(
@@ -70,6 +72,14 @@ def add_parser(commands: Commands) -> None:
             "let boundary vertices without a displacement slide along the boundary, its corners stay fixed; in space "
             "along all flat parts of the boundary"
         ),
+        slide_plane=number(
+            float,
+            "for tetrahedra: let boundary vertices without a displacement slide on the plane A x + B y + C z = D; "
+            "repeat for several planes",
+            metavar=("A", "B", "C", "D"),
+            nargs=4,
+            action="append",
+        ),
         rest=file(
             "reference mesh of distortion, such as the first of several steps (default: the input). For planar meshes "
             "the report gives the distance of the written mesh from the result of a single step from there",
@@ -77,17 +87,6 @@ def add_parser(commands: Commands) -> None:
         ),
     )
     add_options(parser, "max_iterations", "linear_solver", "json")
-    # Before Python 3.14, argparse takes -1e-9 for an option.
-    parser._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
-    parser.add_argument(
-        "--slide-plane",
-        type=float,
-        nargs=4,
-        action="append",
-        metavar=("A", "B", "C", "D"),
-        help="for tetrahedra: let boundary vertices without a displacement slide on the plane A x + B y + C z = D; "
-        "repeat for several planes",
-    )
 
 
 def run(options: argparse.Namespace) -> int:

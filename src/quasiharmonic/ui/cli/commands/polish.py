@@ -62,7 +62,7 @@ def add_parser(commands: Commands) -> None:
         "pieces",
         to=text("OUTLINE", "the outline of the boundary, as for qhm map (default: the polygon of the boundary)"),
     )
-    add_options(parser, "islands", "pack", "resolution", "padding", "texture", "json", "surface")
+    add_options(parser, "islands", "pack", "resolution", "padding", "linear_solver", "texture", "json", "surface")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
         from quasiharmonic.apps.atlas import island_functions as atlas
         from quasiharmonic.targets.boundary.sliding_curves import find_sliding_curves
 
-        given |= {"islands": options.islands, "free": options.free}
+        given |= {"islands": options.islands, "free": options.free, "time_limit": options.time_limit}
         if options.free:
             return atlas.polish(mesh, **given)
         slide = options.slide
