@@ -19,6 +19,8 @@ UNDIVIDED_COST = 1e3
 FLAT = 2e-6
 # No two triangles with a larger angle between them, in radians, count as flat, however small they are.
 _FLAT_ANGLE = np.pi / 180
+# Triangles with a smaller share of the area belong to no flat face: their planes are arbitrary.
+_LEAST_AREA = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,9 @@ def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
     size = float(np.linalg.norm(np.ptp(V, axis=0)))
     P = V[F] / size
     normal = np.cross(P[:, 1] - P[:, 0], P[:, 2] - P[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]
+    doubled = np.linalg.norm(normal, axis=1)
+    normal /= np.maximum(doubled, np.finfo(float).tiny)[:, None]
+    tiny = doubled <= _LEAST_AREA * doubled.sum()
     flat_P = P.reshape(-1, 3)
     ahead = np.roll(np.arange(F.size).reshape(-1, 3), -1, axis=1).ravel()
     apex = np.roll(np.arange(F.size).reshape(-1, 3), -2, axis=1).ravel()
@@ -87,7 +91,7 @@ def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
     angle = np.arctan2(sine, (a * b).sum(axis=1))
     above = ((flat_P[apex[other]] - start) * a).sum(axis=1)
     height = np.maximum(np.abs(above), np.abs(((flat_P[apex[one]] - start) * b).sum(axis=1)))
-    flat = (height <= FLAT) & (angle <= _FLAT_ANGLE)
+    flat = (height <= FLAT) & (angle <= _FLAT_ANGLE) & ~(tiny[one // 3] | tiny[other // 3])
     return Hinges(one, other, np.where(above > 0, -angle, angle), length * size, flat)
 
 

@@ -26,14 +26,14 @@ CREASE = np.pi / 6
 # Smaller angles at which curved parts are divided.
 _ANGLES = np.deg2rad([20.0, 13.0, 9.0, 6.0, 4.0])
 # There, a piece has at least this share of the area, and its squared perimeter is at most this multiple of its own area.
-_LEAST_SHARE, _LONGEST = 0.05, 40.0
+_LEAST_SHARE, _LONGEST = 0.15, 40.0
 # Between creases, a piece with at least this share of the area is kept in any case.
-_LARGE_SHARE = 0.05
-# Smaller ones are kept unless at half of their corners many pieces meet, as on a rough scan, or four pieces with little
-# curvature in radians, as on a coarse sphere.
-_ROUGH, _MANY, _ROUND = 0.5, 5, 0.7
+_LARGE_SHARE = 0.2
+# Smaller ones are kept unless at half of their corners many pieces meet, as on a rough scan, or there is little curvature
+# in radians where three or four pieces meet, as on a coarse sphere.
+_ROUGH, _MANY, _ROUND = 0.5, 5, {3: 0.45, 4: 0.8}
 # Pieces with a smaller share of the area are dropped if they mostly border on curved parts.
-_SMALL_SHARE = 0.01
+_SMALL_SHARE = 0.02
 # Largest angle defect of a vertex of a developable piece, and of all its vertices together, in radians.
 _DEFECT, _ALL_DEFECTS = 1e-3, 0.1
 # A piece may have this number of vertices with larger defects, such as the apex of a cone. They are cut open.
@@ -95,7 +95,8 @@ class _Parts:
         at[self.split] = F
         around = np.bincount(at)[at]
         curvature = np.abs(2 * np.pi - np.bincount(at, total))[at]
-        rounded = (around == _MANY - 1) & (curvature > _DEFECT) & (curvature < _ROUND)
+        little = np.where(around == 3, _ROUND[3], _ROUND[4])
+        rounded = (curvature > _DEFECT) & (curvature < little)
         corner = rim & (around >= 3)
         rough = np.bincount(part[corner], (rounded | (around >= _MANY))[corner], self.count)
         self.rough = rough > _ROUGH * np.bincount(part[corner], minlength=self.count)
@@ -154,10 +155,10 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, co
     doubled = np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
     length = np.linalg.norm(V[F] - V[np.roll(F, -1, axis=1)], axis=2)
     found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
-    for angle in (CREASE, *_ANGLES):
+    for angle in (CREASE, *_ANGLES, 0.0):
         rest = found.label < 0
         within = ~apart & rest[hinges.first] & rest[hinges.second]
-        joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat | together)
+        joined = within & ((np.abs(hinges.angle) <= (angle or CREASE)) | hinges.flat | together)
         parts = _Parts(F, hinges, joined, angles, area)
         chosen = parts.developable & mark(parts.count, parts.component[rest])
         outline = np.where(hinges.mark_sides(joined, len(F)), 0.0, length)
@@ -165,6 +166,11 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, co
         if angle == CREASE:
             chosen &= ~parts.rough | (parts.area >= _LARGE_SHARE)
             chosen = _drop_scattered(hinges, parts, chosen, rim)
+        elif not angle:
+            # What is left between pieces can be developable as a whole.
+            creased = within & ~joined
+            chosen[parts.component[hinges.first[creased]]] = False
+            chosen[parts.component[hinges.second[creased]]] = False
         else:
             chosen &= (parts.area >= _LEAST_SHARE) & (rim**2 <= _LONGEST * parts.area * doubled.sum() / 2)
         if chosen.any():
