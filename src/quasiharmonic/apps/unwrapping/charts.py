@@ -16,12 +16,14 @@ from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
 from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
+from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
+from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unfolding import unfold
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.fans import fans, renumber
-from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys, pair_keys
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each, scale_to_unit
 
@@ -31,6 +33,8 @@ MAX_STRETCH = 1.5
 _MIN_GAIN = 0.1
 # Closed components of at most this number of triangles, with at most this share of the area, become one chart each.
 _SMALL, _SMALL_SHARE = 24, 0.01
+# The first cuts may be longer by this factor if they are mirrored. In the end, seams are then longer by about a quarter.
+_GROWTH = 1.6
 
 
 def find_charts(
@@ -43,6 +47,7 @@ def find_charts(
     uv_cuts: ArrayLike | None = None,
     uv: FloatArray | None = None,
     choose: Callable[[list[list[Chart]]], list[Chart]] | None = None,
+    mirror: Mirror | None = None,
     seed: int = 0,
     callback: Callable[[str, int, int], object] | None = None,
     jobs: int | None = None,
@@ -74,6 +79,9 @@ def find_charts(
         that is bijective, with stretches up to 3, is the initial map of its chart.
     choose : callable, optional
         Chooses from several lists of charts of the developable parts, whose number decreases; by default the last one.
+    mirror : Mirror, optional
+        Mirror images, if seams and charts are to be mirrored. Curved parts are mirrored unless a triangle of theirs
+        crosses the plane, or the seams there would grow by more than a quarter.
     seed : int
         Unused: the search has no random choices.
     callback : callable, optional
@@ -90,20 +98,50 @@ def find_charts(
     cost = np.ones(F.shape) if edge_costs is None else np.asarray(edge_costs, dtype=np.float64)
     given = np.empty((0, 2), dtype=np.int64) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
     if uv_cuts is None:
-        exact, charts = _develop(V, F, cost, max_charts, choose, workers)
+        exact, charts = _develop(V, F, cost, max_charts, choose, workers, mirror)
         working, rest = list[WorkingChart](), np.flatnonzero(~exact)
     else:
         exact, charts = _lay_flat(V, F, given)
         working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
     cut = partial(_cut, V, F, given=given, cost=cost)
-    working += [chart for some in workers.map("cut", cut, [rest] if rest.size else []) for chart in some]
-    areas = [chart.surface_area for chart in working]
-    total = sum(areas) + sum(float(signed_areas(chart.F, in_units(chart.uv, 0)).sum()) for chart in charts)
+    total = float(_doubled_areas(V, F).sum() / 2)
     divisible = None if max_charts is None else max_charts - len(charts)
-    found = search_charts(
-        working, max_stretch, max_charts=divisible, total_area=total, joinable=uv_cuts is None, workers=workers
-    )
-    return sorted(charts + _finish(found, max_stretch, total), key=lambda chart: int(chart.triangles[0]))
+
+    def search(parts: list[WorkingChart], most: int | None, share: float) -> list[Chart]:
+        found = search_charts(
+            parts, max_stretch, max_charts=most, total_area=share * total, joinable=uv_cuts is None, workers=workers
+        )
+        return _finish(found, max_stretch, share * total)
+
+    working += [chart for some in workers.map("cut", cut, [rest] if rest.size else []) for chart in some]
+    half = rest[mirror.positive[rest]] if mirror is not None else rest[:0]
+    one_side = cut(half) if half.size and 2 * half.size == rest.size else []
+    if mirror is not None and one_side and _are_short(one_side, working, F[rest], V):
+        found = search(one_side, None if divisible is None else max(divisible // 2, 1), 0.5)
+        charts += mirror_charts(F, found, mirror)
+    else:
+        charts += search(working, divisible, 1.0)
+    return sorted(charts, key=lambda chart: int(chart.triangles[0]))
+
+
+def _are_short(half: list[WorkingChart], whole: list[WorkingChart], F: IntArray, V: FloatArray) -> bool:
+    """Whether the seams of both halves of a surface (f, 3) are not much longer than those of the whole."""
+    rim = boundary_edges(F, len(V))
+    outline = float(np.linalg.norm(V[rim[:, 0]] - V[rim[:, 1]], axis=1).sum())
+    # Each seam is on the outline of charts twice.
+    return 2 * _perimeter(half) - outline <= _GROWTH * (_perimeter(whole) - outline)
+
+
+def _perimeter(charts: list[WorkingChart]) -> float:
+    """Length of the outlines of charts."""
+    ends = [chart.V[np.stack([loop, np.roll(loop, -1)])] for chart in charts for loop in chart.piece.loops]
+    return float(sum(np.linalg.norm(start - end, axis=1).sum() for start, end in ends))
+
+
+def _doubled_areas(V: FloatArray, F: IntArray) -> FloatArray:
+    """Return twice the areas (f,) of triangles."""
+    doubled: FloatArray = np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
+    return doubled
 
 
 def _develop(
@@ -113,6 +151,7 @@ def _develop(
     max_charts: int | None,
     choose: Callable[[list[list[Chart]]], list[Chart]] | None,
     workers: Workers,
+    mirror: Mirror | None,
 ) -> tuple[BoolArray, list[Chart]]:
     """Make charts of the developable parts; return a mask (f,) of their triangles, and the charts."""
     undivided = cost >= UNDIVIDED_COST
@@ -120,7 +159,14 @@ def _develop(
     rows = np.flatnonzero(~mask)
     if not rows.size:
         return mask, charts
-    developed, more = develop_charts(V, F[rows], cost[rows], choose or itemgetter(-1), workers.check_wanted)
+    developed, more = develop_charts(
+        V,
+        F[rows],
+        cost[rows],
+        choose or itemgetter(-1),
+        workers.check_wanted,
+        None if mirror is None else mirror.select(rows),
+    )
     apart = int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1
     if max_charts is None or len(charts) + len(more) + apart <= max_charts:
         charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]
@@ -152,7 +198,7 @@ def _unfold_small(V: FloatArray, F: IntArray, undivided: BoolArray) -> tuple[Boo
     component = fans(F)[1]
     sides = edge_keys(F, F[:, (1, 2, 0)], len(V))
     _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
-    area = np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
+    area = _doubled_areas(V, F)
     chosen = (np.bincount(component) <= _SMALL) & (np.bincount(component, area) <= _SMALL_SHARE * area.sum())
     chosen[component[(times[edge].reshape(sides.shape) < 2).any(axis=1)]] = False
     rows = np.flatnonzero(chosen[component])

@@ -10,6 +10,7 @@ from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, find_hinges
 from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
+from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.geometry.mesh.fans import renumber
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
 
@@ -24,6 +25,7 @@ def develop_charts(
     cost: FloatArray,
     choose: Callable[[list[list[Chart]]], list[Chart]],
     check_wanted: Callable[[], object],
+    mirror: Mirror | None = None,
 ) -> tuple[BoolArray, list[Chart]]:
     """Unroll the developable pieces of a surface, and join them to charts without stretch.
 
@@ -38,6 +40,8 @@ def develop_charts(
         Chooses from several lists of charts, whose number decreases.
     check_wanted : callable
         Called now and then; may raise an exception.
+    mirror : Mirror, optional
+        Mirror images, if seams and charts are to be mirrored.
 
     Returns
     -------
@@ -47,12 +51,12 @@ def develop_charts(
         By rows of ``F``.
     """
     hinges = find_hinges(V, F)
-    pieces = find_pieces(V, F, hinges, np.zeros(hinges.one.size, dtype=bool), cost)
+    pieces = find_pieces(V, F, hinges, np.zeros(hinges.one.size, dtype=bool), cost, mirror)
     if not pieces.count:
         return pieces.label >= 0, []
     corners = V[F]
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
-    model = PaperModel(F, hinges, pieces, area / 2)
+    model = PaperModel(F, hinges, pieces, area / 2, mirror)
     weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other]) / 2
     together = (cost.ravel()[hinges.one] >= UNDIVIDED_COST) | (cost.ravel()[hinges.other] >= UNDIVIDED_COST)
     model.list_contacts(np.ones(weight.size, dtype=bool))

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from heapq import heapify, heappop, heappush
+from typing import Any
 
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull, find_smallest_box
 from quasiharmonic.apps.unwrapping.hinges import Hinges
 from quasiharmonic.apps.unwrapping.pieces import Pieces
+from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.fans import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
@@ -58,10 +60,16 @@ class PaperModel:
         Changed: joined pieces get one label and one frame.
     area : float
         Area of the whole surface.
+    mirror : Mirror, optional
+        Mirror images. What is joined is then joined on both sides.
     """
 
-    def __init__(self, F: IntArray, hinges: Hinges, pieces: Pieces, area: float) -> None:
+    def __init__(
+        self, F: IntArray, hinges: Hinges, pieces: Pieces, area: float, mirror: Mirror | None = None
+    ) -> None:
         self._F, self._hinges, self._pieces = F, hinges, pieces
+        self._mirror = mirror
+        self._hinge_image = None if mirror is None else mirror.of_hinges(hinges, F)
         self._joined_sides = hinges.mark_sides(pieces.glued, len(F)).ravel()
         self._side = np.sqrt(area / _EXPECTED)
         self._unit = _GAP * np.sqrt(area)
@@ -72,12 +80,14 @@ class PaperModel:
         # Hinges between two charts, and how often each chart has changed.
         self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
         self._version = dict.fromkeys(self._charts, 0)
+        self._watched: BoolArray = np.zeros(hinges.one.size, dtype=np.bool_)
 
     def list_contacts(self, may_join: BoolArray) -> None:
         """Find where charts may be joined, given a mask of hinges (e,)."""
         label, hinges = self._pieces.label, self._hinges
         one, other = label[hinges.first], label[hinges.second]
-        between = np.flatnonzero(may_join & (one >= 0) & (other >= 0) & (one != other))
+        self._watched = may_join & (one >= 0) & (other >= 0) & (one != other)
+        between = np.flatnonzero(self._watched)
         low, high = np.minimum(one, other)[between], np.maximum(one, other)[between]
         order = np.lexsort((high, low))
         starts = np.flatnonzero(np.diff(low[order] * len(self._charts) + high[order], prepend=-1))
@@ -111,9 +121,43 @@ class PaperModel:
             if versions != [self._version.get(a), self._version.get(b)]:
                 continue
             forced = bool(undivided[self._contacts[a][b]].any())
-            if self._try(a, b, weight, (np.inf, np.inf) if forced else limits):
-                for c in self._contacts[a]:
-                    heappush(queue, self._entry(min(a, c), max(a, c), weight))
+            for chart in self._join_symmetrically(a, b, weight, (np.inf, np.inf) if forced else limits):
+                for c in self._contacts[chart]:
+                    heappush(queue, self._entry(min(chart, c), max(chart, c), weight))
+
+    def _join_symmetrically(self, a: int, b: int, weight: FloatArray, limits: tuple[float, float]) -> set[int]:
+        """Join two charts, and their mirror images; return the charts that changed."""
+        if self._mirror is None:
+            return {a} if self._try(a, b, weight, limits) else set()
+        label = self._pieces.label
+        images = [self._mirror.triangle[self._charts[k].triangles[0]] for k in (a, b)]
+        before = self._save()
+        if not self._try(a, b, weight, limits):
+            return set()
+        c, d = sorted(label[images].tolist())
+        # The union may be its own image. Otherwise, the images are two charts, one of which may be the union.
+        if (c == d or (d in self._contacts.get(c, ()) and self._try(c, d, weight, limits))) and self._is_mirrored():
+            return {a, c} & self._charts.keys()
+        self._restore(before)
+        return set()
+
+    def _is_mirrored(self) -> bool:
+        """Whether the mirror image of every glued hinge is glued."""
+        glued = self._pieces.glued
+        return self._hinge_image is None or bool((glued[self._hinge_image] == glued)[self._watched].all())
+
+    def _save(self) -> tuple[Any, ...]:
+        """Return a copy of everything that `_try` changes."""
+        pieces = self._pieces
+        contacts = {k: dict(others) for k, others in self._contacts.items()}
+        arrays = [array.copy() for array in (pieces.label, pieces.place, pieces.glued, self._joined_sides)]
+        return contacts, dict(self._charts), dict(self._version), arrays
+
+    def _restore(self, saved: tuple[Any, ...]) -> None:
+        """Undo what was done since `_save`."""
+        self._contacts, self._charts, self._version, (label, place, glued, sides) = saved
+        self._pieces.label[:], self._pieces.place[:], self._pieces.glued[:] = label, place, glued
+        self._joined_sides[:] = sides
 
     def _entry(self, a: int, b: int, weight: FloatArray) -> tuple[float, int, int, int, int]:
         return (-float(weight[self._contacts[a][b]].sum()), a, b, self._version[a], self._version[b])

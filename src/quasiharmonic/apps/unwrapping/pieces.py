@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.apps.unwrapping.flat_parts import covers_once
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, Hinges
+from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, meet, spanning_links
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.fans import fans
@@ -40,6 +41,8 @@ _DEFECT, _ALL_DEFECTS = 1e-3, 0.1
 _APEXES = 2
 # Factor on the cost of cutting a flat face.
 _FLAT_COST = 1e3
+# Factor on the cost of cutting an edge that is its own mirror image.
+_ON_PLANE = 0.9
 # Largest stretch of an unrolled piece.
 _STRETCH = 1.001
 # Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
@@ -102,7 +105,7 @@ class _Parts:
         self.rough = rough > _ROUGH * np.bincount(part[corner], minlength=self.count)
 
     def find_cut(self, hinges: Hinges, k: int, here: IntArray, cost: FloatArray) -> IntArray:
-        """Return which of the hinges ``here`` of part ``k`` to cut so that it becomes a disk without apex inside."""
+        """Return which of the hinges ``here`` of part ``k`` to cut, at a cost, to get a disk without apex inside."""
         rows = np.flatnonzero(self.component == k)
         names, own = np.unique(self.split[rows], return_inverse=True)
         loops = boundary_loops(own.reshape(-1, 3), len(names))
@@ -111,11 +114,18 @@ class _Parts:
             terminal[loop] = number
         side = hinges.one[here]
         ends = np.stack([self.split.ravel()[side], np.roll(self.split, -1, axis=1).ravel()[side]], axis=1)
-        dear = hinges.length[here] * (cost.ravel()[side] + cost.ravel()[hinges.other[here]])
-        # A cut along an edge inside a flat face would end there.
-        dear[hinges.flat[here]] *= _FLAT_COST
         apexes = np.searchsorted(names, np.intersect1d(self.apexes, names))
-        return _find_cut(np.searchsorted(names, ends), dear, terminal, apexes)
+        return _find_cut(np.searchsorted(names, ends), cost, terminal, apexes)
+
+
+def _cut_costs(hinges: Hinges, cost: FloatArray, image: IntArray | None) -> FloatArray:
+    """Return what it costs to cut each hinge (e,), given factors (f, 3) and the mirror images of the hinges."""
+    dear = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other])
+    # A cut along an edge inside a flat face would end there.
+    dear[hinges.flat] *= _FLAT_COST
+    if image is not None:
+        dear[image == np.arange(image.size)] *= _ON_PLANE
+    return dear
 
 
 def _drop_scattered(hinges: Hinges, parts: _Parts, chosen: BoolArray, rim: FloatArray) -> BoolArray:
@@ -135,7 +145,9 @@ def _drop_scattered(hinges: Hinges, parts: _Parts, chosen: BoolArray, rim: Float
         chosen = kept
 
 
-def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, cost: FloatArray) -> Pieces:
+def find_pieces(
+    V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, cost: FloatArray, mirror: Mirror | None = None
+) -> Pieces:
     """Find developable pieces and unroll them.
 
     Parameters
@@ -147,6 +159,8 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, co
         Hinges that separate pieces.
     cost : (f, 3) float64
         Factor on the cost of cutting each side. Triangles stay together at factors of at least `UNDIVIDED_COST`.
+    mirror : Mirror, optional
+        Mirror images; the cuts of tubes and cones are then mirrored, and lie on the plane where possible.
     """
     together = (cost.ravel()[hinges.one] >= UNDIVIDED_COST) | (cost.ravel()[hinges.other] >= UNDIVIDED_COST)
     shapes = rest_shapes(V, F)
@@ -174,14 +188,21 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, co
         else:
             chosen &= (parts.area >= _LEAST_SHARE) & (rim**2 <= _LONGEST * parts.area * doubled.sum() / 2)
         if chosen.any():
-            _unroll(V, F, hinges, parts, chosen, cost, found)
+            _unroll(V, F, hinges, parts, chosen, cost, found, mirror)
         if (found.label >= 0).all():
             break
     return found
 
 
 def _unroll(
-    V: FloatArray, F: IntArray, hinges: Hinges, parts: _Parts, chosen: BoolArray, cost: FloatArray, found: Pieces
+    V: FloatArray,
+    F: IntArray,
+    hinges: Hinges,
+    parts: _Parts,
+    chosen: BoolArray,
+    cost: FloatArray,
+    found: Pieces,
+    mirror: Mirror | None,
 ) -> None:
     """Unroll the chosen parts (c,) and add those that do not overlap themselves to the pieces."""
     inside = parts.joined & chosen[parts.component[hinges.first]]
@@ -189,9 +210,15 @@ def _unroll(
     met = meet(place, hinges, inside, _SAME)
     wrong = mark(parts.count, parts.component[hinges.first[inside & ~met]])
     cut = np.zeros(inside.size, dtype=bool)
+    image = None if mirror is None or not wrong.any() else mirror.of_hinges(hinges, F)
+    dear = _cut_costs(hinges, cost, image)
     for k in np.flatnonzero(wrong).tolist():
         here = np.flatnonzero(inside & (parts.component[hinges.first] == k))
-        cut[here[parts.find_cut(hinges, k, here, cost)]] = True
+        if image is not None and cut[image[here]].any():
+            # The mirror image of this part has been cut.
+            cut[here] = cut[image[here]]
+        else:
+            cut[here[parts.find_cut(hinges, k, here, dear[here])]] = True
     if cut.any():
         place = _lay(V, F, hinges, inside & ~cut)
         # Cuts to holes that need none close again.

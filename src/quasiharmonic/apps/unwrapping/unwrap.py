@@ -19,6 +19,7 @@ from quasiharmonic.apps.unwrapping.layout import ChartLayout, choose_packed, fin
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.symmetry import Symmetry, find_mirror
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.find import side_costs
@@ -154,7 +155,9 @@ def unwrap(
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)
     kept_uv = None if corner_uv is None else _turn_corners(corner_uv, cleaned)
+    mirror, symmetry = None, Symmetry(None, 0.0, False, "")
     if kept_uv is None:
+        mirror, symmetry = find_mirror(points, cleaned.F, "auto")
         cost = keep_flat_faces(points, cleaned.F, cost)
     charts = find_charts(
         points,
@@ -164,6 +167,7 @@ def unwrap(
         edge_costs=cost,
         uv_cuts=None if kept_uv is None else _find_uv_cuts(kept_uv, cleaned),
         uv=kept_uv,
+        mirror=mirror,
         choose=partial(choose_packed, size=size, padding=float(padding), tiles=tiles, rotate=rotate, loss=_LOSS),
         seed=seed,
         callback=report,
