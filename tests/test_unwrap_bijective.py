@@ -31,7 +31,7 @@ def sphere(n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [8, 32])
+@pytest.mark.parametrize("n", [16, 32])
 def test_spheres_with_a_pole_of_almost_coincident_vertices(n):
     V, F = sphere(n)
     result = unwrap(V, F, resolution=1024)

@@ -24,6 +24,7 @@ STRATEGIES = "speed", "paper"
 #: Default maximum number of iterations of a search.
 MAX_ITERATIONS = 2000
 REFERENCES = "equilateral", "rest", "corrected"
+SYMMETRIES = "auto", "x", "y", "z"
 LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 
 
@@ -101,6 +102,38 @@ def motion_ratio(name: str, value: Any) -> None:
     """Check a maximum displacement of vertices relative to that of the boundary, or None."""
     if value is not None and (not isinstance(value, Real) or not float(value) >= 1):
         raise ValueError(f"{name} must be a number of at least 1, not {value!r}: the boundary itself has ratio 1")
+
+
+def positive_or_none(name: str, value: Any) -> None:
+    """Check a positive integer or None."""
+    if value is not None:
+        positive(name, value)
+
+
+def stretch_bound(name: str, value: Any) -> None:
+    """Check a bound on the stretch."""
+    if not isinstance(value, Real) or isinstance(value, bool) or not 1 <= float(value) < float("inf"):
+        raise ValueError(f"{name} must be a finite number of at least 1, not {value!r}")
+
+
+def degrees_or_none(name: str, value: Any) -> None:
+    """Check an angle between two normals in degrees, or None."""
+    if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= 180):
+        raise ValueError(f"{name} must be an angle in degrees, above 0 and at most 180, not {value!r}")
+
+
+def share(name: str, value: Any) -> None:
+    """Check a number from 0 to 1."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= float(value) <= 1:
+        raise ValueError(f"{name} must be a number from 0 to 1, not {value!r}")
+
+
+def mirror_axis(name: str, value: Any) -> None:
+    """Check the axis of a plane of symmetry, ``"auto"``, or None."""
+    if value is not None:
+        from quasiharmonic.util.arrays import check_choice
+
+        check_choice(name, value, SYMMETRIES)
 
 
 def reference_name(name: str, value: Any) -> None:
@@ -305,3 +338,45 @@ class AnimationOptions(SolverOptions):
     fill_gaps: bool = option(False, check=switch)
     start: Any = option(None)
     max_iterations: int = option(MAX_ITERATIONS, check=positive)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UnwrapOptions(Options):
+    """Options of `quasiharmonic.unwrap`."""
+
+    max_stretch: float = option(
+        1.5,
+        "bound on the stretch, which 99 %% of the surface keep; smaller values need more seams (default: 1.5)",
+        check=stretch_bound,
+    )
+    max_charts: int | None = option(None, "maximum number of charts (default: no limit)", check=positive_or_none)
+    hard_edges: float | None = option(
+        None, "seams at all edges with a larger angle between the normals, in degrees", check=degrees_or_none
+    )
+    symmetry: str | None = option(
+        "auto",
+        "mirror seams and charts in the middle plane normal to an axis (default: auto, where the model is symmetric)",
+        check=mirror_axis,
+        choices=(*SYMMETRIES, "none"),
+    )
+    packing_loss: float = option(
+        0.02,
+        "share of the texture that may stay unused so that flat and developable parts are joined (default: 0.02)",
+        check=share,
+    )
+    divide_for_packing: bool = option(
+        False, "also divide flat and developable parts where the texture is used better then", check=switch
+    )
+    resolution: Any = option(2048)
+    padding: float = option(4.0, "minimum texels between two charts (default: 4)")
+    texels_per_unit: float | None = option(None, "texels per unit of length of the model (default: as many as fit)")
+    tiles: int = option(1, "UDIM tiles (default: 1)", check=positive)
+    rotate: bool = option(True)
+    stack: Any = option(False)
+    outward: bool = option(False, "treat closed components that are inside out as turned outward", check=switch)
+    weld: Any = option(True, check=welding)
+    edge_costs: Any = option(None)
+    uv: Any = option(None)
+    seed: int = option(0, "seed of random choices (default: 0)", check=count)
+    callback: Callable[[Any], object] | None = option(None, check=function)
+    jobs: int | None = option(None, "number of threads (default: all cores)", check=positive_or_none)

@@ -15,7 +15,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, 
 from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
 from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
-from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unfolding import unfold
@@ -33,7 +33,7 @@ MAX_STRETCH = 1.5
 _MIN_GAIN = 0.1
 # Closed components of at most this number of triangles, with at most this share of the area, become one chart each.
 _SMALL, _SMALL_SHARE = 24, 0.01
-# The first cuts may be longer by this factor if they are mirrored. In the end, seams are then longer by about a quarter.
+# The first cuts may be longer by this factor if they are mirrored; seams are then longer by up to about a quarter.
 _GROWTH = 1.6
 
 
@@ -70,7 +70,8 @@ def find_charts(
         Maximum number of charts. It is exceeded only by components, and by parts without an injective map.
     edge_costs : (f, 3) float64, optional
         Positive factor on the cost of cutting each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0. Two
-        triangles stay together at factors of at least `UNDIVIDED_COST`, where possible.
+        triangles stay together at factors of at least `UNDIVIDED_COST`, where possible. Sides with factors of at most
+        `DEMANDED_COST` become seams.
     uv_cuts : (l, 2) array of int, optional
         Edges that are cut in any case, such as the seams of existing texture coordinates. Further cuts are then made
         only in closed parts, in parts with handles, and where the bound requires it.
@@ -96,14 +97,16 @@ def find_charts(
     """
     workers = Workers(jobs, callback)
     cost = np.ones(F.shape) if edge_costs is None else np.asarray(edge_costs, dtype=np.float64)
-    given = np.empty((0, 2), dtype=np.int64) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
+    demanded = cost <= DEMANDED_COST
+    given = _ends(F, demanded) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
     if uv_cuts is None:
         exact, charts = _develop(V, F, cost, max_charts, choose, workers, mirror)
         working, rest = list[WorkingChart](), np.flatnonzero(~exact)
     else:
         exact, charts = _lay_flat(V, F, given)
         working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
-    cut = partial(_cut, V, F, given=given, cost=cost)
+    min_gain = _MIN_GAIN if uv_cuts is None else np.inf
+    cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain)
     total = float(_doubled_areas(V, F).sum() / 2)
     divisible = None if max_charts is None else max_charts - len(charts)
 
@@ -138,6 +141,11 @@ def _perimeter(charts: list[WorkingChart]) -> float:
     return float(sum(np.linalg.norm(start - end, axis=1).sum() for start, end in ends))
 
 
+def _ends(F: IntArray, sides: BoolArray) -> IntArray:
+    """Return the edges (l, 2) at some sides (f, 3)."""
+    return np.stack([F[sides], F[:, (1, 2, 0)][sides]], axis=1)
+
+
 def _doubled_areas(V: FloatArray, F: IntArray) -> FloatArray:
     """Return twice the areas (f,) of triangles."""
     doubled: FloatArray = np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
@@ -155,7 +163,7 @@ def _develop(
 ) -> tuple[BoolArray, list[Chart]]:
     """Make charts of the developable parts; return a mask (f,) of their triangles, and the charts."""
     undivided = cost >= UNDIVIDED_COST
-    mask, charts = _unfold_small(V, F, undivided)
+    mask, charts = _unfold_small(V, F, undivided, cost <= DEMANDED_COST)
     rows = np.flatnonzero(~mask)
     if not rows.size:
         return mask, charts
@@ -192,7 +200,9 @@ def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, lis
     return mask, charts
 
 
-def _unfold_small(V: FloatArray, F: IntArray, undivided: BoolArray) -> tuple[BoolArray, list[Chart]]:
+def _unfold_small(
+    V: FloatArray, F: IntArray, undivided: BoolArray, demanded: BoolArray
+) -> tuple[BoolArray, list[Chart]]:
     """Unfold small closed components without cuts; return a mask (f,) of their triangles, and their charts."""
     mask, charts = np.zeros(len(F), dtype=bool), list[Chart]()
     component = fans(F)[1]
@@ -200,7 +210,7 @@ def _unfold_small(V: FloatArray, F: IntArray, undivided: BoolArray) -> tuple[Boo
     _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
     area = _doubled_areas(V, F)
     chosen = (np.bincount(component) <= _SMALL) & (np.bincount(component, area) <= _SMALL_SHARE * area.sum())
-    chosen[component[(times[edge].reshape(sides.shape) < 2).any(axis=1)]] = False
+    chosen[component[((times[edge].reshape(sides.shape) < 2) | demanded).any(axis=1)]] = False
     rows = np.flatnonzero(chosen[component])
     if not rows.size:
         return mask, charts
@@ -246,8 +256,10 @@ def _try_map(chart: WorkingChart, corner_uv: FloatArray) -> None:
             chart.uv = None
 
 
-def _cut(V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: FloatArray) -> list[WorkingChart]:
-    """Cut triangles into disks; return them as charts without maps. Demanded cuts are extended only to make disks."""
+def _cut(
+    V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: FloatArray, min_gain: float
+) -> list[WorkingChart]:
+    """Cut triangles into disks; return them as charts without maps. ``given`` cuts are demanded."""
     n = len(V)
     sides = edge_keys(F[rows], F[rows][:, (1, 2, 0)], n)
     there = given[np.isin(pair_keys(given, n), sides)]
@@ -258,7 +270,7 @@ def _cut(V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: Floa
             own.reshape(-1, 3),
             edges=np.searchsorted(vertices, there),
             edge_costs=cost[rows],
-            min_gain=np.inf if len(there) else _MIN_GAIN,
+            min_gain=min_gain if len(there) else _MIN_GAIN,
         )
     ]
     parts = _split(F[rows], rows, cut, n)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
-from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, find_hinges
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, find_hinges
 from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
@@ -35,7 +35,7 @@ def develop_charts(
     F : (f, 3) int64
     cost : (f, 3) float64
         Factor on the cost of cutting each side of each triangle. Pieces are joined across sides with factors of at
-        least `UNDIVIDED_COST` unless they overlap.
+        least `UNDIVIDED_COST` unless they overlap, and never at factors of at most `DEMANDED_COST`.
     choose : callable
         Chooses from several lists of charts, whose number decreases.
     check_wanted : callable
@@ -51,15 +51,16 @@ def develop_charts(
         By rows of ``F``.
     """
     hinges = find_hinges(V, F)
-    pieces = find_pieces(V, F, hinges, np.zeros(hinges.one.size, dtype=bool), cost, mirror)
+    demanded = hinges.touch(cost <= DEMANDED_COST)
+    pieces = find_pieces(V, F, hinges, cost, mirror)
     if not pieces.count:
         return pieces.label >= 0, []
     corners = V[F]
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
     model = PaperModel(F, hinges, pieces, area / 2, mirror)
     weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other]) / 2
-    together = (cost.ravel()[hinges.one] >= UNDIVIDED_COST) | (cost.ravel()[hinges.other] >= UNDIVIDED_COST)
-    model.list_contacts(np.ones(weight.size, dtype=bool))
+    together = hinges.touch(cost >= UNDIVIDED_COST)
+    model.list_contacts(~demanded)
     found = [_list_charts(F, model, pieces)]
     for longest, loss in _ROUNDS:
         model.join(weight, together, longest, loss, check_wanted)

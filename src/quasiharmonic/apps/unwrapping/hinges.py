@@ -14,6 +14,8 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 #: Triangles on the two sides of an edge with at least this cost factor stay together, such as those of a polygon.
 UNDIVIDED_COST = 1e3
+#: Sides with at most this cost factor must be seams.
+DEMANDED_COST = 1e-9
 # Two triangles lie in one plane if no corner of one is farther from the plane of the other than this, relative to the
 # diagonal of the model's box. Files with six decimal digits store flat faces with such errors.
 FLAT = 2e-6
@@ -54,6 +56,11 @@ class Hinges:
         """The triangles (e,) of the sides ``other``."""
         return self.other // 3
 
+    def touch(self, sides: BoolArray) -> BoolArray:
+        """Return the hinges (e,) with one or both of their sides among some sides (f, 3)."""
+        chosen: BoolArray = sides.ravel()[self.one] | sides.ravel()[self.other]
+        return chosen
+
     def mark_sides(self, chosen: BoolArray, count: int) -> BoolArray:
         """Return a mask (count, 3) of the sides of chosen hinges (e,), given the number of triangles."""
         marked = np.zeros(3 * count, dtype=np.bool_)
@@ -93,9 +100,3 @@ def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
     height = np.maximum(np.abs(above), np.abs(((flat_P[apex[one]] - start) * b).sum(axis=1)))
     flat = (height <= FLAT) & (angle <= _FLAT_ANGLE) & ~(tiny[one // 3] | tiny[other // 3])
     return Hinges(one, other, np.where(above > 0, -angle, angle), length * size, flat)
-
-
-def keep_flat_faces(V: FloatArray, F: IntArray, cost: FloatArray) -> FloatArray:
-    """Return costs (f, 3) of cutting the sides of triangles that keep flat faces together where possible."""
-    hinges = find_hinges(V, F)
-    return np.where(hinges.mark_sides(hinges.flat, len(F)), np.maximum(cost, UNDIVIDED_COST), cost)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
@@ -51,9 +52,12 @@ def join_small_charts(
         if not _is_small(chart, total_area):
             continue
         tail, head = _sides(chart)
+        wanted = _demanded(chart)
         length = np.linalg.norm(chart.V[tail] - chart.V[head], axis=1)
         tries = 0
         for i in np.argsort(-length, kind="stable").tolist():
+            if (int(tail[i]), int(head[i])) in wanted:
+                continue
             other = owner.get((int(chart.vertices[head[i]]), int(chart.vertices[tail[i]])), k)
             if other == k:
                 continue
@@ -71,6 +75,12 @@ def join_small_charts(
 
 def _is_small(chart: WorkingChart, total_area: float) -> bool:
     return len(chart.F) <= _SMALL and chart.surface_area <= _SHARE * total_area
+
+
+def _demanded(chart: WorkingChart) -> set[tuple[int, int]]:
+    """Return the sides of triangles that must be seams, by their ends."""
+    demanded = chart.cost <= DEMANDED_COST
+    return set(zip(chart.F[demanded].tolist(), chart.F[:, (1, 2, 0)][demanded].tolist(), strict=True))
 
 
 def _sides(chart: WorkingChart) -> tuple[IntArray, IntArray]:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import make_shape
-from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
 from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
 from quasiharmonic.util.arrays import FloatArray
 
 # Share of the texture that charts are expected to cover.
@@ -29,6 +29,7 @@ def divide_long_charts(
     size: tuple[int, int],
     tiles: int,
     max_charts: int | None,
+    for_packing: bool = False,
 ) -> list[Chart]:
     """Divide charts across their middle until each fits into a texture that the charts cover well.
 
@@ -49,6 +50,8 @@ def divide_long_charts(
         Number of textures.
     max_charts : int or None
         Maximum number of charts.
+    for_packing : bool
+        Whether charts without stretch are divided like the others, and not only where they are too long.
 
     Returns
     -------
@@ -63,13 +66,13 @@ def divide_long_charts(
     while waiting:
         chart = waiting.pop()
         full = max_charts is not None and len(done) + len(waiting) + 1 >= max_charts
-        if full or len(chart.F) < 2 or not _is_too_long(chart, side):
+        if full or len(chart.F) < 2 or not _is_too_long(chart, side, for_packing):
             done.append(chart)
             continue
         parts = _divide(chart, V, cost, bound)
-        if chart.isometric and not parts:
+        if chart.isometric and not for_packing:
             # Flat faces are cut only where they are too long themselves.
-            parts = _divide(chart, V, np.ones(cost.shape), bound)
+            parts = _keep_shorter(chart, parts) or _keep_shorter(chart, _divide(chart, V, np.ones(cost.shape), bound))
         if parts:
             waiting += parts
         else:
@@ -78,21 +81,25 @@ def divide_long_charts(
 
 
 def _divide(chart: Chart, V: FloatArray, cost: FloatArray, bound: float) -> list[Chart]:
-    """Divide a chart across its middle; return no parts if it should stay whole, or if they would be hardly shorter."""
+    """Divide a chart across its middle; return no parts if it should stay whole."""
     working = chart.open(V, cost)
     if is_undivided(working):
         return []
-    parts = [chart.part(part, bound) for part in divide(working, bound)]
-    return [] if chart.isometric and max(map(_length, parts)) > _SHORTER * _length(chart) else parts
+    return [chart.part(part, bound) for part in divide(working, bound)]
+
+
+def _keep_shorter(chart: Chart, parts: list[Chart]) -> list[Chart]:
+    """Return the parts of a chart, or none if they are hardly shorter."""
+    return parts if parts and max(map(_length, parts)) <= _SHORTER * _length(chart) else []
 
 
 def _area(chart: Chart) -> float:
     return make_shape(chart.uv, chart.F).area
 
 
-def _is_too_long(chart: Chart, side: float) -> bool:
+def _is_too_long(chart: Chart, side: float, for_packing: bool) -> bool:
     """Whether a chart prevents a scale at which the texture has this side."""
-    if chart.isometric:
+    if chart.isometric and not for_packing:
         return _length(chart) > _LONGEST_ISOMETRIC * side
     shape = make_shape(chart.uv, chart.F)
     width, height = shape.extent(shape.direction)

@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_cuts import divide_overlap
 from quasiharmonic.apps.unwrapping.chart_maps import WORST_STRETCH
-from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.apps.unwrapping.rounding import grid_unit
 from quasiharmonic.geometry.exact.certificate import Certificate, certify

@@ -31,7 +31,7 @@ _GAP = 2.0**-20
 _TRIES = 64
 
 
-class _Chart:
+class _Leaf:
     """Triangles (k,) that are laid out together, the convex hull of their corners, and the area of its smallest box."""
 
     def __init__(self, triangles: IntArray, place: ComplexArray) -> None:
@@ -64,9 +64,7 @@ class PaperModel:
         Mirror images. What is joined is then joined on both sides.
     """
 
-    def __init__(
-        self, F: IntArray, hinges: Hinges, pieces: Pieces, area: float, mirror: Mirror | None = None
-    ) -> None:
+    def __init__(self, F: IntArray, hinges: Hinges, pieces: Pieces, area: float, mirror: Mirror | None = None) -> None:
         self._F, self._hinges, self._pieces = F, hinges, pieces
         self._mirror = mirror
         self._hinge_image = None if mirror is None else mirror.of_hinges(hinges, F)
@@ -76,7 +74,7 @@ class PaperModel:
         order = np.argsort(pieces.label, kind="stable")
         order = order[pieces.label[order] >= 0]
         parts = np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1) if order.size else []
-        self._charts = {k: _Chart(rows, pieces.place[rows].ravel()) for k, rows in enumerate(parts)}
+        self._charts = {k: _Leaf(rows, pieces.place[rows].ravel()) for k, rows in enumerate(parts)}
         # Hinges between two charts, and how often each chart has changed.
         self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
         self._version = dict.fromkeys(self._charts, 0)
@@ -168,7 +166,7 @@ class PaperModel:
         one, other = self._charts[a], self._charts[b]
         place = self._pieces.place
         moved = motion[0] * place[other.triangles] + motion[1]
-        union = _Chart(
+        union = _Leaf(
             np.concatenate([one.triangles, other.triangles]),
             np.concatenate([one.hull, motion[0] * other.hull + motion[1]]),
         )

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.apps.unwrapping.flat_parts import covers_once
-from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, Hinges
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, meet, spanning_links
 from quasiharmonic.energies.measures import distortion
@@ -26,12 +26,12 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 CREASE = np.pi / 6
 # Smaller angles at which curved parts are divided.
 _ANGLES = np.deg2rad([20.0, 13.0, 9.0, 6.0, 4.0])
-# There, a piece has at least this share of the area, and its squared perimeter is at most this multiple of its own area.
+# There, a piece has at least this share of the area, and its squared perimeter is at most this multiple of its area.
 _LEAST_SHARE, _LONGEST = 0.15, 40.0
 # Between creases, a piece with at least this share of the area is kept in any case.
 _LARGE_SHARE = 0.2
-# Smaller ones are kept unless at half of their corners many pieces meet, as on a rough scan, or there is little curvature
-# in radians where three or four pieces meet, as on a coarse sphere.
+# Smaller ones are kept unless at half of their corners many pieces meet, as on a rough scan, or three or four pieces
+# with little curvature, in radians, as on a coarse sphere.
 _ROUGH, _MANY, _ROUND = 0.5, 5, {3: 0.45, 4: 0.8}
 # Pieces with a smaller share of the area are dropped if they mostly border on curved parts.
 _SMALL_SHARE = 0.02
@@ -145,9 +145,7 @@ def _drop_scattered(hinges: Hinges, parts: _Parts, chosen: BoolArray, rim: Float
         chosen = kept
 
 
-def find_pieces(
-    V: FloatArray, F: IntArray, hinges: Hinges, apart: BoolArray, cost: FloatArray, mirror: Mirror | None = None
-) -> Pieces:
+def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mirror: Mirror | None = None) -> Pieces:
     """Find developable pieces and unroll them.
 
     Parameters
@@ -155,14 +153,13 @@ def find_pieces(
     V : (n, 3) float64
     F : (f, 3) int64
     hinges : Hinges
-    apart : (e,) bool
-        Hinges that separate pieces.
     cost : (f, 3) float64
-        Factor on the cost of cutting each side. Triangles stay together at factors of at least `UNDIVIDED_COST`.
+        Factor on the cost of cutting each side. Triangles stay together at factors of at least `UNDIVIDED_COST`,
+        and are apart at factors of at most `DEMANDED_COST`.
     mirror : Mirror, optional
         Mirror images; the cuts of tubes and cones are then mirrored, and lie on the plane where possible.
     """
-    together = (cost.ravel()[hinges.one] >= UNDIVIDED_COST) | (cost.ravel()[hinges.other] >= UNDIVIDED_COST)
+    together, apart = hinges.touch(cost >= UNDIVIDED_COST), hinges.touch(cost <= DEMANDED_COST)
     shapes = rest_shapes(V, F)
     area = shapes.m / shapes.m.sum()
     angles = np.stack([np.abs(np.angle(-shapes.sides[k - 1].conj() * shapes.sides[k])) for k in range(3)], axis=1)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
+from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
 from quasiharmonic.io.adapters.trimesh import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, find_exponent, names_of
@@ -121,6 +122,8 @@ class UnwrapResult(Outcome):
         Texels per unit of length of the model.
     V : (n, 2) or (n, 3) float64
         Positions of the model's vertices.
+    symmetry : Symmetry
+        Which plane of symmetry was found, and whether seams and charts are mirrored.
     seconds : float
         Wall time of the call.
     """
@@ -140,6 +143,7 @@ class UnwrapResult(Outcome):
     resolution: tuple[int, int]
     texels_per_unit: float
     V: FloatArray
+    symmetry: Symmetry
     seconds: float
 
     def __iter__(self) -> Iterator[Any]:
@@ -180,6 +184,7 @@ class UnwrapResult(Outcome):
             f"{100 * self.utilisation:.1f} % of the texture used, {self.texels_per_unit:.4g} texels per unit",
             f"certificate: {self.certificate.summary()}",
         ]
+        lines += describe_symmetry(self.symmetry)
         if self.misses:
             shown = ", ".join(f"chart {miss.chart} by {miss.excess:.3g}" for miss in self.misses[:_LISTED])
             more = f", … ({len(self.misses)} charts)" if len(self.misses) > _LISTED else ""
@@ -203,6 +208,7 @@ class UnwrapResult(Outcome):
             "utilisation": self.utilisation,
             "texels_per_unit": self.texels_per_unit,
             "resolution": list(self.resolution),
+            "symmetry": self.symmetry._asdict(),
             "reversed": int(self.cleaned.flipped.sum()),
             "excluded": self.cleaned.excluded.tolist(),
             "collapsed": self.cleaned.collapsed.tolist(),

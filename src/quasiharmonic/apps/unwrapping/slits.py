@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys
@@ -30,7 +31,7 @@ def close_slits(chart: WorkingChart) -> WorkingChart | None:
     one, other = rim[order[first]], rim[order[first + 1]]
     z = chart.uv[:, 0] + 1j * chart.uv[:, 1]
     apart = np.maximum(np.abs(z[tail[one]] - z[head[other]]), np.abs(z[head[one]] - z[tail[other]]))
-    same = apart <= _SAME * np.abs(z[tail[one]] - z[head[one]])
+    same = (apart <= _SAME * np.abs(z[tail[one]] - z[head[one]])) & (chart.cost.ravel()[one] > DEMANDED_COST)
     if not same.any():
         return None
     cut = mark(chart.F.size, np.setdiff1d(rim, np.concatenate([one[same], other[same]])))

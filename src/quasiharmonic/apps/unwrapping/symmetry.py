@@ -15,6 +15,8 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 # A vertex has a mirror image if a vertex is this close to it, relative to the diagonal of the model's box.
 _TOLERANCE = 1e-6
 _AXES = "xyz"
+# A smaller share of mirror images is due to chance.
+_WORTH_REPORTING = 0.9
 
 
 class Symmetry(NamedTuple):
@@ -125,3 +127,25 @@ def _pair(F: IntArray, image: IntArray, height: FloatArray) -> Mirror | None:
     at = np.where(image == np.arange(len(image)), 0.0, height)[F]
     positive: BoolArray = np.logical_and((at >= 0).all(axis=1), (at > 0).any(axis=1))
     return Mirror(image, triangle, positive)
+
+
+def check_symmetry(found: Symmetry, mirror: Mirror | None, chart: IntArray) -> Symmetry:
+    """Return what was done, given the chart (f,) of each triangle in the end."""
+    if mirror is None:
+        return found
+    pairs = np.unique(np.stack([chart, chart[mirror.triangle]], axis=1), axis=0)
+    if len(pairs) == int(chart.max(initial=-1)) + 1:
+        return found
+    reason = "triangles of curved parts cross the plane, or mirrored seams would be much longer"
+    return found._replace(applied=False, reason=reason)
+
+
+def describe_symmetry(found: Symmetry) -> list[str]:
+    """Return a line on the symmetry of a model, if most of its vertices have mirror images."""
+    if found.applied:
+        return [f"symmetric in {found.axis}: seams and charts are mirrored"]
+    if found.share < _WORTH_REPORTING:
+        return []
+    return [
+        f"{100 * found.share:.4g} % of the vertices have a mirror image in {found.axis}: not mirrored, {found.reason}"
+    ]

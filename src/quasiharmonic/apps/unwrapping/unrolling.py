@@ -12,7 +12,7 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 
 
 def spanning_links(first: IntArray, second: IntArray, rank: FloatArray, size: int) -> BoolArray:
-    """Return which links (e,) between nodes below ``size`` form a spanning forest of least sum of ranks, all distinct."""
+    """Return which links (e,) between nodes below ``size`` form the spanning forest of smallest ranks, all distinct."""
     links = csr_array((rank, (first.astype(np.int32), second.astype(np.int32))), shape=(size, size))
     return np.isin(rank, minimum_spanning_tree(links).data)
 

@@ -5,65 +5,76 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from numbers import Real
+from typing import NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.pack import check_texture, pack_charts
+from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
-from quasiharmonic.apps.unwrapping.charts import MAX_STRETCH, find_charts
+from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
-from quasiharmonic.apps.unwrapping.hinges import keep_flat_faces
-from quasiharmonic.apps.unwrapping.layout import ChartLayout, choose_packed, find_differing_sides, find_seams, join_charts
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, find_hinges
+from quasiharmonic.apps.unwrapping.layout import (
+    ChartLayout,
+    choose_packed,
+    find_differing_sides,
+    find_seams,
+    join_charts,
+)
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
-from quasiharmonic.apps.unwrapping.symmetry import Symmetry, find_mirror
+from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, check_symmetry, find_mirror
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.find import side_costs
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    check_bool,
-    check_callback,
-    check_integer,
     find_exponent,
     real_array,
     triangle_array,
     vertex_array,
 )
+from quasiharmonic.util.options import UnwrapOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
-# XX
-_LOSS = 0.02
 # Positions beyond this power of two, or all below its reciprocal, are scaled.
 _MAX_EXPONENT = 300
+# Smaller factors on the cost of seams count as this one.
+_LEAST_COST = 1e-6
+
+
+class UnwrapKeywords(TypedDict, total=False):
+    """Types of the options of `unwrap`."""
+
+    max_stretch: float
+    max_charts: int | None
+    resolution: int | tuple[int, int]
+    padding: float
+    texels_per_unit: float | None
+    tiles: int
+    rotate: bool
+    stack: bool
+    outward: bool
+    weld: bool | float
+    hard_edges: float | None
+    symmetry: str | None
+    packing_loss: float
+    divide_for_packing: bool
+    edge_costs: ArrayLike | None
+    uv: ArrayLike | None
+    seed: int
+    callback: Callable[[UnwrapStep], object] | None
+    jobs: int | None
 
 
 @accepts_mesh
 @reports_progress
-def unwrap(
-    V: ArrayLike,
-    F: ArrayLike,
-    *,
-    max_stretch: float = MAX_STRETCH,
-    max_charts: int | None = None,
-    resolution: int | tuple[int, int] = 2048,
-    padding: float = 4,
-    texels_per_unit: float | None = None,
-    tiles: int = 1,
-    rotate: bool = True,
-    stack: bool = False,
-    outward: bool = False,
-    weld: bool | float = True,
-    edge_costs: ArrayLike | None = None,
-    uv: ArrayLike | None = None,
-    seed: int = 0,
-    callback: Callable[[UnwrapStep], object] | None = None,
-    jobs: int | None = None,
-) -> UnwrapResult:
+@takes(UnwrapOptions, UnwrapKeywords)
+def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> UnwrapResult:
     """Compute texture coordinates for any model: charts with little stretch, packed into a texture, certified.
 
     Parameters
@@ -97,6 +108,20 @@ def unwrap(
     weld : bool or float
         Whether vertices at equal positions count as one, or a distance relative to the diagonal of the bounding box
         within which they do; see `clean`. The result has the numbering of the input.
+    hard_edges : float, optional
+        All edges with a larger angle between the normals, in degrees, become seams, as baked normal maps need it.
+    symmetry : str or None
+        Axis normal to the plane of symmetry, ``"x"``, ``"y"`` or ``"z"``; ``"auto"`` takes the first one that fits.
+        Seams and charts are mirrored if every vertex has a mirror image, to 1e-6 of the diagonal of the model's box,
+        and every triangle. Curved parts are not if triangles of theirs cross the plane, or if their seams would be
+        much longer. `UnwrapResult.symmetry` says what was done. Without effect if ``uv`` is given, and ``"auto"`` also
+        with ``edge_costs``.
+    packing_loss : float
+        Flat and developable parts are joined across edges, for fewer charts and shorter seams, as long as the estimated
+        share of the texture that they use falls by at most this value below the best one.
+    divide_for_packing : bool
+        Whether flat and developable parts are also divided where the texture is used better then. By default, they are
+        divided only where they are longer than the texture's side.
     edge_costs : (f, 3) array, optional
         Positive factor on the cost of a seam at each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
         Large values keep seams away from visible parts. Values of at least 1,000 keep two triangles together where
@@ -136,67 +161,46 @@ def unwrap(
     began = time.perf_counter()
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)
-    _check_options(max_stretch, max_charts, seed, jobs)
-    check_bool("outward", outward)
-    check_callback(callback)
-    corner_uv = None if uv is None else _corner_positions(uv, F, len(V))
-    costs = None if edge_costs is None else side_costs(edge_costs, len(F))
+    wanted = UnwrapOptions(**options)
+    size = check_texture(
+        wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, wanted.stack
+    )
+    corner_uv = None if wanted.uv is None else _corner_positions(wanted.uv, F, len(V))
+    costs = None if wanted.edge_costs is None else side_costs(wanted.edge_costs, len(F))
 
     def report(phase: str, done: int = 0, total: int = 1) -> None:
-        if callback is not None:
-            callback(UnwrapStep(phase, done, total))
+        if wanted.callback is not None:
+            wanted.callback(UnwrapStep(phase, done, total))
 
     report("clean")
-    cleaned = clean(V, F, outward, weld=weld)
+    cleaned = clean(V, F, wanted.outward, weld=wanted.weld)
     # In this unit, areas neither overflow nor underflow.
     exponent = find_exponent(cleaned.V)
     exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
-    cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)
-    kept_uv = None if corner_uv is None else _turn_corners(corner_uv, cleaned)
-    mirror, symmetry = None, Symmetry(None, 0.0, False, "")
-    if kept_uv is None:
-        mirror, symmetry = find_mirror(points, cleaned.F, "auto")
-        cost = keep_flat_faces(points, cleaned.F, cost)
-    charts = find_charts(
-        points,
-        cleaned.F,
-        max_stretch=float(max_stretch),
-        max_charts=max_charts,
-        edge_costs=cost,
-        uv_cuts=None if kept_uv is None else _find_uv_cuts(kept_uv, cleaned),
-        uv=kept_uv,
-        mirror=mirror,
-        choose=partial(choose_packed, size=size, padding=float(padding), tiles=tiles, rotate=rotate, loss=_LOSS),
-        seed=seed,
-        callback=report,
-        jobs=jobs,
-    )
-    if corner_uv is None:
-        charts = divide_long_charts(
-            charts, points, cost, bound=float(max_stretch), size=size, tiles=tiles, max_charts=max_charts
-        )
+    rules = _find_rules(points, cleaned, costs, corner_uv, wanted)
+    bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit
+    charts = _make_charts(points, cleaned, rules, wanted, size, report)
     while True:
         report("pack")
         packing = pack_charts(
             [(chart.uv, chart.F) for chart in charts],
             resolution=size,
-            padding=float(padding),
-            texels_per_unit=None if texels_per_unit is None else float(np.ldexp(texels_per_unit, exponent)),
-            tiles=tiles,
-            rotate=rotate,
-            stack=stack,
+            padding=padding,
+            texels_per_unit=None if density is None else float(np.ldexp(density, exponent)),
+            tiles=wanted.tiles,
+            rotate=wanted.rotate,
+            stack=wanted.stack,
         )
         report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
-        certificate = certify_charts(layout, cleaned.triangles, size=size, padding=float(padding), stacked=stack)
+        certificate = certify_charts(layout, cleaned.triangles, size=size, padding=padding, stacked=wanted.stack)
         assert certificate.disjoint, "packed charts keep a distance larger than the rounding"
         faulty = np.flatnonzero(~certificate.bijective_charts)
         if not faulty.size:
             break
         scale = packing.texels_per_unit / max(size)
-        charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=cost, bound=float(max_stretch))
+        charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=rules.cost, bound=bound)
     # Rows of texture coordinates are ordered by vertex, then by chart.
     key, indices = np.unique(F * len(layout.uv) + cleaned.restore_corners(layout.rows), return_inverse=True)
     vmapping, row = np.divmod(key, len(layout.uv))
@@ -225,18 +229,98 @@ def unwrap(
         resolution=size,
         texels_per_unit=float(np.ldexp(packing.texels_per_unit, -exponent)),
         V=V,
+        symmetry=check_symmetry(rules.symmetry, rules.mirror, layout.chart),
         seconds=time.perf_counter() - began,
     )
 
 
-def _check_options(max_stretch: float, max_charts: int | None, seed: int, jobs: int | None) -> None:
-    """Check the numbers that do not concern the texture."""
-    if not isinstance(max_stretch, Real) or isinstance(max_stretch, bool) or not 1 <= float(max_stretch) < np.inf:
-        raise ValueError(f"max_stretch must be a finite number of at least 1, not {max_stretch!r}")
-    check_integer("seed", seed, minimum=0)
-    for name, count in (("max_charts", max_charts), ("jobs", jobs)):
-        if count is not None:
-            check_integer(name, count, minimum=1)
+class _Rules(NamedTuple):
+    """Where seams are wanted on a cleaned mesh.
+
+    Attributes
+    ----------
+    cost : (f, 3) float64
+        Factor on the cost of a seam at each side; see `find_charts`.
+    uv : (f, 3, 2) float64 or None
+        Texture coordinates whose seams are kept.
+    mirror : Mirror or None
+        Mirror images, if the model is symmetric.
+    symmetry : Symmetry
+    """
+
+    cost: FloatArray
+    uv: FloatArray | None
+    mirror: Mirror | None
+    symmetry: Symmetry
+
+
+def _find_rules(
+    points: FloatArray,
+    cleaned: CleanedMesh,
+    costs: FloatArray | None,
+    corner_uv: FloatArray | None,
+    wanted: UnwrapOptions,
+) -> _Rules:
+    """Return where seams are wanted, given costs (f, 3) and texture coordinates (f, 3, 2) of the model."""
+    F = cleaned.F
+    cost = np.ones(F.shape) if costs is None else _turn_sides(costs, cleaned)
+    mirror, symmetry = None, Symmetry(None, 0.0, False, "")
+    uv = None if corner_uv is None else _turn_corners(corner_uv, cleaned)
+    if uv is None:
+        hinges = find_hinges(points, F)
+        if wanted.symmetry is not None and (costs is None or wanted.symmetry != "auto"):
+            mirror, symmetry = find_mirror(points, F, wanted.symmetry)
+        cost = np.maximum(cost, _LEAST_COST)
+        if not wanted.divide_for_packing:
+            cost[hinges.mark_sides(hinges.flat, len(F))] *= UNDIVIDED_COST
+        if wanted.hard_edges is not None:
+            cost[hinges.mark_sides(np.abs(hinges.angle) > np.deg2rad(wanted.hard_edges), len(F))] = DEMANDED_COST
+    return _Rules(cost, uv, mirror, symmetry)
+
+
+def _make_charts(
+    points: FloatArray,
+    cleaned: CleanedMesh,
+    rules: _Rules,
+    wanted: UnwrapOptions,
+    size: tuple[int, int],
+    report: Callable[[str, int, int], object],
+) -> list[Chart]:
+    """Return the charts of a cleaned mesh that keep the bound, and fit into the texture."""
+    bound, tiles = float(wanted.max_stretch), wanted.tiles
+    charts = find_charts(
+        points,
+        cleaned.F,
+        max_stretch=bound,
+        max_charts=wanted.max_charts,
+        edge_costs=rules.cost,
+        uv_cuts=None if rules.uv is None else _find_uv_cuts(rules.uv, cleaned),
+        uv=rules.uv,
+        mirror=rules.mirror,
+        choose=partial(
+            choose_packed,
+            size=size,
+            padding=float(wanted.padding),
+            tiles=tiles,
+            rotate=wanted.rotate,
+            loss=float(wanted.packing_loss),
+        ),
+        seed=wanted.seed,
+        callback=report,
+        jobs=wanted.jobs,
+    )
+    if rules.uv is not None:
+        return charts
+    return divide_long_charts(
+        charts,
+        points,
+        rules.cost,
+        bound=bound,
+        size=size,
+        tiles=tiles,
+        max_charts=wanted.max_charts,
+        for_packing=wanted.divide_for_packing,
+    )
 
 
 def _corner_positions(uv: ArrayLike, F: IntArray, n: int) -> FloatArray:

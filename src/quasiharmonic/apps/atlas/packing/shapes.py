@@ -12,7 +12,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat
 
 # Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
 _AS_SMALL = 1e-9
-# A shape is straight if at least this share of its outline lies along two perpendicular directions, up to this angle.
+# A shape is straight if this share of its outline lies along two perpendicular directions, up to this angle.
 _STRAIGHT, _SKEW = 0.4, np.pi / 180
 # Positions of hull points computed per block.
 _BLOCK = 1 << 20
@@ -38,7 +38,7 @@ class Shape:
         Unit vector along a side of the shape's box: along most of the outline if the shape is straight, otherwise that
         of the smallest box. It is rotated by at most 45° from the x-axis.
     straight : bool
-        Whether most of the outline lies along two perpendicular directions. Such a shape is turned by right angles only.
+        Whether much of the outline lies along two perpendicular directions. Such a shape is turned by right angles.
     """
 
     tails: ComplexArray

@@ -28,13 +28,14 @@ from quasiharmonic.ui.cli.arguments import (
     add_options,
     byte_count,
     count,
+    declared,
     file,
     flag,
     number,
     pick,
-    steps,
     weld,
 )
+from quasiharmonic.util.options import UnwrapOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStep
@@ -48,31 +49,20 @@ def add_parser(commands: Commands) -> None:
 
     parser = add_command(commands, "unwrap", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map', 'seams')} file to write")
+    own = declared(UnwrapOptions)
     add_options(
         parser,
-        max_stretch=number(
-            float,
-            "bound on the stretch, which 99 %% of the surface keep; smaller values need more seams (default: 1.5)",
-            metavar="S",
-            default=1.5,
-        ),
-        max_charts=number(count, "maximum number of charts (default: no limit)"),
+        **own,
         resolution=number(
             _resolution, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)", default=(2048, 2048)
         ),
-        padding=number(float, "minimum texels between two charts (default: 4)", default=4.0),
-        texels_per_unit=number(float, "texels per unit of length of the model (default: as many as fit)", metavar="D"),
-        tiles=number(count, "UDIM tiles (default: 1)", default=1),
         no_rotate=flag("do not rotate charts to fit better"),
         stack=flag("let identical and mirrored components share their texture coordinates"),
-        outward=flag("treat closed components that are inside out as turned outward"),
         weld=weld("yes"),
         keep_seams=flag("keep the seams of the input's texture coordinates (vt), and add seams only where necessary"),
         edge_costs=file(
             "file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line"
         ),
-        seed=number(steps, "seed of random choices (default: 0)", default=0),
-        jobs=number(count, "number of threads (default: all cores)"),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
     add_options(parser, "texture", "json", "surface")
@@ -106,8 +96,9 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.util.arrays import count_of
 
-    size = pick(options, "max_stretch", "max_charts", "resolution", "padding", "texels_per_unit", "tiles")
-    given = pick(options, "stack", "outward", "weld", "seed", "jobs")
+    given = pick(options, "resolution", "stack", "weld", *declared(UnwrapOptions))
+    if options.symmetry == "none":
+        given["symmetry"] = None
     with pipeline.working(options.input, _words) as show:
         result = unwrap(
             mesh.V,
@@ -116,7 +107,6 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             edge_costs=_edge_costs(mesh, options.edge_costs),
             uv=corner_positions(mesh) if options.keep_seams else None,
             callback=_bound_memory(show, options.memory),
-            **size,
             **given,
         )
     unwrapped, divided = add_map(mesh, result)
