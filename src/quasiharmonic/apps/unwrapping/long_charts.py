@@ -15,8 +15,8 @@ from quasiharmonic.util.arrays import FloatArray
 _EXPECTED = 0.6
 # Longest chart in sides of the texture at this scale, and longest chart that covers less than a share of its box.
 _LONGEST, _LONGEST_LOOSE, _LOOSE = 0.85, 0.7, 0.6
-# The same for charts without stretch. Each part of one must be this much shorter.
-_LONGEST_ISOMETRIC = 1.1
+# The same for charts without stretch, and for cuts through flat faces. Each part must be this much shorter.
+_LONGEST_ISOMETRIC, _LONGEST_FLAT = 1.1, 2.0
 _SHORTER = 0.85
 
 
@@ -71,8 +71,9 @@ def divide_long_charts(
             continue
         parts = _divide(chart, V, cost, bound)
         if chart.isometric and not for_packing:
-            # Flat faces are cut only where they are too long themselves.
-            parts = _keep_shorter(chart, parts) or _keep_shorter(chart, _divide(chart, V, np.ones(cost.shape), bound))
+            parts = _keep_shorter(chart, parts)
+            if not parts and _length(chart) > _LONGEST_FLAT * side:
+                parts = _keep_shorter(chart, _divide(chart, V, np.ones(cost.shape), bound))
         if parts:
             waiting += parts
         else:
