@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -37,6 +39,11 @@ class Chart:
     uv: FloatArray
     stretch: FloatArray
     misses: float
+
+    @cached_property
+    def shape(self) -> Shape:
+        """The part of the plane that the chart covers."""
+        return make_shape(self.uv, self.F)
 
     @property
     def isometric(self) -> bool:

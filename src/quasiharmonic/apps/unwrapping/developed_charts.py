@@ -61,20 +61,25 @@ def develop_charts(
     weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other]) / 2
     together = hinges.touch(cost >= UNDIVIDED_COST)
     model.list_contacts(~demanded)
-    found = [_list_charts(F, model, pieces)]
+    known: dict[int, Chart] = {}
+    found = [_list_charts(F, model, pieces, known)]
     for longest, loss in _ROUNDS:
         model.join(weight, together, longest, loss, check_wanted)
-        found.append(_list_charts(F, model, pieces))
+        found.append(_list_charts(F, model, pieces, known))
     return pieces.label >= 0, choose(found)
 
 
-def _list_charts(F: IntArray, model: PaperModel, pieces: Pieces) -> list[Chart]:
-    """Return the joined pieces as charts."""
+def _list_charts(F: IntArray, model: PaperModel, pieces: Pieces, known: dict[int, Chart]) -> list[Chart]:
+    """Return the joined pieces as charts; ``known`` are those with these labels before."""
     order = np.argsort(pieces.label, kind="stable")
     order = order[pieces.label[order] >= 0]
     charts = []
     for rows in np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1):
-        own, corner = renumber(model.split(rows), F[rows])
-        uv = to_points(pieces.place[rows].ravel()[corner])
-        charts.append(Chart(rows, own, F[rows].ravel()[corner], uv, np.ones(rows.size), 0.0))
+        label = int(pieces.label[rows[0]])
+        # A label keeps its triangles unless more are joined to them.
+        if label not in known or len(known[label].triangles) != rows.size:
+            own, corner = renumber(model.split(rows), F[rows])
+            uv = to_points(pieces.place[rows].ravel()[corner])
+            known[label] = Chart(rows, own, F[rows].ravel()[corner], uv, np.ones(rows.size), 0.0)
+        charts.append(known[label])
     return charts

@@ -9,7 +9,6 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.layout import estimate_use
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.atlas.packing.shapes import make_shape
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.rounding import round_positions
@@ -57,7 +56,7 @@ def choose_packed(
         if k + 1 < len(found) and len(found[k]) == len(found[k + 1]):
             use[k] = use[k + 1]
         elif len(found[k]) <= _MOST_COMPARED:
-            shapes = [make_shape(chart.uv, chart.F) for chart in found[k]]
+            shapes = [chart.shape for chart in found[k]]
             use[k] = estimate_use(shapes, size, padding, tiles, rotate=rotate)
         if use[k] >= _GOOD_USE - loss:
             break

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.packing.shapes import make_shape
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
 from quasiharmonic.util.arrays import FloatArray
@@ -95,14 +94,14 @@ def _keep_shorter(chart: Chart, parts: list[Chart]) -> list[Chart]:
 
 
 def _area(chart: Chart) -> float:
-    return make_shape(chart.uv, chart.F).area
+    return chart.shape.area
 
 
 def _is_too_long(chart: Chart, side: float, for_packing: bool) -> bool:
     """Whether a chart prevents a scale at which the texture has this side."""
     if chart.isometric and not for_packing:
         return _length(chart) > _LONGEST_ISOMETRIC * side
-    shape = make_shape(chart.uv, chart.F)
+    shape = chart.shape
     width, height = shape.extent(shape.direction)
     loose = shape.area < _LOOSE * width * height
     return max(width, height) > side * (_LONGEST_LOOSE if loose else _LONGEST)
@@ -110,5 +109,4 @@ def _is_too_long(chart: Chart, side: float, for_packing: bool) -> bool:
 
 def _length(chart: Chart) -> float:
     """Longer side of a chart's box."""
-    shape = make_shape(chart.uv, chart.F)
-    return max(shape.extent(shape.direction))
+    return max(chart.shape.extent(chart.shape.direction))

@@ -205,11 +205,17 @@ def _expected_scale(shapes: Sequence[Shape], size: tuple[int, int], padding: flo
     b = length * padding / 2
     # The largest shape must fit in the tile, in its best direction of a few.
     turns = np.exp(0.5j * pi * np.arange(_TURNS) / _TURNS)
-    sides = [min(max(shape.extent(turn)) for turn in turns) for shape in shapes]
+    sides = [_least_length(shape, turns) for shape in shapes]
     fits = (max(size) - padding) / (max(sides) or 1.0)
     if free <= 0:
         return 0.0
     return min(2 * free / (b + sqrt(b**2 + 4 * area * free)), fits) if area > 0 else fits
+
+
+def _least_length(shape: Shape, turns: ComplexArray) -> float:
+    """Longest side of a shape's box in the best of several directions."""
+    seen = shape.hull * turns.conj()[:, None]
+    return float(np.maximum(np.ptp(seen.real, axis=1), np.ptp(seen.imag, axis=1)).min())
 
 
 class _Search:
