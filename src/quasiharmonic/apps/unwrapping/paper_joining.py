@@ -78,6 +78,8 @@ class PaperModel:
         # Hinges between two charts, and how often each chart has changed.
         self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
         self._version = dict.fromkeys(self._charts, 0)
+        # Pairs of charts, with their versions, that cannot be joined.
+        self._hopeless: set[tuple[int, ...]] = set()
         self._watched: BoolArray = np.zeros(hinges.one.size, dtype=np.bool_)
 
     def list_contacts(self, may_join: BoolArray) -> None:
@@ -116,7 +118,7 @@ class PaperModel:
         while queue:
             check()
             _, a, b, *versions = heappop(queue)
-            if versions != [self._version.get(a), self._version.get(b)]:
+            if versions != [self._version.get(a), self._version.get(b)] or (a, b, *versions) in self._hopeless:
                 continue
             forced = bool(undivided[self._contacts[a][b]].any())
             for chart in self._join_symmetrically(a, b, weight, (np.inf, np.inf) if forced else limits):
@@ -171,7 +173,11 @@ class PaperModel:
             np.concatenate([one.hull, motion[0] * other.hull + motion[1]]),
         )
         longest, boxes = limits
-        if union.box > boxes * (one.box + other.box) or union.longest > max(longest, one.longest, other.longest):
+        if union.longest > max(longest, one.longest, other.longest):
+            return False
+        # Whatever else prevents a join prevents it in later rounds, too.
+        self._hopeless.add((a, b, self._version[a], self._version[b]))
+        if union.box > boxes * (one.box + other.box):
             return False
         before = place[other.triangles]
         place[other.triangles] = moved
