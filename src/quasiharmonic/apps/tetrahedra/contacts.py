@@ -16,13 +16,12 @@ import numpy as np
 
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns, SignArray
 from quasiharmonic.geometry.exact.predicates import box_pairs, box_pairs_between, orientation
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, morton_order
 from quasiharmonic.util.progress import heartbeat
 
 #: Maximum number of pairs of triangles that are found.
 MAX_LISTED = 1000
 _SIDES = ((0, 1), (1, 2), (2, 0))
-_AXES = ((0, 1), (1, 2), (2, 0))
 
 
 def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
@@ -32,7 +31,7 @@ def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
     """
     corners = X[F]
     lo, hi = corners.min(axis=1), corners.max(axis=1)
-    order = _spatial_order(0.5 * lo + 0.5 * hi)
+    order = morton_order(0.5 * lo + 0.5 * hi)
     found, count = [np.empty((0, 2), dtype=np.int64)], 0
     for i, j in box_pairs(lo[order], hi[order]):
         heartbeat()
@@ -49,7 +48,7 @@ def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
 def edges_meeting_triangles(edges: IntArray, F: IntArray, X: FloatArray) -> IntArray:
     """Find pairs (k, 2) of edges and non-degenerate triangles that meet outside their common vertices."""
     ends, corners = X[edges], X[F]
-    order, other_order = _spatial_order(0.5 * ends.sum(axis=1)), _spatial_order(corners.mean(axis=1))
+    order, other_order = morton_order(0.5 * ends.sum(axis=1)), morton_order(corners.mean(axis=1))
     boxes = (
         (part[place].min(axis=1), part[place].max(axis=1)) for part, place in ((ends, order), (corners, other_order))
     )
@@ -82,28 +81,6 @@ def _starts_inside(edge: IntArray, F: IntArray, second: BoolArray, X: FloatArray
     one = orientation(f[:, 0], f[:, 1], end) * turn
     other = orientation(f[:, 0], end, f[:, 2]) * turn
     return np.asarray((one >= 0) & (other >= 0))
-
-
-def _spatial_order(centres: FloatArray) -> IntArray:
-    """Order points along a Morton curve, so that points close in the order are close in space."""
-    if not len(centres):
-        return np.empty(0, dtype=np.int64)
-    exponent = np.frexp(np.abs(centres).max())[1]
-    with np.errstate(under="ignore"):
-        grid = (np.ldexp(centres, -exponent) * (1 << 19)).astype(np.int64) + (1 << 19)
-    code = np.zeros(len(centres), dtype=np.int64)
-    for axis in range(3):
-        x = grid[:, axis]
-        for shift, mask in (
-            (32, 0x1F00000000FFFF),
-            (16, 0x1F0000FF0000FF),
-            (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3),
-            (2, 0x1249249249249249),
-        ):
-            x = (x | (x << shift)) & mask
-        code |= x << axis
-    return np.argsort(code, kind="stable")
 
 
 def _meet(F: IntArray, G: IntArray, X: FloatArray, signs: ExactSigns) -> BoolArray:
@@ -187,7 +164,7 @@ def _project(F: IntArray, X: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return two axes for each triangle (k, 3) whose projection has an area, and the orientation of the projection."""
     axes, turn = np.zeros((len(F), 2), dtype=np.int64), np.zeros(len(F))
     left = np.arange(len(F))
-    for pair in _AXES:
+    for pair in _SIDES:
         a, b, c = X[F[left]][:, :, pair].transpose(1, 0, 2)
         sign = orientation(a, b, c)
         axes[left], turn[left] = pair, sign
