@@ -175,7 +175,7 @@ def nearest_on_segments(points: FloatArray, tails: FloatArray, heads: FloatArray
 
 
 def nearest_segment(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the index of the segment (k, 2) nearest to each point (m, 2), and the share of its length there; (m,) each."""
+    """Return the segment (k, 2) nearest to each point (m, 2), and where on it, as a share of its length; (m,) each."""
     nearest, share = np.empty(len(points), dtype=np.int64), np.empty(len(points))
     portion = max(1, _PAIRS // len(tails))
     for start in range(0, len(points), portion):
