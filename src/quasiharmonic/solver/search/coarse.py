@@ -13,7 +13,7 @@ import numpy as np
 
 from quasiharmonic.geometry.coarsening.levels import coarsen
 from quasiharmonic.geometry.coarsening.prolongation import prolong
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 

@@ -21,8 +21,7 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.coarsening.prolongation import are_positive
-from quasiharmonic.geometry.mesh.reference import rest_frames
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, to_points
 
 # Fraction of the way to the weighted mean of its neighbours that a vertex moves.
