@@ -16,14 +16,12 @@ the apex, so it is also visible from a position close to the apex (`prolongation
 So the coarse mesh poses the same problem with fewer unknowns, and a map of it extends to the fine mesh. However, the
 coarse mesh may have no injective map even if the fine mesh has one.
 
+No two vertices removed in one round are neighbours. No fan adds an edge that ends at a fixed vertex, that
+exists already, or that another fan adds, too. So the vertices may be removed and inserted in any order.
+
 References
 ----------
 .. [1] H. Shen, Z. Jiang, D. Zorin, D. Panozzo, Progressive embedding. ACM Transactions on Graphics 38 (2019).
-
-One round of coarsening: choose the vertices to remove, and fill their rings with triangles.
-
-No two removed vertices are neighbours. No fan adds an edge that ends at a fixed vertex, that exists already, or that
-another fan adds, too. So the vertices may be removed and inserted in any order.
 """
 
 from __future__ import annotations

@@ -22,11 +22,9 @@ must run counterclockwise, and a loop inside an odd number clockwise. For a conn
 counterclockwise loop around all others. Any of its loops may be the outer one: an annulus turned inside out is still
 bijective.
 
-Exact certificates of many small maps at once, at a lower cost than one by one.
-
-Most maps are valid and have one boundary loop. A map is bijective if all triangles are positive and its only loop is
-simple (`certify`). These two exact tests of triangles and boundary edges run on all maps together. `certify` then
-checks the remaining maps one by one.
+Many small maps are certified at once, at a lower cost than one by one. Most maps are valid and have one boundary loop.
+A map is bijective if all triangles are positive and its only loop is simple (`certify`). These two exact tests of
+triangles and boundary edges run on all maps together. `certify` then checks the remaining maps one by one.
 
 References
 ----------

@@ -10,9 +10,8 @@ the origin and vertex 1 on the positive x axis, written as complex numbers::
              ╱        ╲      m = area
         z₀ ──────────── z₁
 
-Rest triangles of a surface, laid into the plane to measure the distortion of a map.
-
-A `ReferenceMesh` may choose its triangles; these are always the triangles of the mesh. They have no sign, because a
+*Rest triangles* are laid into the plane to measure the distortion of a map. A `ReferenceMesh` may choose its triangles;
+rest triangles are always the triangles of the mesh. They have no sign, because a
 planar mesh counts as a surface seen from the side on which its triangles are counterclockwise. So the image of a
 triangle is inverted exactly if the certificate lists it as inverted.
 """

@@ -3,7 +3,7 @@
 One sort of the half-edges by their undirected edges gives all edges. It separates edges shared by two triangles,
 boundary edges, and edges that do not occur in a surface.
 
-Checks whether triangles form a valid surface. Each check names the offending elements.
+Checks of whether triangles form a valid surface name the offending elements.
 """
 
 from __future__ import annotations
