@@ -16,7 +16,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from quasiharmonic.solver.construction.halfedges import HalfEdges, Triangle
+from quasiharmonic.solver.construction.sheet import HalfEdges, Triangle
 from quasiharmonic.solver.methods.local_repair import Patch
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 from quasiharmonic.util.progress import heartbeat
