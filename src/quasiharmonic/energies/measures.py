@@ -28,7 +28,7 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.tables import make_dataframe
+from quasiharmonic.util.optional import make_dataframe
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

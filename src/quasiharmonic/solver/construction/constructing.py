@@ -18,7 +18,7 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import embed_tutte
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.solver.construction.cutting import Cutting, TooManyError
-from quasiharmonic.solver.construction.opening import as_refined, midpoints, thin_refinement
+from quasiharmonic.solver.construction.thinning import as_refined, midpoints, thin_refinement
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import LocalRepair, RandomRestarts, Untangling
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, find_exponent, scale_to_unit, to_complex

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import material, progress_line, report, written_map
+from quasiharmonic.ui.cli import material, report, streams, written_map
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
@@ -38,9 +38,9 @@ class Changed:
 
 
 @contextmanager
-def working(source: Path, words: Callable[[Any], str] = progress_line.describe_step) -> Iterator[Any]:
+def working(source: Path, words: Callable[[Any], str] = streams.describe_step) -> Iterator[Any]:
     """Show progress during the block, and name the source in its errors; yield a callback, or None."""
-    with report.about(source), progress_line.line(words) as show:
+    with report.about(source), streams.progress_line(words) as show:
         yield show
 
 

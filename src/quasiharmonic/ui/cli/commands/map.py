@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, progress_line, report, seam_options, slide_options, targets, written_map
+from quasiharmonic.ui.cli import pipeline, report, seam_options, slide_options, streams, targets, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
@@ -126,14 +126,14 @@ def _map(
         problem = one.fitted.problem
         given = pick(options, "polish", *declared(MapOptions))
         slide = one.slide if options.polish else False
-        with progress_line.line() as show:
+        with streams.progress_line() as show:
             result = solve(problem, slide=slide, callback=show, **given)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
             # The short default polish lowers the worst distortion at little cost.
             fine = on_refinement(problem, result.refined)
-            with progress_line.line() as show:
+            with streams.progress_line() as show:
                 result = smooth(fine, result, linear_solver=options.linear_solver, callback=show, slide=one.slide)
         return result
 
