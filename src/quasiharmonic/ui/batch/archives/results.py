@@ -18,7 +18,6 @@ from typing import Any, BinaryIO, NamedTuple
 
 from quasiharmonic.io.lowlevel.atomic import write_whole, writing
 from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.archives import results
 from quasiharmonic.ui.batch.archives.samples import KEYS, PARQUET, is_archive
 from quasiharmonic.ui.batch.archives.tar_stream import (
     END_MARK,
@@ -237,15 +236,15 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.part = path.with_name(path.name + results.PART)
+        self.part = path.with_name(path.name + PART)
         self.entries: dict[str, _Entry] = {}
         with writing(self.part):
             path.parent.mkdir(parents=True, exist_ok=True)
             if not self.part.exists() and path.exists():
-                if not results.is_parquet(path):
+                if not is_parquet(path):
                     os.replace(path, self.part)
                 else:
-                    for result in results.read_results(path):
+                    for result in read_results(path):
                         self.add(*result)
             self._repair()
 
@@ -256,7 +255,7 @@ class Journal:
 
     def add(self, key: str, record: Record, data: bytes | None) -> None:
         """Append a result; OutputError if it cannot be written."""
-        packed = results.pack_result(key, record, data)
+        packed = pack_result(key, record, data)
         with writing(self.part), open(self.part, "ab") as file:
             start = file.tell()
             file.write(packed)
@@ -265,11 +264,11 @@ class Journal:
     def finish(self, order: Sequence[str], stamp: str, settings: str) -> None:
         """Write the finished archive, in the given order of names, and delete the journal."""
         entries = [self.entries[key] for key in order]
-        about = results.describe((entry.record for entry in entries), stamp, settings)
+        about = describe((entry.record for entry in entries), stamp, settings)
         with writing(self.path):
             # An archive without problems has no journal.
             with open(self.part, "a+b") as file:
-                results.write_results(self.path, about, _read_entries(file, entries))
+                write_results(self.path, about, _read_entries(file, entries))
             self.part.unlink()
 
     def _note(self, key: str, start: int, end: int, record: Record) -> None:
@@ -281,7 +280,7 @@ class Journal:
             return
         with open(self.part, "r+b") as file:
             end = 0
-            for one in results.read_tar_results(file, maps=False):
+            for one in read_tar_results(file, maps=False):
                 if one.result is None:
                     break
                 self._note(one.result.key, one.start, one.end, one.result.record)
@@ -289,8 +288,8 @@ class Journal:
             file.truncate(end)
 
 
-def _read_entries(file: BinaryIO, entries: Iterable[_Entry]) -> Iterator[results.Result]:
+def _read_entries(file: BinaryIO, entries: Iterable[_Entry]) -> Iterator[Result]:
     for entry in entries:
         file.seek(entry.start)
         packed = io.BytesIO(file.read(entry.end - entry.start))
-        yield from (one.result for one in results.read_tar_results(packed) if one.result is not None)
+        yield from (one.result for one in read_tar_results(packed) if one.result is not None)
