@@ -25,7 +25,7 @@ import numpy as np
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.solver.field.tensor import TensorField
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, names_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, names_of, sum_at
 
 # The same minimum angle as in `mesh.reference` (§F.1).
 _MIN_ANGLE = np.pi / 6
@@ -98,9 +98,7 @@ class Forces:
     def gather(self, by_p: ComplexArray, by_q: ComplexArray) -> ComplexArray:
         """Sum forces of triangles (f,) on p and q at the vertices."""
         pull: ComplexArray = (self.share * by_p) * self.g + (self.share * by_q) * self.g.conj()
-        at = self.corners.ravel()
-        real, imaginary = (np.bincount(at, part.ravel(), minlength=self.n) for part in (pull.real, pull.imag))
-        return real + 1j * imaginary
+        return sum_at(self.corners.ravel(), pull.ravel(), self.n)
 
 
 @dataclass(frozen=True, eq=False)
