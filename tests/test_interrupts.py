@@ -53,7 +53,7 @@ def interrupted(at, *arguments):
         "argparse",
         "quasiharmonic.ui.cli",
         "quasiharmonic.ui.cli.commands.map",
-        "quasiharmonic.ui.cli.slide_options",
+        "quasiharmonic.ui.cli.targets",
         "quasiharmonic.io",
     ],
 )

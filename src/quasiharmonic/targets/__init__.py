@@ -9,9 +9,8 @@ from quasiharmonic.targets.boundary.corner_spec import nearest_on_boundary
 from quasiharmonic.targets.boundary.correspondence import arc_length
 from quasiharmonic.targets.boundary.sliding_curves import outline_curves
 from quasiharmonic.targets.boundary.turning import BoundaryLoop, boundary_corners, boundary_turning
-from quasiharmonic.targets.outlines.contours import signed_area
+from quasiharmonic.targets.outlines.contours import filled, nested, signed_area
 from quasiharmonic.targets.outlines.letters import letter
-from quasiharmonic.targets.outlines.nesting import filled, nested
 from quasiharmonic.targets.outlines.shapes import disk, ellipse, read_polylines, rectangle, regular_polygon, ring, star
 from quasiharmonic.targets.outlines.svg import read_svg
 from quasiharmonic.targets.outlines.words import word

@@ -24,8 +24,7 @@ from quasiharmonic.targets.boundary.corner_pins import Corners, Pins, pins_by_an
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, project_loop
 from quasiharmonic.targets.boundary.placement import CornerPlacement
 from quasiharmonic.targets.boundary.turning import boundary_turning, in_space, outermost
-from quasiharmonic.targets.outlines.contours import from_corner, in_unit
-from quasiharmonic.targets.outlines.nesting import NestedContour, arrange, filled
+from quasiharmonic.targets.outlines.contours import NestedContour, arrange, filled, from_corner, in_unit
 from quasiharmonic.targets.specification import outline as specified
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, describe, to_complex
 

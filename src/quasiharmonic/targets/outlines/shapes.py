@@ -9,8 +9,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.loops import join_items
 from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.lowlevel.textual import is_number, number, read_text
-from quasiharmonic.targets.outlines.contours import MAX_POINTS, distinct
-from quasiharmonic.targets.outlines.nesting import arrange, collinear
+from quasiharmonic.targets.outlines.contours import MAX_POINTS, arrange, collinear, distinct
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_numbers, check_positive
 
 

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, report, seam_options, slide_options, streams, targets, written_map
+from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, targets, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     began = time.perf_counter()
     if options.slide and options.no_polish:
         raise ValueError("--slide needs polishing: omit --no-polish")
-    slide_options.check_options(options)
+    targets.check_pieces(options)
     seam_options.check_packing(options)
     set_default(options, "kind", "map", asked=options.plot is not None, belongs="--plot")
     source, fixed = io.problem_files(options.input, options.fixed)
