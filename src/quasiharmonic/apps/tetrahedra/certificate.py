@@ -298,7 +298,5 @@ def _degenerate_triangles(F: IntArray, X: FloatArray) -> NDArray[np.bool_]:
     return flat
 
 
-def _name_faces(faces: IntArray, limit: int = 3) -> str:
-    listed = ", ".join(str(tuple(face)) for face in faces[:limit].tolist())
-    rest = f", … ({len(faces)} in all)" if len(faces) > limit else ""
-    return f"{'face' if len(faces) == 1 else 'faces'} {listed}{rest}"
+def _name_faces(faces: IntArray) -> str:
+    return names_of("face", "faces", faces)

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal, NamedTuple
@@ -158,13 +157,6 @@ class ReferenceMesh:
         self.gamma: ComplexArray = np.broadcast_to(gamma, (3, f))
         self.half_gamma: ComplexArray = np.broadcast_to(0.5 * gamma[1:], (2, f))
         self.stiffness_by_entry: FloatArray = np.broadcast_to(per_entry.reshape(9, -1), (9, f))
-
-    def __getitem__(self, part: slice) -> ReferenceMesh:
-        """Restrict to a slice of the triangles, with the same vertices."""
-        part_mesh = copy(self)
-        part_mesh.F, part_mesh.m, part_mesh.gamma = self.F[part], self.m[part], self.gamma[:, part]
-        part_mesh.half_gamma, part_mesh.stiffness_by_entry = self.half_gamma[:, part], self.stiffness_by_entry[:, part]
-        return part_mesh
 
     def edge_stiffness(self, a: FloatArray) -> FloatArray:
         """Off-diagonal entries (3, f) of every triangle's ``Gᵀ A G``, for the edges (0,1), (1,2), (2,0).
