@@ -469,7 +469,7 @@ def count_of(one: str, many: str, count: int) -> str:
 
 
 def names_of(one: str, many: str, indices: NDArray[np.integer]) -> str:
-    """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``. Each has an index, or a row of them."""
+    """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``. Each is an index or a row."""
     listed = ", ".join(str(tuple(i) if isinstance(i, list) else i) for i in indices[:_LISTED].tolist())
     rest = f", … ({len(indices)} in all)" if len(indices) > _LISTED else ""
     return f"{one if len(indices) == 1 else many} {listed}{rest}"

@@ -136,14 +136,8 @@ def check_outputs(options: argparse.Namespace, inputs: Sequence[Path | None]) ->
     plot, pattern = getattr(options, "plot", None), getattr(options, "pattern", None)
     if plot is not None:
         check_picture("--plot", plot, inputs)
-    taken = {options.output.resolve(): "the map (-o)"}
-    for option, path in (("--plot", plot), ("--pattern", pattern), ("--json", _json_file(options.json))):
-        if path is None:
-            continue
-        _check_replaces_nothing(option, path, inputs)
-        if path.resolve() in taken:
-            raise ValueError(f"{option} {path} is also the file of {taken[path.resolve()]}")
-        taken[path.resolve()] = option
+    outputs = {"--plot": plot, "--pattern": pattern, "--json": _json_file(options.json)}
+    _check_distinct(outputs, inputs, {options.output: "the map (-o)"})
 
 
 def _json_file(json_path: str | None) -> Path | None:
@@ -162,14 +156,19 @@ def check_new(outputs: Mapping[str, Path | None], json_path: str | None, inputs:
 
     ``outputs`` maps descriptions to paths, or to None.
     """
-    taken: list[Path] = []
-    for what, path in {**outputs, "--json": _json_file(json_path)}.items():
+    _check_distinct({**outputs, "--json": _json_file(json_path)}, inputs, {})
+
+
+def _check_distinct(outputs: Mapping[str, Path | None], inputs: Sequence[Path | None], taken: dict[Path, str]) -> None:
+    """Check that outputs replace neither an input nor each other, nor the outputs ``taken`` with their descriptions."""
+    for what, path in outputs.items():
         if path is None:
             continue
         _check_replaces_nothing(what, path, inputs)
-        if any(_same(path, other) for other in taken):
-            raise ValueError(f"{what} {path} is also another output")
-        taken.append(path)
+        for other, name in taken.items():
+            if _same(path, other):
+                raise ValueError(f"{what} {path} is also the file of {name}")
+        taken[path] = what
 
 
 def check_picture(
