@@ -38,7 +38,7 @@ import numpy as np
 
 from problems import ADVERSARIAL, FAMILIES, make, parse
 from quasiharmonic import Problem, Status, solve
-from quasiharmonic.solver.construction.simplicity import is_simple
+from quasiharmonic.solver.construction.constructing import is_simple
 from quasiharmonic.solver.search.stages import STRATEGIES
 from speed import machine
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from quasiharmonic import Problem, boundary_loops, distortion, harmonise, io, polish, solve, surfaces, targets
 from quasiharmonic.energies.polishing import ENERGIES
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.util.arrays import FloatArray
 
 Found = tuple[FloatArray, float]

@@ -112,8 +112,7 @@ def session_of(rings):
 
 def following(rings):
     """Return the CPU seconds of one updated map, certificate included."""
-    from quasiharmonic.ui.studio.session.drag import Follower
-    from quasiharmonic.ui.studio.session.falloff import drag_weights
+    from quasiharmonic.ui.studio.session.drag import Follower, drag_weights
 
     moment = session_of(rings).state
     problem, corner = moment.problem, moment.corners[2]

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("shapely", minversion="2.1")
 
 from quasiharmonic import AirMesh, surfaces
-from quasiharmonic.apps.air_mesh.airmesh import thicken, triangulate_between
+from quasiharmonic.apps.air_mesh import thicken, triangulate_between
 from quasiharmonic.energies.measures import mean_ratio
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from quasiharmonic import atlas, io
 from quasiharmonic.atlas import SeamedMesh
-from quasiharmonic.geometry.exact.convexity import find_concave
+from quasiharmonic.geometry.exact.triangles import find_concave
 from quasiharmonic.surfaces import grid, starfish
 from shared.commands import run
 from shared.meshes import lift

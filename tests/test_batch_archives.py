@@ -18,8 +18,7 @@ import pytest
 from quasiharmonic import batch, io
 from quasiharmonic.ui.batch.archives import places
 from quasiharmonic.ui.batch.archives.finding import find_archives
-from quasiharmonic.ui.batch.archives.journal import Journal
-from quasiharmonic.ui.batch.archives.results import read_about, read_results
+from quasiharmonic.ui.batch.archives.results import Journal, read_about, read_results
 from quasiharmonic.ui.batch.archives.samples import read_samples
 from quasiharmonic.ui.batch.archives.tar_stream import Damage, read_members
 from quasiharmonic.ui.cli import main

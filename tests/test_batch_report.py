@@ -16,7 +16,7 @@ from quasiharmonic import batch, io
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.report import charts, page, statistics, write_report
-from quasiharmonic.ui.report.style import STYLE
+from quasiharmonic.ui.report.page import STYLE
 from shared.datasets import star_of, write_problem, write_stars
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]

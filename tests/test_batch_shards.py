@@ -8,9 +8,8 @@ import time
 import pytest
 
 from quasiharmonic import batch
-from quasiharmonic.ui.batch.lock import lock_folder, lock_name
-from quasiharmonic.ui.batch.shards import Shard, read_shard
-from quasiharmonic.ui.batch.slots import Slots
+from quasiharmonic.ui.batch.pool import Slots
+from quasiharmonic.ui.batch.shards import Shard, lock_folder, lock_name, read_shard
 from quasiharmonic.ui.cli import main
 from shared.commands import linux
 from shared.datasets import record_of, write_stars

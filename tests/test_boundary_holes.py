@@ -10,8 +10,8 @@ import pytest
 from quasiharmonic import Problem, cut_open, injective_map, refine, surfaces, targets
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.targets import boundary_to, flattened_edges, outline
+from quasiharmonic.targets.boundary.boundary_to import choose_least_stretch
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, places_along, points_at
-from quasiharmonic.targets.boundary.holes import choose_least_stretch
 from shared.boundaries import holed, placed, torus
 
 

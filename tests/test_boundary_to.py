@@ -11,8 +11,8 @@ from quasiharmonic import Problem, cut_open, diagnose, injective_map, refine, su
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.targets import boundary_to, flattened_edges, outline
 from quasiharmonic.targets.boundary import correspondence
-from quasiharmonic.targets.boundary.chord_clearance import ChordConditions, choose, clear_chords, reach
 from quasiharmonic.targets.boundary.correspondence import max_deviation, points_at
+from quasiharmonic.targets.boundary.placement import ChordConditions, choose, clear_chords, reach
 from quasiharmonic.targets.outlines import contours
 from shared.boundaries import holed, placed, plain_grid, torus
 

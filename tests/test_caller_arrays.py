@@ -28,7 +28,7 @@ from quasiharmonic import (
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP
-from quasiharmonic.geometry.exact.batched_loops import certify_each
+from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.geometry.mesh.operators import operators
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh

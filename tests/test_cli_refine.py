@@ -148,7 +148,7 @@ class TestRejects:
         ):
             assert run("refine", *extra) == 2
             said = capsys.readouterr()
-            assert "would replace an input file" in said.err or "is also another output" in said.err
+            assert "would replace an input file" in said.err or "is also the file of" in said.err
             assert said.out == ""
             assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 

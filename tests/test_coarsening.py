@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, distortion, inverted_triangles, is_injective, solve
-from quasiharmonic.geometry.coarsening.levels import coarsen, has_marked_corner
+from quasiharmonic.geometry.coarsening.levels import (
+    allocate_round,
+    coarsen,
+    has_marked_corner,
+    remove_vertices,
+    split_by_degree,
+)
 from quasiharmonic.geometry.coarsening.prolongation import prolong, reinsertion_positions, smooth
-from quasiharmonic.geometry.coarsening.removal import allocate_round, remove_vertices, split_by_degree
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain

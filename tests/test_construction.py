@@ -13,15 +13,11 @@ from hypothesis import strategies as st
 from quasiharmonic import Problem, certify
 from quasiharmonic.geometry.mesh.refinement import split_edges
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
-from quasiharmonic.solver.construction.constructing import construct_and_thin
-from quasiharmonic.solver.construction.cutting import Cutting
-from quasiharmonic.solver.construction.halfedges import HalfEdges
-from quasiharmonic.solver.construction.opening import thin_refinement
+from quasiharmonic.solver.construction.constructing import construct_and_thin, is_simple
+from quasiharmonic.solver.construction.cutting import Cutting, walk
 from quasiharmonic.solver.construction.regions import Regions
-from quasiharmonic.solver.construction.sheet import Sheet
-from quasiharmonic.solver.construction.simplicity import is_simple
-from quasiharmonic.solver.construction.thinning import quality, triangulate_best
-from quasiharmonic.solver.construction.walks import walk
+from quasiharmonic.solver.construction.sheet import HalfEdges, Sheet
+from quasiharmonic.solver.construction.thinning import quality, thin_refinement, triangulate_best
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods.local_repair import remap_patches
 from quasiharmonic.solver.methods.untangling import untangle

@@ -35,7 +35,7 @@ from quasiharmonic import (
 from quasiharmonic.results import Step
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.cli import main
-from quasiharmonic.ui.display.markup import MAX_TRIANGLES, html
+from quasiharmonic.ui.display import MAX_TRIANGLES, html
 
 PLANE, F = disk(4)
 V = np.column_stack([PLANE, PLANE[:, 0] * PLANE[:, 1]])
@@ -143,7 +143,7 @@ def test_a_display_never_fails(monkeypatch):
         text = html(shown)
         assert not Reader(text).pictures
     assert "no picture: V is not finite" in text
-    monkeypatch.setattr("quasiharmonic.ui.display.markup.MAX_TRIANGLES", 10)
+    monkeypatch.setattr("quasiharmonic.ui.display.MAX_TRIANGLES", 10)
     assert "96 triangles are drawn when asked for: .plot()" in html(RESULT)
     assert MAX_TRIANGLES > 100_000
 

@@ -8,8 +8,8 @@ import pytest
 from quasiharmonic import surfaces
 from quasiharmonic.apps.mesh_motion.quality import element_quality
 from quasiharmonic.energies.measures import mean_ratio
-from quasiharmonic.geometry.exact.convexity import find_concave
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+from quasiharmonic.geometry.exact.triangles import find_concave
 from quasiharmonic.geometry.mesh.elements import (
     corner_triangles,
     covering_triangles,

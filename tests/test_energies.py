@@ -18,8 +18,8 @@ from quasiharmonic.energies.energies import (
     conformal_area_blend,
 )
 from quasiharmonic.energies.springs import MassSpring
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import edges
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.surfaces import random_delaunay
 from shared.meshes import lift
 

@@ -14,8 +14,7 @@ import pytest
 from quasiharmonic import Status, certify, distortion, flatten, keep_distances, surfaces
 from quasiharmonic.apps.flattening import free_boundary, piece
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.distances.distance_descent import DistancePairs, lower_distance_error
-from quasiharmonic.apps.flattening.distances.energy import DistanceEnergy
+from quasiharmonic.apps.flattening.distances.distance_descent import DistanceEnergy, DistancePairs, lower_distance_error
 from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent

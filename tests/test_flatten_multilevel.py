@@ -11,9 +11,8 @@ from quasiharmonic import Status, certify, distortion, find_cuts, flatten, is_in
 from quasiharmonic.apps.flattening import free_boundary, piece
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse, smooth_map, thick_energy
 from quasiharmonic.apps.flattening.multilevel.hierarchy import Hierarchy
-from quasiharmonic.apps.flattening.multilevel.local_smoothing import smooth_map, thick_energy
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units

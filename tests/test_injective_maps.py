@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, boundary_loops, certify, injective_map, injective_maps, solve
-from quasiharmonic.geometry.exact.batched_loops import certify_each
+from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem.problem_batch import set_up_batch

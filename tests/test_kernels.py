@@ -18,9 +18,8 @@ import quasiharmonic
 from quasiharmonic import certify
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP
-from quasiharmonic.geometry.mesh.reference import ReferenceMesh, rest_frames
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh, rest_frames, rest_shapes
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.surfaces import disk

@@ -7,7 +7,7 @@ import pytest
 
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.problem.diagnosis.clipping import Lattice
-from quasiharmonic.problem.diagnosis.links import Polygon
+from quasiharmonic.problem.diagnosis.shortcuts import Polygon
 from shared.polygons import U, circle, spiral
 
 

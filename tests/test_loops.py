@@ -10,8 +10,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from quasiharmonic import certify
-from quasiharmonic.geometry.exact import batched_loops
-from quasiharmonic.geometry.exact.batched_loops import certify_each
+from quasiharmonic.geometry.exact import certificate
+from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.geometry.exact.loops import contacts, doubtful_pairs, join_items, simple_loops
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.exact.triangles import sure_signs, triangle_signs
@@ -234,8 +234,8 @@ def test_certificates_of_many_maps_have_the_given_arrays(monkeypatch):
         single.append(len(F))
         return certify_alone(F, uv, **options)
 
-    certify_alone = batched_loops.certify
-    monkeypatch.setattr(batched_loops, "certify", certify_one)
+    certify_alone = certificate.certify
+    monkeypatch.setattr(certificate, "certify", certify_one)
     F, uv = zip(*maps.values(), strict=True)
     # A loop may begin at any of its vertices.
     loops = [[np.roll(loop, 1) for loop in boundary_loops(T, len(places))] for T, places in maps.values()]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from quasiharmonic import BoundaryCurves, MovingMesh, boundary_loops, certify
+from quasiharmonic.apps.mesh_motion.moving_mesh import MovingDescent
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.energies.newton import sliding_boundary as sliding
-from quasiharmonic.energies.newton.boundary_continuation import MovingDescent
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.polishing import scale_energy
 from quasiharmonic.io import MeshData, write_obj

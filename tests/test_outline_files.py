@@ -75,7 +75,7 @@ def test_invalid_files_of_points(tmp_path, text, message):
 
 
 def test_too_many_points(tmp_path, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.targets.outlines.polylines.MAX_POINTS", 3)
+    monkeypatch.setattr("quasiharmonic.targets.outlines.shapes.MAX_POINTS", 3)
     (tmp_path / "outline.txt").write_text("0 0\n1 0\n1 1\n0 1\n")
     with pytest.raises(ValueError, match="more than 3 points at line 4; use fewer points"):
         targets.read_polylines(tmp_path / "outline.txt")

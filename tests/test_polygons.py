@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import io, refine
-from quasiharmonic.geometry.exact.convexity import find_inverted_fans
+from quasiharmonic.geometry.exact.triangles import find_inverted_fans
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
 from quasiharmonic.io import MeshFileError
 from quasiharmonic.ui.cli import main

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, is_injective
-from quasiharmonic.apps.flattening.scaffold.air_triangulation import triangulate_air
-from quasiharmonic.apps.flattening.scaffold.graded_points import Quadtree
+from quasiharmonic.apps.flattening.air_triangulation import Quadtree, triangulate_air
 from quasiharmonic.geometry.exact import constrained_delaunay as triangulating
 from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, Triangulation, constrained_delaunay
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys, edges

@@ -12,8 +12,7 @@ import pytest
 from quasiharmonic import Problem, certify, io, is_injective, quasi_harmonic_map
 from quasiharmonic.surfaces import cat, grid
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
-from quasiharmonic.ui.studio.session.drag import Follower
-from quasiharmonic.ui.studio.session.falloff import drag_weights
+from quasiharmonic.ui.studio.session.drag import Follower, drag_weights
 from quasiharmonic.ui.studio.session.outlines import make_outline, make_polygon, read_drawing
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.storage import Storage

@@ -9,8 +9,7 @@ from math import comb
 import numpy as np
 import pytest
 
-from quasiharmonic.apps.displacement_fields.nearest import fold_free
-from quasiharmonic.apps.displacement_fields.trilinear import least_coefficients
+from quasiharmonic.apps.displacement_fields.nearest import fold_free, least_coefficients
 from quasiharmonic.apps.displacement_fields.voxels import VoxelGrid
 from quasiharmonic.ui.cli import main
 

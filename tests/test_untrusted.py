@@ -14,7 +14,7 @@ import pytest
 
 from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError
-from quasiharmonic.io.lowlevel.itk_headers import check_header
+from quasiharmonic.io.fields import check_header
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives.samples import read_samples

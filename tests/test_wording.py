@@ -12,7 +12,7 @@ from quasiharmonic import io
 from quasiharmonic.io import MeshData
 from quasiharmonic.surfaces import disk, starfish
 from quasiharmonic.ui.cli import COMMANDS, parser_of
-from quasiharmonic.ui.cli.wording import in_options, list_options, use_options
+from quasiharmonic.ui.cli.report import in_options, list_options, use_options
 from shared.commands import run
 
 

@@ -14,8 +14,7 @@ from quasiharmonic.apps.atlas.mapped_atlas import each_island
 from quasiharmonic.apps.repair.fitting import fit_boundary
 from quasiharmonic.atlas import AtlasVerdict, Island, SeamedMesh
 from quasiharmonic.energies.polishing import polish_result
-from quasiharmonic.geometry.exact.convexity import find_concave
-from quasiharmonic.geometry.exact.triangles import find_overlapping
+from quasiharmonic.geometry.exact.triangles import find_concave, find_overlapping
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.results import Step

@@ -24,7 +24,7 @@ from . import (
 from . import (
     targets as targets,
 )
-from .apps.air_mesh.airmesh import AirMesh as AirMesh
+from .apps.air_mesh import AirMesh as AirMesh
 from .apps.animation.frame_sequence import animate as animate
 from .apps.animation.frames import Animation as Animation
 from .apps.atlas.seam_cuts import cut_open as cut_open

@@ -4,7 +4,7 @@ Every result has ``success``, ``status``, ``message``, ``n_iterations``, ``secon
 ``to_dict()``; every certificate has ``valid``, ``bijective``, ``summary()`` and ``to_dict()``.
 """
 
-from quasiharmonic.apps.air_mesh.airmesh import AirMeshState
+from quasiharmonic.apps.air_mesh import AirMeshState
 from quasiharmonic.apps.animation.frames import Animation, AnimationVerdict, FrameStep
 from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas

@@ -12,8 +12,7 @@ from quasiharmonic import (
 )
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.solver.field.objective import Objective
-from quasiharmonic.solver.field.regularisers import Conformal
-from quasiharmonic.solver.search.harmonised import Harmonised
+from quasiharmonic.solver.search.harmonised import Conformal, Harmonised
 from quasiharmonic.surfaces import grid, random_delaunay
 from quasiharmonic.targets import arc_length
 from shared.meshes import bend, boundary_of, lift

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.energies.energies import Deformation, Energy, QuadraticForm
 from quasiharmonic.energies.mixtures import curvature_of_mixture, mixed_energy, mixed_slopes, mixture_of
-from quasiharmonic.geometry.mesh.reference import blocks
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import blocks, rest_shapes
 from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,

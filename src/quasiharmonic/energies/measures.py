@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.distances import DistanceError, surface_distances
 from quasiharmonic.energies.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
     ComplexArray,
@@ -28,7 +28,7 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.tables import make_dataframe
+from quasiharmonic.util.optional import make_dataframe
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

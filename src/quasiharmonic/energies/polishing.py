@@ -26,7 +26,7 @@ from quasiharmonic.energies.newton.progressive_reference import descend
 from quasiharmonic.energies.newton.sliding_boundary import SlidingModel, move_boundary
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult, Status, Step

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.energies import Deformation, Energy, QuadraticForm, damp, inverse
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, own_triangles
 
 

@@ -4,6 +4,9 @@ In memory a field has displacements along the axes of its grid. In NIfTI and ITK
 of space: those of ITK, which point left, posterior and superior (LPS). NIfTI fields that ITK, ANTs and elastix write
 have them too, with the intent VECTOR (1007). With the intent DISPVECT (1006) they are those of the NIfTI standard,
 right, anterior and superior (RAS).
+
+The headers of ITK's files (MetaImage and NRRD) are checked before: a file must contain its own data, and not announce
+too many of them.
 """
 
 from __future__ import annotations
@@ -21,12 +24,13 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io.errors import MeshFileError, check_path, reading
 from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
-from quasiharmonic.io.lowlevel.itk_headers import check_header
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import check_size, read_npy
 
+# Bytes in which a header must end.
+_LONGEST = 1 << 20
 NIFTI = ".nii", ".nii.gz"
 ITK = ".mha", ".nrrd"
 #: The suffixes of displacement fields.
@@ -37,6 +41,33 @@ _DISPVECT = 1006
 _SKEW = 1e-4
 # Largest displacement out of the plane, relative to the largest in it.
 _OUT_OF_PLANE = 1e-6
+
+
+def check_header(data: bytes, suffix: str) -> None:
+    """Raise a ValueError if a file of this suffix refers to another file, or announces too much data.
+
+    ITK's readers follow the name of a data file to any place.
+    """
+    entries = _entries(data, suffix)
+    other = next((entries[key] for key in ("elementdatafile", "data file", "datafile") if key in entries), "LOCAL")
+    if other.upper() != "LOCAL":
+        raise ValueError(f"refers to the data file {ascii(other)[:80]}: save the data in the file itself")
+    sides = (entries.get("dimsize") or entries.get("sizes") or "").split()
+    if all(side.isdecimal() for side in sides):
+        components = entries.get("elementnumberofchannels", "1")
+        count = prod(map(int, sides)) * (int(components) if components.isdecimal() else 1)
+        check_size(8 * count, "the header announces")
+
+
+def _entries(data: bytes, suffix: str) -> dict[str, str]:
+    """Return the entries of a header: MetaImage's ends with the entry ElementDataFile, NRRD's with an empty line."""
+    entries: dict[str, str] = {}
+    for line in data[:_LONGEST].split(b"\n"):
+        if "elementdatafile" in entries or (suffix != ".mha" and not line.strip()):
+            break
+        key, _, value = line.decode("latin-1").partition("=" if suffix == ".mha" else ":")
+        entries[key.strip().lower()] = value.strip()
+    return entries
 
 
 @dataclass(frozen=True, eq=False)

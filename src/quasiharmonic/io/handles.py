@@ -7,7 +7,6 @@ vertices.
 
 from __future__ import annotations
 
-import io
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +15,7 @@ import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.errors import MeshFileError, check_path
-from quasiharmonic.io.lowlevel.textual import integer, read_text
+from quasiharmonic.io.lowlevel.textual import content_lines, integer, read_text
 from quasiharmonic.io.mesh_files import read_mesh
 from quasiharmonic.io.models.meshdata import MeshData, vertex_places
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, names_of
@@ -170,10 +169,7 @@ def read_handles(path: str | os.PathLike[str], n: int) -> IntArray:
     """
     # Each vertex is stored once, so the memory is bounded by the mesh size.
     seen: dict[int, int] = {}
-    for line, raw in enumerate(io.BytesIO(read_text(path)), 1):
-        text = raw.split(b"#", 1)[0].strip()
-        if not text:
-            continue
+    for line, text in content_lines(read_text(path)):
         try:
             vertex = integer(text)
         except ValueError as error:

@@ -19,8 +19,7 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.linsolve.base import LinearSolver
-from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.linsolve.base import LinearSolver, NotPositiveDefinite
 from quasiharmonic.util.arrays import check_choice
 
 __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver", "takes_order"]

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.linsolve.base import LinearSolver
-from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.linsolve.base import LinearSolver, NotPositiveDefinite
 from quasiharmonic.util.arrays import FloatArray
 
 # Number of unknowns of a planar mesh below which the simplicial code is faster (18 against 30 ms at 20,000).

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quasiharmonic.linsolve.base import LinearSolver, Pattern
-from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.linsolve.base import LinearSolver, NotPositiveDefinite, Pattern
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.threads import read_limit
 

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.linsolve.base import LinearSolver
-from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.linsolve.base import LinearSolver, NotPositiveDefinite
 from quasiharmonic.util.arrays import FloatArray
 
 

@@ -20,8 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from quasiharmonic.linsolve.base import LinearSolver
-from quasiharmonic.linsolve.errors import NotPositiveDefinite
+from quasiharmonic.linsolve.base import LinearSolver, NotPositiveDefinite
 from quasiharmonic.linsolve.qdldl import Qdldl
 from quasiharmonic.linsolve.superlu import SuperLU
 from quasiharmonic.util.arrays import FloatArray

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.reference import Reference, ReferenceMesh, flat_triangles
-from quasiharmonic.geometry.mesh.surface_checks import surface_edges
-from quasiharmonic.geometry.mesh.topology import Edges, trace_loops
+from quasiharmonic.geometry.mesh.topology import Edges, surface_edges, trace_loops
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.util.arrays import (

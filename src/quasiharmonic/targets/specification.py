@@ -10,7 +10,7 @@ from quasiharmonic.io.errors import check_path
 from quasiharmonic.targets.outlines import shapes as outlines
 from quasiharmonic.targets.outlines.contours import MAX_POINTS
 from quasiharmonic.targets.outlines.letters import Font, letter
-from quasiharmonic.targets.outlines.polylines import read_polylines
+from quasiharmonic.targets.outlines.shapes import read_polylines
 from quasiharmonic.targets.outlines.svg import read_svg
 from quasiharmonic.targets.outlines.words import word
 from quasiharmonic.util.arrays import FloatArray, check_numbers

@@ -18,9 +18,10 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
-
 Scalar = TypeVar("Scalar", bound=np.generic)
+
+# Number of elements that a message lists.
+_LISTED = 5
 
 
 class ReadOnly:
@@ -477,20 +478,12 @@ def count_of(one: str, many: str, count: int) -> str:
 
 
 def names_of(one: str, many: str, indices: NDArray[np.integer]) -> str:
-    """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``."""
-    return _list_first(one, many, [str(int(i)) for i in indices[:_LISTED]], len(indices))
+    """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``. Each is an index or a row."""
+    listed = ", ".join(str(tuple(i) if isinstance(i, list) else i) for i in indices[:_LISTED].tolist())
+    rest = f", … ({len(indices)} in all)" if len(indices) > _LISTED else ""
+    return f"{one if len(indices) == 1 else many} {listed}{rest}"
 
 
 def edge_names(pairs: IntArray) -> str:
     """Name the first few of some edges: ``edges (1, 2), (4, 7), … (9 in all)``."""
-    return _list_first("edge", "edges", [f"({i}, {j})" for i, j in pairs[:_LISTED].tolist()], len(pairs))
-
-
-# Number of elements that a message lists.
-_LISTED = 5
-
-
-def _list_first(one: str, many: str, listed: list[str], count: int) -> str:
-    """Join the names of the first of ``count`` elements, and give their number if there are more."""
-    rest = f", … ({count} in all)" if count > len(listed) else ""
-    return f"{one if count == 1 else many} {', '.join(listed)}{rest}"
+    return names_of("edge", "edges", pairs)

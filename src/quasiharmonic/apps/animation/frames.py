@@ -20,8 +20,8 @@ from quasiharmonic.util.arrays import (
     names_of,
     real_array,
 )
+from quasiharmonic.util.optional import make_dataframe
 from quasiharmonic.util.outcome import SummarisedOutcome, Verdict
-from quasiharmonic.util.tables import make_dataframe
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -2,18 +2,27 @@
 
 The least distorted map for a boundary is one of many local minima. If every frame is polished separately, successive
 frames may end in different minima, and vertices jump by up to thirty times the motion of the boundary. The frames are
-therefore polished in order, each with a proximal term to the previous frame
-(`quasiharmonic.energies.newton.proximal`). This follows a branch of minima and leaves it slowly at its end. If a move
-is still too long, sweeps spread it over neighbouring frames. They polish the frames at both ends again with proximal
-terms to the previous and the next frame. The weight grows until no move is too long.
+therefore polished in order, each with a proximal term to the previous frame. This follows a branch of minima and leaves
+it slowly at its end. If a move is still too long, sweeps spread it over neighbouring frames. They polish the frames at
+both ends again with proximal terms to the previous and the next frame. The weight grows until no move is too long.
 
     forward   t = 0, 1, 2, …       E(wₜ) + near(wₜ₋₁), soft
     sweeps    ↓↑ at long moves     E(wₜ) + near(wₜ₋₁) + near(wₜ₊₁), hard
+
+The proximal term keeps a map near its neighbours in the sequence. A penalty is added to the mean energy E for vertices
+further than ``s`` lengths r from their positions in another map a. It is the mean over all n vertices::
+
+    E(w) + (k/n) Σₐ Σᵥ max(0, |wᵥ − aᵥ| / rₐ − s)²
+
+Vertices within this distance are not penalised, so the result is the minimum of the energy if that is near enough. The
+term is convex and separate for each vertex. Its second derivative is ``2k/(n r²)`` along the vertex's displacement, and
+``1 − s r/|w − a|`` of that across. It is a 2×2 block in the existing matrix pattern.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,10 +31,9 @@ from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, in_units
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
-from quasiharmonic.energies.newton.proximal import Neighbour, ProximalPenalty, ProximalTerm
 from quasiharmonic.energies.polishing import scale_energy
 from quasiharmonic.problem import Domain
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 # Weight of the proximal term in the forward pass, as a fraction of the mean energy.
 _PROXIMAL_WEIGHT = 0.5
@@ -45,6 +53,70 @@ _FORWARD_STEPS = 60
 # Newton steps per frame in a sweep.
 _SWEEP_STEPS = 20
 _TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """A neighbouring map (n, 2) in the sequence, and the length unit r for displacements between the two maps."""
+
+    uv: FloatArray
+    length: float
+
+
+@dataclass(frozen=True)
+class ProximalPenalty:
+    """The proximal penalty: its weight k relative to a mean energy, and the displacement s without penalty."""
+
+    weight: float
+    within: float
+
+    def value(self, away: ComplexArray) -> float:
+        """Value of the penalty for displacements (n,) in lengths."""
+        return self.weight * float(np.mean(self._excess(np.abs(away)) ** 2))
+
+    def gradient(self, away: ComplexArray) -> ComplexArray:
+        """Derivative with respect to the displacements, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
+        distance = np.abs(away)
+        return 2 * self.weight / away.size * self._excess(distance) * _direction(away, distance)
+
+    def blocks(self, away: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Second derivatives by the displacements: xx, xy and yy of each vertex's block; (n,) float64 each."""
+        distance = np.abs(away)
+        along = 2 * self.weight / away.size * (distance > self.within)
+        across = along * self._excess(distance) / np.where(distance > 0, distance, 1)
+        unit = _direction(away, distance)
+        xx = along * unit.real**2 + across * unit.imag**2
+        yy = along * unit.imag**2 + across * unit.real**2
+        return xx, (along - across) * unit.real * unit.imag, yy
+
+    def _excess(self, distance: FloatArray) -> FloatArray:
+        return np.maximum(0.0, distance - self.within)
+
+
+class ProximalTerm:
+    """The proximal penalty towards one neighbouring map, as a `Term` for maps in units of ``2 ** exponent``."""
+
+    def __init__(self, neighbour: Neighbour, penalty: ProximalPenalty, exponent: int) -> None:
+        self._penalty = penalty
+        self._neighbour = in_units(neighbour.uv, exponent)
+        self._length = float(np.ldexp(neighbour.length, -exponent))
+
+    def value(self, w: ComplexArray) -> float:
+        """See `Term`."""
+        return self._penalty.value((w - self._neighbour) / self._length)
+
+    def gradient(self, w: ComplexArray) -> ComplexArray:
+        """See `Term`."""
+        return self._penalty.gradient((w - self._neighbour) / self._length) / self._length
+
+    def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
+        """See `Term`."""
+        blocks = self._penalty.blocks((w - self._neighbour) / self._length)
+        system.add_blocks(*(block[system.free] / self._length**2 for block in blocks))
+
+
+def _direction(away: ComplexArray, distance: FloatArray) -> ComplexArray:
+    return np.where(distance > 0, away / np.where(distance > 0, distance, 1), 0)
 
 
 class MotionSmoothing:

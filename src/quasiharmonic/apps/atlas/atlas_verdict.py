@@ -14,8 +14,8 @@ from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of
+from quasiharmonic.util.optional import make_dataframe
 from quasiharmonic.util.outcome import Verdict
-from quasiharmonic.util.tables import make_dataframe
 
 if TYPE_CHECKING:
     from pandas import DataFrame

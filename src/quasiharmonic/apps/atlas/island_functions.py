@@ -25,6 +25,7 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.curves.boundary_curves import sliding_curves
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
@@ -40,7 +41,6 @@ from quasiharmonic.util.arrays import (
     index_array,
     map_array,
     names_of,
-    scale_to_unit,
 )
 from quasiharmonic.util.options import HarmoniseOptions, PolishOptions
 
@@ -357,11 +357,7 @@ def _scale_to_surface(islands: Sequence[Island], surface: FloatArray) -> list[tu
 
 def _surface_areas(mesh: SeamedMesh) -> FloatArray:
     """Areas of the islands on the surface, in a unit near the surface's size."""
-    V = scale_to_unit(mesh.V)
-    a, b, c = V[mesh.F].swapaxes(0, 1)
-    along, across = b - a, c - a
-    squared = (along**2).sum(axis=1) * (across**2).sum(axis=1) - (along * across).sum(axis=1) ** 2
-    area = 0.5 * np.sqrt(np.maximum(squared, 0.0))
+    area = rest_shapes(mesh.V, mesh.F).m
     return np.array([area[island.triangles].sum() for island in mesh.islands])
 
 

@@ -15,7 +15,7 @@ from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.refinement import Refined
-from quasiharmonic.geometry.mesh.surface_checks import manifold_edges
+from quasiharmonic.geometry.mesh.topology import manifold_edges
 from quasiharmonic.io import MeshData, refined_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.result import MapResult, Status

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.problem.result import Status
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, real_array
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, names_of, real_array
 from quasiharmonic.util.outcome import SummarisedOutcome
 
 # Corner triangles of a cell whose vertices are numbered along x and then along y.
@@ -239,12 +239,10 @@ def mean_length(change: FloatArray) -> float:
     return largest * float(np.sqrt(((change / largest) ** 2).sum(axis=-1).mean()))
 
 
-def name_points(mask: BoolArray, most: int = 5) -> str:
+def name_points(mask: BoolArray) -> str:
     """Name the first points of a mask: ``pixels (0, 3), (2, 7), … (17 in all), row and column``."""
-    words, where = _WORDS[mask.ndim], np.argwhere(mask)
-    listed = ", ".join(str(tuple(index)) for index in where[:most].tolist())
-    rest = f", … ({len(where)} in all)" if len(where) > most else ""
-    return f"{words.one if len(where) == 1 else words.many} {listed}{rest}, {words.indices}"
+    words = _WORDS[mask.ndim]
+    return f"{names_of(words.one, words.many, np.argwhere(mask))}, {words.indices}"
 
 
 def cell_corners(points: BoolArray) -> list[BoolArray]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.geometry.mesh.topology import components
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range, invert_indices
 
 
 class Part(NamedTuple):
@@ -53,10 +53,8 @@ def split_parts(V: FloatArray, F: IntArray, kept: BoolArray | None = None) -> li
 
 
 def _make_part(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) -> Part:
-    number = np.zeros(len(V), dtype=np.int64)
-    number[vertices] = np.arange(vertices.size)
     try:
-        return Part(Piece(V[vertices], number[F[triangles]]), vertices, triangles)
+        return Part(Piece(V[vertices], invert_indices(len(V), vertices)[F[triangles]]), vertices, triangles)
     except ValueError as error:
         raise ValueError(f"{name_part(vertices)}: {error}") from None
 

@@ -20,6 +20,7 @@ from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.problem.certification import certify
 from quasiharmonic.util.arrays import FloatArray, check_choice, check_non_negative, map_array
+from quasiharmonic.util.optional import explain_missing
 
 #: Millimetres per unit of the map.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
@@ -206,17 +207,13 @@ def _dxf(lines: Pattern) -> bytes:
 
 
 def _ezdxf() -> Any:
-    try:
+    with explain_missing("DXF output needs ezdxf", "'quasiharmonic[patterns]'"):
         import ezdxf
         import ezdxf.units
-    except ImportError as error:
-        raise ImportError("DXF output needs ezdxf: pip install 'quasiharmonic[patterns]'") from error
     return ezdxf
 
 
 def _shapely() -> Any:
-    try:
+    with explain_missing("an allowance needs Shapely", "'quasiharmonic[shapes]'"):
         import shapely
-    except ImportError as error:
-        raise ImportError("an allowance needs Shapely: pip install 'quasiharmonic[shapes]'") from error
     return shapely

@@ -84,7 +84,8 @@ class Piece:
     def __init__(self, V: ArrayLike, F: ArrayLike) -> None:
         domain = Domain(V, F, [])
         self.F, self.loops = domain.F, domain.loops
-        handles, odd = divmod(self._count_missing(domain), 2)
+        # Every handle lowers the Euler characteristic by two below that of a disk with as many loops.
+        handles, odd = divmod(2 - len(domain.loops) - domain.euler, 2)
         if handles or odd:
             raise ValueError(
                 f"the surface has {count_of('handle', 'handles', handles)} and cannot be flattened: "
@@ -106,11 +107,6 @@ class Piece:
         made.V = np.concatenate([np.ldexp(piece.V, down) for piece, down in zip(pieces, smaller, strict=True)])
         made.area = float(sum(np.ldexp(piece.area, 2 * down) for piece, down in zip(pieces, smaller, strict=True)))
         return made
-
-    @staticmethod
-    def _count_missing(domain: Domain) -> int:
-        """How much the Euler characteristic is below that of a disk with as many loops: two for each handle."""
-        return 2 - len(domain.loops) - domain.euler
 
     def planar_map(self) -> FloatArray | None:
         """Return the surface itself if it is planar and does not overlap itself, as no map is better."""

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.piece import is_scale_free
 from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, Scale
-from quasiharmonic.apps.gradients.freedom import Freedom
-from quasiharmonic.apps.gradients.gauge import Gauge
+from quasiharmonic.apps.gradients.freedom import Freedom, Gauge
 from quasiharmonic.apps.gradients.minimum import Minimum
 from quasiharmonic.apps.gradients.polish_gradient import NOT_FOUND, differentiate_surface_size, make_strain, place_map
 from quasiharmonic.energies.deformation import DeformationEnergy, positive_weights, signed_areas
@@ -53,9 +52,9 @@ def flatten_derivative(
     -------
     Derivative
         The derivative of the energy's minimum near ``uv``; this map is ``Derivative.uv``. Without fixed vertices, the
-        derivative is that of the map nearest to ``uv`` (`quasiharmonic.apps.gradients.gauge`), although `flatten` would
-        lay it out differently. Use functions that do not depend on the map's position and rotation. With one fixed
-        vertex the map can rotate about it, so the same holds for its rotation.
+        derivative is that of the map nearest to ``uv`` (`quasiharmonic.apps.gradients.freedom`), although `flatten`
+        would lay it out differently. Use functions that do not depend on the map's position and rotation. With one
+        fixed vertex the map can rotate about it, so the same holds for its rotation.
 
     Raises
     ------

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.derivative import Derivative, Equilibrium, Scale
-from quasiharmonic.apps.gradients.freedom import Freedom, SlidingFreedom
-from quasiharmonic.apps.gradients.gauge import differentiate_map_size
+from quasiharmonic.apps.gradients.forces import RestStrain
+from quasiharmonic.apps.gradients.freedom import Freedom, SlidingFreedom, differentiate_map_size
 from quasiharmonic.apps.gradients.minimum import Minimum
-from quasiharmonic.apps.gradients.strain import RestStrain
 from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.map_model import in_units

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium
-from quasiharmonic.apps.gradients.forces import Forces, TensorForces
-from quasiharmonic.apps.gradients.strain import CorrectedStrain, RestStrain, Strain
+from quasiharmonic.apps.gradients.forces import CorrectedStrain, Forces, RestStrain, Strain, TensorForces
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem, check_problem

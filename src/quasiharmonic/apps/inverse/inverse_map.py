@@ -17,6 +17,7 @@ from typing import Literal, get_args, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.geometry.curves.arcs import nearest_segment
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.geometry.mesh.topology import boundary_edges
@@ -38,8 +39,6 @@ from quasiharmonic.util.arrays import (
 
 # Points per block, so that the arrays fit into the cache.
 _POINTS = 1 << 14
-# Pairs of a point and an edge per block.
-_PAIRS = 1 << 20
 
 #: The elements that values on a surface belong to.
 Per = Literal["vertex", "corner", "triangle"]
@@ -191,7 +190,7 @@ class InverseMap(ReadOnly):
         edges = boundary_edges(self.F, len(self.uv))
         # Scaled, so that squared lengths stay within the range of doubles.
         size = np.abs(self.uv[edges]).max()
-        row, share = _nearest_on(positions.reshape(-1, 2)[lost] / size, *(self.uv[edges] / size).swapaxes(0, 1))
+        row, share = nearest_segment(positions.reshape(-1, 2)[lost] / size, *(self.uv[edges] / size).swapaxes(0, 1))
         triangle, barycentric = at.triangle.copy().ravel(), at.barycentric.copy().reshape(-1, 3)
         which, corner = self._edge_triangles(edges)
         triangle[lost] = which[row]
@@ -333,22 +332,6 @@ class InverseMap(ReadOnly):
         normal = np.cross(b - a, c - a)
         with np.errstate(invalid="ignore"):
             return normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-
-def _nearest_on(points: FloatArray, a: FloatArray, b: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The segment from ``a`` to ``b`` (k, 2) nearest to each point (m, 2), and the parameter 0 to 1 on it."""
-    row, share = np.empty(len(points), dtype=np.int64), np.empty(len(points))
-    side = b - a
-    length = np.einsum("ki,ki->k", side, side)
-    size = max(1, _PAIRS // len(a))
-    for start in range(0, len(points), size):
-        here = points[start : start + size, None] - a
-        along = np.clip(np.einsum("mki,ki->mk", here, side) / length, 0, 1)
-        away = here - along[..., None] * side
-        best = np.einsum("mki,mki->mk", away, away).argmin(axis=1)
-        row[start : start + size] = best
-        share[start : start + size] = along[np.arange(best.size), best]
-    return row, share
 
 
 def _check(certificate: Certificate, overlapping: bool) -> None:

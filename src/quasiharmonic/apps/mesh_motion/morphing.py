@@ -14,11 +14,11 @@ from quasiharmonic.apps.mesh_motion.midsides import (
     centre_midsides,
     find_sides,
     follow_sides,
+    make_convex,
     restore_midsides,
     untangle_elements,
 )
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult, find_forbidden
-from quasiharmonic.apps.mesh_motion.quadrilaterals import make_convex
 from quasiharmonic.apps.mesh_motion.quality import element_quality
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.apps.tetrahedra.tetrahedral_maps import is_volume, morph_tetrahedra

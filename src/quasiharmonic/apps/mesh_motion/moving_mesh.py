@@ -3,6 +3,16 @@
     boundary moves ──Newton, interior follows──▶ valid ──a step down the energy──▶ next time step
 
 The energy compares with the first mesh and does not depend on the path to the present one.
+
+Boundary continuation moves fixed vertices to new positions together with the map, keeping every triangle positive.
+The step is a Newton step for the new boundary. Let g be the energy's gradient at the free vertices, H its second
+derivative, and Δ the displacement of the fixed vertices. The free vertices move by::
+
+    d = −H⁻¹ (g + (H Δ)_free)
+
+The gradient term also corrects the error of earlier steps. The step is shortened so that no triangle collapses, and
+repeated until the fixed vertices reach their target. The map thus changes continuously: it does not jump to another
+minimum or to the other way around a hole.
 """
 
 from __future__ import annotations
@@ -12,15 +22,16 @@ from typing import TypedDict, Unpack, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.tetrahedra.moving import MovingTetrahedra
-from quasiharmonic.apps.tetrahedra.tetrahedral_maps import is_volume
+from quasiharmonic.apps.tetrahedra.tetrahedral_maps import MovingTetrahedra, is_volume
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.measures import mean_ratio
-from quasiharmonic.energies.newton.boundary_continuation import MovingDescent
-from quasiharmonic.energies.newton.newton_descent import NewtonDescent
+from quasiharmonic.energies.newton.line_search import backtrack
+from quasiharmonic.energies.newton.map_model import Coordinates, NewtonObjective, in_units, newton_descent, out_of_units
+from quasiharmonic.energies.newton.newton_descent import SHIFTS, NewtonDescent
 from quasiharmonic.energies.newton.sliding_boundary import SlidingModel, SlidingSystem, move_boundary
 from quasiharmonic.energies.polishing import find_energy, scale_energy
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
+from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.elements import check_spread
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.accepts_mesh import init_accepts_planar_mesh
@@ -28,6 +39,7 @@ from quasiharmonic.io.adapters.objects import MeshLike
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import (
+    ComplexArray,
     FloatArray,
     IntArray,
     check_bool,
@@ -35,15 +47,96 @@ from quasiharmonic.util.arrays import (
     check_integer,
     map_array,
     names_of,
+    sum_at,
     triangle_array,
     vertex_indices,
 )
 from quasiharmonic.util.options import MovingOptions, takes
 
+# Step as a fraction of the distance to the first collapse of a triangle.
+_FRACTION = 0.8
+# Minimum step, as a share of the remaining displacement.
+_MIN_STEP = 1e-4
 # Minimum decrease, relative to the energy, that a step must predict.
 _TOLERANCE = 1e-4
 # Maximum number of steps that move the boundary.
 _MAX_STEPS = 25
+
+
+class MovingDescent:
+    """A descent whose fixed vertices can be moved to new positions; see `newton_descent` for the parameters."""
+
+    def __init__(
+        self, energy: NewtonObjective, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str
+    ) -> None:
+        self.newton, self._model = newton_descent(energy, uv, fixed, exponent, linear_solver)
+
+    @property
+    def uv(self) -> FloatArray:
+        """The current map; (n, 2) float64."""
+        return self._model.positions(self.newton.w)
+
+    def set_map(self, uv: FloatArray) -> None:
+        """Continue from another injective map (n, 2), with the fixed vertices at their positions in it."""
+        coordinates = self._model.coordinates
+        self._model.coordinates = coordinates.with_pinned(uv[coordinates.fixed])
+        self.newton.state = self._model.evaluate(in_units(uv, coordinates.exponent))
+
+    def move(self, target: FloatArray, tol: float, steps: int) -> float:
+        """Move the fixed vertices to a target (k, 2), as far as possible without inverting triangles.
+
+        Between two partial moves, one descent step lowers the energy. Return the share of the displacement that was
+        reached: 1 if the vertices are exactly at the target.
+        """
+        left = 1.0
+        for k in range(steps):
+            if k > 0:
+                self.newton.step(tol)
+            t = self._move_once(target)
+            left *= 1 - t
+            if left == 0 or t == 0:
+                break
+        return 1 - left
+
+    def _move_once(self, target: FloatArray) -> float:
+        """Take one step of the displacement; return its length, 1 for all of it and 0 for none."""
+        model, start = self._model, self.newton.state
+        system, coordinates = model.system, model.coordinates
+        displacement = np.zeros_like(start.w)
+        displacement[coordinates.fixed] = in_units(target, coordinates.exponent) - start.w[coordinates.fixed]
+        model.assemble(start, 0.0)
+        found = system.descent(
+            model.gradient(start) + self._multiply_curvature(displacement), (0.0, *SHIFTS), model.solve
+        )
+        if found is None:
+            return 0.0
+        displacement[system.free] = found[0]
+
+        def trial(t: float, bound: float) -> tuple[float, Coordinates | None]:
+            w = start.w + t * displacement
+            there = out_of_units(w[coordinates.fixed], coordinates.exponent)
+            moved = coordinates.with_pinned(target if t == 1 else there)
+            return 0.0, moved if is_injective(model.energy.F, moved.positions(w)) else None
+
+        longest = min(1.0, _FRACTION * float(model.energy.steps_to_collapse(start.w, displacement).min()))
+        if not longest >= _MIN_STEP:
+            return 0.0
+        tries = 1 + int(np.log2(longest / _MIN_STEP))
+        taken = backtrack(trial, 0.0, 0.0, longest=longest, tries=tries)
+        if taken is None:
+            return 0.0
+        model.coordinates = taken.state
+        self.newton.state = model.evaluate(start.w + taken.t * displacement)
+        return taken.t
+
+    def _multiply_curvature(self, displacement: ComplexArray) -> ComplexArray:
+        """Product of the clamped second derivative with a displacement (n,), at the free vertices."""
+        energy = self._model.energy
+        corners, g = energy.F.T, energy.g
+        form = energy.curvature_of(self.newton.state.derivatives)
+        p, q = form.apply((g.conj() * displacement[corners]).sum(axis=0), (g * displacement[corners]).sum(axis=0))
+        pull, at = (g * p + g.conj() * q).ravel(), corners.ravel()
+        return sum_at(at, pull, displacement.size)[self._model.system.free]
 
 
 class MovingKeywords(TypedDict, total=False):

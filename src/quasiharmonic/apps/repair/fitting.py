@@ -15,8 +15,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.targets.boundary.boundary_to import boundary_to
 from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 from quasiharmonic.targets.outlines.contours import corners as corners_of
-from quasiharmonic.targets.outlines.contours import in_unit
-from quasiharmonic.targets.outlines.nesting import filled
+from quasiharmonic.targets.outlines.contours import filled, in_unit
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
 
 # Distance between the outlines of several islands, relative to their width.

@@ -30,10 +30,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED, find_contacts
+from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED, find_contacts, outer_winding
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns
 from quasiharmonic.apps.tetrahedra.topology import FaceReport, find_patches, inspect_faces
-from quasiharmonic.apps.tetrahedra.winding import outer_winding
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -300,7 +299,5 @@ def _degenerate_triangles(F: IntArray, X: FloatArray) -> NDArray[np.bool_]:
     return flat
 
 
-def _name_faces(faces: IntArray, limit: int = 3) -> str:
-    listed = ", ".join(str(tuple(face)) for face in faces[:limit].tolist())
-    rest = f", … ({len(faces)} in all)" if len(faces) > limit else ""
-    return f"{'face' if len(faces) == 1 else 'faces'} {listed}{rest}"
+def _name_faces(faces: IntArray) -> str:
+    return names_of("face", "faces", faces)

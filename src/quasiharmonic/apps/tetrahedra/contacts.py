@@ -8,21 +8,31 @@ Candidates are pairs of triangles whose boxes meet. For two triangles there are 
 - No common vertex. They meet if and only if an edge of one meets the other.
 
 Pairs in a common plane are decided in a projection in which the plane does not become a line.
+
+Winding numbers of closed surfaces are exact too, on both sides of their triangles. A line parallel to an axis passes
+through a chosen point of a triangle. The triangles that it crosses, in order, give the winding number between them,
+which is 0 far outside. All numbers are rational, so the result is exact.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.signs import ExactSigns, SignArray
 from quasiharmonic.geometry.exact.predicates import box_pairs, box_pairs_between, orientation
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, morton_order
 from quasiharmonic.util.progress import heartbeat
 
 #: Maximum number of pairs of triangles that are found.
 MAX_LISTED = 1000
 _SIDES = ((0, 1), (1, 2), (2, 0))
-_AXES = ((0, 1), (1, 2), (2, 0))
+# Weights of the corners for a point in a triangle: primes, so that lines through it rarely meet an edge.
+_WEIGHTS = ((101, 211, 307), (503, 229, 97), (13, 29, 911), (331, 17, 659), (1009, 2003, 31), (7, 5, 11))
+_AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 
 
 def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
@@ -32,7 +42,7 @@ def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
     """
     corners = X[F]
     lo, hi = corners.min(axis=1), corners.max(axis=1)
-    order = _spatial_order(0.5 * lo + 0.5 * hi)
+    order = morton_order(0.5 * lo + 0.5 * hi)
     found, count = [np.empty((0, 2), dtype=np.int64)], 0
     for i, j in box_pairs(lo[order], hi[order]):
         heartbeat()
@@ -49,7 +59,7 @@ def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
 def edges_meeting_triangles(edges: IntArray, F: IntArray, X: FloatArray) -> IntArray:
     """Find pairs (k, 2) of edges and non-degenerate triangles that meet outside their common vertices."""
     ends, corners = X[edges], X[F]
-    order, other_order = _spatial_order(0.5 * ends.sum(axis=1)), _spatial_order(corners.mean(axis=1))
+    order, other_order = morton_order(0.5 * ends.sum(axis=1)), morton_order(corners.mean(axis=1))
     boxes = (
         (part[place].min(axis=1), part[place].max(axis=1)) for part, place in ((ends, order), (corners, other_order))
     )
@@ -82,28 +92,6 @@ def _starts_inside(edge: IntArray, F: IntArray, second: BoolArray, X: FloatArray
     one = orientation(f[:, 0], f[:, 1], end) * turn
     other = orientation(f[:, 0], end, f[:, 2]) * turn
     return np.asarray((one >= 0) & (other >= 0))
-
-
-def _spatial_order(centres: FloatArray) -> IntArray:
-    """Order points along a Morton curve, so that points close in the order are close in space."""
-    if not len(centres):
-        return np.empty(0, dtype=np.int64)
-    exponent = np.frexp(np.abs(centres).max())[1]
-    with np.errstate(under="ignore"):
-        grid = (np.ldexp(centres, -exponent) * (1 << 19)).astype(np.int64) + (1 << 19)
-    code = np.zeros(len(centres), dtype=np.int64)
-    for axis in range(3):
-        x = grid[:, axis]
-        for shift, mask in (
-            (32, 0x1F00000000FFFF),
-            (16, 0x1F0000FF0000FF),
-            (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3),
-            (2, 0x1249249249249249),
-        ):
-            x = (x | (x << shift)) & mask
-        code |= x << axis
-    return np.argsort(code, kind="stable")
 
 
 def _meet(F: IntArray, G: IntArray, X: FloatArray, signs: ExactSigns) -> BoolArray:
@@ -187,7 +175,7 @@ def _project(F: IntArray, X: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return two axes for each triangle (k, 3) whose projection has an area, and the orientation of the projection."""
     axes, turn = np.zeros((len(F), 2), dtype=np.int64), np.zeros(len(F))
     left = np.arange(len(F))
-    for pair in _AXES:
+    for pair in _SIDES:
         a, b, c = X[F[left]][:, :, pair].transpose(1, 0, 2)
         sign = orientation(a, b, c)
         axes[left], turn[left] = pair, sign
@@ -237,3 +225,94 @@ def _apart_in_plane(edge: IntArray, F: IntArray, X: FloatArray) -> BoolArray:
     f, segment = _flatten(F, axes, X), _flatten(edge, axes, X)
     f[turn < 0] = f[turn < 0][:, (0, 2, 1)]
     return _is_separated(f, segment) | _is_separated(segment, f)
+
+
+def outer_winding(F: IntArray, X: FloatArray, patches: IntArray) -> IntArray:
+    """Return the winding number on the outer side of each patch of a surface; (p,) int64.
+
+    ``F`` (f, 3) are oriented triangles that meet only in common vertices and edges, and every edge has as many
+    triangles on one side as on the other. ``patches`` (f,) has numbers from 0; the winding number is the same along a
+    patch.
+    """
+    count = int(patches.max(initial=-1)) + 1
+    result = np.zeros(count, dtype=np.int64)
+    known = np.zeros(count, dtype=np.bool_)
+    boxes = _Boxes(X[F], X[F].min(axis=1), X[F].max(axis=1))
+    order = np.argsort(patches, kind="stable")
+    starts = np.searchsorted(patches[order], np.arange(count))
+    for patch in range(count):
+        heartbeat()
+        if known[patch]:
+            continue
+        stop = starts[patch + 1] if patch + 1 < count else len(order)
+        for triangle, outside in _first_line(boxes, order[starts[patch] : stop]):
+            own = patches[triangle]
+            result[own], known[own] = outside, True
+    return result
+
+
+class _Boxes(NamedTuple):
+    """Triangles (f, 3, 3) and the corners (f, 3) of their boxes."""
+
+    corners: FloatArray
+    lo: FloatArray
+    hi: FloatArray
+
+
+class _Line(NamedTuple):
+    """A line along ``axes[2]`` through the point of a triangle that weights of its corners define."""
+
+    triangle: int
+    weights: tuple[int, int, int]
+    axes: tuple[int, int, int]
+
+
+def _first_line(boxes: _Boxes, triangles: IntArray) -> list[tuple[int, int]]:
+    """Return the crossings of a line through one of some triangles: the triangle, and the winding number outside."""
+    for line in _choices(triangles):
+        found = _crossings(boxes, line)
+        if found is not None:
+            return found
+    raise AssertionError("every line through the surface meets an edge")
+
+
+def _choices(triangles: IntArray) -> Iterator[_Line]:
+    for weights in _WEIGHTS:
+        for triangle in triangles[:: max(len(triangles) // 20, 1)].tolist():
+            for axes in _AXES:
+                yield _Line(triangle, weights, axes)
+    for k in range(1, 10000):
+        yield _Line(int(triangles[k % len(triangles)]), (k * k + 1, 7 * k + 3, 5 * k + 2), _AXES[k % 3])
+
+
+def _crossings(boxes: _Boxes, line: _Line) -> list[tuple[int, int]] | None:
+    """Crossings of a line; None if it meets an edge of a triangle."""
+    (corners, lo, hi), (triangle, weights, axes) = boxes, line
+    total = sum(weights)
+    own = _rational(corners[triangle])
+    q = [sum(w * p[a] for w, p in zip(weights, own, strict=True)) / total for a in axes[:2]]
+    near = np.ones(len(corners), dtype=np.bool_)
+    for value, a in zip(q, axes[:2], strict=True):
+        below, above = np.nextafter(float(value), -np.inf), np.nextafter(float(value), np.inf)
+        near &= (lo[:, a] <= above) & (hi[:, a] >= below)
+    found = []
+    for k in np.flatnonzero(near).tolist():
+        p = _rational(corners[k])
+        flat = [(point[axes[0]] - q[0], point[axes[1]] - q[1]) for point in p]
+        areas = [flat[i][0] * flat[j][1] - flat[i][1] * flat[j][0] for i, j in ((1, 2), (2, 0), (0, 1))]
+        if all(area > 0 for area in areas) or all(area < 0 for area in areas):
+            height = sum(area * point[axes[2]] for area, point in zip(areas, p, strict=True)) / sum(areas)
+            found.append((height, 1 if areas[0] > 0 else -1, k))
+        elif not (any(area > 0 for area in areas) and any(area < 0 for area in areas)):
+            return None
+    # From far along the axis, a triangle that faces there is entered from outside.
+    found.sort(key=lambda crossing: -crossing[0])
+    winding, result = 0, []
+    for _, facing, k in found:
+        result.append((k, winding if facing > 0 else winding - 1))
+        winding += facing
+    return result
+
+
+def _rational(points: FloatArray) -> list[list[Fraction]]:
+    return [[Fraction(value) for value in point] for point in points.tolist()]

@@ -1,4 +1,4 @@
-"""Exact orientation of tetrahedra.
+"""Exact orientation of tetrahedra, and of the tetrahedra at the corners of hexahedra.
 
 The predicate has four stages, like `quasiharmonic.geometry.exact.predicates`. Each stage processes the tetrahedra that
 the previous one could not decide:
@@ -35,6 +35,10 @@ _UNDERFLOW_BOUND = 2.0**-1060
 _MIN_DIFFERENCE = 2.0**-200
 # Tetrahedra per block, so that the data stay in the cache.
 _CHUNK = 1 << 14
+# Each corner with its three neighbours, right-handed, in the order of Gmsh and VTK.
+_CORNERS = np.array(
+    [(0, 1, 3, 4), (1, 2, 0, 5), (2, 3, 1, 6), (3, 0, 2, 7), (4, 7, 5, 0), (5, 4, 6, 1), (6, 5, 7, 2), (7, 6, 4, 3)]
+)
 
 
 class ExactSigns:
@@ -148,3 +152,12 @@ def _decide_in_integers(p: FloatArray) -> int:
     ux, uy, uz, vx, vy, vz, wx, wy, wz = (c[i] - c[i % 3] for i in range(3, 12))
     det: int = ux * (vy * wz - vz * wy) + uy * (vz * wx - vx * wz) + uz * (vx * wy - vy * wx)
     return (det > 0) - (det < 0)
+
+
+def find_bad_corners(H: IntArray, X: FloatArray) -> IntArray:
+    """Return the hexahedra (h, 8) with a corner whose tetrahedron is not positive, exactly; ascending.
+
+    Positive corners are necessary for a valid trilinear map, but not sufficient.
+    """
+    sign, _ = tetrahedron_signs(H[:, _CORNERS].reshape(-1, 4), X)
+    return np.flatnonzero((sign.reshape(-1, 8) <= 0).any(axis=1))

@@ -23,7 +23,7 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.options import FlattenOptions
 

@@ -18,8 +18,8 @@ from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, meet, spanning_links
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 
 #: Edges with a larger angle between the normals are creases.

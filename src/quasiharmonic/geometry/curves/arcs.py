@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.predicates import two_product, two_sum
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, check_finite, real_array, to_complex
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_finite, real_array, to_complex
 
 # Longest arc in radians, so that a few nodes integrate its length to rounding.
 _MAX_ARC = np.pi / 4
@@ -23,6 +23,8 @@ ZERO_DERIVATIVE = 1e-9
 _INSIDE = 1e-6
 # Nodes of Gauss' formula for a length.
 _NODES = 16
+# Number of distances between points and segments computed together.
+_PAIRS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +172,18 @@ def nearest_on_segments(points: FloatArray, tails: FloatArray, heads: FloatArray
     square = np.maximum((side**2).sum(axis=-1), np.finfo(np.float64).tiny)
     share = np.clip((offset * side).sum(axis=-1) / square, 0, 1)
     return share, np.linalg.norm(offset - share[..., None] * side, axis=-1)
+
+
+def nearest_segment(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the segment (k, 2) nearest to each point (m, 2), and where on it, as a share of its length; (m,) each."""
+    nearest, share = np.empty(len(points), dtype=np.int64), np.empty(len(points))
+    portion = max(1, _PAIRS // len(tails))
+    for start in range(0, len(points), portion):
+        part = slice(start, start + portion)
+        shares, distance = nearest_on_segments(points[part, None], tails, heads)
+        nearest[part] = distance.argmin(axis=1)
+        share[part] = np.take_along_axis(shares, nearest[part, None], axis=1)[:, 0]
+    return nearest, share
 
 
 def angle_at(angles: FloatArray, t: FloatArray) -> FloatArray:

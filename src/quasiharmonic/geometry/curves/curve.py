@@ -20,6 +20,7 @@ from quasiharmonic.geometry.curves.arcs import (
     count_chords,
     gauss_rule,
     make_lines,
+    nearest_segment,
     on_bezier,
     on_ellipse,
     split_piece,
@@ -45,8 +46,6 @@ _GAP = 1e-9
 _KINK = 1e-3
 # Step in the parameter of the chord that gives the direction of a piece where its derivative is zero.
 _CHORD = 1e-5
-# Number of distances between points and chords computed together.
-_PAIRS = 1 << 20
 # Lengths below this fraction of the curve's size count as rounding.
 _ROUNDING = 1e-13
 # Number of parameters of each piece in the table of lengths.
@@ -251,7 +250,7 @@ class Curve:
         candidate.
         """
         z = to_complex(points)
-        chord, share = self._nearest_chord(z)
+        chord, share = nearest_segment(points, to_points(self._chord_tail), to_points(self._chord_head))
         here, at = self._chord_piece[chord], self._chord_first[chord] + share * self._chord_width[chord]
         best = np.full(z.size, np.inf)
         piece, t = here, at
@@ -407,19 +406,6 @@ class Curve:
         with np.errstate(divide="ignore", invalid="ignore"):
             curvature = (first.conj() * second).imag / np.abs(first) ** 3
         return first / np.abs(first), np.where(slow, 0.0, curvature)
-
-    def _nearest_chord(self, z: ComplexArray) -> tuple[IntArray, FloatArray]:
-        """Index of the chord nearest to each point, and the position on the chord in [0, 1]."""
-        side = self._chord_head - self._chord_tail
-        chord, share = np.empty(z.size, dtype=np.int64), np.empty(z.size)
-        portion = max(1, _PAIRS // side.size)
-        for start in range(0, z.size, portion):
-            part = slice(start, start + portion)
-            offset = z[part, None] - self._chord_tail
-            along = np.clip((offset / side).real, 0.0, 1.0)
-            chord[part] = np.argmin(np.abs(offset - along * side), axis=1)
-            share[part] = np.take_along_axis(along, chord[part, None], axis=1)[:, 0]
-        return chord, share
 
     def _refine(self, piece: IntArray, t: FloatArray, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Parameter of the nearest point of a piece to each given point, by Newton's method, and the distance."""

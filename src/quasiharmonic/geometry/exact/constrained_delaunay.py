@@ -85,10 +85,7 @@ def constrained_delaunay(points: FloatArray, segments: IntArray, hull: IntArray)
 
 
 def delaunay_of_polygon(points: FloatArray) -> IntArray | None:
-    """Triangulate a simple polygon (k, 2) without further points; None if the polygon runs clockwise.
-
-    The algorithm runs in plain Python and suits polygons of up to a few hundred corners.
-    """
+    """Triangulate a simple polygon (k, 2) without further points; None if the polygon runs clockwise."""
     integers = to_integers(points)
     corners = list(zip(integers[::2], integers[1::2], strict=True))
     if sum(corners[k - 1][0] * y - x * corners[k - 1][1] for k, (x, y) in enumerate(corners)) < 0:

@@ -29,7 +29,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.sparse import csr_array
 
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, as_offsets, invert_indices
 from quasiharmonic.util.progress import heartbeat
 

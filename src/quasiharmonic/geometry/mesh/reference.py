@@ -9,20 +9,35 @@ the origin and vertex 1 on the positive x axis, written as complex numbers::
                ╱    ╲        p = ∂u/∂z, q = ∂u/∂z̄ of the complex map u + iv on the triangle
              ╱        ╲      m = area
         z₀ ──────────── z₁
+
+*Rest triangles* are laid into the plane to measure the distortion of a map. A `ReferenceMesh` may choose its triangles;
+rest triangles are always the triangles of the mesh. They have no sign, because a
+planar mesh counts as a surface seen from the side on which its triangles are counterclockwise. So the image of a
+triangle is inverted exactly if the certificate lists it as inverted.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from copy import copy
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_range, own_triangles
+from quasiharmonic.util.arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    check_range,
+    find_exponent,
+    names_of,
+    own_triangles,
+    pad_to_space,
+    vertex_array,
+)
 from quasiharmonic.util.kernels import compiled
 
 Reference = Literal["equilateral", "rest", "corrected"]
@@ -143,13 +158,6 @@ class ReferenceMesh:
         self.half_gamma: ComplexArray = np.broadcast_to(0.5 * gamma[1:], (2, f))
         self.stiffness_by_entry: FloatArray = np.broadcast_to(per_entry.reshape(9, -1), (9, f))
 
-    def __getitem__(self, part: slice) -> ReferenceMesh:
-        """Restrict to a slice of the triangles, with the same vertices."""
-        part_mesh = copy(self)
-        part_mesh.F, part_mesh.m, part_mesh.gamma = self.F[part], self.m[part], self.gamma[:, part]
-        part_mesh.half_gamma, part_mesh.stiffness_by_entry = self.half_gamma[:, part], self.stiffness_by_entry[:, part]
-        return part_mesh
-
     def edge_stiffness(self, a: FloatArray) -> FloatArray:
         """Off-diagonal entries (3, f) of every triangle's ``Gᵀ A G``, for the edges (0,1), (1,2), (2,0).
 
@@ -230,3 +238,57 @@ def _correct(z1: FloatArray, z2: ComplexArray) -> tuple[FloatArray, ComplexArray
     angles *= np.pi / angles.sum(axis=0)
     # Sine rule: |z2| / sin(angle at 1) = |z1| / sin(angle at 2).
     return np.ones_like(z1), np.sin(angles[1]) / np.sin(angles[2]) * np.exp(1j * angles[0])
+
+
+@dataclass(frozen=True, eq=False)
+class RestShapes:
+    """Triangles laid into the plane counterclockwise, vertex 0 at 0 and vertex 1 on the positive x axis.
+
+    Attributes
+    ----------
+    unit : float
+        Unit of length: a power of two near the size of the mesh, so that areas and their inverses neither
+        overflow nor underflow.
+    sides : (3, f) complex128
+        Sides from vertex 0 to 1, 1 to 2 and 2 to 0, in units.
+    m : (f,) float64
+        Areas in square units.
+    """
+
+    unit: float
+    sides: ComplexArray
+    m: FloatArray
+
+    @property
+    def flat(self) -> NDArray[np.int64]:
+        """Ascending indices of the triangles whose area is zero in floating point."""
+        return np.flatnonzero(~(self.m > 0))
+
+    def check_areas(self, reason: str) -> None:
+        """Raise a ValueError with the triangles of zero area and the reason why areas are needed, if there are any."""
+        flat = self.flat
+        if flat.size:
+            raise ValueError(f"{names_of('triangle', 'triangles', flat)} of zero area in the rest mesh: {reason}")
+
+    def half_gradients(self) -> ComplexArray:
+        """Half the gradients ``γᵢ/2`` of the hat functions (3, f) in inverse units; NaN for triangles without area.
+
+        ``∂w/∂z = Σ conj(gᵢ) wᵢ`` and ``∂w/∂z̄ = Σ gᵢ wᵢ``.
+        """
+        m = np.where(self.m > 0, self.m, np.nan)
+        return 0.25j * self.sides[(1, 2, 0), :] / m
+
+
+def rest_shapes(V: ArrayLike, F: NDArray[np.integer], *, lowest: float = 0.0) -> RestShapes:
+    """Lay the triangles of a planar or curved mesh into the plane.
+
+    ``lowest`` is the minimum height as a fraction of the longest side; lower triangles are raised to this height.
+    """
+    positions = vertex_array(V, finite=False)
+    exponent = find_exponent(positions) - 1
+    z1, z2 = rest_frames(pad_to_space(np.ldexp(positions, -exponent)), F)
+    if lowest:
+        longest = np.maximum(np.maximum(z1, np.abs(z2)), np.abs(z2 - z1))
+        z1 = np.where(z1 > 0, z1, longest)
+        z2.imag = np.maximum(z2.imag, lowest * longest**2 / np.where(z1 > 0, z1, 1.0))
+    return RestShapes(float(np.ldexp(1.0, exponent)), np.stack([z1 + 0j, z2 - z1, -z2]), 0.5 * z1 * z2.imag)

@@ -1,11 +1,12 @@
 """Tables of numbers in a file, text or binary, with the byte position of each number.
 
 With these positions, numbers can be replaced without changing any other byte.
+`MeshParts`, the common result of the finite-element readers, consists of such tables.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -151,3 +152,19 @@ def replace_numbers(data: bytes, table: Table, values: FloatArray) -> bytes:
         pieces += [data[at:begin], text.encode()]
         at = end
     return b"".join([*pieces, data[at:]])
+
+
+@dataclass(frozen=True, eq=False)
+class MeshParts:
+    """Positions and elements of a file, and a function that changes only the positions."""
+
+    points: FloatArray  # (n, 3): positions, converted to double
+    # (f, 3), (f, 4) or (f, 6): elements in the format of `geometry.mesh.elements`. Of a mesh in space (t, 4) or (t, 8):
+    # tetrahedra and hexahedra; a tetrahedron among hexahedra repeats its last node.
+    F: IntArray
+    precision: np.dtype[np.floating]  # Precision of the positions in the file
+    # Each callable returns values at all points, (n, k) float64, NaN at points without value. It raises `ValueError`
+    # if the data are damaged.
+    fields: Mapping[str, Callable[[], FloatArray]]
+    # Returns the bytes of the file with the first coordinates of its points replaced, by (n, 2) or (n, 3) float64
+    replace_points: Callable[[FloatArray], bytes]

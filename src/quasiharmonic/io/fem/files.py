@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.io.errors import MeshFileError, reading
-from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.byte_tables import MeshParts
 from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import is_planar

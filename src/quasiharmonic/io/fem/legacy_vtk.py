@@ -7,8 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from quasiharmonic.io.fem.byte_tables import Table, TableReader, replace_numbers
-from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.byte_tables import MeshParts, Table, TableReader, replace_numbers
 from quasiharmonic.io.fem.vtk_cells import elements, find_counts
 from quasiharmonic.util.arrays import FloatArray, IntArray
 

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.fem.byte_tables import TableReader, replace_numbers
-from quasiharmonic.io.fem.meshparts import MeshParts
+from quasiharmonic.io.fem.byte_tables import MeshParts, TableReader, replace_numbers
 from quasiharmonic.io.fem.vtk_cells import elements
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.untrusted import check_end

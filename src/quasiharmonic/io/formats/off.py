@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from array import array
@@ -12,7 +11,15 @@ import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.lowlevel.atomic import write_whole
-from quasiharmonic.io.lowlevel.textual import integer, integer_table, number, number_table, read_text, shown
+from quasiharmonic.io.lowlevel.textual import (
+    content_lines,
+    integer,
+    integer_table,
+    number,
+    number_table,
+    read_text,
+    shown,
+)
 from quasiharmonic.io.models.meshdata import MeshData, in_plane, polygon_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -41,7 +48,7 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
         for a file that is missing or not text.
     """
     data = read_text(path)
-    lines = _content(data)
+    lines = content_lines(data)
     line, text = next(lines, (1, b""))
     header, *counts = text.split(None, 3) or [b""]
     if not _HEADER.fullmatch(header):
@@ -152,10 +159,3 @@ def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -
     if size > 3 and len(set(ring)) < size:
         raise MeshFileError(path, f"face with {size} corners that uses a vertex twice", line, "remove the repetition")
     return ring
-
-
-def _content(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield non-empty lines without comments, each with its number."""
-    for line, raw in enumerate(io.BytesIO(data), 1):
-        if text := raw.split(b"#", 1)[0].strip():
-            yield line, text

@@ -8,7 +8,7 @@ import re
 import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError, reading
-from quasiharmonic.io.formats.welding import weld
+from quasiharmonic.io.formats.vertex_data import weld
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray

@@ -1,11 +1,15 @@
-"""Normals and colours in `MeshData`: normals are OBJ lines, colours are the numbers after the coordinates."""
+"""Data of vertices that several formats treat alike.
+
+Normals are OBJ lines in `MeshData`, and colours the numbers after the coordinates. Vertices at equal positions are
+merged if files store triangles without shared vertices.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
 def normal_lines(normals: FloatArray) -> bytes:
@@ -30,3 +34,10 @@ def colours_of(mesh: MeshData) -> FloatArray | None:
     if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
         return None
     return extra
+
+
+def weld(points: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the distinct points of (k, d), in the order of their first occurrence, and the row of each point (k,)."""
+    _, first, which = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    return points[first[order]], np.argsort(order)[which.ravel()]

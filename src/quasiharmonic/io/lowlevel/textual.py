@@ -7,6 +7,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,13 @@ def read_text(path: str | os.PathLike[str]) -> bytes:
         line = data.count(b"\n", 0, nul) + 1
         raise MeshFileError(path, "a NUL byte", line, "this is a binary or a damaged file")
     return data if data.endswith(b"\n") or not data else data + b"\n"
+
+
+def content_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the non-empty lines of a text without comments (``#``), each with its number."""
+    for line, raw in enumerate(BytesIO(data), 1):
+        if text := raw.split(b"#", 1)[0].strip():
+            yield line, text
 
 
 def shown(token: bytes) -> str:
@@ -189,10 +197,7 @@ def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, lis
     another count of numbers or anything but finite numbers.
     """
     rows = []
-    for at, line in enumerate(read_text(path).split(b"\n"), 1):
-        text = line.partition(b"#")[0].strip()
-        if not text:
-            continue
+    for at, text in content_lines(read_text(path)):
         if b";" in text:
             words = [word.strip().replace(b",", b".") for word in text.split(b";")]
         else:

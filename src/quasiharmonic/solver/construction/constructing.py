@@ -1,4 +1,7 @@
-"""A map of a refined mesh onto a simple target: constructed, certified and thinned."""
+"""A map of a refined mesh onto a simple target: constructed, certified and thinned.
+
+The pieces of the cut mesh are mapped by Tutte's embedding, and repaired if double precision is insufficient.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,93 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.certificate import Certificate, certify
+from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.exact.certificate import Certificate, certify, inverted_triangles
+from quasiharmonic.geometry.exact.loops import check_loops, winding
 from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.linsolve.laplacian import embed_tutte
 from quasiharmonic.problem import Domain, Problem
-from quasiharmonic.solver.construction.ancestry import as_refined, midpoints
 from quasiharmonic.solver.construction.cutting import Cutting, TooManyError
-from quasiharmonic.solver.construction.embedding import embed_pieces
-from quasiharmonic.solver.construction.opening import thin_refinement
-from quasiharmonic.solver.construction.simplicity import is_simple
-from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, scale_to_unit, to_complex
+from quasiharmonic.solver.construction.thinning import as_refined, midpoints, thin_refinement
+from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.methods import LocalRepair, RandomRestarts, Untangling
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, find_exponent, scale_to_unit, to_complex
 
+# Number of weight updates.
+_WEIGHT_UPDATES = 4
+# Exponent of the areas in the weights.
+_AREA_POWER = 0.5
+# Maximum ratio of weights in one update.
+_MAX_RATIO = 1e6
+# Methods that untangle the last triangles and may also move vertices on cuts. Each is limited, because double precision
+# may be insufficient.
+_REPAIRS = LocalRepair(tries=30), Untangling(iterations=200), RandomRestarts(max_failures=20, tries=20)
 # Maximum number of added vertices per mesh vertex before another way to cut is tried.
 _ADDED_PER_VERTEX = 50
 # Final maximum of added vertices: walks around many displaced pins can grow without bound.
 _MAX_ADDED = 60_000
+
+
+def embed_pieces(problem: Problem, w: ComplexArray, fixed: IntArray) -> ComplexArray:
+    """Embed convex pieces into their polygons, and untangle triangles that rounding has inverted.
+
+    ``w`` (n,) has the positions of the vertices on the boundaries of pieces, ``fixed`` (k,), in the problem's frame.
+    Return the map with the fewest inverted triangles found, counted at its final positions.
+    """
+    best, fewest = w, len(problem.F) + 1
+    for candidate in _candidates(problem, w, fixed):
+        inverted = inverted_triangles(problem.F, problem.positions(candidate)).size
+        if inverted < fewest:
+            best, fewest = candidate, inverted
+        if fewest == 0:
+            break
+    return best
+
+
+def _candidates(problem: Problem, w: ComplexArray, fixed: IntArray) -> Iterator[ComplexArray]:
+    """Yield embeddings with different weights, then maps from untangling the best of them."""
+    weights, best, fewest = np.ones(len(problem.F)), w, np.inf
+    for _ in range(1 + _WEIGHT_UPDATES):
+        try:
+            w = embed_tutte(problem.F, w, fixed, weights)
+        except NotPositiveDefinite:
+            break
+        yield w
+        inverted = inverted_triangles(problem.F, problem.positions(w)).size
+        if inverted < fewest:
+            best, fewest = w, inverted
+        # Small triangles get smaller weights.
+        areas = np.abs(signed_areas(problem.F, w))
+        weights = weights * np.clip(areas / areas.max(), 1 / _MAX_RATIO, 1.0) ** _AREA_POWER
+    objective = Objective(problem)
+    here = objective.of_map(best)
+    for repair in _REPAIRS:
+        try:
+            for step in repair.iterates(objective, here):
+                again, here = step.w is here.w, step
+                if not again:
+                    yield here.w
+        except NotPositiveDefinite:
+            return
+
+
+def is_simple(problem: Problem) -> bool:
+    """Whether a surface can be mapped bijectively onto its target if its mesh is fine enough, determined exactly.
+
+    True if the surface has no handles and the target is simple. Its loops must be simple, disjoint, nested as an outer
+    one around all others, and wound as the mesh's. Pins must be distinct and strictly inside.
+    """
+    domain = problem.domain
+    if domain.euler != 2 - len(domain.loops):
+        return False
+    if len(np.unique(problem.target, axis=0)) < len(problem.target):
+        return False
+    uv = problem.place_fixed()
+    if check_loops(domain.loops, uv)[1]:
+        return False
+    turns, on = winding(uv[domain.pins], *uv[domain.edges.boundary.T])
+    return bool(np.all(~on & (turns == 1)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.constrained_delaunay import triangulate_inside
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.solver.construction.halfedges import Edge, HalfEdges
+from quasiharmonic.solver.construction.sheet import Edge, HalfEdges
 from quasiharmonic.util.arrays import FloatArray, IntArray, cyclic_pairs
 
 # A turn counts as straight if the point is off the line by at most this many roundings of the largest coordinate.

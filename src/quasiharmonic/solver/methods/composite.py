@@ -19,21 +19,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.constrained_delaunay import delaunay_of_polygon, triangulate_inside
+from quasiharmonic.geometry.exact.constrained_delaunay import delaunay_of_polygon
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates
 from quasiharmonic.solver.methods.vector_adam import VectorAdam
-from quasiharmonic.util.arrays import ComplexArray, IntArray, check_integer, cyclic_pairs, to_points
+from quasiharmonic.util.arrays import ComplexArray, IntArray, check_integer, to_points
 
 # Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
 _EVEN_SHARE = 0.5
-# Margin between the target and the box of its triangulation, as a fraction of its extent.
-_MARGIN = 0.1
-# Up to this number of corners a direct triangulation is as fast and avoids loading SciPy's Qhull. For so small a mesh,
-# loading takes longer than all other work.
-_DIRECT_UP_TO = 100
 # Schedule after the composite: short steps suffice, and long ones would leave its neighbourhood.
 NEARBY_STEPS = ((0, 0.2), (39, 0.2), (40, 0.05))
 
@@ -111,26 +106,13 @@ def composite_map(objective: Objective) -> ComplexArray | None:
 
 
 def polygon_triangles(outline: ComplexArray) -> IntArray | None:
-    """Triangulate a simple polygon without additional vertices; corners (k,) are of magnitude about one.
+    """Triangulate a simple polygon without additional vertices; corners (k,).
 
     Return strictly positive triangles (k - 2, 3), or None if the polygon intersects itself or runs clockwise.
     """
-    k = len(outline)
-    ring = np.arange(k)
     points = to_points(outline)
-    if not simple_loops([ring], points).all():
-        return None
-    if k <= _DIRECT_UP_TO:
-        return delaunay_of_polygon(points)
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = _MARGIN * (high - low)
-    sides = cyclic_pairs(ring)
-    try:
-        F = triangulate_inside(points, sides, low - margin, high + margin)
-    except ValueError:
-        return None
-    # If the polygon runs clockwise, the rest of the box is to its left, and the number of triangles differs.
-    return F if len(F) == k - 2 else None
+    simple = simple_loops([np.arange(len(outline))], points).all()
+    return delaunay_of_polygon(points) if simple else None
 
 
 def _corners_of_disk(outline: ComplexArray) -> ComplexArray:

@@ -26,9 +26,8 @@ from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.solver.construction.constructing import Construction, constructions, refined_problem
-from quasiharmonic.solver.construction.opening import thin_refinement
-from quasiharmonic.solver.construction.simplicity import is_simple
+from quasiharmonic.solver.construction.constructing import Construction, constructions, is_simple, refined_problem
+from quasiharmonic.solver.construction.thinning import thin_refinement
 from quasiharmonic.solver.refine.refining import refine_problem
 from quasiharmonic.solver.search.record import RepairBudget
 from quasiharmonic.solver.search.search import allowed_repairs, search_map

@@ -13,9 +13,9 @@ import numpy as np
 
 from quasiharmonic.geometry.coarsening.levels import coarsen
 from quasiharmonic.geometry.coarsening.prolongation import prolong
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.problem import Domain, Problem
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, mark, pad_to_space
 
 # Vertices of the coarse mesh, as a fraction of the fine mesh's.
 _SHARE = 1 / 8
@@ -47,14 +47,10 @@ class CoarseMesh:
     """
 
     def __init__(self, fine: Domain, goal: int) -> None:
-        self._fixed = np.zeros(fine.n, dtype=bool)
-        self._fixed[fine.fixed] = True
+        self._fixed = mark(fine.n, fine.fixed)
         self._coarsening = coarsen(fine.F, fine.n, self._fixed, goal)
-        used = np.zeros(fine.n, dtype=bool)
-        used[self._coarsening.F] = True
-        self._vertices = np.flatnonzero(used)
-        number = np.full(fine.n, -1)
-        number[self._vertices] = np.arange(self._vertices.size)
+        self._vertices = np.flatnonzero(mark(fine.n, self._coarsening.F))
+        number = invert_indices(fine.n, self._vertices)
         F = number[self._coarsening.F]
         self.domain = Domain(_perturb_flat(fine.V[self._vertices], F), F, number[fine.fixed])
 
@@ -93,8 +89,7 @@ def _perturb_flat(V: FloatArray, F: IntArray) -> FloatArray:
     low = ~(2 * shapes.m >= _MIN_HEIGHT * lengths.max(axis=0) ** 2)
     if not low.any():
         return V
-    space = np.zeros((len(V), 3))
-    space[:, : V.shape[1]] = V
+    space = pad_to_space(V)
     shortest = np.full(len(V), np.inf)
     for length, ends in zip(lengths, ((0, 1), (1, 2), (2, 0)), strict=True):
         for corner in ends:

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.batched_loops import certify_each
+from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status

@@ -25,9 +25,8 @@ from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.field.objective import Objective
-from quasiharmonic.solver.field.regularisers import Conformal
 from quasiharmonic.solver.search.harmonic_descent import HarmonicDescent
-from quasiharmonic.solver.search.harmonised import Harmonised
+from quasiharmonic.solver.search.harmonised import Conformal, Harmonised
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

@@ -1,4 +1,10 @@
-"""Placement of one boundary loop along one contour: the start, and the vertices at corners."""
+"""Placement of one boundary loop along one contour: the start, and the vertices at corners.
+
+The vertices at corners are chosen so that chords have space. A chord, an interior edge between two boundary vertices,
+cuts off a part of the surface. That part has positive area only if the target bends to the left between the chord's
+ends. On a polygon, there must be a convex corner between them. So the vertices at convex corners must be chosen such
+that no chord has both ends between (or at) two successive ones.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +13,137 @@ from dataclasses import dataclass
 import numpy as np
 
 from quasiharmonic.geometry.exact.loops import contacts
-from quasiharmonic.targets.boundary.chord_clearance import clear_chords
 from quasiharmonic.targets.boundary.chords import STRAIGHT, flat_chords
-from quasiharmonic.targets.boundary.correspondence import Held, find_start, max_deviation, places_along, points_at
-from quasiharmonic.util.arrays import FloatArray, IntArray, cyclic_pairs
+from quasiharmonic.targets.boundary.correspondence import (
+    BoundaryStretch,
+    Held,
+    arc_parameters,
+    find_start,
+    max_deviation,
+    places_along,
+    points_at,
+    stretches,
+)
+from quasiharmonic.targets.outlines.contours import corners, turns
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs
 
+# Minimum left turn in radians, larger than that of a rounded straight line.
+_MIN_TURN = 1e-9
+# Maximum shift of a vertex to a corner, as a share of the loop. Beyond it, the target no longer resembles the surface,
+# and splitting edges is better.
+FARTHEST = 0.2
 # Maximum number of starts to try, nearest to the best fit first, if chords lack space.
 _MAX_STARTS = 256
 # Number of rotations to try for a hole.
 _ROTATIONS = 48
 # Additional deviation of a target from its contour allowed for chords, as a share of the larger side.
 _ALLOWED_DEVIATION = 0.02
+
+
+def clear_chords(
+    s: FloatArray, contour: FloatArray, pins: Held, *, corner_angle: float, chords: IntArray
+) -> list[tuple[int, float]] | None:
+    """Choose vertices for the convex corners of a contour, near them along the loop, so that chords have space.
+
+    ``s`` (n,) are the vertices' parameters along their loop, and ``chords`` (c, 2) pairs of them. The result contains
+    the ``pins`` and the chosen vertices with their corners, in order around. It is None if no choice leaves space for
+    all chords, or only one that shifts a vertex by more than a fifth of the loop. Chords across a pin are ignored.
+    """
+    t, bends = arc_parameters(contour), turns(contour)
+    sharp = corners(contour, corner_angle)
+    left = np.flatnonzero(bends > _MIN_TURN)
+    found: list[tuple[int, float]] = []
+    for stretch in stretches(s, pins):
+        here, wanted = stretch.within(t, sharp[bends[sharp] > 0])
+        spare = _between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
+        straight = _between(wanted, stretch.within(t, left)[1]) == 0
+        conditions = ChordConditions(reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
+        chosen = choose(stretch.along, wanted, conditions)
+        if chosen is None:
+            return None
+        found.append((int(stretch.run[0]), stretch.begin))
+        found += [(int(stretch.run[k]), float(t[corner])) for k, corner in zip(chosen, here, strict=True)]
+    return found
+
+
+@dataclass(frozen=True)
+class ChordConditions:
+    """Conditions on the vertices at convex corners of a stretch."""
+
+    # (c + 1,): for every vertex of the stretch, the smallest end of a chord that begins there or later. Ascending.
+    reach: IntArray
+    straight: BoolArray  # (w + 1,): whether each side, from one convex corner to the next, has no left turn
+    spare: IntArray  # (w + 1,): number of vertices that each side needs for other corners
+    farthest: float  # Maximum distance of a vertex from the corner that it takes
+
+
+def reach(stretch: BoundaryStretch, chords: IntArray, n: int) -> IntArray:
+    """Compute `ChordConditions.reach` for a stretch of a loop with ``n`` vertices; c + 1 where no chord is left."""
+    count = len(stretch.run) - 1
+    # Chords in both directions around the loop; those that leave the stretch are ignored.
+    begin = (np.concatenate([chords[:, 0], chords[:, 1]]) - stretch.run[0]) % n
+    length = np.concatenate([chords[:, 1] - chords[:, 0], chords[:, 0] - chords[:, 1]]) % n
+    within = begin + length <= count
+    reach = np.full(count + 1, count + 1)
+    np.minimum.at(reach, begin[within], (begin + length)[within])
+    return np.minimum.accumulate(reach[::-1])[::-1]
+
+
+def _between(wanted: FloatArray, others: FloatArray) -> IntArray:
+    """Numbers of ``others`` before the first, strictly between successive, and after the last of ``wanted``."""
+    ends = np.concatenate([[0.0], wanted, [1.0]])
+    return np.searchsorted(others, ends[1:], side="left") - np.searchsorted(others, ends[:-1], side="right")
+
+
+def choose(along: FloatArray, wanted: FloatArray, conditions: ChordConditions) -> IntArray | None:
+    """Choose vertices for wanted parameters with the least sum of squared distances that leave space, or None.
+
+    Row j + 1 of ``cost`` has, for every vertex, the lowest cost of the parameters up to j if j takes that vertex. On a
+    straight side, the next corner must come before the end of any chord that begins at or after this one.
+    """
+    count = len(along) - 1
+    vertex = np.arange(count + 1)
+    # Row 0: before the first parameter there is only the pin at the start.
+    cost = [np.where(vertex == 0, 0.0, np.inf)]
+    for j in range(len(wanted) + 1):
+        # Consider only earlier candidates that leave space for a chord to this vertex and enough vertices for the other
+        # corners.
+        low = (
+            np.searchsorted(conditions.reach, vertex, side="right")
+            if conditions.straight[j]
+            else np.zeros(count + 1, np.int64)
+        )
+        best = _range_minima(cost[j], low, vertex - conditions.spare[j])
+        if j < len(wanted):
+            away = np.abs(along - wanted[j])
+            best += np.where(away <= conditions.farthest, away**2, np.inf)
+            best[count] = np.inf
+        cost.append(best)
+    if not np.isfinite(cost[-1][count]):
+        return None
+    chosen = np.empty(len(wanted), dtype=np.int64)
+    end = count
+    for j in reversed(range(len(wanted))):
+        options = np.where(vertex < end - conditions.spare[j + 1], cost[j + 1], np.inf)
+        if conditions.straight[j + 1]:
+            options[conditions.reach <= end] = np.inf
+        end = chosen[j] = int(np.argmin(options))
+    return chosen
+
+
+def _range_minima(values: FloatArray, low: IntArray, high: IntArray) -> FloatArray:
+    """Minimum of ``values[low[i]:high[i]]`` for every i; infinite where the range is empty."""
+    # Row k has the minimum of every 2ᵏ successive values. Two overlapping ranges of this length cover any range.
+    rows = [values]
+    while 2 ** len(rows) <= values.size:
+        half = 2 ** (len(rows) - 1)
+        rows.append(np.minimum(rows[-1], np.append(rows[-1][half:], np.full(half, np.inf))))
+    length = high - low
+    least = np.full(low.size, np.inf)
+    for k, row in enumerate(rows):
+        here = (length >= 2**k) & (length < 2 ** (k + 1))
+        least[here] = np.minimum(row[low[here]], row[high[here] - 2**k])
+    return least
 
 
 @dataclass(frozen=True, eq=False)

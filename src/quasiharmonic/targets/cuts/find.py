@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.fans import open_along
-from quasiharmonic.geometry.mesh.surface_checks import manifold_edges
-from quasiharmonic.geometry.mesh.topology import components, edge_keys
+from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.targets.cuts.levels import cut_by_levels

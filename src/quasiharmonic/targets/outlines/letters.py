@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.targets.outlines.contours import Pieces, flatten, signed_area
-from quasiharmonic.targets.outlines.nesting import nested
+from quasiharmonic.targets.outlines.contours import Pieces, flatten, nested, signed_area
 from quasiharmonic.util.arrays import FloatArray, check_positive, describe
 
 Font = str | PathLike[str]

@@ -7,9 +7,8 @@ import itertools
 import numpy as np
 
 from quasiharmonic.geometry.curves.curve import Curve
-from quasiharmonic.targets.outlines.contours import distinct, signed_area
+from quasiharmonic.targets.outlines.contours import distinct, filled, nested, signed_area
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter
-from quasiharmonic.targets.outlines.nesting import filled, nested
 from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive
 from quasiharmonic.util.optional import explain_missing
 

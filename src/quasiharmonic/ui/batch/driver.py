@@ -20,12 +20,11 @@ from quasiharmonic.ui.batch.archives import places
 from quasiharmonic.ui.batch.archives.archived import ArchivedProblems, scratch_folder
 from quasiharmonic.ui.batch.archives.finding import find_archives
 from quasiharmonic.ui.batch.archives.outputs import Outputs
-from quasiharmonic.ui.batch.lock import lock_folder, lock_name
 from quasiharmonic.ui.batch.loose import LooseProblems
 from quasiharmonic.ui.batch.pool import solve_in_processes
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, group_small
 from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
-from quasiharmonic.ui.batch.shards import WHOLE, Shard, read_shard, shard_of, table_name
+from quasiharmonic.ui.batch.shards import WHOLE, Shard, lock_folder, lock_name, read_shard, shard_of, table_name
 from quasiharmonic.ui.batch.supervisor import Finished, resident
 from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
 from quasiharmonic.util.threads import count_cores

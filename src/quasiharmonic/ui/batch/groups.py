@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quasiharmonic import io
-from quasiharmonic.geometry.exact.batched_loops import certify_each
+from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.linsolve import available

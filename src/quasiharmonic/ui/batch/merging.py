@@ -10,9 +10,8 @@ from typing import NamedTuple
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.lowlevel.atomic import new_folder, write_whole
 from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.lock import lock_folder, lock_name
 from quasiharmonic.ui.batch.problems import MARKER
-from quasiharmonic.ui.batch.shards import WHOLE, Shard, shard_of, table_name
+from quasiharmonic.ui.batch.shards import WHOLE, Shard, lock_folder, lock_name, shard_of, table_name
 from quasiharmonic.util.untrusted import parse_json
 
 

@@ -1,21 +1,100 @@
-"""Solve problems in processes of this machine."""
+"""Solve problems in processes of this machine.
+
+Fewer worker processes run at a time after one of them lacked memory, more again after some time.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from queue import Empty, SimpleQueue
 
 from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
-from quasiharmonic.ui.batch.slots import Slots
 from quasiharmonic.ui.batch.supervisor import ClosedError, Finished, Supervisor
 
+# Number of groups of problems that must succeed before another worker process may run.
+_STEADY = 20
 # Seconds between two values None while nothing is finished.
 _POLL_INTERVAL = 0.2
 # Number of problems waiting to be solved alone from which this is done before the end.
 _MANY = 16
+
+
+class Slots:
+    """Limit of the number of threads that solve problems at a time.
+
+    Parameters
+    ----------
+    count : int
+        Number of threads, the highest limit.
+
+    Attributes
+    ----------
+    limit : int
+        Present limit, from 1 to ``count``.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.limit = count
+        self._count = count
+        self._busy = 0
+        self.reserved = False
+        self._steady = 0
+        self._closed = False
+        self._changed = threading.Condition()
+        self._one_alone = threading.Lock()
+
+    @contextmanager
+    def one(self, rest: Callable[[], object]) -> Iterator[None]:
+        """Occupy a slot during the block. If none is free, call ``rest`` once, to release memory, and wait."""
+        with self._changed:
+            if not self._is_free():
+                rest()
+            self._changed.wait_for(self._is_free)
+            self._busy += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._busy -= 1
+                self._changed.notify_all()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Run the block, which must not occupy a slot, while no slot is occupied."""
+        with self._one_alone:
+            with self._changed:
+                self.reserved = True
+                self._changed.wait_for(lambda: not self._busy or self._closed)
+            try:
+                yield
+            finally:
+                with self._changed:
+                    self.reserved = False
+                    self._changed.notify_all()
+
+    def _is_free(self) -> bool:
+        return self._closed or (not self.reserved and self._busy < self.limit)
+
+    def record(self, *, starved: bool) -> None:
+        """Halve the limit if a process lacked memory; otherwise raise it by one after some successes."""
+        with self._changed:
+            self._steady = 0 if starved else self._steady + 1
+            if starved:
+                self.limit = max(self.limit // 2, 1)
+            elif self._steady >= _STEADY and self.limit < self._count:
+                self.limit += 1
+                self._steady = 0
+                self._changed.notify_all()
+
+    def close(self) -> None:
+        """Let all waiting threads continue."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
 
 
 def solve_in_processes(groups: Iterator[list[ProblemFiles]], orders: Orders, jobs: int) -> Generator[Finished | None]:

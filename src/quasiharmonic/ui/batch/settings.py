@@ -26,7 +26,7 @@ from quasiharmonic.util.options import (
     Options,
     option,
     positive,
-    positive_number,
+    seconds,
     switch,
 )
 
@@ -48,12 +48,6 @@ def _text(name: str, value: Any) -> None:
     """Check a text or None."""
     if not isinstance(value, str | None):
         raise ValueError(f"{name} must be a text or None, not {describe(value)}")
-
-
-def _limit(name: str, value: Any) -> None:
-    """Check a positive number or None."""
-    if value is not None:
-        positive_number(name, value)
 
 
 @dataclass(frozen=True)
@@ -244,8 +238,8 @@ class Orders(Options):
     output: Path  # Absolute path of the run's folder, the same on all machines
     settings: Settings
     threads: int = option(1, check=positive)  # Threads of the linear solver
-    time_limit: float | None = option(None, check=_limit)  # Seconds of wall time per problem
-    memory_limit: int | None = option(None, check=_limit)  # Bytes of resident memory of the process for a problem
+    time_limit: float | None = option(None, check=seconds)  # Seconds of wall time per problem
+    memory_limit: int | None = option(None, check=seconds)  # Bytes of resident memory of the process for a problem
     retry: bool = option(False, check=switch)  # Whether to retry failures that the input did not cause
 
     def folder(self, files: ProblemFiles) -> Path:

@@ -1,11 +1,19 @@
-"""Split a data set into disjoint shards, one for each job of an array."""
+"""Split a data set into disjoint shards, one for each job of an array.
+
+A lock on the output folder ensures that only one run writes a shard.
+"""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from hashlib import blake2b
+from pathlib import Path
 from typing import NamedTuple
 
+from quasiharmonic.io.errors import OutputError
+from quasiharmonic.io.lowlevel.atomic import writing
 from quasiharmonic.util.arrays import describe
 
 
@@ -54,3 +62,50 @@ def shard_of(name: str) -> Shard | None:
     """Return the shard of a manifest's file name, `WHOLE` for that of the whole data set; None for other files."""
     found = re.fullmatch(r"records(?:-([0-9]+)-of-([0-9]+))?\.(?:csv|parquet)", name)
     return None if found is None else Shard(int(found[1] or 1), int(found[2] or 1))
+
+
+def lock_name(part: Shard) -> str:
+    """Return the name of the lock file in the output folder; every shard has its own.
+
+    The file is not deleted after the run; only the system's lock on it counts.
+    """
+    return "qhm-batch.lock" if part == WHOLE else f"qhm-batch-{part.label}.lock"
+
+
+@contextmanager
+def lock_folder(folder: Path, name: str) -> Iterator[None]:
+    """Lock a folder against other runs with the same lock file; the system releases the lock when this process ends.
+
+    If the system or the file system has no such locks, the folder is not locked. OutputError if another run has locked
+    the folder, or the folder cannot be written to.
+    """
+    with writing(f"to {folder}"):
+        file = open(folder / name, "ab")  # noqa: SIM115
+    with file:
+        try:
+            _lock(file.fileno())
+        except (BlockingIOError, PermissionError):
+            raise OutputError(
+                f"another run is writing to {folder}: wait for its end, or choose another folder"
+            ) from None
+        except OSError:
+            pass  # a file system without locks
+        yield
+
+
+def _lock(descriptor: int) -> None:
+    """Lock an open file; BlockingIOError (POSIX) or PermissionError (Windows) if another process has locked it."""
+    try:
+        import fcntl
+    except ImportError:
+        _lock_on_windows(descriptor)
+    else:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _lock_on_windows(descriptor: int) -> None:
+    try:
+        import msvcrt
+    except ImportError:
+        return  # a system without locks
+    msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]

@@ -24,10 +24,9 @@ from pathlib import Path
 from typing import Any
 
 from quasiharmonic.ui.cli.interrupts import Interrupts
-from quasiharmonic.ui.cli.report import ReportError, describe_error
+from quasiharmonic.ui.cli.report import ReportError, describe_error, in_options, use_options
 from quasiharmonic.ui.cli.streams import NO_READER, output_failed, tell
 from quasiharmonic.ui.cli.version import Version
-from quasiharmonic.ui.cli.wording import in_options, use_options
 
 # The subcommands by group, in the order of the help. Each is a module of `commands`.
 GROUPS = {

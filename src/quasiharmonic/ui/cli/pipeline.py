@@ -2,6 +2,8 @@
 
 A command that writes a map is one call of `change_map`. Other commands use the last steps, `finish` after they have
 written a file and `conclude` if they write none.
+
+If they read a mesh, it gets the texture that ``--texture`` adds to the written surface.
 """
 
 from __future__ import annotations
@@ -13,10 +15,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import material, progress_line, report, written_map
+from quasiharmonic.ui.cli import report, streams, written_map
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
+
+# The value of --texture that needs no file.
+CHECKERBOARD = "checkerboard"
 
 
 @dataclass
@@ -37,10 +42,41 @@ class Changed:
     describe: Callable[[MeshData], Account]  # Called with the mesh as a reader gets it from the written file
 
 
+def read_mesh(options: argparse.Namespace, path: Path) -> MeshData:
+    """Read a mesh and attach the texture that the options request.
+
+    ValueError or OSError if the output format has no textures, a companion file cannot be written, or the image is
+    missing or invalid.
+    """
+    from dataclasses import replace
+
+    from quasiharmonic import io
+
+    if options.texture is None:
+        return io.read_mesh(path)
+    companions = io.find_format(options.output, "write_map", "image").companions
+    texture = io.checkerboard() if options.texture == CHECKERBOARD else io.read_texture(options.texture)
+    if companions is not None:
+        _check_companions(options, companions(options.output, texture))
+    return replace(io.read_mesh(path), texture=texture)
+
+
+def _check_companions(options: argparse.Namespace, companions: tuple[Path, ...]) -> None:
+    """Raise ValueError if a companion file of the output would replace an input or another output."""
+    from quasiharmonic import io
+
+    taken = (getattr(options, name, None) for name in ("input", "texture", "plot", "json"))
+    named = {Path(str(path)).resolve() for path in taken if path is not None}
+    for path in companions:
+        io.check_writable(path)
+        if path.resolve() in named:
+            raise ValueError(f"{path}, which goes with {options.output}, would replace another file: change -o")
+
+
 @contextmanager
-def working(source: Path, words: Callable[[Any], str] = progress_line.describe_step) -> Iterator[Any]:
+def working(source: Path, words: Callable[[Any], str] = streams.describe_step) -> Iterator[Any]:
     """Show progress during the block, and name the source in its errors; yield a callback, or None."""
-    with report.about(source), progress_line.line(words) as show:
+    with report.about(source), streams.progress_line(words) as show:
         yield show
 
 
@@ -50,7 +86,7 @@ def change_map(
     *,
     source: Path | None = None,
     inputs: Sequence[Path | None] = (),
-    read: Callable[[argparse.Namespace, Path], MeshData] = material.read_mesh,
+    read: Callable[[argparse.Namespace, Path], MeshData] = read_mesh,
 ) -> int:
     """Read a mesh, change its map, write it, read it back, report; return the exit status.
 

@@ -1,4 +1,7 @@
-"""Final report of a command, as text or JSON, and checks of output paths."""
+"""Final report of a command, as text or JSON, and checks of output paths.
+
+Messages of the library are put in the words of the command line: options in place of keyword arguments.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,67 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from quasiharmonic.ui.cli.streams import require_output, tell
-from quasiharmonic.ui.cli.wording import in_options
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.problem import Domain
     from quasiharmonic.ui.cli.written_map import WrittenMap
+
+_options: ContextVar[Mapping[str, str] | None] = ContextVar("options", default=None)
+
+_ASSIGNED: Final = re.compile(r"(?<![\w/.-])([a-z_]+)=('[^']*'|[^\s,;:)]+)")
+# A name with an underscore, not in a path or a file name.
+_NAME: Final = re.compile(r"(?<![\w/.-])[a-z]+(?:_[a-z]+)+(?![\w/-]|\.\w)")
+# Names after a verb or a preposition that is followed by nothing else.
+_LISTED: Final = re.compile(r"\b(omit|set|by) ((?:[a-z_]+)(?:(?:, (?:and |or )?| and | or )[a-z_]+)*)\b")
+_COUNTING = "(indices count from 0)"
+# Matches messages that name elements by their numbers.
+_NUMBERED = re.compile(
+    r"\b(vertex|vertices|nodes?|triangles?|quadrilaterals?|edges?|corners?|loops?|islands?|rows?|between) [-(]?\d"
+)
+# A message that gives the range of indices, or that repeats a number of the command line, needs no such note.
+_NEEDS_NO_NOTE = re.compile(r"\b0 … \d|\bnamed? .*\bmore than once")
+
+
+def use_options(parser: argparse.ArgumentParser, command: str) -> None:
+    """Use the options of a subcommand in the messages from now on."""
+    _options.set(list_options(parser, command))
+
+
+def list_options(parser: argparse.ArgumentParser, command: str) -> dict[str, str]:
+    """Return the options of a subcommand by the names of their values."""
+    options = {}
+    for subcommands in parser._actions:
+        if isinstance(subcommands, argparse._SubParsersAction) and command in subcommands.choices:
+            for action in subcommands.choices[command]._actions:
+                long = [option for option in action.option_strings if option.startswith("--")]
+                if long:
+                    options[action.dest] = long[0]
+    return options
+
+
+def in_options(text: str) -> str:
+    """Return a message with the options of the current subcommand in place of keyword arguments of the same names."""
+    options = _options.get()
+    if not options:
+        return text
+
+    def assigned(found: re.Match[str]) -> str:
+        if found[1] not in options:
+            return found[0]
+        value = found[2].strip("'")
+        return options[found[1]] if value in ("True", "False") else f"{options[found[1]]} {value}"
+
+    def listed(found: re.Match[str]) -> str:
+        return f"{found[1]} " + re.sub(r"[a-z_]+", lambda name: options.get(name[0], name[0]), found[2])
+
+    text = _LISTED.sub(listed, _ASSIGNED.sub(assigned, text))
+    return _NAME.sub(lambda found: options.get(found[0], found[0]), text)
 
 
 def sizes(domain: Domain) -> dict[str, Any]:
@@ -82,14 +136,8 @@ def check_outputs(options: argparse.Namespace, inputs: Sequence[Path | None]) ->
     plot, pattern = getattr(options, "plot", None), getattr(options, "pattern", None)
     if plot is not None:
         check_picture("--plot", plot, inputs)
-    taken = {options.output.resolve(): "the map (-o)"}
-    for option, path in (("--plot", plot), ("--pattern", pattern), ("--json", _json_file(options.json))):
-        if path is None:
-            continue
-        _check_replaces_nothing(option, path, inputs)
-        if path.resolve() in taken:
-            raise ValueError(f"{option} {path} is also the file of {taken[path.resolve()]}")
-        taken[path.resolve()] = option
+    outputs = {"--plot": plot, "--pattern": pattern, "--json": _json_file(options.json)}
+    _check_distinct(outputs, inputs, {options.output: "the map (-o)"})
 
 
 def _json_file(json_path: str | None) -> Path | None:
@@ -108,14 +156,19 @@ def check_new(outputs: Mapping[str, Path | None], json_path: str | None, inputs:
 
     ``outputs`` maps descriptions to paths, or to None.
     """
-    taken: list[Path] = []
-    for what, path in {**outputs, "--json": _json_file(json_path)}.items():
+    _check_distinct({**outputs, "--json": _json_file(json_path)}, inputs, {})
+
+
+def _check_distinct(outputs: Mapping[str, Path | None], inputs: Sequence[Path | None], taken: dict[Path, str]) -> None:
+    """Check that outputs replace neither an input nor each other, nor the outputs ``taken`` with their descriptions."""
+    for what, path in outputs.items():
         if path is None:
             continue
         _check_replaces_nothing(what, path, inputs)
-        if any(_same(path, other) for other in taken):
-            raise ValueError(f"{what} {path} is also another output")
-        taken.append(path)
+        for other, name in taken.items():
+            if _same(path, other):
+                raise ValueError(f"{what} {path} is also the file of {name}")
+        taken[path] = what
 
 
 def check_picture(
@@ -146,15 +199,6 @@ def _check_replaces_nothing(option: str, path: Path, inputs: Sequence[Path | Non
 def _same(path: Path, other: Path) -> bool:
     """Whether two paths are the same file, also through symbolic or hard links."""
     return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
-
-
-_COUNTING = "(indices count from 0)"
-# Matches messages that name elements by their numbers.
-_NUMBERED = re.compile(
-    r"\b(vertex|vertices|nodes?|triangles?|quadrilaterals?|edges?|corners?|loops?|islands?|rows?|between) [-(]?\d"
-)
-# A message that gives the range of indices, or that repeats a number of the command line, needs no such note.
-_NEEDS_NO_NOTE = re.compile(r"\b0 … \d|\bnamed? .*\bmore than once")
 
 
 @contextmanager

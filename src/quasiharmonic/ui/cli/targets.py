@@ -1,4 +1,7 @@
-"""Options for the target of the boundary, and the problem that they define."""
+"""Options for the target of the boundary, and the problem that they define.
+
+The boundary may slide along the target; vertices that cannot slide are described.
+"""
 
 from __future__ import annotations
 
@@ -172,3 +175,23 @@ def read_corners(text: str) -> CornerSpec:
         return asked_corners.read_corners(text)
     except ValueError as error:
         raise ValueError(f"--corners {text}: {error}") from None
+
+
+def check_pieces(options: argparse.Namespace) -> None:
+    """Raise ValueError if ``--pieces`` is given without ``--slide`` and ``--to``."""
+    if options.pieces is not None and not (options.slide and options.to is not None):
+        raise ValueError("--pieces assigns vertices to sides of the outline: add --slide and --to")
+
+
+def describe_off_outline(curves: BoundaryCurves, island: Island) -> list[str]:
+    """Return a sentence about the boundary vertices that are not on the curves, if there are any."""
+    from quasiharmonic.geometry.mesh.topology import boundary_loops
+    from quasiharmonic.util.arrays import names_of
+
+    loops = boundary_loops(island.F, len(island.V))
+    off = island.vertices[curves.off(loops, island.uv)]
+    if not off.size:
+        return []
+    count = sum(loop.size for loop in loops)
+    off_outline = names_of("vertex", "vertices", off)
+    return [f"{off.size} of {count} boundary vertices are off the outline and stay fixed: {off_outline}"]

@@ -120,7 +120,7 @@ def find_bent(mesh: MeshData, F: NDArray[np.int64], uv: NDArray[np.float64]) -> 
     """Return the faces that get inverted triangles if a reader splits them at their first corner."""
     import numpy as np
 
-    from quasiharmonic.geometry.exact.convexity import find_inverted_fans
+    from quasiharmonic.geometry.exact.triangles import find_inverted_fans
 
     return np.empty(0, dtype=np.int64) if mesh.polygons is None else find_inverted_fans(mesh.polygons, F, uv)
 

@@ -27,9 +27,10 @@ from quasiharmonic.apps.flattening.multilevel.coarse_flattening import (
     descend_level,
     flatten_levels,
     prolong_map,
+    smooth_map,
+    thick_energy,
 )
 from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
-from quasiharmonic.apps.flattening.multilevel.local_smoothing import smooth_map, thick_energy
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.energies.distances import SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet

@@ -2,6 +2,10 @@
 
 A limb of a thousand triangles, which a map into a disk shrinks to a millionth, has about ten triangles on the coarse
 mesh. So steps on the coarse mesh replace steps on the whole mesh, also to resolve overlaps.
+
+Before Newton steps, a prolonged map is smoothed, and its worst triangles are improved locally: most vertices already
+have good positions. The remaining one percent would cost many steps on the whole mesh, but local steps on patches
+around them are cheap.
 """
 
 from __future__ import annotations
@@ -10,17 +14,35 @@ from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
-from quasiharmonic.apps.flattening.multilevel.hierarchy import Hierarchy, Level
-from quasiharmonic.apps.flattening.multilevel.local_smoothing import smooth_map, thick_energy
+from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
+from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
+from quasiharmonic.geometry.coarsening.levels import has_marked_corner
+from quasiharmonic.geometry.coarsening.prolongation import are_positive
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, to_points
 
+# Fraction of the way to the weighted mean of its neighbours that a vertex moves.
+_STEP = 0.8
+_SWEEPS = 4
+# Minimum weight of a neighbour.
+_MIN_WEIGHT = 0.02
+# A triangle is bad if its density is this factor times the 75 % quantile.
+_BAD = 20.0
+# Rings of triangles around bad triangles that belong to a patch.
+_RINGS = 2
+# Patches are not smoothed if they cover more than this fraction of the mesh.
+_MAX_SHARE = 0.4
+_MAX_STEPS = 20
+_MOVE_TOLERANCE = 1e-2
 #: Number of vertices of the coarsest mesh.
 COARSEST = 150
 #: Minimum ratio between the vertex counts of successive meshes.
@@ -33,6 +55,82 @@ STEPS = (300, 40)
 _HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
 # From this height on, all boundary vertices are placed inside the coarse image, not only those at intersections.
 _LATE = 1e-3
+
+
+def smooth_map(
+    V: FloatArray, F: IntArray, loops: Sequence[IntArray], uv: FloatArray, linear_solver: str = "auto"
+) -> FloatArray:
+    """Lower the distortion of a bijective map (n, 2) at low cost; the result is bijective."""
+    energy = thick_energy(V, F)
+    before = in_units(uv, 0)
+    after = _smooth_interior(V, F, loops, before)
+    with np.errstate(all="ignore"):
+        better = energy.value(after) < energy.value(before)
+    start = (after if better else before).view(np.float64).reshape(-1, 2)
+    opened = _descend_on_patches(V, F, start, energy, linear_solver)
+    return start if Rim(loops).meets_itself(opened) else opened
+
+
+def thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
+    """The symmetric Dirichlet energy with the thinnest rest triangles thickened, for maps far from the minimum."""
+    shapes = rest_shapes(V, F, lowest=LOWEST)
+    layout = np.zeros((len(F), 3), dtype=np.complex128)
+    layout[:, 1], layout[:, 2] = shapes.unit * shapes.sides[0], -shapes.unit * shapes.sides[2]
+    corners = np.arange(F.size).reshape(-1, 3)
+    return DeformationEnergy(to_points(layout), F, ReweightedDirichlet(), rest_F=corners)
+
+
+def _smooth_interior(V: FloatArray, F: IntArray, loops: Sequence[IntArray], w: ComplexArray) -> ComplexArray:
+    """Move interior vertices towards the Laplacian mean of their neighbours, without inverting triangles."""
+    n = len(V)
+    z1, z2 = rest_frames(V, F)
+    corners = np.stack([np.zeros(z2.shape), z1, z2])
+    twice_area = np.maximum(z1 * z2.imag, np.finfo(np.float64).tiny)
+    tail, head, weight = [], [], []
+    for k in range(3):
+        after, before = (k + 1) % 3, (k + 2) % 3
+        one, other = corners[after] - corners[k], corners[before] - corners[k]
+        tail += [F[:, after], F[:, before]]
+        head += [F[:, before], F[:, after]]
+        weight += 2 * [np.maximum((one.conj() * other).real / twice_area, _MIN_WEIGHT)]
+    graph = csr_array((np.concatenate(weight), (np.concatenate(tail), np.concatenate(head))), shape=(n, n))
+    total = graph @ np.ones(n)
+    inner = ~mark(n, np.concatenate(loops))
+    for _ in range(_SWEEPS):
+        new = np.where(inner, w + _STEP * ((graph @ w) / total - w), w)
+        back = np.zeros(n, dtype=bool)
+        inverted = F.compress(~are_positive(new, F), axis=0)
+        while len(inverted) and not back[inverted].all():
+            back[inverted] = True
+            new[inverted] = w[inverted]
+            touched = F.compress(has_marked_corner(F, back), axis=0)
+            inverted = touched.compress(~are_positive(new, touched), axis=0)
+        w = new
+    return w
+
+
+def _descend_on_patches(
+    V: FloatArray, F: IntArray, uv: FloatArray, energy: DeformationEnergy, linear_solver: str
+) -> FloatArray:
+    """Descend on patches around the worst triangles, with all other vertices fixed; the boundary may overlap itself."""
+    with np.errstate(all="ignore"):
+        density = energy.energy.density(energy.deform(in_units(uv, 0)))
+    loose = mark(len(V), F[density > _BAD * np.quantile(density, 0.75)])
+    for _ in range(_RINGS):
+        loose[F[has_marked_corner(F, loose)]] = True
+    patches = F[has_marked_corner(F, loose)]
+    if not 0 < len(patches) < _MAX_SHARE * len(F):
+        return uv
+    vertices, flat = np.unique(patches, return_inverse=True)
+    patches = flat.reshape(-1, 3)
+    descent = SurfaceDescent(
+        thick_energy(V[vertices], patches), uv[vertices], linear_solver, np.flatnonzero(~loose[vertices])
+    )
+    for _ in islice(descend(descent, SymmetricDirichlet(), _MOVE_TOLERANCE), _MAX_STEPS):
+        pass
+    opened = uv.copy()
+    opened[vertices] = descent.uv
+    return opened
 
 
 def flatten_coarse(

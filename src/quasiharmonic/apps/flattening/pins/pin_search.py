@@ -20,11 +20,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.flattening.air_triangulation import triangulate_air
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.layout import to_given_unit
 from quasiharmonic.apps.flattening.piece import Flattening, Piece, energy_name
 from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
-from quasiharmonic.apps.flattening.scaffold.air_triangulation import triangulate_air
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify

@@ -13,8 +13,7 @@ import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
-from quasiharmonic.io.formats.vertex_data import normal_lines
-from quasiharmonic.io.formats.welding import weld
+from quasiharmonic.io.formats.vertex_data import normal_lines, weld
 from quasiharmonic.io.models.meshdata import Carried, MeshData
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
 

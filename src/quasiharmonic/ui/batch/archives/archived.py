@@ -17,8 +17,8 @@ from quasiharmonic.io.lowlevel.atomic import writing
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives import places, results
 from quasiharmonic.ui.batch.archives.finding import Archive
-from quasiharmonic.ui.batch.archives.journal import Journal
 from quasiharmonic.ui.batch.archives.outputs import Outputs
+from quasiharmonic.ui.batch.archives.results import Journal
 from quasiharmonic.ui.batch.archives.samples import Sample, read_samples
 from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from quasiharmonic.apps.animation.frames import Animation, FrameStep
     from quasiharmonic.io import MeshData
-    from quasiharmonic.problem import Problem
     from quasiharmonic.ui.cli.arguments import Commands
 
 PICTURES = ".gif", ".mp4"
@@ -78,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apps.animation.frame_sequence import animate
     from quasiharmonic.geometry.mesh.topology import boundary_edges
     from quasiharmonic.problem import Problem
-    from quasiharmonic.ui.plot.animation import check_animation
+    from quasiharmonic.ui.plot.animation import check_animation, save_animation
 
     set_default(options, "max_motion_ratio", None, asked=options.polish is not None, belongs="--polish")
     drawn = [path for path in options.output if path.suffix.lower() in PICTURES]
@@ -112,7 +111,9 @@ def run(options: argparse.Namespace) -> int:
         # Errors are `ReportError` only if another output is already written.
         before = [*folders, *drawn[:t]]
         with report.after_writing(before[0]) if before else nullcontext():
-            _draw(path, problem, animation, options.frames_per_second)
+            named = ((f"frame {number}", frame.uv) for number, frame in enumerate(animation.frames))
+            rate = options.frames_per_second
+            save_animation(path, problem.V, problem.F, named, fixed=problem.fixed, frames_per_second=rate)
     missing = len(positions) - len(animation.frames)
 
     def describe() -> pipeline.Account:
@@ -220,13 +221,6 @@ def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[b
                 certified &= written_map.certify_map(io.read_mesh(path)).injective
     others = {path.name for path in folder.glob("*.obj") if path.stem.isdecimal()} - written
     return certified, sorted(others)
-
-
-def _draw(path: Path, problem: Problem, animation: Animation, rate: int) -> None:
-    from quasiharmonic.ui.plot.animation import save_animation
-
-    named = ((f"frame {t}", frame.uv) for t, frame in enumerate(animation.frames))
-    save_animation(path, problem.V, problem.F, named, fixed=problem.fixed, frames_per_second=rate)
 
 
 def _words(step: FrameStep) -> str:

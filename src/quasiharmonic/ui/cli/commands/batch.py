@@ -21,7 +21,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import progress_line, report, targets
+from quasiharmonic.ui.cli import report, streams, targets
 from quasiharmonic.ui.cli.arguments import (
     SHARED,
     add_command,
@@ -154,7 +154,7 @@ def run(options: argparse.Namespace) -> int:
     rest = pick(options, "retry", "table", "shard", "scheduler")
     time_limit = options.time_limit or None
     try:
-        with progress_line.line(_words, live=LIVE, log=LOG) as show:
+        with streams.progress_line(_words, live=LIVE, log=LOG) as show:
             progress = batch.run(
                 options.source, options.output, settings, time_limit=time_limit, callback=show, **limits, **rest
             )

@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem import Problem
     from quasiharmonic.solver.mapping import solve
-    from quasiharmonic.ui.cli import progress_line, report, written_map
+    from quasiharmonic.ui.cli import report, streams, written_map
     from quasiharmonic.ui.cli.commands import map
 
     folder: Path = options.output
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
         V, F = surfaces.cat()
         (loop,) = boundary_loops(F, len(V))
         problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
-        with progress_line.line() as show:
+        with streams.progress_line() as show:
             mapped = each_island(SeamedMesh(V, F), lambda _: solve(problem, callback=show))
         io.write_mapped(output, io.MeshData(V, F).with_places(mapped.mesh))
     with report.after_writing(output):

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, progress_line, report, seam_options, slide_options, targets, written_map
+from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, targets, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     began = time.perf_counter()
     if options.slide and options.no_polish:
         raise ValueError("--slide needs polishing: omit --no-polish")
-    slide_options.check_options(options)
+    targets.check_pieces(options)
     seam_options.check_packing(options)
     set_default(options, "kind", "map", asked=options.plot is not None, belongs="--plot")
     source, fixed = io.problem_files(options.input, options.fixed)
@@ -126,14 +126,14 @@ def _map(
         problem = one.fitted.problem
         given = pick(options, "polish", "linear_solver", *declared(MapOptions))
         slide = one.slide if options.polish else False
-        with progress_line.line() as show:
+        with streams.progress_line() as show:
             result = solve(problem, slide=slide, callback=show, **given)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
             # The short default polish lowers the worst distortion at little cost.
             fine = on_refinement(problem, result.refined)
-            with progress_line.line() as show:
+            with streams.progress_line() as show:
                 result = smooth(fine, result, linear_solver=options.linear_solver, callback=show, slide=one.slide)
         return result
 

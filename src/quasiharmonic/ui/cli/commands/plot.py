@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import finite_elements, report, written_map
 from quasiharmonic.ui.cli.arguments import MEASURES, add_command, add_options, choice, set_default, text
-from quasiharmonic.ui.cli.material import CHECKERBOARD
+from quasiharmonic.ui.cli.pipeline import CHECKERBOARD
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, report, seam_options, slide_options, written_map
+from quasiharmonic.ui.cli import pipeline, report, seam_options, targets, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("--to gives the outline to slide along: add --slide")
     if options.free and (options.slide or options.fixed is not None):
         raise ValueError("--free frees the boundary: omit --slide and --fixed")
-    slide_options.check_options(options)
+    targets.check_pieces(options)
     notes: list[str] = []
 
     def lower(mesh: SeamedMesh, given: dict[str, Any]) -> MappedAtlas:
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
             if len(mesh.islands) > 1:
                 raise ValueError(f"--slide --to supports one island, but the mesh has {len(mesh.islands)}")
             slide = find_sliding_curves(options.to, pieces=options.pieces)
-            notes.extend(slide_options.describe_off_outline(slide, mesh.islands[0]))
+            notes.extend(targets.describe_off_outline(slide, mesh.islands[0]))
         return atlas.polish(mesh, slide=slide, **given)
 
     return lower_distortion(options, lower, inputs=(options.pieces,), notes=notes)

@@ -192,6 +192,8 @@ def _read(path: Path) -> _MappedFile:
 
 def _values(options: argparse.Namespace, source: _MappedFile, between: SurfaceMap) -> NDArray[np.float64]:
     """Read the values of the source, and return those of the target's vertices; NaN for unused vertices."""
+    from quasiharmonic.util.arrays import mark
+
     path = options.values[0]
     values = _read_table(path)
     count = len(source.mesh.V) if options.per == "vertex" else len(source.mesh.F)
@@ -203,17 +205,8 @@ def _values(options: argparse.Namespace, source: _MappedFile, between: SurfaceMa
     if options.per == "vertex":
         values = values[source.origin]
     out = between.transfer(values, per=options.per, outside=options.outside)
-    out[_unused(between.source)] = float("nan")
+    out[~mark(len(between.source.V), between.source.F)] = float("nan")
     return out
-
-
-def _unused(surface: InverseMap) -> NDArray[np.bool_]:
-    """Return which vertices no triangle uses."""
-    import numpy as np
-
-    unused = np.ones(len(surface.V), dtype=np.bool_)
-    unused[surface.F] = False
-    return unused
 
 
 def _landmarks(options: argparse.Namespace, source: _MappedFile, target: _MappedFile, between: SurfaceMap) -> bytes:

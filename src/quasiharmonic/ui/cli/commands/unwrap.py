@@ -21,7 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import material, pipeline, written_map
+from quasiharmonic.ui.cli import pipeline, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
@@ -87,7 +87,7 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
     from quasiharmonic.util.untrusted import bounded
 
     with bounded(options.memory):
-        return material.read_mesh(options, source)
+        return pipeline.read_mesh(options, source)
 
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:

@@ -13,7 +13,7 @@ import numpy as np
 
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.targets import outline, outline_curves, read_svg
-from quasiharmonic.ui.studio.session.uploads import stored_file
+from quasiharmonic.ui.studio.session.validation import stored_file
 from quasiharmonic.util.arrays import FloatArray
 
 # A decimal number of limited length.

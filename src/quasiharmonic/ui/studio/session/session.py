@@ -14,9 +14,8 @@ import numpy as np
 from quasiharmonic.io.models.textures import Texture, texture_of
 from quasiharmonic.ui.studio.protocol import Array, MessageFrame
 from quasiharmonic.ui.studio.session import frames, operations, validation
-from quasiharmonic.ui.studio.session.drag import DragMap, Follower
+from quasiharmonic.ui.studio.session.drag import DragMap, Follower, drag_weights
 from quasiharmonic.ui.studio.session.exports import list_files
-from quasiharmonic.ui.studio.session.falloff import drag_weights
 from quasiharmonic.ui.studio.session.history import History
 from quasiharmonic.ui.studio.session.islands import Numbering
 from quasiharmonic.ui.studio.session.outlines import Outline, make_outline, make_polygon, read_drawing

@@ -1,8 +1,15 @@
-"""Extract and validate the parameters of messages from a page, which are untrusted."""
+"""Extract and validate the parameters of messages from a page, which are untrusted.
+
+Files arrive as bytes, and are stored for functions that read paths.
+"""
 
 from __future__ import annotations
 
 import math
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
@@ -79,3 +86,12 @@ def indices(frame: MessageFrame, name: str, n: int) -> list[int]:
     if not isinstance(values, list) or not all(type(value) is int and 0 <= value < n for value in values):
         raise RequestError(f"the message lacks {name}, a list of numbers below {n}")
     return sorted(set(values))
+
+
+@contextmanager
+def stored_file(name: str, content: bytes) -> Iterator[Path]:
+    """Store a file under a name in a temporary folder during the block; return its path."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(content)
+        yield path

@@ -1,4 +1,4 @@
-/* Kernels of `linsolve/guard.py`: norms of a matrix and residuals of a solution. */
+/* Kernels of `linsolve/base.py`: norms of a matrix and residuals of a solution. */
 #include "arguments.h"
 
 #include <math.h>

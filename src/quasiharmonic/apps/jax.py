@@ -1,4 +1,13 @@
-"""The JAX function, with a custom gradient, that all maps share; it computes them by callbacks to NumPy."""
+"""Maps as functions of JAX, with gradients.
+
+Parameters, results and errors are those of the functions of the same names in `quasiharmonic.torch`, with JAX arrays in
+place of tensors. First call ``jax.config.update("jax_enable_x64", True)``. Besides leading batch axes, `jax.vmap` adds
+one as well. Under `jax.jit` the maps are computed by a callback (`jax.pure_callback`), and JAX raises its own error
+with the message of `MapNotFound`. First derivatives are available in reverse mode (`jax.grad`, `jax.vjp`). JAX does not
+support `jax.jvp` of these functions.
+
+All maps share one function with a custom gradient, `apply_layer`, and build on `apps.gradients.layers`.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +17,40 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from threading import Lock
-from typing import Any
+from typing import Any, Unpack
 
-import jax
-import jax.numpy as jnp
+from quasiharmonic.util.optional import explain_missing
+
+with explain_missing("quasiharmonic.jax needs JAX", "'quasiharmonic[jax]'"):
+    import jax
+    import jax.numpy as jnp
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.gradients.layers import (
     Array,
+    DoubtfulDerivative,
+    FlattenedKeywords,
     Layer,
+    MapNotFound,
+    SolvedKeywords,
+    SolvedOptions,
     compute_gradients,
     compute_maps,
+    make_flattened_layer,
+    make_solved_layer,
+    make_tensor_layer,
     select_arguments,
     sum_to_shape,
 )
+from quasiharmonic.geometry.mesh.reference import Reference
+from quasiharmonic.problem import Problem
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.options import FlattenOptions, takes
+
+__all__ = ["DoubtfulDerivative", "MapNotFound", "flatten", "injective_map", "quasi_harmonic_map"]
 
 # JAX passes only arrays from the forward to the backward pass. This cache keeps the last derivatives; older ones are
 # computed again from their maps.
@@ -148,3 +175,40 @@ def _check(name: str, array: Any) -> None:
                 f"{name} is on {elsewhere[0]}, but maps are computed on the CPU: "
                 f"jax.device_put({name}, jax.devices('cpu')[0])"
             )
+
+
+def quasi_harmonic_map(
+    problem: Problem,
+    mu: jax.Array | None = None,
+    *,
+    target: jax.Array | None = None,
+    rest: jax.Array | None = None,
+    reference: Reference = "equilateral",
+    linear_solver: str = "auto",
+) -> jax.Array:
+    """Return quasi-harmonic maps (…, n, 2) float64 of arrays, as `quasiharmonic.torch.quasi_harmonic_map`.
+
+    The gradient by ``mu`` is ``∂/∂Re μ − i ∂/∂Im μ``, JAX's convention.
+    """
+    settings = problem, reference, linear_solver
+    return apply_layer(make_tensor_layer, settings, {"mu": mu, "target": target, "rest": rest})
+
+
+@takes(SolvedOptions, SolvedKeywords)
+def injective_map(
+    problem: Problem,
+    *,
+    target: jax.Array | None = None,
+    rest: jax.Array | None = None,
+    **options: Unpack[SolvedKeywords],
+) -> jax.Array:
+    """Return polished injective maps (…, n, 2) float64 of arrays, as `quasiharmonic.torch.injective_map`."""
+    return apply_layer(make_solved_layer, (problem, options), {"target": target, "rest": rest})
+
+
+@takes(FlattenOptions, FlattenedKeywords)
+def flatten(
+    rest: jax.Array, F: ArrayLike, *, target: jax.Array | None = None, **options: Unpack[FlattenedKeywords]
+) -> jax.Array:
+    """Return maps (…, n, 2) float64 with a free boundary, as `quasiharmonic.torch.flatten`."""
+    return apply_layer(make_flattened_layer, (rest, F, target, options), {"rest": rest, "target": target})

@@ -1,7 +1,14 @@
-"""Figures of displayable objects, by type."""
+"""HTML and figures of results, as notebooks display them.
+
+The HTML is an escaped summary and the figure, which depends on the result's type. `quasiharmonic/__init__.py` registers
+this module with `util.display`, which imports it when a result is displayed.
+"""
 
 from __future__ import annotations
 
+from base64 import b64encode
+from html import escape
+from io import BytesIO
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +20,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui import plot
-from quasiharmonic.ui.plot.canvas import RED, caption, new_figure, verdict
+from quasiharmonic.ui.plot.canvas import RED, caption, new_figure, png_bytes, verdict
 from quasiharmonic.ui.plot.elements import elements_figure
 from quasiharmonic.ui.plot.maps import map_figure
 from quasiharmonic.util.display import Displayable
@@ -22,6 +29,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KINDS = ("map", "distortion", "texture", "convergence")
+# Maximum number of triangles drawn automatically; drawing half as many takes about one second.
+MAX_TRIANGLES = 200_000
+_COLORS = 128
+_STYLE = "white-space: pre-wrap; margin: 0 0 0.5em; font-size: 90%"
 
 
 def draw(shown: Displayable, kind: str, *, measure: str = "isometric") -> Figure:
@@ -90,3 +101,44 @@ def _diagnosis(diagnosis: Diagnosis) -> Figure:
 def _bad(certificate: Certificate) -> np.ndarray:
     """Return the triangles that are not positive."""
     return np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
+
+
+def html(shown: Displayable) -> str:
+    """Return a few lines of HTML with the picture; errors of drawing become part of the text."""
+    lines = [f"<strong>{escape(type(shown).__name__)}</strong>: {escape(shown.short_repr())}"]
+    lines.append(f'<pre style="{_STYLE}">{escape(shown.summary())}</pre>')
+    lines.append(_picture(shown))
+    return f'<div class="quasiharmonic">{"".join(lines)}</div>'
+
+
+def _picture(shown: Displayable) -> str:
+    """Return the picture as an inline image, or the reason why there is none."""
+    count = _triangles(shown)
+    if count == 0:
+        return ""
+    if count > MAX_TRIANGLES:
+        return f"<em>{count:,} triangles are drawn when asked for: .plot()</em>"
+    try:
+        data = b64encode(_png(draw(shown, "map"))).decode()
+    except (ValueError, ImportError) as error:
+        return f"<em>no picture: {escape(str(error))}</em>"
+    words = escape(shown.short_repr(), quote=True)
+    return f'<img alt="{words}" style="max-width: 100%" src="data:image/png;base64,{data}"/>'
+
+
+def _png(figure: Figure) -> bytes:
+    """Return a PNG with few colours, a third of the size, because notebooks store every picture."""
+    from PIL import Image
+
+    Image.open(BytesIO(png_bytes(figure, dpi=80))).convert("RGB").quantize(_COLORS).save(
+        small := BytesIO(), format="png", optimize=True
+    )
+    return small.getvalue()
+
+
+def _triangles(shown: Displayable) -> int:
+    """Return the number of triangles to draw; 0 if the surface is not known."""
+    surface = shown.problem if isinstance(shown, Diagnosis) else shown
+    if isinstance(surface, MapResult) and surface.V is None:
+        return 0
+    return len(getattr(surface, "F", ()))
