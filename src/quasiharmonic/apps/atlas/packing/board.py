@@ -44,6 +44,12 @@ class Bitmaps:
         self.count = min(int(bitmap.sum()) for bitmap in cells)
 
 
+    def half(self, which: int) -> Bitmaps:
+        """Return every second bitmap, from the first or second one; all if there is only one."""
+        some = slice(which, None, 2) if len(self.cells) > 1 else slice(None)
+        return Bitmaps(self.directions[some], self.cells[some])
+
+
 class Board:
     """A rectangle of cells, on which bitmaps do not overlap.
 

@@ -249,7 +249,8 @@ class _Search:
         large, small = self._order[:bitmaps], self._order[bitmaps:]
         turns = np.exp(0.125j * pi * (np.arange(4) if len(shapes) <= _MOST_DIRECTIONS else np.arange(0, 4, 2)))
         turns = turns if few and skewed else turns[:1]
-        self._bitmaps = {}
+        self._bitmaps: dict[int, Bitmaps] = {}
+        self._halves: dict[tuple[int, int], Bitmaps] = {}
         # Where the last of several shapes was placed, by the number of cells and the order of these shapes.
         self._spots: dict[tuple[int, ...], tuple[int, Spot] | None] = {}
         for i in large.tolist():
@@ -273,6 +274,14 @@ class _Search:
                 cells.append(np.rot90(bitmap, quarters))
         return Bitmaps(np.array(directions), cells)
 
+    def _select(self, i: int, part: int) -> Bitmaps:
+        """Return the bitmaps of a shape in all directions, 0, or in one half of them, 1 or 2."""
+        if part == 0:
+            return self._bitmaps[i]
+        if (i, part) not in self._halves:
+            self._halves[i, part] = self._bitmaps[i].half(part - 1)
+        return self._halves[i, part]
+
     def enlarge(self, trials: int = _TRIALS) -> tuple[Layout, IntArray] | None:
         """Find the smallest board on which few bitmaps fit; the layout on it, and the order of the shapes."""
         low, high = int(_FEWEST_CELLS * self.cells), int(_MORE_CELLS * self.cells)
@@ -286,7 +295,8 @@ class _Search:
         generator, best_order = np.random.default_rng(0), self._order
         for _ in range(trials // len(self.areas)):
             order = np.argsort(-self.areas * np.exp(generator.normal(0, _SPREAD, len(self.areas))), kind="stable")
-            while (found := self.place_in(high - 1, order)) is not None:
+            parts = generator.integers(0, 3, len(self.areas))
+            while (found := self.place_in(high - 1, order, parts)) is not None:
                 high, best, best_order = high - 1, found, order
         return best, best_order
 
@@ -311,8 +321,11 @@ class _Search:
                 return None
         return best
 
-    def place_in(self, cells: int, order: IntArray | None = None) -> Layout | None:
-        """Place the bitmaps on boards with a number of cells along the longer side; None if one does not fit."""
+    def place_in(self, cells: int, order: IntArray | None = None, parts: IntArray | None = None) -> Layout | None:
+        """Place the bitmaps on boards with a number of cells along the longer side; None if one does not fit.
+
+        ``parts`` (n,) restricts the directions of each shape to one half, 1 or 2, or not, 0.
+        """
         texels = max(self._size) / cells
         columns, rows = (int(side / texels * (1 + 1e-12)) for side in self._size)
         boards: list[Board] = []
@@ -333,9 +346,10 @@ class _Search:
         placed: tuple[int, ...] = (cells,)
         for i in (self._order[: self._few] if order is None else order).tolist():
             heartbeat()
-            bitmaps = self._bitmaps[i]
+            part = 0 if parts is None else int(parts[i])
+            bitmaps = self._select(i, part)
             # Orders of few shapes often begin alike.
-            placed = (*placed, i)
+            placed = (*placed, i, part)
             if placed not in self._spots:
                 self._spots[placed] = find(bitmaps)
             found = self._spots[placed]
