@@ -15,7 +15,7 @@ _EXPECTED = 0.6
 # Longest chart in sides of the texture at this scale, and longest chart that covers less than a share of its box.
 _LONGEST, _LONGEST_LOOSE, _LOOSE = 0.85, 0.7, 0.6
 # The same for charts without stretch, and for cuts through flat faces. Each part must be this much shorter.
-_LONGEST_ISOMETRIC, _LONGEST_FLAT = 1.1, 2.0
+_LONGEST_ISOMETRIC, _LONGEST_FLAT = 0.95, 2.0
 _SHORTER = 0.85
 
 
