@@ -367,6 +367,9 @@ class UnwrapOptions(Options):
     divide_for_packing: bool = option(
         False, "also divide flat and developable parts where the texture is used better then", check=switch
     )
+    straighten: bool = option(
+        False, "make strips of quadrilaterals rectangles, as far as the bound on the stretch permits", check=switch
+    )
     resolution: Any = option(2048)
     padding: float = option(4.0, "minimum texels between two charts (default: 4)")
     texels_per_unit: float | None = option(None, "texels per unit of length of the model (default: as many as fit)")

@@ -29,6 +29,8 @@ class Chart:
     misses : float
         How much the chart exceeds the bound on stretch; 0 if all charts together keep it. It is the larger of two
         differences: between the 99 % quantile by area and ``max_stretch``, and between the largest stretch and 3.
+    straight : bool
+        Whether the chart is a strip that was made a rectangle.
     """
 
     triangles: IntArray
@@ -37,6 +39,7 @@ class Chart:
     uv: FloatArray
     stretch: FloatArray
     misses: float
+    straight: bool = False
 
     @property
     def isometric(self) -> bool:
