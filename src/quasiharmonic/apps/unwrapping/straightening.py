@@ -51,7 +51,7 @@ class Strip(NamedTuple):
     straightened: bool
 
 
-class _Grid(NamedTuple):
+class _GridPlaces(NamedTuple):
     """Column and row of each corner (k, 3) of a grid."""
 
     column: IntArray
@@ -172,7 +172,7 @@ def _lay_squares(F: IntArray, hinges: Hinges, joined: BoolArray, diagonal: BoolA
 
 def _find_grid(
     place: ComplexArray, hinges: Hinges, rows: IntArray, here: IntArray, diagonal: BoolArray, weight: FloatArray
-) -> _Grid | None:
+) -> _GridPlaces | None:
     """Return columns and rows of the corners of a part, if it is a grid or a tube; None otherwise.
 
     Parameters
@@ -212,10 +212,10 @@ def _find_grid(
     if inner.size != links or (np.bincount(cell[:, 0] * n + cell[:, 1], minlength=m * n) != 2).any():
         return None
     corner = cell[:, None] + offset
-    return _Grid(corner[..., 0], corner[..., 1])
+    return _GridPlaces(corner[..., 0], corner[..., 1])
 
 
-def _make_rectangle(V: FloatArray, F: IntArray, cost: FloatArray, rows: IntArray, grid: _Grid) -> Chart:
+def _make_rectangle(V: FloatArray, F: IntArray, cost: FloatArray, rows: IntArray, grid: _GridPlaces) -> Chart:
     """Return a grid as a chart whose columns and rows have constant widths, means of the lengths of their sides."""
     T, (column, row) = F[rows], grid
     node = column * (int(row.max()) + 1) + row
