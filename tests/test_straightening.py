@@ -118,7 +118,7 @@ def almost(V, F):
     return V, F[:-1]
 
 
-@pytest.mark.parametrize("model", [disk(4), torus(12, 8), almost(*tube(bent, 16))])
+@pytest.mark.parametrize("model", [disk(4), torus(12, 8), almost(*tube(bent, 16)), tube(frustum, 5, 1)])
 def test_what_is_no_grid_stays_as_it_is(model):
     V, F = model
     before, result = (unwrap(V, F, resolution=256, straighten=on) for on in (False, True))

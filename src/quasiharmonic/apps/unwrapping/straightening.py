@@ -25,6 +25,8 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 _ANGLES = (np.pi, np.pi / 3, CREASE)
 # No angle of a quadrilateral differs by more from a right angle, in radians.
 _SKEWED = np.pi / 4
+# Fewer triangles between creases are no strip: pairs of them are everywhere on a rough surface.
+_FEWEST = 12
 # Strips with at most this stretch are straight when they are unrolled.
 _STRAIGHT = 1.001
 
@@ -100,7 +102,7 @@ def straighten_strips(
         joined = ~apart & (together | (np.abs(hinges.angle) <= angle)) & left[hinges.first] & left[hinges.second]
         place = _lay_squares(F, hinges, joined, diagonal)
         for rows, here in _list_parts(F, hinges, joined):
-            if not paired[rows].all() or (hinges.flat | diagonal)[here].all():
+            if rows.size < _FEWEST or not paired[rows].all() or (hinges.flat | diagonal)[here].all():
                 continue
             grid = _find_grid(place, hinges, rows, here, diagonal, weight)
             if grid is None:
