@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -93,7 +95,7 @@ def test_teeth_of_slits_move_to_the_other_side():
     place = V[:, :2]
     path = np.array([[2, 2], [3, 3], [4, 4], [4, 5], [5, 5], [6, 6]])
     numbers = [int(np.flatnonzero((place == point).all(axis=1))[0]) for point in path]
-    slit = {frozenset(pair) for pair in zip(numbers[:-1], numbers[1:], strict=True)}
+    slit = {frozenset(pair) for pair in itertools.pairwise(numbers)}
     cut = np.array([frozenset(pair) in slit for pair in zip(tail.tolist(), head.tolist(), strict=True)])
     chart = make_chart(np.arange(len(F)), np.ones(F.shape), cut.reshape(-1, 3))
     above = ABOVE.copy()

@@ -40,7 +40,7 @@ def move_teeth(charts: Sequence[WorkingChart], bound: float) -> list[WorkingChar
     """
     if not charts:
         return []
-    layout = _Layout(charts)
+    layout = _SeamedCharts(charts)
     layout.move(bound)
     changed = [k for k in range(len(charts)) if layout.changed[k]]
     done = list(charts)
@@ -50,7 +50,7 @@ def move_teeth(charts: Sequence[WorkingChart], bound: float) -> list[WorkingChar
     return done if good else list(charts)
 
 
-class _Layout:
+class _SeamedCharts:
     """Triangles of several charts, by vertices of all charts."""
 
     def __init__(self, charts: Sequence[WorkingChart]) -> None:
