@@ -26,6 +26,7 @@ from quasiharmonic.apps.unwrapping.layout import (
 )
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
+from quasiharmonic.apps.unwrapping.mirrored_charts import pair_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
 from quasiharmonic.apps.unwrapping.straightening import Strip, straighten_strips
 from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, check_symmetry, find_mirror
@@ -60,7 +61,7 @@ class UnwrapKeywords(TypedDict, total=False):
     texels_per_unit: float | None
     tiles: int
     rotate: bool
-    stack: bool
+    stack: bool | str
     outward: bool
     weld: bool | float
     hard_edges: float | None
@@ -104,8 +105,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Number of tiles (UDIM). Tile k is the unit square whose lower left corner is ``(k % 10, k // 10)``.
     rotate : bool
         Whether charts may be rotated to fit better.
-    stack : bool
-        Whether identical components share their texture coordinates; mirrored components, too.
+    stack : bool or str
+        Whether identical components share their texture coordinates; mirrored components, too. With ``"mirrored"``,
+        only the mirror images of a symmetric model do; see ``symmetry``.
     outward : bool
         Whether closed components that are inside out are treated as turned outward. Their texture is then mirrored
         relative to the triangles of the input.
@@ -171,7 +173,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     F = triangle_array(F, len(V))
     wanted = UnwrapOptions(**options)
     size = check_texture(
-        wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, wanted.stack
+        wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, bool(wanted.stack)
     )
     corner_uv = None if wanted.uv is None else _corner_positions(wanted.uv, F, len(V))
     costs = None if wanted.edge_costs is None else side_costs(wanted.edge_costs, len(F))
@@ -198,11 +200,12 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             texels_per_unit=None if density is None else float(np.ldexp(density, exponent)),
             tiles=wanted.tiles,
             rotate=wanted.rotate,
-            stack=wanted.stack,
+            stack=bool(wanted.stack),
+            kinds=pair_charts(charts, rules.mirror) if wanted.stack == "mirrored" else None,
         )
         report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
-        certificate = certify_charts(layout, cleaned.triangles, size=size, padding=padding, stacked=wanted.stack)
+        certificate = certify_charts(layout, cleaned.triangles, size=size, padding=padding, stacked=bool(wanted.stack))
         assert certificate.disjoint, "packed charts keep a distance larger than the rounding"
         faulty = np.flatnonzero(~certificate.bijective_charts)
         if not faulty.size:
