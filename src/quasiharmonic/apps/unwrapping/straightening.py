@@ -133,9 +133,11 @@ def _find_diagonals(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray
     corners = [apex[hinges.one], apex[hinges.other], one[hinges.one] + other[hinges.other]]
     corners.append(other[hinges.one] + one[hinges.other])
     skewed = np.abs(np.stack(corners) - np.pi / 2).max(axis=0)
-    inside = np.floor(np.log(np.minimum(cost.ravel()[hinges.one], cost.ravel()[hinges.other])) / np.log(UNDIVIDED_COST))
+    least = np.minimum(cost.ravel()[hinges.one], cost.ravel()[hinges.other])
+    # Flat faces have high costs, and polygons inside them the square of these.
+    inside = (least >= UNDIVIDED_COST).astype(np.int64) + (least >= UNDIVIDED_COST**2)
     chosen, free = np.zeros(apart.size, dtype=bool), np.ones(len(F), dtype=bool)
-    order = np.lexsort((skewed, -np.maximum(inside, 0)))
+    order = np.lexsort((skewed, -inside))
     order = order[(skewed <= _SKEWED)[order] & ~apart[order]]
     for k, a, b in zip(order.tolist(), hinges.first[order].tolist(), hinges.second[order].tolist(), strict=True):
         if free[a] and free[b]:
