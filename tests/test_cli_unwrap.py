@@ -331,3 +331,17 @@ def test_the_only_chart_of_an_inside_out_model_may_be_mirrored(tmp_path, capsys,
     capsys.readouterr()
     assert run("check", out) == 0
     assert "1 island: 1 injective, 1 bijective.\nMirrored" in capsys.readouterr().out
+
+
+def test_straighten_makes_strips_rectangles(tmp_path, capsys):
+    angle, height = np.meshgrid(np.linspace(0, 2, 9), np.arange(6.0))
+    radius = 3 - 0.2 * height
+    place = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1).reshape(-1, 3)
+    lines = [f"v {x} {y} {z}\n" for x, y, z in place.tolist()]
+    lines += [f"f {k} {k + 1} {k + 10} {k + 9}\n" for k in range(1, 46) if k % 9]
+    (tmp_path / "model.obj").write_text("".join(lines))
+    call = ("unwrap", tmp_path / "model.obj", "-o", tmp_path / "out.obj", "--resolution", 256)
+    assert run(*call, "--straighten", "--json", tmp_path / "report.json") == 0
+    (strip,) = json.loads((tmp_path / "report.json").read_text())["strips"]
+    assert (strip["columns"] * strip["rows"], strip["straightened"]) == (40, True)
+    assert "1 of 1 strip straightened" in capsys.readouterr().out

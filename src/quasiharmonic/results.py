@@ -22,6 +22,7 @@ from quasiharmonic.apps.tetrahedra.result import TetrahedraResult, TetrahedraSta
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.warping.image_warp import WarpResult
 from quasiharmonic.energies.distances import DistanceError
 from quasiharmonic.energies.measures import Distortion, Statistics
@@ -69,6 +70,7 @@ __all__ = [
     "Status",
     "Step",
     "Stretch",
+    "Strip",
     "SurfacePoints",
     "TetrahedraCertificate",
     "TetrahedraResult",

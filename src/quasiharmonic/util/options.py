@@ -136,6 +136,16 @@ def mirror_axis(name: str, value: Any) -> None:
         check_choice(name, value, SYMMETRIES)
 
 
+def stacking(name: str, value: Any) -> None:
+    """Check which charts are stacked: a boolean or ``"mirrored"``."""
+    if isinstance(value, str):
+        from quasiharmonic.util.arrays import check_choice
+
+        check_choice(name, value, ("mirrored",))
+    else:
+        switch(name, value)
+
+
 def reference_name(name: str, value: Any) -> None:
     """Check the name of reference triangles."""
     from quasiharmonic.util.arrays import check_choice
@@ -367,12 +377,15 @@ class UnwrapOptions(Options):
     divide_for_packing: bool = option(
         False, "also divide flat and developable parts where the texture is used better then", check=switch
     )
+    straighten: bool = option(
+        False, "make strips of quadrilaterals rectangles, as far as the bound on the stretch permits", check=switch
+    )
     resolution: Any = option(2048)
     padding: float = option(4.0, "minimum texels between two charts (default: 4)")
     texels_per_unit: float | None = option(None, "texels per unit of length of the model (default: as many as fit)")
     tiles: int = option(1, "UDIM tiles (default: 1)", check=positive)
     rotate: bool = option(True)
-    stack: Any = option(False)
+    stack: Any = option(False, check=stacking)
     outward: bool = option(False, "treat closed components that are inside out as turned outward", check=switch)
     weld: Any = option(True, check=welding)
     edge_costs: Any = option(None)

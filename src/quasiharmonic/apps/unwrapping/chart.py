@@ -31,6 +31,8 @@ class Chart:
     misses : float
         How much the chart exceeds the bound on stretch; 0 if all charts together keep it. It is the larger of two
         differences: between the 99 % quantile by area and ``max_stretch``, and between the largest stretch and 3.
+    straight : bool
+        Whether the chart is a strip that was made a rectangle, or a part of it.
     """
 
     triangles: IntArray
@@ -39,6 +41,7 @@ class Chart:
     uv: FloatArray
     stretch: FloatArray
     misses: float
+    straight: bool = False
 
     @cached_property
     def shape(self) -> Shape:
@@ -63,4 +66,4 @@ class Chart:
         stretch = self.stretch[np.searchsorted(self.triangles, working.triangles)]
         uv = np.ldexp(working.uv, working.piece.exponent)
         missed = self.misses if (stretch > bound).any() else 0.0
-        return Chart(working.triangles, working.F, working.vertices, uv, stretch, missed)
+        return Chart(working.triangles, working.F, working.vertices, uv, stretch, missed, self.straight)

@@ -32,6 +32,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import (
 from quasiharmonic.apps.unwrapping.joining import join_small_charts
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
 from quasiharmonic.apps.unwrapping.slits import close_slits
+from quasiharmonic.apps.unwrapping.teeth import move_teeth
 from quasiharmonic.util.threads import HAS_THREADS, count_cores, make_executor
 
 T = TypeVar("T")
@@ -161,7 +162,9 @@ def search_charts(
     here = [_close(chart, joinable) for chart in here]
     overlapping = [chart for chart in here if not chart.bijective]
     workers.map("separate", partial(guard_chart, check_wanted=workers.check_wanted), overlapping)
-    return join_small_charts(here, aim, total_area, workers.check_wanted) if joinable else here
+    if not joinable:
+        return here
+    return move_teeth(join_small_charts(here, aim, total_area, workers.check_wanted), aim)
 
 
 class _Job(NamedTuple):

@@ -95,6 +95,8 @@ def find_charts(
     list of Chart
         Ordered by first triangle. The result does not depend on ``jobs``.
     """
+    if not len(F):
+        return []
     workers = Workers(jobs, callback)
     cost = np.ones(F.shape) if edge_costs is None else np.asarray(edge_costs, dtype=np.float64)
     demanded = cost <= DEMANDED_COST

@@ -50,7 +50,7 @@ def divide_long_charts(
     max_charts : int or None
         Maximum number of charts.
     for_packing : bool
-        Whether charts without stretch are divided like the others, and not only where they are too long.
+        Whether charts without stretch and rectangles are divided like the others, and not only where they are too long.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def divide_long_charts(
             done.append(chart)
             continue
         parts = _divide(chart, V, cost, bound)
-        if chart.isometric and not for_packing:
+        if _is_fixed(chart, for_packing):
             parts = _keep_shorter(chart, parts)
             if not parts and _length(chart) > _LONGEST_FLAT * side:
                 parts = _keep_shorter(chart, _divide(chart, V, np.ones(cost.shape), bound))
@@ -99,12 +99,17 @@ def _area(chart: Chart) -> float:
 
 def _is_too_long(chart: Chart, side: float, for_packing: bool) -> bool:
     """Whether a chart prevents a scale at which the texture has this side."""
-    if chart.isometric and not for_packing:
+    if _is_fixed(chart, for_packing):
         return _length(chart) > _LONGEST_ISOMETRIC * side
     shape = chart.shape
     width, height = shape.extent(shape.direction)
     loose = shape.area < _LOOSE * width * height
     return max(width, height) > side * (_LONGEST_LOOSE if loose else _LONGEST)
+
+
+def _is_fixed(chart: Chart, for_packing: bool) -> bool:
+    """Whether a chart is divided only where it is too long for the texture."""
+    return (chart.isometric or chart.straight) and not for_packing
 
 
 def _length(chart: Chart) -> float:

@@ -14,6 +14,15 @@ def mirror_charts(F: IntArray, charts: list[Chart], mirror: Mirror) -> list[Char
     return [*charts, *(_mirror(F, chart, mirror) for chart in charts)]
 
 
+def pair_charts(charts: list[Chart], mirror: Mirror | None) -> list[int]:
+    """Return a number for each chart that it shares with its mirror image only; charts without one have their own."""
+    owner = {chart.triangles.tobytes(): k for k, chart in enumerate(charts)}
+    if mirror is None:
+        return list(range(len(charts)))
+    images = [owner.get(np.sort(mirror.triangle[chart.triangles]).tobytes(), k) for k, chart in enumerate(charts)]
+    return [min(k, image) for k, image in enumerate(images)]
+
+
 def _mirror(F: IntArray, chart: Chart, mirror: Mirror) -> Chart:
     """Return the mirror image of a chart."""
     rows = mirror.triangle[chart.triangles]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
+from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
 from quasiharmonic.io.adapters.trimesh import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
@@ -122,6 +123,9 @@ class UnwrapResult(Outcome):
         Texels per unit of length of the model.
     V : (n, 2) or (n, 3) float64
         Positions of the model's vertices.
+    strips : tuple of Strip
+        Strips of quadrilaterals that were found with ``straighten=True``, ordered by first triangle; which of them are
+        rectangles now, and how much that stretches them.
     symmetry : Symmetry
         Which plane of symmetry was found, and whether seams and charts are mirrored.
     seconds : float
@@ -143,6 +147,7 @@ class UnwrapResult(Outcome):
     resolution: tuple[int, int]
     texels_per_unit: float
     V: FloatArray
+    strips: tuple[Strip, ...]
     symmetry: Symmetry
     seconds: float
 
@@ -185,6 +190,8 @@ class UnwrapResult(Outcome):
             f"certificate: {self.certificate.summary()}",
         ]
         lines += describe_symmetry(self.symmetry)
+        if self.strips:
+            lines.append(_describe_strips(self.strips))
         if self.misses:
             shown = ", ".join(f"chart {miss.chart} by {miss.excess:.3g}" for miss in self.misses[:_LISTED])
             more = f", … ({len(self.misses)} charts)" if len(self.misses) > _LISTED else ""
@@ -208,6 +215,7 @@ class UnwrapResult(Outcome):
             "utilisation": self.utilisation,
             "texels_per_unit": self.texels_per_unit,
             "resolution": list(self.resolution),
+            "strips": [strip._asdict() for strip in self.strips],
             "symmetry": self.symmetry._asdict(),
             "reversed": int(self.cleaned.flipped.sum()),
             "excluded": self.cleaned.excluded.tolist(),
@@ -215,6 +223,16 @@ class UnwrapResult(Outcome):
             "close_vertices": self.cleaned.close.tolist(),
             "mesh": self.cleaned.report.to_dict(),
         }
+
+
+def _describe_strips(strips: tuple[Strip, ...]) -> str:
+    """Return a line on what was straightened."""
+    left = [f"triangle {strip.triangle} (stretch {strip.stretch:.3g})" for strip in strips if not strip.straightened]
+    line = f"{len(strips) - len(left)} of {count_of('strip', 'strips', len(strips))} straightened"
+    if left:
+        more = ", …" if len(left) > _LISTED else ""
+        line += f"; others stay as they are: {', '.join(left[:_LISTED])}{more}"
+    return line
 
 
 def _finite(stretch: Stretch) -> dict[str, float | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, TypedDict, Unpack
 
@@ -25,7 +26,9 @@ from quasiharmonic.apps.unwrapping.layout import (
 )
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
+from quasiharmonic.apps.unwrapping.mirrored_charts import pair_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.straightening import Strip, straighten_strips
 from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, check_symmetry, find_mirror
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
@@ -34,6 +37,7 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     find_exponent,
+    mark,
     real_array,
     triangle_array,
     vertex_array,
@@ -57,13 +61,14 @@ class UnwrapKeywords(TypedDict, total=False):
     texels_per_unit: float | None
     tiles: int
     rotate: bool
-    stack: bool
+    stack: bool | str
     outward: bool
     weld: bool | float
     hard_edges: float | None
     symmetry: str | None
     packing_loss: float
     divide_for_packing: bool
+    straighten: bool
     edge_costs: ArrayLike | None
     uv: ArrayLike | None
     seed: int
@@ -100,8 +105,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Number of tiles (UDIM). Tile k is the unit square whose lower left corner is ``(k % 10, k // 10)``.
     rotate : bool
         Whether charts may be rotated to fit better.
-    stack : bool
-        Whether identical components share their texture coordinates; mirrored components, too.
+    stack : bool or str
+        Whether identical components share their texture coordinates; mirrored components, too. With ``"mirrored"``,
+        only the mirror images of a symmetric model do; see ``symmetry``.
     outward : bool
         Whether closed components that are inside out are treated as turned outward. Their texture is then mirrored
         relative to the triangles of the input.
@@ -122,6 +128,10 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     divide_for_packing : bool
         Whether flat and developable parts are also divided where the texture is used better then. By default, they are
         divided only where they are longer than the texture's side.
+    straighten : bool
+        Whether strips become rectangles: curved parts that are regular grids of quadrilaterals, or tubes of these, each
+        quadrilateral made of two triangles. A strip ends at edges of the surface, at creases or at demanded seams.
+        Strips of which a triangle would be stretched beyond the bound stay as they are (`UnwrapResult.strips`).
     edge_costs : (f, 3) array, optional
         Positive factor on the cost of a seam at each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
         Large values keep seams away from visible parts. Values of at least 1,000 keep two triangles together where
@@ -163,7 +173,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     F = triangle_array(F, len(V))
     wanted = UnwrapOptions(**options)
     size = check_texture(
-        wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, wanted.stack
+        wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, bool(wanted.stack)
     )
     corner_uv = None if wanted.uv is None else _corner_positions(wanted.uv, F, len(V))
     costs = None if wanted.edge_costs is None else side_costs(wanted.edge_costs, len(F))
@@ -180,7 +190,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     rules = _find_rules(points, cleaned, costs, corner_uv, wanted)
     bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit
-    charts = _make_charts(points, cleaned, rules, wanted, size, report)
+    charts, strips = _make_charts(points, cleaned, rules, wanted, size, report)
     while True:
         report("pack")
         packing = pack_charts(
@@ -190,11 +200,12 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             texels_per_unit=None if density is None else float(np.ldexp(density, exponent)),
             tiles=wanted.tiles,
             rotate=wanted.rotate,
-            stack=wanted.stack,
+            stack=bool(wanted.stack),
+            kinds=pair_charts(charts, rules.mirror) if wanted.stack == "mirrored" else None,
         )
         report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
-        certificate = certify_charts(layout, cleaned.triangles, size=size, padding=padding, stacked=wanted.stack)
+        certificate = certify_charts(layout, cleaned.triangles, size=size, padding=padding, stacked=bool(wanted.stack))
         assert certificate.disjoint, "packed charts keep a distance larger than the rounding"
         faulty = np.flatnonzero(~certificate.bijective_charts)
         if not faulty.size:
@@ -229,6 +240,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         resolution=size,
         texels_per_unit=float(np.ldexp(packing.texels_per_unit, -exponent)),
         V=V,
+        strips=tuple(strip._replace(triangle=int(cleaned.triangles[strip.triangle])) for strip in strips),
         symmetry=check_symmetry(rules.symmetry, rules.mirror, layout.chart),
         seconds=time.perf_counter() - began,
     )
@@ -285,18 +297,23 @@ def _make_charts(
     wanted: UnwrapOptions,
     size: tuple[int, int],
     report: Callable[[str, int, int], object],
-) -> list[Chart]:
-    """Return the charts of a cleaned mesh that keep the bound, and fit into the texture."""
-    bound, tiles = float(wanted.max_stretch), wanted.tiles
+) -> tuple[list[Chart], list[Strip]]:
+    """Return the charts of a cleaned mesh that keep the bound, and fit into the texture; and its strips."""
+    bound, tiles, most = float(wanted.max_stretch), wanted.tiles, wanted.max_charts
+    uv_cuts = None if rules.uv is None else _find_uv_cuts(rules.uv, cleaned)
+    straight, strips = list[Chart](), list[Strip]()
+    if wanted.straighten:
+        straight, strips = straighten_strips(points, cleaned.F, rules.cost, uv_cuts, bound, most)
+    rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     charts = find_charts(
         points,
-        cleaned.F,
+        cleaned.F[rest],
         max_stretch=bound,
-        max_charts=wanted.max_charts,
-        edge_costs=rules.cost,
-        uv_cuts=None if rules.uv is None else _find_uv_cuts(rules.uv, cleaned),
-        uv=rules.uv,
-        mirror=rules.mirror,
+        max_charts=None if most is None else most - len(straight),
+        edge_costs=rules.cost[rest],
+        uv_cuts=uv_cuts,
+        uv=None if rules.uv is None else rules.uv[rest],
+        mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
         choose=partial(
             choose_packed,
             size=size,
@@ -309,18 +326,20 @@ def _make_charts(
         callback=report,
         jobs=wanted.jobs,
     )
+    charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
     if rules.uv is not None:
-        return charts
-    return divide_long_charts(
+        return sorted(charts, key=lambda chart: int(chart.triangles[0])), strips
+    charts = divide_long_charts(
         charts,
         points,
         rules.cost,
         bound=bound,
         size=size,
         tiles=tiles,
-        max_charts=wanted.max_charts,
+        max_charts=most,
         for_packing=wanted.divide_for_packing,
     )
+    return charts, strips
 
 
 def _corner_positions(uv: ArrayLike, F: IntArray, n: int) -> FloatArray:

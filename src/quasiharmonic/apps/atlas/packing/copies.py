@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,14 +37,14 @@ class Copy(NamedTuple):
     deviation: float
 
 
-def find_copies(charts: list[tuple[FloatArray, IntArray]]) -> dict[int, Copy]:
-    """Find the charts that are congruent to an earlier one, with vertices and triangles in any order."""
-    originals: defaultdict[tuple[int, int], list[_Original]] = defaultdict(list)
+def find_copies(charts: list[tuple[FloatArray, IntArray]], kinds: Sequence[int] | None = None) -> dict[int, Copy]:
+    """Find the charts that are congruent to an earlier one of their kind, with vertices and triangles in any order."""
+    originals: defaultdict[tuple[int, int, int], list[_Original]] = defaultdict(list)
     copies = {}
     for i, (uv, F) in enumerate(charts):
         z = to_complex(uv)
         z = z - z.mean()
-        same_sizes = originals[len(uv), len(F)]
+        same_sizes = originals[len(uv), len(F), kinds[i] if kinds is not None else 0]
         for original in same_sizes:
             found = _align(z, F, original.z, charts[original.chart][1], original.tree)
             if found is not None:

@@ -84,6 +84,7 @@ def pack_charts(
     tiles: int = 1,
     rotate: bool = True,
     stack: bool = False,
+    kinds: Sequence[int] | None = None,
 ) -> Packing:
     """Pack charts into one or several textures by their shapes, as large as possible and at one texel density.
 
@@ -106,6 +107,8 @@ def pack_charts(
         Allow rotations.
     stack : bool
         Place congruent charts, and mirrored ones, at the same position.
+    kinds : sequence of int, optional
+        A number for each chart. Charts with different numbers are not stacked.
 
     Returns
     -------
@@ -119,6 +122,10 @@ def pack_charts(
     """
     pairs = _check_charts(charts)
     size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)
+    if kinds is not None and len(kinds) != len(pairs):
+        raise ValueError(
+            f"kinds must have {count_of('number', 'numbers', len(pairs))}, one per chart, not {len(kinds)}"
+        )
     if not pairs:
         return Packing((), (), texels_per_unit or 1.0, 0.0)
     # Scale by a power of two to about unit size, so that squares do not overflow.
@@ -126,7 +133,7 @@ def pack_charts(
     pairs = [(np.ldexp(uv, -exponent), F) for uv, F in pairs]
     with np.errstate(over="ignore", under="ignore"):
         wanted = None if texels_per_unit is None else float(np.ldexp(texels_per_unit, exponent))
-    copies = find_copies(pairs) if stack else {}
+    copies = find_copies(pairs, kinds) if stack else {}
     originals = [i for i in range(len(pairs)) if i not in copies]
     shapes = [make_shape(*pairs[i]) for i in originals]
     # Coordinates of later tiles are larger, and so are their rounding errors.

@@ -27,6 +27,7 @@ from quasiharmonic.ui.cli.arguments import (
     add_files,
     add_options,
     byte_count,
+    choice,
     count,
     declared,
     file,
@@ -57,7 +58,14 @@ def add_parser(commands: Commands) -> None:
             _resolution, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)", default=(2048, 2048)
         ),
         no_rotate=flag("do not rotate charts to fit better"),
-        stack=flag("let identical and mirrored components share their texture coordinates"),
+        stack=choice(
+            ("mirrored",),
+            "let identical and mirrored components share their texture coordinates, or only the mirror images of a "
+            "symmetric model",
+            nargs="?",
+            const=True,
+            default=False,
+        ),
         weld=weld("yes"),
         keep_seams=flag("keep the seams of the input's texture coordinates (vt), and add seams only where necessary"),
         edge_costs=file(

@@ -1,0 +1,169 @@
+"""Smooth the outlines of charts: teeth, triangles with two sides on a seam, move into the notch on its other side.
+
+The seam then takes the third side, which is shorter. The triangle's corners are vertices of the other chart already, so
+its map only has to be free of overlaps there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from heapq import heapify, heappop, heappush
+
+import numpy as np
+
+from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, find_pairs
+from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
+from quasiharmonic.targets.cuts.graph import edge_graph
+from quasiharmonic.util.arrays import ComplexArray, IntArray, to_complex, to_points
+
+# The seam must become shorter by this share of the two sides.
+_SAVES = 0.02
+# No vertex of an outline may lie in a notch, or this close to it, relative to its height.
+_CLOSE = 0.05
+
+
+def move_teeth(charts: Sequence[WorkingChart], bound: float) -> list[WorkingChart]:
+    """Move triangles between charts, and across slits, where this shortens the seams.
+
+    Parameters
+    ----------
+    charts : sequence of WorkingChart
+        With bijective maps.
+    bound : float
+        Largest stretch of a triangle that moves.
+
+    Returns
+    -------
+    list of WorkingChart
+        All have bijective maps.
+    """
+    if not charts:
+        return []
+    layout = _SeamedCharts(charts)
+    layout.move(bound)
+    changed = [k for k in range(len(charts)) if layout.changed[k]]
+    done = list(charts)
+    for k in changed:
+        done[k] = layout.take(k)
+    good = all(done[k].bijective and not (done[k].too_long.any() and not charts[k].too_long.any()) for k in changed)
+    return done if good else list(charts)
+
+
+class _SeamedCharts:
+    """Triangles of several charts, by vertices of all charts."""
+
+    def __init__(self, charts: Sequence[WorkingChart]) -> None:
+        start = np.cumsum([0, *(len(chart.V) for chart in charts)])
+        self.triangles = np.concatenate([chart.triangles for chart in charts])
+        self.F = np.concatenate([chart.F + first for chart, first in zip(charts, start, strict=False)])
+        self.V = np.concatenate([chart.V for chart in charts])
+        self.vertices = np.concatenate([chart.vertices for chart in charts])
+        self.chart = np.repeat(np.arange(len(charts)), [len(chart.F) for chart in charts])
+        self.cost = np.concatenate([chart.cost for chart in charts])
+        self.changed = np.zeros(len(charts), dtype=bool)
+        unit = [np.ldexp(chart.uv, chart.piece.exponent) for chart in charts if chart.uv is not None]
+        self.z = to_complex(np.concatenate(unit))
+        self.rims = [np.concatenate(chart.piece.loops) + first for chart, first in zip(charts, start, strict=False)]
+        # The mesh of all charts without seams.
+        _, first, own = np.unique(self.vertices, return_index=True, return_inverse=True)
+        T = own[self.F]
+        graph = edge_graph(self.V[first], T, self.cost)
+        self.price = graph.cost[graph.side.T]
+        shapes = rest_shapes(self.V, self.F)
+        self.sides = shapes.unit * shapes.sides
+        self.ahead = np.roll(np.arange(T.size).reshape(-1, 3), -1, axis=1).ravel()
+        self.partner = np.full(T.size, -1)
+        one, other = find_pairs(T)
+        self.partner[one], self.partner[other] = other, one
+        self.fixed = (self.cost <= DEMANDED_COST) | (self.cost >= UNDIVIDED_COST)
+
+    def _is_seam(self, side: int) -> bool:
+        """Whether a side is on a seam between two triangles."""
+        other = int(self.partner[side])
+        if other < 0:
+            return False
+        F, ahead = self.F.ravel(), self.ahead
+        return bool(F[side] != F[ahead[other]] or F[ahead[side]] != F[other])
+
+    def _find_tooth(self, t: int) -> tuple[float, int] | None:
+        """Return what moving a triangle saves, and its tip's corner; None if it is no tooth, or must stay."""
+        seams = [self._is_seam(3 * t + k) for k in range(3)]
+        if sum(seams) != 2:
+            return None
+        base = seams.index(False)
+        tip = (base + 2) % 3
+        if self.partner[3 * t + base] < 0 or self.fixed[t].any():
+            return None
+        before, after = self.partner[3 * t + (tip + 2) % 3], self.partner[3 * t + tip]
+        if self.F.ravel()[before] != self.F.ravel()[self.ahead[after]]:
+            return None
+        left = self.price[t, tip] + self.price[t, (tip + 2) % 3]
+        saved = float(left - self.price[t, base])
+        return (saved, tip) if saved > _SAVES * left else None
+
+    def move(self, bound: float) -> None:
+        """Move all teeth, the greatest saving first."""
+        one = np.flatnonzero(self.partner >= 0)
+        F, other = self.F.ravel(), self.partner[one]
+        seam = (F[one] != F[self.ahead[other]]) | (F[self.ahead[one]] != F[other])
+        twice = np.flatnonzero(np.bincount(one[seam] // 3, minlength=len(self.F)) == 2).tolist()
+        queue = [(-found[0], t) for t in twice if (found := self._find_tooth(t)) is not None]
+        heapify(queue)
+        while queue:
+            _, t = heappop(queue)
+            found = self._find_tooth(t)
+            if found is None or not self._move(t, found[1], bound):
+                continue
+            for near in self.partner[3 * t : 3 * t + 3].tolist():
+                if near >= 0 and (more := self._find_tooth(near // 3)) is not None:
+                    heappush(queue, (-more[0], near // 3))
+
+    def _move(self, t: int, tip: int, bound: float) -> bool:
+        """Move a tooth into its notch, if it fits."""
+        before, after = (int(self.partner[3 * t + (tip + shift) % 3]) for shift in (2, 0))
+        F = self.F.ravel()
+        corners = np.empty(3, dtype=np.int64)
+        corners[tip], corners[(tip + 1) % 3], corners[(tip + 2) % 3] = F[before], F[after], F[self.ahead[before]]
+        z = self.z[corners]
+        goal = int(self.chart[before // 3])
+        if len(set(corners.tolist())) < 3 or not self._keeps(t, z, bound) or self._is_occupied(t, goal, corners):
+            return False
+        self.changed[[self.chart[t], goal]] = True
+        rim = self.rims[self.chart[t]]
+        self.rims[self.chart[t]] = rim[rim != self.F[t, tip]]
+        self.F[t], self.chart[t] = corners, goal
+        return True
+
+    def _keeps(self, t: int, z: ComplexArray, bound: float) -> bool:
+        """Whether a triangle with corners (3,) complex128 in the plane is positive and keeps the bound."""
+        a, b = self.sides[0, t], -self.sides[2, t]
+        u, v = z[1] - z[0], z[2] - z[0]
+        # u = p a + q conj(a), v = p b + q conj(b)
+        det = a * b.conjugate() - a.conjugate() * b
+        p, q = (u * b.conjugate() - v * a.conjugate()) / det, (a * v - b * u) / det
+        high, low = abs(p) + abs(q), abs(p) - abs(q)
+        return bool(low > 0 and max(high, 1 / low) <= bound)
+
+    def _is_occupied(self, t: int, goal: int, corners: IntArray) -> bool:
+        """Whether a vertex of a chart's outline lies in a notch."""
+        rim = self.rims[goal]
+        others = self.z[rim[~np.isin(rim, [*corners, *self.F[t]])]]
+        z = self.z[corners]
+        inside = np.ones(others.size, dtype=bool)
+        for k in range(3):
+            along = z[(k + 1) % 3] - z[k]
+            height = ((z[(k + 2) % 3] - z[k]) / along).imag
+            inside &= ((others - z[k]) / along).imag > -_CLOSE * height
+        return bool(inside.any())
+
+    def take(self, k: int) -> WorkingChart:
+        """Return a chart with its map."""
+        rows = np.flatnonzero(self.chart == k)
+        rows = rows[np.argsort(self.triangles[rows])]
+        names, own = np.unique(self.F[rows], return_inverse=True)
+        chart = WorkingChart(
+            self.triangles[rows], self.vertices[names], self.V[names], own.reshape(-1, 3), self.cost[rows]
+        )
+        chart.use(np.ldexp(to_points(self.z[names]), -chart.piece.exponent))
+        return chart

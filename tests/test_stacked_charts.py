@@ -1,0 +1,69 @@
+"""Mirror images on top of each other: ``stack="mirrored"`` of `unwrap`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic import io, unwrap
+from quasiharmonic.atlas import pack_charts
+from quasiharmonic.surfaces import annulus
+from shared.commands import run
+from shared.meshes import lift
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Two identical components and their mirror images in x."""
+    points, triangles = annulus(4)
+    points = lift(points) + np.array([3, 0, 0])
+    count = len(points)
+    points = np.concatenate([points, points + np.array([0, 7, 3])])
+    V = np.concatenate([points, points * [-1, 1, 1]])
+    turned = triangles[:, ::-1]
+    return V, np.concatenate([triangles, triangles + count, turned + 2 * count, turned + 3 * count])
+
+
+def places(result):
+    """The number of charts that lie at places of their own."""
+    centres = [result.uvs[np.unique(result.indices[result.charts == k])].mean(axis=0) for k in range(result.n_charts)]
+    return len(np.unique(np.round(centres, 5), axis=0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stack", "axis", "count"), [(False, "x", 4), ("mirrored", "x", 2), (True, "x", 1), ("mirrored", None, 4)]
+)
+def test_only_mirror_images_are_stacked(model, stack, axis, count):
+    result = unwrap(*model, resolution=256, max_stretch=3, stack=stack, symmetry=axis)
+    assert result.success
+    assert result.n_charts == 4
+    assert result.symmetry.applied == (axis == "x")
+    assert places(result) == count
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("words", "count"), [((), 4), (("--stack",), 1), (("--stack", "mirrored"), 2)])
+def test_command_line(model, tmp_path, words, count):
+    io.write_obj(tmp_path / "in.obj", io.MeshData(*model))
+    call = ("unwrap", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--resolution", 256, "--max-stretch", 3)
+    assert run(*call, *words) == 0
+    written = io.read_mesh(tmp_path / "out.obj")
+    size = len(written.F) // 4
+    centres = [written.vt[np.unique(written.FT[k * size : (k + 1) * size])].mean(axis=0) for k in range(4)]
+    assert len(np.unique(np.round(centres, 5), axis=0)) == count
+
+
+def test_bad_input_is_named(model):
+    with pytest.raises(ValueError, match="stack must be one of mirrored, not 'both'"):
+        unwrap(*model, stack="both")
+    square = np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
+    with pytest.raises(ValueError, match="kinds must have 2 numbers, one per chart, not 1"):
+        pack_charts([square, square], kinds=[0])
+
+
+def test_charts_of_different_kinds_are_apart():
+    square = np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
+    packing = pack_charts([square] * 3, resolution=64, stack=True, kinds=[0, 1, 0])
+    np.testing.assert_allclose(packing.uv[0], packing.uv[2])
+    assert np.abs(packing.uv[0] - packing.uv[1]).max() > 0.1
