@@ -17,8 +17,8 @@ from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, 
 from quasiharmonic.apps.unwrapping.pieces import CREASE
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, spanning_links
 from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
-from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 
 # Strips end at edges with larger angles between the normals. The first one allows all edges.
