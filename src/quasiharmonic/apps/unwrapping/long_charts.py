@@ -14,8 +14,10 @@ from quasiharmonic.util.arrays import FloatArray
 _EXPECTED = 0.6
 # Longest chart in sides of the texture at this scale, and longest chart that covers less than a share of its box.
 _LONGEST, _LONGEST_LOOSE, _LOOSE = 0.85, 0.7, 0.6
-# The same for charts without stretch, and for cuts through flat faces. Each part must be this much shorter.
-_LONGEST_ISOMETRIC, _LONGEST_FLAT = 0.95, 2.0
+# The same for charts without stretch, for those with almost all of the area, and for cuts through flat faces. Each part
+# must be this much shorter.
+_LONGEST_ISOMETRIC, _LONGEST_ALONE, _LONGEST_FLAT = 0.95, 1.3, 2.0
+_ALONE = 0.9
 _SHORTER = 0.85
 
 
@@ -65,7 +67,7 @@ def divide_long_charts(
     while waiting:
         chart = waiting.pop()
         full = max_charts is not None and len(done) + len(waiting) + 1 >= max_charts
-        if full or len(chart.F) < 2 or not _is_too_long(chart, side, for_packing):
+        if full or len(chart.F) < 2 or not _is_too_long(chart, side, area, for_packing):
             done.append(chart)
             continue
         parts = _divide(chart, V, cost, bound)
@@ -97,10 +99,11 @@ def _area(chart: Chart) -> float:
     return chart.shape.area
 
 
-def _is_too_long(chart: Chart, side: float, for_packing: bool) -> bool:
+def _is_too_long(chart: Chart, side: float, area: float, for_packing: bool) -> bool:
     """Whether a chart prevents a scale at which the texture has this side."""
     if _is_fixed(chart, for_packing):
-        return _length(chart) > _LONGEST_ISOMETRIC * side
+        longest = _LONGEST_ALONE if chart.shape.area > _ALONE * area else _LONGEST_ISOMETRIC
+        return _length(chart) > longest * side
     shape = chart.shape
     width, height = shape.extent(shape.direction)
     loose = shape.area < _LOOSE * width * height
