@@ -22,8 +22,8 @@ from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.geometry.mesh.triangle_shapes import rest_shapes
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 
-#: Edges with a larger angle between the normals are creases.
-CREASE = np.pi / 6
+#: Edges with a larger angle between the normals are creases. Tubes with twelve sides have none.
+CREASE = np.pi / 6 + 1e-3
 # Smaller angles at which curved parts are divided.
 _ANGLES = np.deg2rad([20.0, 13.0, 9.0, 6.0, 4.0])
 # There, a piece has at least this share of the area, and its squared perimeter is at most this multiple of its area.
