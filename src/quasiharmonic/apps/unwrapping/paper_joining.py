@@ -79,6 +79,8 @@ class PaperModel:
         self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
         self._version = dict.fromkeys(self._charts, 0)
         self._watched: BoolArray = np.zeros(hinges.one.size, dtype=np.bool_)
+        # Pairs of charts that overlap if they are joined at this number of hinges. They also do when others are added.
+        self._overlapping = set[tuple[int, int, int]]()
 
     def list_contacts(self, may_join: BoolArray) -> None:
         """Find where charts may be joined, given a mask of hinges (e,)."""
@@ -149,11 +151,11 @@ class PaperModel:
         pieces = self._pieces
         contacts = {k: dict(others) for k, others in self._contacts.items()}
         arrays = [array.copy() for array in (pieces.label, pieces.place, pieces.glued, self._joined_sides)]
-        return contacts, dict(self._charts), dict(self._version), arrays
+        return contacts, dict(self._charts), dict(self._version), set(self._overlapping), arrays
 
     def _restore(self, saved: tuple[Any, ...]) -> None:
         """Undo what was done since `_save`."""
-        self._contacts, self._charts, self._version, (label, place, glued, sides) = saved
+        self._contacts, self._charts, self._version, self._overlapping, (label, place, glued, sides) = saved
         self._pieces.label[:], self._pieces.place[:], self._pieces.glued[:] = label, place, glued
         self._joined_sides[:] = sides
 
@@ -162,6 +164,9 @@ class PaperModel:
 
     def _try(self, a: int, b: int, weight: FloatArray, limits: tuple[float, float]) -> bool:
         """Move chart ``b`` to chart ``a`` and join them, if their union is good."""
+        contact = self._contacts[a][b]
+        if (a, b, contact.size) in self._overlapping:
+            return False
         motion = self._find_motion(a, b, weight)
         one, other = self._charts[a], self._charts[b]
         place = self._pieces.place
@@ -175,13 +180,13 @@ class PaperModel:
             return False
         before = place[other.triangles]
         place[other.triangles] = moved
-        contact = self._contacts[a][b]
         glued = contact[self._meet(contact)]
         glued_sides = np.concatenate([self._hinges.one[glued], self._hinges.other[glued]])
         self._joined_sides[glued_sides] = True
         if not self._is_simple(union.triangles):
             place[other.triangles] = before
             self._joined_sides[glued_sides] = False
+            self._overlapping.add((a, b, contact.size))
             return False
         self._pieces.glued[glued] = True
         self._pieces.label[other.triangles] = a
