@@ -169,7 +169,8 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
     for angle in (CREASE, *_ANGLES, 0.0):
         rest = found.label < 0
         within = ~apart & rest[hinges.first] & rest[hinges.second]
-        joined = within & ((np.abs(hinges.angle) <= (angle or CREASE)) | hinges.flat | together)
+        # What is left between pieces can be developable as a whole, with its creases.
+        joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat | together) if angle else within
         parts = _Parts(F, hinges, joined, angles, area)
         chosen = parts.developable & mark(parts.count, parts.component[rest])
         outline = np.where(hinges.mark_sides(joined, len(F)), 0.0, length)
@@ -177,12 +178,7 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
         if angle == CREASE:
             chosen &= ~parts.rough | (parts.area >= _LARGE_SHARE)
             chosen = _drop_scattered(hinges, parts, chosen, rim)
-        elif not angle:
-            # What is left between pieces can be developable as a whole.
-            creased = within & ~joined
-            chosen[parts.component[hinges.first[creased]]] = False
-            chosen[parts.component[hinges.second[creased]]] = False
-        else:
+        elif angle:
             chosen &= (parts.area >= _LEAST_SHARE) & (rim**2 <= _LONGEST * parts.area * doubled.sum() / 2)
         if chosen.any():
             _unroll(V, F, hinges, parts, chosen, cost, found, mirror)
