@@ -27,6 +27,8 @@ _SAME = 1e-3
 _EXPECTED = 0.7
 # Boundaries that are closer than this multiple of the root of the area count as touching.
 _GAP = 2.0**-20
+# Lengths count as equal up to this factor.
+_AS_LONG = 1 + 1e-9
 # Edges between two pieces that are compared, longest first.
 _TRIES = 64
 
@@ -176,7 +178,8 @@ class PaperModel:
             np.concatenate([one.hull, motion[0] * other.hull + motion[1]]),
         )
         longest, boxes = limits
-        if union.box > boxes * (one.box + other.box) or union.longest > max(longest, one.longest, other.longest):
+        longest = _AS_LONG * max(longest, one.longest, other.longest)
+        if union.box > boxes * (one.box + other.box) or union.longest > longest:
             return False
         before = place[other.triangles]
         place[other.triangles] = moved
