@@ -238,7 +238,8 @@ class _Search:
         radius = _MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
         self._windows = not few
         self.areas = np.array([shape.area for shape in shapes])
-        self._order = np.argsort(-self.areas, kind="stable")
+        # Shapes of equal area stay in their order, whatever the rounding.
+        self._order = np.argsort(-np.round(self.areas / (self.areas.max() or 1.0), 9), kind="stable")
         self._few = bitmaps
         large, small = self._order[:bitmaps], self._order[bitmaps:]
         turns = np.exp(0.125j * pi * (np.arange(4) if len(shapes) <= _MOST_DIRECTIONS else np.arange(0, 4, 2)))
