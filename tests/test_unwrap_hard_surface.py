@@ -135,7 +135,7 @@ def test_a_cone_has_one_straight_cut(n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("across, deep, corners", [(3, 1, 16), (2, 3, 12), (8, 5, 4)])
+@pytest.mark.parametrize(("across", "deep", "corners"), [(3, 1, 16), (2, 3, 12), (8, 5, 4)])
 def test_plates_keep_their_holes(across, deep, corners):
     V, F = models.plate(across, deep, thick=0.05, corners=corners)
     result = unwrap(V, F, resolution=4096, padding=1)
@@ -148,7 +148,9 @@ def test_plates_keep_their_holes(across, deep, corners):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, degrees", [("house", 30), ("house", 60), ("gear", 30), ("stairs", 89), ("plate", 20)])
+@pytest.mark.parametrize(
+    ("name", "degrees"), [("house", 30), ("house", 60), ("gear", 30), ("stairs", 89), ("plate", 20)]
+)
 def test_hard_edges_are_seams(name, degrees):
     V, F = DEVELOPABLE[name]
     result = unwrap(V, F, resolution=1024, hard_edges=degrees)

@@ -106,7 +106,7 @@ def test_an_unknown_axis_is_an_error():
 @examples(20)
 def test_the_mirror_of_random_triangles(seed, axis):
     random = np.random.default_rng(seed)
-    half = np.abs(random.normal(size=(12, 3))) + [0.1, 0, 0]
+    half = 0.1 + np.abs(random.normal(size=(12, 3)))
     half[random.random(12) < 0.4, 0] = 0
     triangles = np.array([random.permutation(12)[:3] for _ in range(8)])
     V, F = models.mirrored((half, triangles[(half[triangles][:, :, 0] > 0).any(axis=1)]))
