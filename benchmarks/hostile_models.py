@@ -19,25 +19,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hard_models import Mesh, blocks, split_edges
 from quasiharmonic import unwrap
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from sculptures import surface_net
 
-Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 BOUNDS = 1.05, 1.1, 1.2, 1.5, 3.0
-
-
-def split_edges(V: NDArray[np.float64], F: NDArray[np.int64], times: int) -> Mesh:
-    """Divide every triangle into four, several times."""
-    for _ in range(times):
-        sides = np.sort(np.concatenate([F[:, [0, 1]], F[:, [1, 2]], F[:, [2, 0]]]), axis=1)
-        ends, number = np.unique(sides, axis=0, return_inverse=True)
-        a, b, c = (number.ravel() + len(V)).reshape(3, -1)
-        x, y, z = F.T
-        F = np.concatenate([np.stack(part, axis=1) for part in ((x, a, c), (a, y, b), (c, b, z), (a, b, c))])
-        V = np.concatenate([V, V[ends].mean(axis=1)])
-    return V, F
 
 
 def sphere(random: np.random.Generator) -> Mesh:
@@ -52,22 +40,6 @@ def sphere(random: np.random.Generator) -> Mesh:
     if random.random() < 0.5:
         V = V.astype(np.float32).astype(np.float64)
     return V, np.concatenate([np.stack([a, a + 1, b + 1], axis=1), np.stack([a, b + 1, b], axis=1)])
-
-
-def blocks(solid: NDArray[np.bool_]) -> Mesh:
-    """The surface of unit blocks."""
-    padded = np.pad(solid, 1)
-    squares = []
-    for axis in range(3):
-        for sense in (1, -1):
-            at = np.argwhere(padded & ~np.roll(padded, -sense, axis=axis))
-            first, second = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]][::sense]
-            corner = at + (np.eye(3, dtype=int)[axis] if sense > 0 else 0)
-            squares.append(np.stack([corner, corner + first, corner + first + second, corner + second], axis=1))
-    corners = np.concatenate(squares)
-    V, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    Q = number.reshape(-1, 4)
-    return V.astype(np.float64), np.concatenate([Q[:, [0, 1, 2]], Q[:, [0, 2, 3]]])
 
 
 def voxels(random: np.random.Generator) -> Mesh:

@@ -139,7 +139,7 @@ class RestStrain(Strain):
     """The strain of the rest triangles ``F`` of ``V``; ValueError names triangles without positive finite area.
 
     With ``signed``, planar triangles may be clockwise, as in a `ReferenceMesh`. Triangles in space are always
-    counterclockwise, and so are those of a planar surface in `mesh.triangle_shapes`. ``m`` (f,) are areas, ``half`` (3,
+    counterclockwise, and so are those of a planar surface in `mesh.reference`. ``m`` (f,) are areas, ``half`` (3,
     f) complex half the gradients of the hat functions.
     """
 

@@ -21,6 +21,8 @@ DEMANDED_COST = 1e-9
 FLAT = 2e-6
 # No two triangles with a larger angle between them, in radians, count as flat, however small they are.
 _FLAT_ANGLE = np.pi / 180
+# Lengths are rounded to this number of bits, so that equal lengths stay equal if a model is moved or rotated.
+_BITS = 30
 # Triangles with a smaller share of the area belong to no flat face: their planes are arbitrary.
 _LEAST_AREA = 1e-9
 
@@ -99,4 +101,6 @@ def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
     above = ((flat_P[apex[other]] - start) * a).sum(axis=1)
     height = np.maximum(np.abs(above), np.abs(((flat_P[apex[one]] - start) * b).sum(axis=1)))
     flat = (height <= FLAT) & (angle <= _FLAT_ANGLE) & ~(tiny[one // 3] | tiny[other // 3])
-    return Hinges(one, other, np.where(above > 0, -angle, angle), length * size, flat)
+    fraction, exponent = np.frexp(length * size)
+    rounded = np.ldexp(np.rint(np.ldexp(fraction, _BITS)), exponent - _BITS)
+    return Hinges(one, other, np.where(above > 0, -angle, angle), rounded, flat)

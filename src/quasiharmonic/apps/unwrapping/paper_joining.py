@@ -27,6 +27,8 @@ _SAME = 1e-3
 _EXPECTED = 0.7
 # Boundaries that are closer than this multiple of the root of the area count as touching.
 _GAP = 2.0**-20
+# Lengths count as equal up to this factor.
+_AS_LONG = 1 + 1e-9
 # Edges between two pieces that are compared, longest first.
 _TRIES = 64
 
@@ -78,9 +80,9 @@ class PaperModel:
         # Hinges between two charts, and how often each chart has changed.
         self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
         self._version = dict.fromkeys(self._charts, 0)
-        # Pairs of charts, with their versions, that cannot be joined.
-        self._hopeless: set[tuple[int, ...]] = set()
         self._watched: BoolArray = np.zeros(hinges.one.size, dtype=np.bool_)
+        # Pairs of charts that overlap if they are joined at this number of hinges. They also do when others are added.
+        self._overlapping = set[tuple[int, int, int]]()
 
     def list_contacts(self, may_join: BoolArray) -> None:
         """Find where charts may be joined, given a mask of hinges (e,)."""
@@ -118,7 +120,7 @@ class PaperModel:
         while queue:
             check()
             _, a, b, *versions = heappop(queue)
-            if versions != [self._version.get(a), self._version.get(b)] or (a, b, *versions) in self._hopeless:
+            if versions != [self._version.get(a), self._version.get(b)]:
                 continue
             forced = bool(undivided[self._contacts[a][b]].any())
             for chart in self._join_symmetrically(a, b, weight, (np.inf, np.inf) if forced else limits):
@@ -151,11 +153,11 @@ class PaperModel:
         pieces = self._pieces
         contacts = {k: dict(others) for k, others in self._contacts.items()}
         arrays = [array.copy() for array in (pieces.label, pieces.place, pieces.glued, self._joined_sides)]
-        return contacts, dict(self._charts), dict(self._version), arrays
+        return contacts, dict(self._charts), dict(self._version), set(self._overlapping), arrays
 
     def _restore(self, saved: tuple[Any, ...]) -> None:
         """Undo what was done since `_save`."""
-        self._contacts, self._charts, self._version, (label, place, glued, sides) = saved
+        self._contacts, self._charts, self._version, self._overlapping, (label, place, glued, sides) = saved
         self._pieces.label[:], self._pieces.place[:], self._pieces.glued[:] = label, place, glued
         self._joined_sides[:] = sides
 
@@ -164,6 +166,9 @@ class PaperModel:
 
     def _try(self, a: int, b: int, weight: FloatArray, limits: tuple[float, float]) -> bool:
         """Move chart ``b`` to chart ``a`` and join them, if their union is good."""
+        contact = self._contacts[a][b]
+        if (a, b, contact.size) in self._overlapping:
+            return False
         motion = self._find_motion(a, b, weight)
         one, other = self._charts[a], self._charts[b]
         place = self._pieces.place
@@ -173,21 +178,18 @@ class PaperModel:
             np.concatenate([one.hull, motion[0] * other.hull + motion[1]]),
         )
         longest, boxes = limits
-        if union.longest > max(longest, one.longest, other.longest):
-            return False
-        # Whatever else prevents a join prevents it in later rounds, too.
-        self._hopeless.add((a, b, self._version[a], self._version[b]))
-        if union.box > boxes * (one.box + other.box):
+        longest = _AS_LONG * max(longest, one.longest, other.longest)
+        if union.box > boxes * (one.box + other.box) or union.longest > longest:
             return False
         before = place[other.triangles]
         place[other.triangles] = moved
-        contact = self._contacts[a][b]
         glued = contact[self._meet(contact)]
         glued_sides = np.concatenate([self._hinges.one[glued], self._hinges.other[glued]])
         self._joined_sides[glued_sides] = True
         if not self._is_simple(union.triangles):
             place[other.triangles] = before
             self._joined_sides[glued_sides] = False
+            self._overlapping.add((a, b, contact.size))
             return False
         self._pieces.glued[glued] = True
         self._pieces.label[other.triangles] = a

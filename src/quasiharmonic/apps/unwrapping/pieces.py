@@ -45,6 +45,10 @@ _FLAT_COST = 1e3
 _ON_PLANE = 0.9
 # Largest stretch of an unrolled piece.
 _STRETCH = 1.001
+# Vertices of a piece that touch, up to this fraction of a typical edge, are moved inward by a fraction of their edges.
+_TOUCHING, _APART = 1e-5, 2e-4
+# Positions are compared on a grid that contains no simple fractions.
+_OFFSET = 0.3819
 # Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
 _SAME = 1e-3
 
@@ -169,7 +173,8 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
     for angle in (CREASE, *_ANGLES, 0.0):
         rest = found.label < 0
         within = ~apart & rest[hinges.first] & rest[hinges.second]
-        joined = within & ((np.abs(hinges.angle) <= (angle or CREASE)) | hinges.flat | together)
+        # What is left between pieces can be developable as a whole, with its creases.
+        joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat | together) if angle else within
         parts = _Parts(F, hinges, joined, angles, area)
         chosen = parts.developable & mark(parts.count, parts.component[rest])
         outline = np.where(hinges.mark_sides(joined, len(F)), 0.0, length)
@@ -177,12 +182,7 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
         if angle == CREASE:
             chosen &= ~parts.rough | (parts.area >= _LARGE_SHARE)
             chosen = _drop_scattered(hinges, parts, chosen, rim)
-        elif not angle:
-            # What is left between pieces can be developable as a whole.
-            creased = within & ~joined
-            chosen[parts.component[hinges.first[creased]]] = False
-            chosen[parts.component[hinges.second[creased]]] = False
-        else:
+        elif angle:
             chosen &= (parts.area >= _LEAST_SHARE) & (rim**2 <= _LONGEST * parts.area * doubled.sum() / 2)
         if chosen.any():
             _unroll(V, F, hinges, parts, chosen, cost, found, mirror)
@@ -227,10 +227,11 @@ def _unroll(
     count = np.bincount(own.ravel())
     z = np.bincount(own.ravel(), place[rows].real.ravel()) + 1j * np.bincount(own.ravel(), place[rows].imag.ravel())
     z /= count
-    uv = np.stack([z.real, z.imag], axis=1)
     origin = np.empty(len(names), dtype=np.int64)
     origin[own] = F[rows]
     kinds, which = np.unique(component[rows], return_inverse=True)
+    z = _separate_touching(z, own, which)
+    uv = np.stack([z.real, z.imag], axis=1)
     good = covers_once(own, uv, which, np.ones(len(kinds), dtype=bool))
     # Several fans may belong to one part if unglued hinges divide it; such a part is curved.
     part = np.empty(len(kinds), dtype=np.int64)
@@ -244,6 +245,26 @@ def _unroll(
     glue = met.copy()
     glue[met] = mark(len(F), accepted)[hinges.first[met]]
     found.glued |= glue
+
+
+def _separate_touching(z: ComplexArray, F: IntArray, part: IntArray) -> ComplexArray:
+    """Return positions (n,) at which no part touches itself in a vertex, given the part of each triangle (f, 3)."""
+    owner = np.empty(len(z), dtype=np.int64)
+    owner[F] = part[:, None]
+    unit = _TOUCHING * np.sqrt(np.abs(z).max() ** 2 / len(z))
+    key = np.stack([owner, *(np.floor(x / unit + _OFFSET).astype(np.int64) for x in (z.real, z.imag))], axis=1)
+    _, at, times = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    touching = (times > 1)[at.ravel()]
+    if not touching.any():
+        return z
+    corners = z[F]
+    inward = corners.mean(axis=1, keepdims=True) - corners
+    shortest = np.abs(corners - np.roll(corners, 1, axis=1)).min(axis=1)
+    least = np.full(len(z), np.inf)
+    np.minimum.at(least, F, shortest[:, None])
+    step = np.bincount(F.ravel(), inward.real.ravel()) + 1j * np.bincount(F.ravel(), inward.imag.ravel())
+    length = np.maximum(np.abs(step), np.finfo(float).tiny)
+    return np.where(touching, z + _APART * least * step / length, z)
 
 
 def _is_stretched(V: FloatArray, F: IntArray, uv: FloatArray) -> BoolArray:

@@ -47,6 +47,8 @@ from quasiharmonic.util.progress import reports_progress
 
 # Positions beyond this power of two, or all below its reciprocal, are scaled.
 _MAX_EXPONENT = 300
+# Angles between normals, in radians, that differ by at most this value count as equal, as files round positions.
+_SAME_ANGLE = 1e-4
 # Smaller factors on the cost of seams count as this one.
 _LEAST_COST = 1e-6
 
@@ -286,7 +288,8 @@ def _find_rules(
         if not wanted.divide_for_packing:
             cost[hinges.mark_sides(hinges.flat, len(F))] *= UNDIVIDED_COST
         if wanted.hard_edges is not None:
-            cost[hinges.mark_sides(np.abs(hinges.angle) > np.deg2rad(wanted.hard_edges), len(F))] = DEMANDED_COST
+            sharp = np.abs(hinges.angle) > np.deg2rad(wanted.hard_edges) + _SAME_ANGLE
+            cost[hinges.mark_sides(sharp, len(F))] = DEMANDED_COST
     return _Rules(cost, uv, mirror, symmetry)
 
 

@@ -32,6 +32,8 @@ _EXPECTED = 0.8
 _FEWEST_CELLS, _MORE_CELLS = 0.8, 1.25
 # Placements tried with other orders of the charts, in all.
 _TRIALS = 300
+# The same for an estimate.
+_ESTIMATED = 100
 # Directions compared for the expected scale.
 _TURNS = 16
 # Angles compared for the direction of a single chart, and the precision of the best one.
@@ -119,7 +121,11 @@ def estimate_use(shapes: Sequence[Shape], size: tuple[int, int], padding: float,
     if expected <= least_scale(shapes):
         return 0.0
     search = _Search(shapes, size, padding, tiles, expected, rotate=rotate, skewed=False)
-    layout = search.enlarge_coarsely()
+    if len(shapes) > _MANY:
+        layout = search.enlarge_coarsely()
+    else:
+        found = search.enlarge(_ESTIMATED)
+        layout = None if found is None else found[0]
     return 0.0 if layout is None else sum(search.areas) * layout.scale**2 / (tiles * size[0] * size[1])
 
 
@@ -244,7 +250,8 @@ class _Search:
         radius = _MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
         self._windows = not few
         self.areas = np.array([shape.area for shape in shapes])
-        self._order = np.argsort(-self.areas, kind="stable")
+        # Shapes of equal area stay in their order, whatever the rounding.
+        self._order = np.argsort(-np.round(self.areas / (self.areas.max() or 1.0), 9), kind="stable")
         self._few = bitmaps
         large, small = self._order[:bitmaps], self._order[bitmaps:]
         turns = np.exp(0.125j * pi * (np.arange(4) if len(shapes) <= _MOST_DIRECTIONS else np.arange(0, 4, 2)))
