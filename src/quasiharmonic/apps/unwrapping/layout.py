@@ -44,23 +44,40 @@ class ChartLayout:
 
 
 # More charts are not packed for comparison. A layout that uses this share of the texture is good enough.
+# From this share of straight outlines on, the share may be smaller by a difference. Sides are straight up to this sine of
+# their angle with an axis.
+_MOSTLY_STRAIGHT, _BENT, _SKEW = 0.85, 0.03, 0.017
 _MOST_COMPARED, _GOOD_USE = 150, 0.83
 
 
 def choose_packed(
     found: list[list[Chart]], *, size: tuple[int, int], padding: float, tiles: int, rotate: bool, loss: float
 ) -> list[Chart]:
-    """Return the last of several lists of charts that uses the texture at most by ``loss`` worse than the best one."""
+    """Return the last of several lists of charts that uses the texture at most by ``loss`` worse than the best one.
+
+    If almost all outlines of a list lie along the axes, so must those of the list that is returned.
+    """
     use = [0.0] * len(found)
-    for k in reversed(range(len(found))):
-        if k + 1 < len(found) and len(found[k]) == len(found[k + 1]):
+    straight = np.array([_straight_share(charts) for charts in found])
+    allowed = straight >= (straight.max() - _BENT if straight.max() >= _MOSTLY_STRAIGHT else 0.0)
+    for k in np.flatnonzero(allowed)[::-1].tolist():
+        if k + 1 < len(found) and allowed[k + 1] and len(found[k]) == len(found[k + 1]):
             use[k] = use[k + 1]
         elif len(found[k]) <= _MOST_COMPARED:
             shapes = [chart.shape for chart in found[k]]
             use[k] = estimate_use(shapes, size, padding, tiles, rotate=rotate)
         if use[k] >= _GOOD_USE - loss:
             break
-    return found[int(np.flatnonzero(np.array(use) >= max(use) - loss)[-1])]
+    return found[int(np.flatnonzero(allowed & (np.array(use) >= max(use) - loss))[-1])]
+
+
+def _straight_share(charts: list[Chart]) -> float:
+    """Share of the outlines of charts, by length, that lies along the sides of their boxes."""
+    sides = [(chart.shape.heads - chart.shape.tails) / chart.shape.direction for chart in charts]
+    along = np.concatenate([np.empty(0, dtype=np.complex128), *sides])
+    length = np.abs(along)
+    straight = np.minimum(np.abs(along.real), np.abs(along.imag)) <= _SKEW * length
+    return float(length[straight].sum() / max(length.sum(), np.finfo(float).tiny))
 
 
 def join_charts(charts: Sequence[Chart], packing: Packing, count: int) -> ChartLayout:
