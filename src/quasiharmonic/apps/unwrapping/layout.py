@@ -43,10 +43,11 @@ class ChartLayout:
         return np.where(self.mirrored[:, None], self.rows[:, ::-1], self.rows)
 
 
+# From this share of straight outlines on, the share may be smaller by a difference.
+_MOSTLY_STRAIGHT, _BENT = 0.85, 0.03
+# Sides are straight up to this sine of their angle with an axis.
+_SKEW = 0.017
 # More charts are not packed for comparison. A layout that uses this share of the texture is good enough.
-# From this share of straight outlines on, the share may be smaller by a difference. Sides are straight up to this sine of
-# their angle with an axis.
-_MOSTLY_STRAIGHT, _BENT, _SKEW = 0.85, 0.03, 0.017
 _MOST_COMPARED, _GOOD_USE = 150, 0.83
 
 
