@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.copies import Copy, Motion, find_copies
-from quasiharmonic.apps.atlas.packing.layout import MAX_SIZE, Layout, find_layout, find_sufficient_size, least_scale
+from quasiharmonic.apps.atlas.packing.layout import (
+    BITMAPS,
+    MAX_SIZE,
+    Layout,
+    find_layout,
+    find_sufficient_size,
+    least_scale,
+)
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -84,6 +91,7 @@ def pack_charts(
     tiles: int = 1,
     rotate: bool = True,
     stack: bool = False,
+    closely: int = BITMAPS,
 ) -> Packing:
     """Pack charts into one or several textures by their shapes, as large as possible and at one texel density.
 
@@ -106,6 +114,8 @@ def pack_charts(
         Allow rotations.
     stack : bool
         Place congruent charts, and mirrored ones, at the same position.
+    closely : int
+        Number of charts that are placed by their shapes; all others are placed as boxes, which is faster.
 
     Returns
     -------
@@ -136,7 +146,7 @@ def pack_charts(
         raise ValueError(
             f"with {texels_per_unit:g} texels per unit, all charts are smaller than a texel: use more texels per unit"
         )
-    layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+    layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted, bitmaps=closely)
     if layout is None:
         width, height = find_sufficient_size(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
         if max(width, height) > MAX_SIZE:
