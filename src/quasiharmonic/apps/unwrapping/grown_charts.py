@@ -1,8 +1,9 @@
 """Charts grown by normals: nearly flat, and found quickly, but more than a search finds.
 
 Every triangle starts as a chart. In each round, pairs of neighbouring charts are joined whose triangles all face nearly
-the same way; long common outlines and flat pairs come first. A chart is projected along its mean normal. No triangle is
-inclined by more than the bound on the stretch permits. A chart that overlaps itself is divided.
+the same way; long common outlines and flat pairs come first. Normals are averaged before, because those of noisy
+surfaces differ everywhere. A chart is projected along its mean normal. It is divided if it overlaps itself, and steep
+triangles are cut off.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH
 from quasiharmonic.apps.unwrapping.flat_parts import covers_once
 from quasiharmonic.apps.unwrapping.hinges import find_pairs
 from quasiharmonic.geometry.mesh.fans import fans, renumber
@@ -20,6 +22,8 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_expo
 _MOST_INCLINED, _LEAST_INCLINED = np.pi / 3, 1e-3
 # Cells of directions along half an edge of the cube around all directions, times the largest angle.
 _CELLS = 1.5
+# Number of averages of the normals over neighbouring triangles.
+_SMOOTHINGS = 4
 # Charts that are not joined after so many rounds stay apart.
 _MAX_ROUNDS = 100
 
@@ -46,8 +50,8 @@ def grow_charts(
     Returns
     -------
     list of Chart
-        Bijective, except for single triangles that are too thin for double precision. The stretch is at most the bound,
-        or 2 if that is less.
+        Bijective, except for single triangles that are too thin for double precision. No triangle is stretched by more
+        than 3. Charts of smooth surfaces keep the bound; charts of noisy ones may exceed it.
     """
     if not rows.size:
         return []
@@ -64,16 +68,20 @@ def grow_charts(
         place = np.zeros((int(split.max()) + 1, 2))
         place[split] = uv
         size = np.bincount(component)
-        flat = np.bincount(component, stretch > max(bound, 1 / np.cos(_LEAST_INCLINED))) == 0
-        good = covers_once(split, place, component, flat & (size > 1)) | (size == 1)
+        steep = stretch > WORST_STRETCH
+        mild = np.bincount(component, steep) == 0
+        good = covers_once(split, place, component, mild & (size > 1)) | (size == 1)
         order = np.argsort(component, kind="stable")
         for k, some in enumerate(np.split(order, np.cumsum(size)[:-1])):
             if good[k]:
                 own, corner = renumber(split[some], triangles[some])
                 uv_of = np.ldexp(uv[some].reshape(-1, 2)[corner], exponent)
-                charts.append(Chart(rows[left[some]], own, triangles[some].ravel()[corner], uv_of, stretch[some], 0.0))
+                missed = _find_excess(stretch[some], cross[left[some]], max(bound, 1 / np.cos(_LEAST_INCLINED)))
+                charts.append(
+                    Chart(rows[left[some]], own, triangles[some].ravel()[corner], uv_of, stretch[some], missed)
+                )
             else:
-                label[left[some]] = 2 * k + _halve(uv[some])
+                label[left[some]] = 2 * k + (steep[some] if 0 < steep[some].sum() < some.size else _halve(uv[some]))
         left = left[~good[component]]
     return charts
 
@@ -86,7 +94,7 @@ def _join(
     one, other = find_pairs(F)
     joined = ~(cut.ravel()[one] | cut.ravel()[other])
     one, other = one[joined], other[joined]
-    normal = _scale_to_one(cross)
+    normal = _smooth(cross, one // 3, other // 3, most)
     # Neighbours that face the same cell of directions are joined at once.
     facing = _find_cells(normal, most)
     alike = facing[one // 3] == facing[other // 3]
@@ -97,9 +105,8 @@ def _join(
     np.maximum.at(radius, part, _angles(normal, middle[part]))
     weight = (np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2) * cost).ravel()
     common = (weight[one] + weight[other]) / 2
-    outline = np.bincount(part, weight.reshape(-1, 3).sum(axis=1)) - np.bincount(
-        part[one[alike] // 3], 2 * common[alike], len(middle)
-    )
+    inner = np.bincount(part[one[alike] // 3], 2 * common[alike], len(middle))
+    outline: FloatArray = (np.bincount(part, weight.reshape(-1, 3).sum(axis=1)) - inner).astype(np.float64)
     a, b, common = _list_pairs(part[one // 3], part[other // 3], common)
     label, mean, inclined = np.arange(len(middle)), middle, radius
     for _ in range(_MAX_ROUNDS):
@@ -115,11 +122,31 @@ def _join(
         new = np.arange(len(cross))
         new[b[chosen]] = a[chosen]
         new = _rank(new)
-        cross, outline, label = _sum_rows(cross, new), np.bincount(new, outline), new[label]
+        cross, outline, label = _sum_rows(cross, new), np.bincount(new, outline).astype(np.float64), new[label]
         mean, inclined = _scale_to_one(cross), np.zeros(len(cross))
         np.maximum.at(inclined, label, _angles(middle, mean[label]) + radius)
         a, b, common = _list_pairs(new[a], new[b], common)
     return label[part]
+
+
+def _find_excess(stretch: FloatArray, cross: FloatArray, bound: float) -> float:
+    """Return by how much 99 % of the area of a chart exceed the bound on stretch."""
+    area, order = np.linalg.norm(cross, axis=1), np.argsort(-stretch)
+    over = int(np.searchsorted(np.cumsum(area[order]), FREE_SHARE * area.sum()))
+    return max(float(stretch[order[over]]) - bound, 0.0)
+
+
+def _smooth(cross: FloatArray, first: IntArray, second: IntArray, most: float) -> FloatArray:
+    """Return normals (k, 3) without noise, given pairs of neighbouring triangles."""
+    area, itself = np.linalg.norm(cross, axis=1)[:, None], np.arange(len(cross))
+    smooth = _scale_to_one(cross)
+    for _ in range(_SMOOTHINGS):
+        # Creases stay sharp.
+        near = _angles(smooth[first], smooth[second]) <= most
+        a, b = first[near], second[near]
+        rows, to = np.concatenate([itself, a, b]), np.concatenate([itself, b, a])
+        smooth = _scale_to_one(_sum_rows((smooth * area)[rows], to))
+    return smooth
 
 
 def _find_cells(normal: FloatArray, most: float) -> IntArray:
