@@ -172,10 +172,10 @@ def _edge_costs(mesh: MeshData, path: Path | None) -> Any:
 
 def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) -> Callable[[UnwrapStep], None] | None:
     """Return a callback that shows steps, and raises MemoryError above the limit of resident memory."""
-    from quasiharmonic.ui.batch.supervisor import resident
-
     if limit is None:
         return show
+    from quasiharmonic.ui.batch.supervisor import resident
+
     if resident(os.getpid()) is None:
         raise ValueError("--memory needs psutil on this system: pip install psutil")
 
