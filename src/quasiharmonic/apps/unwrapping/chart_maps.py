@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from quasiharmonic.apps.flattening.disk_start import map_to_disk
+from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
 from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
@@ -207,10 +209,6 @@ def keeps_bound(chart: WorkingChart, bound: float) -> bool:
 
 def _initial_map(piece: Piece) -> FloatArray | None:
     """An injective map (n, 2), or None if none was found in double precision."""
-    # Flat and developable models need none of these modules, whose import takes longer than their unwrap.
-    from quasiharmonic.apps.flattening.disk_start import map_to_disk
-    from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
-
     starts = [map_to_disk, flatten_coarse]
     for start in reversed(starts) if len(piece.F) >= COARSE_FROM else starts:
         uv = start(piece.V, piece.F, piece.loops)

@@ -37,7 +37,7 @@ from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refine.attempts import on_refinement
-from quasiharmonic.ui.batch import groups, island_problems, metadata, records, unwrapped_models
+from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.util.options import PolishOptions
 from quasiharmonic.util.standard_input import detach_input
@@ -142,6 +142,9 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
     with metadata.time_phase(record, "read"), bounded(job["record"].get("memory_limit")):
         mesh = io.read_mesh(job["mesh"])
     if settings["unwrap"] is not None:
+        # SciPy's subpackages that this needs would double the time in which workers for maps start.
+        from quasiharmonic.ui.batch import unwrapped_models
+
         unwrapped_models.unwrap_model(mesh, settings["unwrap"], records.map_path(folder), record, tell)
         return
     with metadata.time_phase(record, "read"):

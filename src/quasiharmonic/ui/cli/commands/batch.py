@@ -2,10 +2,8 @@
 
 Map every problem of a data set, each in a separate process: a failure does not affect other problems. Maps and
 records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has all records. To
-continue an interrupted run, give the same command again.
-
-With --unwrap, every model gets texture coordinates, as by qhm unwrap; the records list charts, stretch, used texture
-and what was cleaned.
+continue an interrupted run, give the same command again. With --unwrap, every model gets texture coordinates, as by
+qhm unwrap; the records list charts, stretch, used texture and what was cleaned.
 
 Exit status: 0 every problem has a certified injective map (--flatten, --unwrap: bijective); 1 some have not (the
 records give the reason); 2 wrong call, or stopped: finished results are kept; 3 finished, but the report failed.
