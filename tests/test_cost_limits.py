@@ -210,6 +210,16 @@ class TestImports:
         assert not found & {"matplotlib", "scipy.optimize", "scipy.spatial", "scipy.sparse.csgraph", "scipy.linalg"}
 
     @pytest.mark.long
+    def test_the_command_unwraps_a_flat_model_without_slow_imports(self, tmp_path):
+        V, F = disk(2)
+        io.write_obj(tmp_path / "mesh.obj", io.MeshData(V, F))
+        words = ["unwrap", str(tmp_path / "mesh.obj"), "-o", str(tmp_path / "out.obj")]
+        found = self.modules(f"from quasiharmonic.ui.cli import main; assert main({words!r}) == 0")
+        assert not found & {"matplotlib", "dask", "scipy.optimize", "shapely", "pyarrow"}
+        assert not found & {"quasiharmonic.solver.search.search", "quasiharmonic.ui.batch", "quasiharmonic.io.fem.vtu"}
+        assert len([name for name in found if name.startswith("quasiharmonic")]) < 240
+
+    @pytest.mark.long
     @pytest.mark.parametrize("letter", [None, "R", pytest.param("C", marks=pytest.mark.nightly)])
     def test_the_command_maps_a_small_mesh_without_slow_imports(self, letter, tmp_path):
         """No time is measured; SciPy's subpackages and matplotlib would take longer than the map."""

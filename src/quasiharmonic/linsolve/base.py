@@ -7,6 +7,7 @@ the copy of the values, the residual test, one step of refinement, locking.
 from __future__ import annotations
 
 import threading
+import time
 from abc import ABC, abstractmethod
 from functools import cache
 from importlib.util import find_spec
@@ -191,10 +192,13 @@ class LinearSolver(ABC):
         self._lock = threading.Lock()
         self._ready = False
         self._closed = False
+        began = time.monotonic()
         if self.n:
             heartbeat()
             self._test = ResidualTest(self._indptr, self._indices, self._values)
             self._analyse()
+        # Expected seconds of the next factorisation. The first takes about as long as the analysis.
+        self._expected = time.monotonic() - began
 
     @classmethod
     def present(cls) -> bool:
@@ -219,14 +223,16 @@ class LinearSolver(ABC):
         values = np.asarray(values)
         if values.shape != (self.nnz,):
             raise ValueError(f"values has shape {values.shape}; the analysed pattern has {self.nnz} entries")
-        heartbeat()
+        heartbeat(self._expected)
         with self._lock:
             self._require_open()
             self._ready = False
             np.copyto(self._values, values)
+            began = time.monotonic()
             if self.n:
                 self._test.read()
                 self._factor()
+            self._expected = time.monotonic() - began
             self._ready = True
 
     def solve(self, rhs: ArrayLike) -> FloatArray:

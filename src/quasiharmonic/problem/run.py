@@ -155,6 +155,18 @@ def finish(compute: Callable[[], T]) -> tuple[T, bool]:
     return compute(), True
 
 
+def run_until(seconds: float | None, compute: Callable[[], T]) -> T | None:
+    """Return the result of a computation, or None if the time limit ends it. Other interrupts propagate."""
+    if seconds is None:
+        return compute()
+    with time_limit(seconds) as limit:
+        with Run().until_interrupted():
+            return compute()
+        if not limit.reached:
+            raise KeyboardInterrupt
+    return None
+
+
 def run_within(seconds: float | None, compute: Callable[[], MapResult]) -> MapResult:
     """Return the result of a computation that ends after a time limit, if there is one, with the best map so far.
 

@@ -391,5 +391,8 @@ class UnwrapOptions(Options):
     edge_costs: Any = option(None)
     uv: Any = option(None)
     seed: int = option(0, "seed of random choices (default: 0)", check=count)
+    time_limit: float | None = option(
+        None, "end the search for few charts after this many seconds, and keep the best charts", check=seconds
+    )
     callback: Callable[[Any], object] | None = option(None, check=function)
     jobs: int | None = option(None, "number of threads (default: all cores)", check=positive_or_none)

@@ -7,6 +7,7 @@ the last step again. After a time limit, `heartbeat` ends the work like Ctrl-C.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -79,15 +80,16 @@ class TimeLimit:
 
     def __init__(self, seconds: float, outer: TimeLimit | None) -> None:
         self._end, self._outer = time.monotonic() + seconds, outer
+        self._raised = threading.local()
         self.reached = False
 
-    def check(self) -> None:
-        """Raise KeyboardInterrupt, once, if this limit or an outer one is over."""
-        if not self.reached and time.monotonic() >= self._end:
-            self.reached = True
+    def check(self, ahead: float = 0.0) -> None:
+        """Raise KeyboardInterrupt, once in each thread, if this limit or an outer one is over so many seconds ahead."""
+        if not hasattr(self._raised, "once") and time.monotonic() + ahead >= self._end:
+            self.reached = self._raised.once = True
             raise KeyboardInterrupt
         if self._outer is not None:
-            self._outer.check()
+            self._outer.check(ahead)
 
 
 _TIME_LIMIT: ContextVar[TimeLimit | None] = ContextVar("time limit", default=None)
@@ -104,14 +106,30 @@ def time_limit(seconds: float) -> Iterator[TimeLimit]:
         _TIME_LIMIT.reset(token)
 
 
-def heartbeat() -> None:
+def keep_time_limit(function: Callable[P, R]) -> Callable[P, R]:
+    """Return a function for another thread, in which `heartbeat` ends its work after the time limit of this thread."""
+    limit = _TIME_LIMIT.get()
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        token = _TIME_LIMIT.set(limit)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            _TIME_LIMIT.reset(token)
+
+    return call
+
+
+def heartbeat(ahead: float = 0.0) -> None:
     """Report that work continues; long loops call this at least every tenth of a second.
 
-    Exceptions raised by the callback propagate to the caller. KeyboardInterrupt is raised after a time limit.
+    Exceptions raised by the callback propagate to the caller. KeyboardInterrupt is raised after a time limit, and if
+    the limit will be over before the next step ends, which takes about ``ahead`` seconds.
     """
     limit = _TIME_LIMIT.get()
     if limit is not None:
-        limit.check()
+        limit.check(ahead)
     reporter = _REPORTER.get()
     if reporter is not None:
         reporter.repeat_if_due()

@@ -13,7 +13,6 @@ import numpy as np
 from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
-from quasiharmonic.solver.mapping import solve
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
@@ -25,6 +24,9 @@ def map_to_disk(
     ``V`` (n, 3) is of about unit size, and the surface is connected and has no handles. Return a bijective map (n, 2),
     or None if none was found in double precision. Ctrl-C raises KeyboardInterrupt.
     """
+    # The search's modules take longer to import than `unwrap` takes for a model of flat parts, which needs none.
+    from quasiharmonic.solver.mapping import solve
+
     lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
     longest = int(np.argmax([length.sum() for length in lengths]))
     outer = loops[longest]

@@ -67,3 +67,10 @@ class Chart:
         uv = np.ldexp(working.uv, working.piece.exponent)
         missed = self.misses if (stretch > bound).any() else 0.0
         return Chart(working.triangles, working.F, working.vertices, uv, stretch, missed, self.straight)
+
+
+def finish_chart(chart: WorkingChart, misses: float) -> Chart:
+    """Return a chart with its map in the surface's unit, given how much it exceeds the bound on stretch."""
+    assert chart.uv is not None
+    uv = np.ldexp(chart.uv, chart.piece.exponent)
+    return Chart(chart.triangles, chart.F, chart.vertices, uv, chart.stretch, misses)

@@ -187,10 +187,12 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
     else:
         chart.use(chart.uv)
     before, good = chart.uv, chart.bijective and keeps_bound(chart, bound)
-    _descend(chart, EvenStretch(bound), check_wanted)
-    if good and not (chart.bijective and keeps_bound(chart, bound)):
-        assert before is not None
-        chart.use(before)
+    try:
+        _descend(chart, EvenStretch(bound), check_wanted)
+    finally:
+        if good and not (chart.bijective and keeps_bound(chart, bound)):
+            assert before is not None
+            chart.use(before)
 
 
 def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None:
@@ -224,12 +226,15 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
     descent = SurfaceDescent(energy, chart.uv, "auto")
     least = 1 - _SLOW if len(chart.F) >= _LARGE else 1.0
     before = np.inf
-    for _ in itertools.islice(descend(descent, density, _TOLERANCE), _MAX_STEPS):
-        check_wanted()
-        if descent.distortion < _NOTHING or descent.distortion > least * before:
-            break
-        before = descent.distortion
-    chart.use(descent.uv)
+    try:
+        for _ in itertools.islice(descend(descent, density, _TOLERANCE), _MAX_STEPS):
+            check_wanted()
+            if descent.distortion < _NOTHING or descent.distortion > least * before:
+                break
+            before = descent.distortion
+    finally:
+        # After a time limit, the chart has the map so far.
+        chart.use(descent.uv)
 
 
 def _fit_scale(piece: Piece, uv: FloatArray) -> FloatArray:

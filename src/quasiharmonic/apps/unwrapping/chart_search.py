@@ -33,6 +33,7 @@ from quasiharmonic.apps.unwrapping.joining import join_small_charts
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
 from quasiharmonic.apps.unwrapping.slits import close_slits
 from quasiharmonic.apps.unwrapping.teeth import move_teeth
+from quasiharmonic.util.progress import heartbeat, keep_time_limit
 from quasiharmonic.util.threads import HAS_THREADS, count_cores, make_executor
 
 T = TypeVar("T")
@@ -72,7 +73,8 @@ class Workers:
         self._stop = threading.Event()
 
     def check_wanted(self) -> None:
-        """Raise KeyboardInterrupt if the caller no longer waits for results."""
+        """Raise KeyboardInterrupt if the caller no longer waits for results, or after a time limit."""
+        heartbeat()
         if self._stop.is_set():
             raise KeyboardInterrupt
 
@@ -83,7 +85,7 @@ class Workers:
             return self._map_here(phase, function, items)
         pool = make_executor(self._jobs, "find_charts")
         try:
-            futures = [pool.submit(function, item) for item in items]
+            futures = [pool.submit(keep_time_limit(function), item) for item in items]
             waiting: set[Future[R]] = set(futures)
             while waiting:
                 done, waiting = wait(waiting, _TICK, FIRST_COMPLETED)
@@ -105,6 +107,7 @@ class Workers:
         return results
 
     def _report(self, phase: str, done: int, total: int) -> None:
+        heartbeat()
         if self._callback is not None:
             self._callback(phase, done, total)
 
@@ -117,6 +120,7 @@ def search_charts(
     total_area: float,
     joinable: bool,
     workers: Workers,
+    keep: Callable[[list[WorkingChart]], object],
 ) -> list[WorkingChart]:
     """Flatten charts and cut them further until they keep a bound on stretch or the limits are reached.
 
@@ -134,6 +138,8 @@ def search_charts(
         Whether no cut is demanded. Then small charts may be joined to any neighbour, slits are closed, and the search
         goes beyond the bound while that takes few charts.
     workers : Workers
+    keep : callable
+        Called with the charts so far, with and without maps; the search changes their maps.
 
     Returns
     -------
@@ -143,7 +149,9 @@ def search_charts(
     aim = 1 + (_AIM if joinable else 1.0) * (bound - 1)
     root = sum(len(chart.F) for chart in charts) ** 0.5
     few, many = (len(charts) + round(base + share * root) for base, share in (_FEW_CHARTS, _MANY_CHARTS))
+    keep([*charts])
     here = [part for parts in workers.map("flatten", partial(_flatten_first, aim, workers), charts) for part in parts]
+    keep(here)
     for goal, rounds, most in ((aim, _FEW_ROUNDS, few), (bound, _MANY_ROUNDS, many)):
         for _ in range(rounds):
             room = (most if max_charts is None else min(max_charts, most)) - len(here)
@@ -157,9 +165,11 @@ def search_charts(
             found = workers.map("improve", partial(_improve, goal, workers, joinable), jobs)
             changed = {k: parts for (k, _), (parts, same) in zip(chosen, found, strict=True) if not same}
             here = [part for k, chart in enumerate(here) for part in changed.get(k, [chart])]
+            keep(here)
             if not changed:
                 break
     here = [_close(chart, joinable) for chart in here]
+    keep(here)
     overlapping = [chart for chart in here if not chart.bijective]
     workers.map("separate", partial(guard_chart, check_wanted=workers.check_wanted), overlapping)
     if not joinable:

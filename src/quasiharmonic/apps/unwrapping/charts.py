@@ -10,10 +10,11 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
 from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
+from quasiharmonic.apps.unwrapping.draft import Draft
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
@@ -48,6 +49,7 @@ def find_charts(
     uv: FloatArray | None = None,
     choose: Callable[[list[list[Chart]]], list[Chart]] | None = None,
     mirror: Mirror | None = None,
+    draft: Draft | None = None,
     seed: int = 0,
     callback: Callable[[str, int, int], object] | None = None,
     jobs: int | None = None,
@@ -83,6 +85,8 @@ def find_charts(
     mirror : Mirror, optional
         Mirror images, if seams and charts are to be mirrored. Curved parts are mirrored unless a triangle of theirs
         crosses the plane, or the seams there would grow by more than a quarter.
+    draft : Draft, optional
+        Gets the charts so far, in case that a time limit ends the search.
     seed : int
         Unused: the search has no random choices.
     callback : callable, optional
@@ -97,7 +101,7 @@ def find_charts(
     """
     if not len(F):
         return []
-    workers = Workers(jobs, callback)
+    workers, draft = Workers(jobs, callback), draft or Draft()
     cost = np.ones(F.shape) if edge_costs is None else np.asarray(edge_costs, dtype=np.float64)
     demanded = cost <= DEMANDED_COST
     given = _ends(F, demanded) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
@@ -109,12 +113,19 @@ def find_charts(
         working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
     min_gain = _MIN_GAIN if uv_cuts is None else np.inf
     cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain)
+    draft.charts = [*charts]
     total = float(_doubled_areas(V, F).sum() / 2)
     divisible = None if max_charts is None else max_charts - len(charts)
 
     def search(parts: list[WorkingChart], most: int | None, share: float) -> list[Chart]:
         found = search_charts(
-            parts, max_stretch, max_charts=most, total_area=share * total, joinable=uv_cuts is None, workers=workers
+            parts,
+            max_stretch,
+            max_charts=most,
+            total_area=share * total,
+            joinable=uv_cuts is None,
+            workers=workers,
+            keep=draft.keep,
         )
         return _finish(found, max_stretch, share * total)
 
@@ -122,11 +133,13 @@ def find_charts(
     half = rest[mirror.positive[rest]] if mirror is not None else rest[:0]
     one_side = cut(half) if half.size and 2 * half.size == rest.size else []
     if mirror is not None and one_side and _are_short(one_side, working, F[rest], V):
+        draft.mirror = mirror
         found = search(one_side, None if divisible is None else max(divisible // 2, 1), 0.5)
         charts += mirror_charts(F, found, mirror)
     else:
         charts += search(working, divisible, 1.0)
-    return sorted(charts, key=lambda chart: int(chart.triangles[0]))
+    draft.charts, draft.working = sorted(charts, key=lambda chart: int(chart.triangles[0])), ()
+    return [*draft.charts]
 
 
 def _are_short(half: list[WorkingChart], whole: list[WorkingChart], F: IntArray, V: FloatArray) -> bool:
@@ -294,12 +307,7 @@ def _split(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[tuple[Int
 def _finish(charts: list[WorkingChart], bound: float, total: float) -> list[Chart]:
     """Return the charts in the surface's unit; ``total`` is the area of the surface."""
     kept = sum(chart.share_over(bound) * chart.surface_area for chart in charts) <= FREE_SHARE * total
-    done = []
-    for chart in charts:
-        assert chart.uv is not None
-        uv = np.ldexp(chart.uv, chart.piece.exponent)
-        done.append(Chart(chart.triangles, chart.F, chart.vertices, uv, chart.stretch, _excess(chart, bound, kept)))
-    return done
+    return [finish_chart(chart, _excess(chart, bound, kept)) for chart in charts]
 
 
 def _excess(chart: WorkingChart, bound: float, kept: bool) -> float:

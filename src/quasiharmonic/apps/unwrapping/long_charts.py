@@ -9,6 +9,7 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.progress import heartbeat
 
 # Share of the texture that charts are expected to cover.
 _EXPECTED = 0.6
@@ -65,6 +66,7 @@ def divide_long_charts(
     done: list[Chart] = []
     waiting = list(charts)
     while waiting:
+        heartbeat()
         chart = waiting.pop()
         full = max_charts is not None and len(done) + len(waiting) + 1 >= max_charts
         if full or len(chart.F) < 2 or not _is_too_long(chart, side, area, for_packing):

@@ -57,6 +57,13 @@ def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:
     return divide_polygons(replace(mesh, vt=vt, FT=FT))
 
 
+def is_written(written: MeshData, result: UnwrapResult) -> bool:
+    """Return whether a file has exactly the certified texture coordinates, triangle by triangle."""
+    if written.vt is None or written.FT is None or written.FT.shape != result.indices.shape:
+        return False
+    return bool(np.array_equal(written.vt[written.FT], result.uvs[result.indices]))
+
+
 def divide_polygons(mesh: MeshData) -> tuple[MeshData, int]:
     """Divide polygons that seams of the map cross into triangles; return the mesh and the number of these polygons."""
     polygons = mesh.polygons

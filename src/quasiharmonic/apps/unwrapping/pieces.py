@@ -21,6 +21,7 @@ from quasiharmonic.geometry.mesh.fans import fans
 from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
+from quasiharmonic.util.progress import heartbeat
 
 #: Edges with a larger angle between the normals are creases. Those of a cylinder with twelve sides, 30°, are not.
 CREASE = np.deg2rad(30.01)
@@ -171,6 +172,7 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
     length = np.linalg.norm(V[F] - V[np.roll(F, -1, axis=1)], axis=2)
     found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
     for angle in (CREASE, *_ANGLES, 0.0):
+        heartbeat()
         rest = found.label < 0
         within = ~apart & rest[hinges.first] & rest[hinges.second]
         # What is left between pieces can be developable as a whole, with its creases.

@@ -34,6 +34,10 @@ class UnwrapStatus(Enum):
         "Every chart is bijective and no two charts overlap, verified exactly. Some charts exceed the bound on the "
         "stretch: see misses. Raise max_stretch, or max_charts if it was given."
     )
+    TIME_LIMIT = (
+        "Every chart is bijective and no two charts overlap, verified exactly. The time limit ended the search for few "
+        "charts: see unfinished. Allow more time."
+    )
 
 
 class Stretch(NamedTuple):
@@ -130,6 +134,9 @@ class UnwrapResult(Outcome):
         Which plane of symmetry was found, and whether seams and charts are mirrored.
     seconds : float
         Wall time of the call.
+    unfinished : (k,) int64
+        After a time limit, the charts that were grown by normals, because the search had no bijective charts within the
+        bound there; they are more than necessary. Empty if the limit did not end the search.
     """
 
     vmapping: IntArray
@@ -150,6 +157,7 @@ class UnwrapResult(Outcome):
     strips: tuple[Strip, ...]
     symmetry: Symmetry
     seconds: float
+    unfinished: IntArray
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.vmapping, self.indices, self.uvs))
@@ -192,6 +200,11 @@ class UnwrapResult(Outcome):
         lines += describe_symmetry(self.symmetry)
         if self.strips:
             lines.append(_describe_strips(self.strips))
+        if self.status is UnwrapStatus.TIME_LIMIT:
+            lines.append(
+                f"ended by the time limit: {count_of('chart', 'charts', len(self.unfinished))} of {self.n_charts} "
+                "grown by normals, because the search had no better ones"
+            )
         if self.misses:
             shown = ", ".join(f"chart {miss.chart} by {miss.excess:.3g}" for miss in self.misses[:_LISTED])
             more = f", … ({len(self.misses)} charts)" if len(self.misses) > _LISTED else ""
@@ -217,6 +230,7 @@ class UnwrapResult(Outcome):
             "resolution": list(self.resolution),
             "strips": [strip._asdict() for strip in self.strips],
             "symmetry": self.symmetry._asdict(),
+            "unfinished": self.unfinished.tolist(),
             "reversed": int(self.cleaned.flipped.sum()),
             "excluded": self.cleaned.excluded.tolist(),
             "collapsed": self.cleaned.collapsed.tolist(),

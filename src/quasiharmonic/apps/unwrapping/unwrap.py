@@ -11,11 +11,13 @@ from typing import NamedTuple, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.atlas.packing.layout import BITMAPS
 from quasiharmonic.apps.atlas.packing.pack import check_texture, pack_charts
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
+from quasiharmonic.apps.unwrapping.draft import Draft
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, find_hinges
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
@@ -32,6 +34,7 @@ from quasiharmonic.apps.unwrapping.straightening import Strip, straighten_strips
 from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, check_symmetry, find_mirror
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.problem.run import run_until
 from quasiharmonic.targets.cuts.find import side_costs
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -51,6 +54,10 @@ _MAX_EXPONENT = 300
 _SAME_ANGLE = 1e-4
 # Smaller factors on the cost of seams count as this one.
 _LEAST_COST = 1e-6
+# After a time limit, charts are completed, packed and certified in about the time that the preparation takes.
+_RESERVED = 1.0
+# Then so many charts are packed by their shapes, and further ones as boxes.
+_PACKED_CLOSELY = 100
 
 
 class UnwrapKeywords(TypedDict, total=False):
@@ -74,6 +81,7 @@ class UnwrapKeywords(TypedDict, total=False):
     edge_costs: ArrayLike | None
     uv: ArrayLike | None
     seed: int
+    time_limit: float | None
     callback: Callable[[UnwrapStep], object] | None
     jobs: int | None
 
@@ -142,7 +150,11 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Texture coordinates of each vertex, or of each corner, whose seams are kept. Further seams are made only in
         closed parts, in parts with handles, and where the bound requires it. By default all seams are new.
     seed : int
-        Seed of random choices. Equal input and seed give equal results.
+        Seed of random choices. Equal input and seed give equal results, unless the time limit ends the search.
+    time_limit : float, optional
+        Wall time in seconds after which the best charts so far are returned, with status ``TIME_LIMIT``. Where the
+        search has no bijective charts within the bound yet, the charts are grown by normals: these are more, and
+        `UnwrapResult.unfinished` lists them. Cleaning, packing and verification always run to their end.
     callback : callable, optional
         Called with an `UnwrapStep`, at least every half second. Exceptions propagate.
     jobs : int, optional
@@ -192,7 +204,15 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     rules = _find_rules(points, cleaned, costs, corner_uv, wanted)
     bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit
-    charts, strips = _make_charts(points, cleaned, rules, wanted, size, report)
+    draft, grown, strips = Draft(), np.zeros(len(cleaned.F), dtype=bool), list[Strip]()
+    spent = time.perf_counter() - began
+    left = None if wanted.time_limit is None else wanted.time_limit - (1 + _RESERVED) * spent
+    made = run_until(left, lambda: _make_charts(points, cleaned, rules, wanted, size, draft, report))
+    ended = made is None
+    if made is None:
+        charts, grown = draft.complete(points, cleaned.F, rules.cost, rules.cuts, bound)
+    else:
+        charts, strips = made
     while True:
         report("pack")
         packing = pack_charts(
@@ -204,6 +224,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             rotate=wanted.rotate,
             stack=bool(wanted.stack),
             kinds=pair_charts(charts, rules.mirror) if wanted.stack == "mirrored" else None,
+            closely=_PACKED_CLOSELY if ended else BITMAPS,
         )
         report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
@@ -238,13 +259,14 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         misses=tuple(misses),
         utilisation=packing.utilisation,
         cleaned=cleaned,
-        status=UnwrapStatus.STRETCHED if misses else UnwrapStatus.UNWRAPPED,
+        status=UnwrapStatus.TIME_LIMIT if ended else UnwrapStatus.STRETCHED if misses else UnwrapStatus.UNWRAPPED,
         resolution=size,
         texels_per_unit=float(np.ldexp(packing.texels_per_unit, -exponent)),
         V=V,
         strips=tuple(strip._replace(triangle=int(cleaned.triangles[strip.triangle])) for strip in strips),
         symmetry=check_symmetry(rules.symmetry, rules.mirror, layout.chart),
         seconds=time.perf_counter() - began,
+        unfinished=np.unique(layout.chart[grown]),
     )
 
 
@@ -257,6 +279,8 @@ class _Rules(NamedTuple):
         Factor on the cost of a seam at each side; see `find_charts`.
     uv : (f, 3, 2) float64 or None
         Texture coordinates whose seams are kept.
+    cuts : (l, 2) int64 or None
+        These seams.
     mirror : Mirror or None
         Mirror images, if the model is symmetric.
     symmetry : Symmetry
@@ -264,6 +288,7 @@ class _Rules(NamedTuple):
 
     cost: FloatArray
     uv: FloatArray | None
+    cuts: IntArray | None
     mirror: Mirror | None
     symmetry: Symmetry
 
@@ -290,7 +315,7 @@ def _find_rules(
         if wanted.hard_edges is not None:
             sharp = np.abs(hinges.angle) > np.deg2rad(wanted.hard_edges) + _SAME_ANGLE
             cost[hinges.mark_sides(sharp, len(F))] = DEMANDED_COST
-    return _Rules(cost, uv, mirror, symmetry)
+    return _Rules(cost, uv, None if uv is None else _find_uv_cuts(uv, cleaned), mirror, symmetry)
 
 
 def _make_charts(
@@ -299,24 +324,26 @@ def _make_charts(
     rules: _Rules,
     wanted: UnwrapOptions,
     size: tuple[int, int],
+    draft: Draft,
     report: Callable[[str, int, int], object],
 ) -> tuple[list[Chart], list[Strip]]:
     """Return the charts of a cleaned mesh that keep the bound, and fit into the texture; and its strips."""
     bound, tiles, most = float(wanted.max_stretch), wanted.tiles, wanted.max_charts
-    uv_cuts = None if rules.uv is None else _find_uv_cuts(rules.uv, cleaned)
     straight, strips = list[Chart](), list[Strip]()
     if wanted.straighten:
-        straight, strips = straighten_strips(points, cleaned.F, rules.cost, uv_cuts, bound, most)
+        straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.cuts, bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
+    draft.rows, draft.others = np.flatnonzero(rest), straight
     charts = find_charts(
         points,
         cleaned.F[rest],
         max_stretch=bound,
         max_charts=None if most is None else most - len(straight),
         edge_costs=rules.cost[rest],
-        uv_cuts=uv_cuts,
+        uv_cuts=rules.cuts,
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
+        draft=draft,
         choose=partial(
             choose_packed,
             size=size,

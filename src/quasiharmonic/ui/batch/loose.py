@@ -66,6 +66,10 @@ class LooseProblems:
         if none:
             raise ValueError(
                 f"there are no problems in {self._source}: a problem is a folder with input.obj and handles.txt"
-                + ("" if self.orders.settings.plain else "; for plain meshes, give an outline or flatten them")
+                + (
+                    ""
+                    if self.orders.settings.plain
+                    else "; for plain meshes, give an outline, or flatten or unwrap them"
+                )
             )
         return count

@@ -44,8 +44,11 @@ def describe_search(results: Sequence[MapResult], status: Status) -> Record:
     }
 
 
-def describe_map(path: Path, required: str, certified: bool, bijective: bool, inverted: int) -> Record:
-    """Return the exact results for a written map, which was required to be ``"injective"`` or ``"bijective"``."""
+def describe_map(path: Path, required: str, certified: bool, bijective: bool, inverted: int | None) -> Record:
+    """Return the exact results for a written map, which was required to be ``"injective"`` or ``"bijective"``.
+
+    The number of inverted triangles is None if charts may be mirrored.
+    """
     return {
         "outcome": required if certified else f"not {required}",
         "certified": certified,

@@ -78,6 +78,13 @@ COLUMNS: dict[str, type] = {
     # Mean of σ₁/σ₂ + σ₂/σ₁ − 2 (§10), and the largest max(σ₁, 1/σ₂) after scaling to the surface's area.
     "mips": float,
     "isometric": float,
+    # Of an unwrapped model: charts, length of the seams, stretch that 99 % of the surface keep, used share of the
+    # texture, and what was cleaned.
+    "charts": int,
+    "seam_length": float,
+    "stretch": float,
+    "utilisation": float,
+    "cleaned": str,
     # Final mean energy of the flattening of a connected surface.
     "energy": float,
     # Peak resident memory of the process, bytes.

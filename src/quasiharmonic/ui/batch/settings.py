@@ -24,6 +24,7 @@ from quasiharmonic.util.options import (
     REFERENCES,
     STRATEGIES,
     Options,
+    UnwrapOptions,
     option,
     positive,
     seconds,
@@ -48,6 +49,18 @@ def _text(name: str, value: Any) -> None:
     """Check a text or None."""
     if not isinstance(value, str | None):
         raise ValueError(f"{name} must be a text or None, not {describe(value)}")
+
+
+def _unwrap_options(name: str, value: Any) -> None:
+    """Check the options of `quasiharmonic.unwrap` for models from files, or None."""
+    if value is None:
+        return
+    if not isinstance(value, dict):
+        raise ValueError(f"{name} must be a dict of options of unwrap or None, not {describe(value)}")
+    for unusable in ("callback", "edge_costs", "uv", "jobs"):
+        if unusable in value:
+            raise ValueError(f"{name} cannot have the option {unusable}: omit it")
+    UnwrapOptions(**value)
 
 
 @dataclass(frozen=True)
@@ -95,6 +108,10 @@ class Settings(Options):
     linear_solver : str
         As for `quasiharmonic.injective_map`, like ``strategy``, ``reference`` and ``max_iterations``.
 
+    unwrap : dict or None
+        If given, problems are models of any kind, and `quasiharmonic.unwrap` computes their texture coordinates with
+        these options, such as ``{"max_stretch": 1.2}``. No other setting applies.
+
     Raises
     ------
     ValueError
@@ -119,6 +136,8 @@ class Settings(Options):
     max_iterations: int = option(MAX_ITERATIONS, check=positive)
     linear_solver: str = option("auto", check=lambda name, value: check_choice(name, value, ("auto", *available())))
 
+    unwrap: dict[str, Any] | None = option(None, check=_unwrap_options)
+
     def __post_init__(self) -> None:
         """Check the values, without reading files."""
         super().__post_init__()
@@ -127,6 +146,10 @@ class Settings(Options):
     def _check_combination(self) -> None:
         """Raise ValueError if a setting has no effect with the others."""
         changed = {one.name for one in fields(self) if getattr(self, one.name) != one.default}
+        if self.unwrap is not None:
+            others = [one.name for one in fields(self) if one.name in changed and one.name != "unwrap"]
+            if others:
+                raise ValueError(f"{others[0]} does not apply to unwrap: omit one of them")
         if self.flatten:
             for name in ("to", "corners", "refine", "strategy", "polish", "slide", "reference"):
                 if name in changed:
@@ -149,7 +172,7 @@ class Settings(Options):
     @property
     def plain(self) -> bool:
         """Whether problems are plain meshes."""
-        return self.flatten or self.to is not None
+        return self.flatten or self.unwrap is not None or self.to is not None
 
     @property
     def together(self) -> bool:
@@ -157,7 +180,15 @@ class Settings(Options):
 
         This requires QDLDL, whose result for a mesh does not depend on the other meshes of the group.
         """
-        alone = self.flatten or self.pack or self.cut or self.refine or self.slide or self.polish is not None
+        alone = (
+            self.flatten
+            or self.unwrap is not None
+            or self.pack
+            or self.cut
+            or self.refine
+            or self.slide
+            or self.polish is not None
+        )
         by_qdldl = self.linear_solver in ("auto", "qdldl") and "qdldl" in available()
         return by_qdldl and not alone and self.reference in (None, "equilateral")
 

@@ -139,9 +139,15 @@ def solve_files(job: dict[str, Any], tell: Tell) -> Record:
 def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -> None:
     """Read, solve, write, certify and measure a problem; each result is recorded as soon as it is known."""
     settings = job["settings"]
+    with metadata.time_phase(record, "read"), bounded(job["record"].get("memory_limit")):
+        mesh = io.read_mesh(job["mesh"])
+    if settings["unwrap"] is not None:
+        # SciPy's subpackages that this needs would double the time in which workers for maps start.
+        from quasiharmonic.ui.batch import unwrapped_models
+
+        unwrapped_models.unwrap_model(mesh, settings["unwrap"], records.map_path(folder), record, tell)
+        return
     with metadata.time_phase(record, "read"):
-        with bounded(job["record"].get("memory_limit")):
-            mesh = io.read_mesh(job["mesh"])
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
     with metadata.time_phase(record, "setup"):
         if not settings["flatten"] and settings["to"] is None and mesh.FT is None:

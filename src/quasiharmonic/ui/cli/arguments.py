@@ -93,6 +93,14 @@ def _declare(one: Field[Any]) -> Option:
     return number(float, words, metavar="SECONDS" if check is options.seconds else "X", default=one.default)
 
 
+def texture_size(text: str) -> tuple[int, int]:
+    """Convert N or WIDTHxHEIGHT; for argparse."""
+    sides = [count(side) for side in text.lower().split("x")]
+    if len(sides) > 2:
+        raise argparse.ArgumentTypeError(f"{text} is neither N nor WIDTHxHEIGHT")
+    return sides[0], sides[-1]
+
+
 def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option) -> None:
     """Add options of `SHARED`, then options with these names and keywords; underscores stand for hyphens."""
     for name, option in [*((name, SHARED[name]) for name in shared), *own.items()]:

@@ -120,6 +120,7 @@ def _page(run: BatchRun, other: BatchRun | None) -> str:
         _tiles(run),
         _outcomes(run),
         _groups(run),
+        _unwrapped(run),
         '<div class="pair">',
         _distortion(run, other),
         _times(run) if other is None else _comparison(run, other),
@@ -225,7 +226,36 @@ def _groups(run: BatchRun) -> str:
     return _table(("folder", *head), rows, last_is_sum=True)
 
 
+def _unwrapped(run: BatchRun) -> str:
+    """Return a table of the charts of unwrapped models, those with most charts first; empty for maps."""
+    rows = _worst(run, "charts", _MAX_LISTED)
+    if not rows:
+        return ""
+    lines = [
+        (
+            shown(row["problem"]),
+            *(number(float(row.get(name) or np.nan)) for name in ("charts", "seam_length", "stretch", "utilisation")),
+            shown(row.get("cleaned") or "–"),
+        )
+        for row in rows
+    ]
+    count, stretch, use = (
+        number(quantile(run.certified_column(name), 0.5)) for name in ("charts", "stretch", "utilisation")
+    )
+    cleaned = sum(bool(row.get("cleaned")) for row in run.rows)
+    words = (
+        f"Medians: {count} charts, stretch {stretch}, {use} of the texture used. "
+        f"{cleaned:,} of {len(run.rows):,} models were cleaned."
+    )
+    if len(run.rows) > _MAX_LISTED:
+        words += f" The table of records lists more than these {_MAX_LISTED}."
+    head = "model", "charts", "seam length", "stretch of 99 %", "used texture", "cleaned"
+    return f"<h2>Charts</h2><p>{words}</p>{_table(head, lines)}"
+
+
 def _distortion(run: BatchRun, other: BatchRun | None) -> str:
+    if not np.isfinite(run.certified_column("mips")).any() and np.isfinite(run.column("charts")).any():
+        return ""
     series = [("ours", run.certified_column("mips"))]
     legend = [("ours", run.name)]
     if other is not None:
@@ -282,11 +312,11 @@ def _phases(run: BatchRun) -> str:
     return f'<section class="card"><h2>Time by phase</h2>{table}</section>'
 
 
-def _worst(run: BatchRun, column: str) -> list[Record]:
+def _worst(run: BatchRun, column: str, most: int = _PICTURES) -> list[Record]:
     """Return the certified records with the highest values in a column, in decreasing order."""
     values = np.where(run.certified, run.column(column), np.nan)
     order = np.argsort(-values, kind="stable")
-    return [run.rows[k] for k in order[:_PICTURES] if not np.isnan(values[k])]
+    return [run.rows[k] for k in order[:most] if not np.isnan(values[k])]
 
 
 def _gallery(title: str, draw: Draw, rows: Sequence[Record]) -> str:

@@ -32,7 +32,7 @@ class BatchRun:
 
     @property
     def wanted(self) -> str:
-        """Requested property of the maps: ``"bijective"`` if boundaries were free, else ``"injective"``."""
+        """Requested property of the maps: ``"bijective"`` if boundaries were free or models unwrapped."""
         free = any(row.get("outcome") in ("bijective", "not bijective") for row in self.rows)
         return "bijective" if free or self.about.get("settings", {}).get("flatten") is True else "injective"
 

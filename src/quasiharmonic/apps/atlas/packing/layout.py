@@ -24,8 +24,8 @@ _CELLS_OF_MANY, _FEW_OF_MANY, _MOST_CELLS = 128, 20, 2048
 _MOST_DIRECTIONS, _MANY = 20, 50
 # Range of the scale on the finer board, relative to that on the coarser one.
 _FINE_GAIN, _FINE_LOSS = 1.06, 1.01
-# Charts beyond this number are placed as boxes, the smallest ones.
-_BITMAPS = 500
+#: Charts beyond this number are placed as boxes, the smallest ones.
+BITMAPS = 500
 # Share of the tiles that charts with half the padding around them are expected to cover.
 _EXPECTED = 0.8
 # The number of cells along a tile varies between these multiples of the expected number.
@@ -70,7 +70,14 @@ class Layout:
 
 
 def find_layout(
-    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool, scale: float | None
+    shapes: Sequence[Shape],
+    size: tuple[int, int],
+    padding: float,
+    tiles: int,
+    *,
+    rotate: bool,
+    scale: float | None,
+    bitmaps: int = BITMAPS,
 ) -> Layout | None:
     """Place shapes at the largest common scale that is found, or at a given scale.
 
@@ -87,6 +94,8 @@ def find_layout(
         Allow rotations.
     scale : float or None
         Texels per unit of length.
+    bitmaps : int
+        Maximum number of shapes that are not placed as boxes.
 
     Returns
     -------
@@ -98,11 +107,11 @@ def find_layout(
     if scale is not None:
         if not _may_fit(shapes, size, tiles, scale):
             return None
-        search = _Search(shapes, size, padding, tiles, scale, rotate=rotate)
+        search = _Search(shapes, size, padding, tiles, scale, rotate=rotate, bitmaps=bitmaps)
         return search.place_in(search.cells)
     expected, least = _expected_scale(shapes, size, padding, tiles), least_scale(shapes)
     while expected > least:
-        search = _Search(shapes, size, padding, tiles, expected, rotate=rotate)
+        search = _Search(shapes, size, padding, tiles, expected, rotate=rotate, bitmaps=bitmaps)
         if len(shapes) > _MANY:
             layout = search.enlarge_coarsely()
             if layout is not None:
@@ -236,7 +245,7 @@ class _Search:
         scale: float,
         *,
         rotate: bool,
-        bitmaps: int = _BITMAPS,
+        bitmaps: int = BITMAPS,
         given: ComplexArray | None = None,
         skewed: bool = True,
     ) -> None:

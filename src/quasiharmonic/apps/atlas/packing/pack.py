@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.copies import Copy, Motion, find_copies
-from quasiharmonic.apps.atlas.packing.layout import MAX_SIZE, Layout, find_layout, find_sufficient_size, least_scale
+from quasiharmonic.apps.atlas.packing.layout import (
+    BITMAPS,
+    MAX_SIZE,
+    Layout,
+    find_layout,
+    find_sufficient_size,
+    least_scale,
+)
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -85,6 +92,7 @@ def pack_charts(
     rotate: bool = True,
     stack: bool = False,
     kinds: Sequence[int] | None = None,
+    closely: int = BITMAPS,
 ) -> Packing:
     """Pack charts into one or several textures by their shapes, as large as possible and at one texel density.
 
@@ -109,6 +117,8 @@ def pack_charts(
         Place congruent charts, and mirrored ones, at the same position.
     kinds : sequence of int, optional
         A number for each chart. Charts with different numbers are not stacked.
+    closely : int
+        Number of charts that are placed by their shapes; all others are placed as boxes, which is faster.
 
     Returns
     -------
@@ -143,7 +153,7 @@ def pack_charts(
         raise ValueError(
             f"with {texels_per_unit:g} texels per unit, all charts are smaller than a texel: use more texels per unit"
         )
-    layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+    layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted, bitmaps=closely)
     if layout is None:
         width, height = find_sufficient_size(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
         if max(width, height) > MAX_SIZE:

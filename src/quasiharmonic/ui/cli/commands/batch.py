@@ -2,13 +2,15 @@
 
 Map every problem of a data set, each in a separate process: a failure does not affect other problems. Maps and
 records are in OUT/results, each written as soon as it is finished; in the end OUT/records.csv has all records. To
-continue an interrupted run, give the same command again.
+continue an interrupted run, give the same command again. With --unwrap, every model gets texture coordinates, as by
+qhm unwrap; the records list charts, stretch, used texture and what was cleaned.
 
-Exit status: 0 every problem has a certified injective map (--flatten: bijective); 1 some have not (the records give
-the reason); 2 wrong call, or stopped: finished results are kept; 3 finished, but the report failed.
+Exit status: 0 every problem has a certified injective map (--flatten, --unwrap: bijective); 1 some have not (the
+records give the reason); 2 wrong call, or stopped: finished results are kept; 3 finished, but the report failed.
 
     qhm batch problems/ -o results/ --report
     qhm batch meshes/ -o flat/ --flatten --cut -j 4
+    qhm batch models/ -o unwrapped/ --unwrap --max-stretch 1.3 --report
     qhm batch -o results/ --report --against other.csv
     qhm batch problems/ -o results/ --shard $SLURM_ARRAY_TASK_ID/16
     qhm batch -o results/ --merge --report
@@ -19,7 +21,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import report, streams, targets
 from quasiharmonic.ui.cli.arguments import (
@@ -29,19 +31,23 @@ from quasiharmonic.ui.cli.arguments import (
     byte_count,
     choice,
     count,
+    declared,
     file,
     flag,
     number,
     pick,
     text,
+    texture_size,
 )
 from quasiharmonic.ui.cli.streams import tell
-from quasiharmonic.util.options import ENERGIES, FLATTENED
+from quasiharmonic.util.options import ENERGIES, FLATTENED, UnwrapOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
     from quasiharmonic.ui.cli.arguments import Commands
 
+# Options of `unwrap` that are options of a run.
+_OF_RUNS = "jobs", "time_limit"
 #: Seconds between two updates of the line on a terminal.
 LIVE = 0.1
 #: Seconds between two lines elsewhere.
@@ -127,6 +133,14 @@ def add_parser(commands: Commands) -> None:
     add_options(solver, "font", **of_outlines)
     add_options(solver, "pieces", "refine", strategy=SHARED["strategy"] | {"default": None})
     add_options(solver, "reference", "max_iterations", "linear_solver")
+    models = parser.add_argument_group("texture coordinates of each model, as for qhm unwrap")
+    add_options(
+        models,
+        unwrap=flag("unwrap every mesh file: charts with little stretch, packed into a texture"),
+        resolution=number(texture_size, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)"),
+        # The defaults are those of `unwrap`; the limits of a run are options of their own.
+        **{name: one | {"default": None} for name, one in declared(UnwrapOptions).items() if name not in _OF_RUNS},
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -149,6 +163,7 @@ def run(options: argparse.Namespace) -> int:
         _folder(options)
     options.strategy = options.strategy or "speed"
     options.pieces = None if options.pieces is None else str(options.pieces)
+    options.unwrap = _unwrap_options(options)
     settings = batch.Settings(**pick(options, *(one.name for one in fields(batch.Settings))))
     limits = pick(options, "jobs", "threads", "memory_limit")
     rest = pick(options, "retry", "table", "shard", "scheduler")
@@ -163,7 +178,7 @@ def run(options: argparse.Namespace) -> int:
             f"qhm batch: interrupted; finished results are kept in {options.output}; give the same command to continue"
         )
         return 2
-    wanted = "bijective" if options.flatten else "injective"
+    wanted = "bijective" if options.flatten or settings.unwrap is not None else "injective"
     records = places.join(options.output, table_name(read_shard(options.shard), options.table))
     with report.after_writing(records):
         print(_account(progress, wanted, records), flush=True)
@@ -171,6 +186,17 @@ def run(options: argparse.Namespace) -> int:
         with report.after_writing(records):
             _write_report(options)
     return 0 if progress.solved == progress.total else 1
+
+
+def _unwrap_options(options: argparse.Namespace) -> dict[str, Any] | None:
+    """Return the given options of `unwrap`, or None without --unwrap."""
+    names = ["resolution", *(name for name in declared(UnwrapOptions) if name not in _OF_RUNS)]
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if options.unwrap:
+        return given | ({"symmetry": None} if given.get("symmetry") == "none" else {})
+    for name in given:
+        raise ValueError(f"--{name.replace('_', '-')} applies only to --unwrap: add --unwrap, or omit it")
+    return None
 
 
 def _merge(options: argparse.Namespace) -> int:

@@ -28,12 +28,12 @@ from quasiharmonic.ui.cli.arguments import (
     add_options,
     byte_count,
     choice,
-    count,
     declared,
     file,
     flag,
     number,
     pick,
+    texture_size,
     weld,
 )
 from quasiharmonic.util.options import UnwrapOptions
@@ -55,7 +55,7 @@ def add_parser(commands: Commands) -> None:
         parser,
         **own,
         resolution=number(
-            _resolution, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)", default=(2048, 2048)
+            texture_size, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)", default=(2048, 2048)
         ),
         no_rotate=flag("do not rotate charts to fit better"),
         stack=choice(
@@ -100,7 +100,7 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
     """Unwrap a mesh."""
-    from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions
+    from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions, is_written
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.util.arrays import count_of
 
@@ -120,7 +120,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
     unwrapped, divided = add_map(mesh, result)
 
     def describe(written: MeshData) -> pipeline.Account:
-        same = _is_written(written, result)
+        same = is_written(written, result)
         facts = {
             **result.to_dict(),
             "success": result.success and same,
@@ -139,14 +139,6 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         return account
 
     return pipeline.Changed(unwrapped, describe)
-
-
-def _resolution(text: str) -> tuple[int, int]:
-    """Convert N or WIDTHxHEIGHT; for argparse."""
-    sides = [count(side) for side in text.lower().split("x")]
-    if len(sides) > 2:
-        raise argparse.ArgumentTypeError(f"{text} is neither N nor WIDTHxHEIGHT")
-    return sides[0], sides[-1]
 
 
 def _words(step: UnwrapStep) -> str:
@@ -180,10 +172,10 @@ def _edge_costs(mesh: MeshData, path: Path | None) -> Any:
 
 def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) -> Callable[[UnwrapStep], None] | None:
     """Return a callback that shows steps, and raises MemoryError above the limit of resident memory."""
-    from quasiharmonic.ui.batch.supervisor import resident
-
     if limit is None:
         return show
+    from quasiharmonic.ui.batch.supervisor import resident
+
     if resident(os.getpid()) is None:
         raise ValueError("--memory needs psutil on this system: pip install psutil")
 
@@ -195,15 +187,6 @@ def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) 
             show(step)
 
     return check
-
-
-def _is_written(written: MeshData, result: UnwrapResult) -> bool:
-    """Return whether a file has exactly the certified texture coordinates, triangle by triangle."""
-    import numpy as np
-
-    if written.vt is None or written.FT is None or written.FT.shape != result.indices.shape:
-        return False
-    return bool(np.array_equal(written.vt[written.FT], result.uvs[result.indices]))
 
 
 def _cleaning(result: UnwrapResult) -> list[str]:

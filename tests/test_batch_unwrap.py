@@ -1,0 +1,134 @@
+"""Data sets of models that `unwrap` gives texture coordinates: records, resume, archives, shards, report."""
+
+from __future__ import annotations
+
+import io as streams
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+
+import numpy as np
+import pytest
+
+from quasiharmonic import batch, io, unwrap
+from quasiharmonic.surfaces import starfish
+from shared.commands import linux, run
+from shared.datasets import record_of
+
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
+
+V, F = starfish(2, 4)
+
+
+@pytest.fixture
+def models(tmp_path):
+    """A clean model, one with a repeated and a reversed triangle, one without area, and one that is no mesh."""
+    folder = tmp_path / "set"
+    (folder / "sub").mkdir(parents=True)
+    io.write_obj(folder / "clean.obj", io.MeshData(V, F))
+    spoilt = np.concatenate([F, F[:1]])
+    spoilt[5] = spoilt[5, ::-1]
+    io.write_ply(folder / "sub" / "spoilt.ply", io.MeshData(V, spoilt))
+    (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+    (folder / "text.obj").write_text("f one two three\n")
+    return folder
+
+
+def settings(**options):
+    return batch.Settings(unwrap={"resolution": 256, **options})
+
+
+def test_records_of_models_and_of_failures(models, tmp_path):
+    progress = batch.run(models, tmp_path / "out", settings(max_stretch=1.3), jobs=2)
+    assert (progress.total, progress.solved, progress.failed) == (4, 2, 2)
+    expected = unwrap(V, F, max_stretch=1.3, resolution=256)
+    written = io.read_mesh(tmp_path / "out/results/clean.obj/map.obj")
+    np.testing.assert_array_equal(written.vt[written.FT], expected.uvs[expected.indices])
+    record = record_of(tmp_path / "out", "clean.obj")
+    assert record["outcome"] == "bijective"
+    assert record["certified"] is True
+    assert record["status"] == "unwrapped"
+    assert record["charts"] == expected.n_charts
+    assert (record["stretch"], record["isometric"]) == (expected.stretch.p99, expected.stretch.worst)
+    assert (record["seam_length"], record["utilisation"]) == (expected.seam_length, expected.utilisation)
+    assert (record["vertices"], record["triangles"], record["cleaned"]) == (len(V), len(F), None)
+    assert set(record) <= set(batch.COLUMNS)
+    spoilt = record_of(tmp_path / "out", "sub/spoilt.ply")
+    assert spoilt["certified"] is True
+    assert spoilt["cleaned"] == "repeated triangles excluded: 1, triangles reversed: 1"
+    for name, words in (("flat.obj", "degenerate"), ("text.obj", "line 1")):
+        failed = record_of(tmp_path / "out", name)
+        assert failed["outcome"] == "invalid"
+        assert words in failed["error"]
+
+
+def test_finished_models_are_skipped_unless_an_option_changes(models, tmp_path):
+    out = tmp_path / "out"
+    batch.run(models, out, settings(), jobs=1)
+    assert batch.run(models, out, settings(), jobs=1).resumed == 4
+    assert batch.run(models, out, settings(max_stretch=1.2), jobs=1).resumed == 0
+
+
+@linux
+def test_a_killed_run_is_continued(models, tmp_path):
+    for k in range(6):
+        io.write_obj(models / f"more{k}.obj", io.MeshData(V * (k + 2), F))
+    out = tmp_path / "out"
+    command = ["batch", models, "-o", out, "--unwrap", "--resolution", "256", "-j", "1"]
+    process = subprocess.Popen([sys.executable, "-m", "quasiharmonic", *map(str, command)], stdout=subprocess.DEVNULL)
+    while not list(out.glob("results/*/record.json")):
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    finished = len(list(out.glob("results/**/record.json")))
+    assert run(*command) == 1
+    assert finished > 0
+    rows = list(batch.read_table(out / "records.csv"))
+    assert len(rows) == 10
+    assert sum(row["certified"] is True for row in rows) == 8
+
+
+def test_archives_and_shards(models, tmp_path):
+    with tarfile.open(tmp_path / "models.tar", "w") as tar:
+        for name in ("one", "two", "three"):
+            data = (models / "clean.obj").read_bytes()
+            info = tarfile.TarInfo(f"{name}.obj")
+            info.size = len(data)
+            tar.addfile(info, streams.BytesIO(data))
+    assert batch.run(tmp_path / "models.tar", tmp_path / "out", settings(), jobs=1).solved == 3
+    with tarfile.open(tmp_path / "out/results/models.tar") as tar:
+        assert {"one.obj", "one.json", "three.obj"} <= set(tar.getnames())
+    for shard in ("1/2", "2/2"):
+        batch.run(models, tmp_path / "shards", settings(), jobs=1, shard=shard)
+    merged = batch.merge([tmp_path / "shards"], tmp_path / "shards")
+    assert (merged.total, merged.solved) == (4, 2)
+
+
+def test_the_command_reports_charts_and_cleaning(models, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = "--unwrap", "--max-stretch", "1.3", "--resolution", "256x128", "--symmetry", "none", "--report"
+    assert run("batch", models, "-o", out, "-j", "1", *options) == 1
+    assert "2 of 4 problems have a certified bijective map" in capsys.readouterr().out
+    page = (out / "report.html").read_text()
+    assert "<th>charts</th>" in page
+    assert "1 of 4 models were cleaned" in page
+    assert "triangles reversed: 1" in page
+    assert "Distribution of distortion" not in page
+    expected = unwrap(V, F, max_stretch=1.3, resolution=(256, 128), symmetry=None)
+    assert record_of(out, "clean.obj")["charts"] == expected.n_charts
+
+
+def test_other_settings_are_an_error(models, tmp_path, capsys):
+    with pytest.raises(ValueError, match="flatten does not apply to unwrap"):
+        batch.Settings(unwrap={}, flatten=True)
+    with pytest.raises(ValueError, match="max_stretch"):
+        batch.Settings(unwrap={"max_stretch": 0.5})
+    with pytest.raises(ValueError, match="cannot have the option uv"):
+        batch.Settings(unwrap={"uv": []})
+    with pytest.raises(ValueError, match="must be a dict"):
+        batch.Settings(unwrap=True)
+    assert run("batch", models, "-o", tmp_path / "out", "--max-stretch", "1.3") == 2
+    assert "--max-stretch applies only to --unwrap" in capsys.readouterr().err
