@@ -9,7 +9,7 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.util.arrays import FloatArray, mark
+from quasiharmonic.util.arrays import FloatArray, IntArray, mark
 
 # Factor on the cost of a seam inside a polygon, which the file cannot store.
 _INSIDE_POLYGON = 1e3
@@ -37,6 +37,21 @@ def corner_positions(mesh: MeshData) -> FloatArray:
     if mesh.vt is None or mesh.FT is None:
         raise ValueError("the file has no texture coordinates (vt) whose seams could be used: omit --keep-seams")
     return np.where(mesh.FT[:, :, None] >= 0, mesh.vt[mesh.FT], np.nan)
+
+
+def statement_labels(mesh: MeshData, *keywords: str) -> IntArray:
+    """Return a label (f,) for each triangle, equal where the last statements with these keywords in the file are equal.
+
+    The keywords are those of OBJ files: ``o`` and ``g`` for groups, ``usemtl`` for materials, ``s`` for smoothing.
+    """
+    labels, names = np.zeros((mesh.faces, len(keywords)), dtype=np.int64), dict[bytes, int]()
+    for line, at in zip(mesh.statements.split(b"\n"), mesh.statement_faces.tolist(), strict=False):
+        keyword, _, name = line.partition(b" ")
+        if keyword.decode(errors="replace") in keywords:
+            column = keywords.index(keyword.decode())
+            labels[max(at, 0) :, column] = names.setdefault(name.strip(), len(names) + 1)
+    number: IntArray = np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
+    return number[mesh.rings.of_triangle]
 
 
 def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:

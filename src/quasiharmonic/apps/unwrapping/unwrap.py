@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypedDict, Unpack
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,18 +15,17 @@ from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, find_hinges
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
     choose_packed,
-    find_differing_sides,
     find_seams,
     join_charts,
 )
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
-from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, check_symmetry, find_mirror
+from quasiharmonic.apps.unwrapping.seam_rules import Rules, find_rules
+from quasiharmonic.apps.unwrapping.symmetry import check_symmetry
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.find import side_costs
@@ -43,8 +42,6 @@ from quasiharmonic.util.progress import reports_progress
 
 # Positions beyond this power of two, or all below its reciprocal, are scaled.
 _MAX_EXPONENT = 300
-# Smaller factors on the cost of seams count as this one.
-_LEAST_COST = 1e-6
 
 
 class UnwrapKeywords(TypedDict, total=False):
@@ -65,6 +62,9 @@ class UnwrapKeywords(TypedDict, total=False):
     packing_loss: float
     divide_for_packing: bool
     edge_costs: ArrayLike | None
+    seams: ArrayLike | None
+    no_seams: ArrayLike | None
+    labels: ArrayLike | None
     uv: ArrayLike | None
     seed: int
     callback: Callable[[UnwrapStep], object] | None
@@ -115,7 +115,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Seams and charts are mirrored if every vertex has a mirror image, to 1e-6 of the diagonal of the model's box,
         and every triangle. Curved parts are not if triangles of theirs cross the plane, or if their seams would be
         much longer. `UnwrapResult.symmetry` says what was done. Without effect if ``uv`` is given, and ``"auto"`` also
-        with ``edge_costs``.
+        with ``edge_costs``, ``seams``, ``no_seams`` or ``labels``.
     packing_loss : float
         Flat and developable parts are joined across edges, for fewer charts and shorter seams, as long as the estimated
         share of the texture that they use falls by at most this value below the best one.
@@ -126,6 +126,15 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Positive factor on the cost of a seam at each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
         Large values keep seams away from visible parts. Values of at least 1,000 keep two triangles together where
         possible, such as the triangles of a polygon.
+    seams : (k, 2) array of int, optional
+        Edges that become seams, by vertices, such as `UnwrapResult.seams`. Where they end inside a flat or developable
+        part, they are extended to its border or to another seam. A single edge elsewhere is extended by one edge.
+        Boundary edges have no effect.
+    no_seams : (k, 2) array of int, optional
+        Edges that must not become seams.
+    labels : (f,) array of int, optional
+        Part of the model to which each triangle belongs, such as a material. Seams between parts cost almost nothing,
+        and charts are joined across them last.
     uv : (n, 2) or (f, 3, 2) array, optional
         Texture coordinates of each vertex, or of each corner, whose seams are kept. Further seams are made only in
         closed parts, in parts with handles, and where the bound requires it. By default all seams are new.
@@ -146,8 +155,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     ------
     ValueError
         If an array has the wrong shape, a position is not finite, an index is out of range, or no triangle has an area.
-        The message names the elements. If the texture is too small for the padding of all charts, the message states
-        the smallest sufficient resolution.
+        The message names the elements. Also if pairs in ``seams`` or ``no_seams`` are no edges of the mesh, are in both
+        lists, or cannot be kept. If the texture is too small for the padding of all charts, the message states the
+        smallest sufficient resolution.
 
     Examples
     --------
@@ -178,7 +188,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     exponent = find_exponent(cleaned.V)
     exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
-    rules = _find_rules(points, cleaned, costs, corner_uv, wanted)
+    rules = find_rules(points, cleaned, F, costs, corner_uv, wanted)
     bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit
     charts = _make_charts(points, cleaned, rules, wanted, size, report)
     while True:
@@ -201,6 +211,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             break
         scale = packing.texels_per_unit / max(size)
         charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=rules.cost, bound=bound)
+    seams = find_seams(cleaned, layout)
+    rules.wanted.check(cleaned, seams)
     # Rows of texture coordinates are ordered by vertex, then by chart.
     key, indices = np.unique(F * len(layout.uv) + cleaned.restore_corners(layout.rows), return_inverse=True)
     vmapping, row = np.divmod(key, len(layout.uv))
@@ -218,7 +230,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         indices=indices.reshape(-1, 3),
         uvs=layout.uv[row],
         charts=cleaned.restore_corners(np.repeat(layout.chart[:, None], 3, axis=1))[:, 0],
-        seams=find_seams(cleaned, layout),
+        seams=seams,
         certificate=certificate,
         triangle_stretch=every,
         stretch=_summarise(stretch, area),
@@ -234,54 +246,10 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     )
 
 
-class _Rules(NamedTuple):
-    """Where seams are wanted on a cleaned mesh.
-
-    Attributes
-    ----------
-    cost : (f, 3) float64
-        Factor on the cost of a seam at each side; see `find_charts`.
-    uv : (f, 3, 2) float64 or None
-        Texture coordinates whose seams are kept.
-    mirror : Mirror or None
-        Mirror images, if the model is symmetric.
-    symmetry : Symmetry
-    """
-
-    cost: FloatArray
-    uv: FloatArray | None
-    mirror: Mirror | None
-    symmetry: Symmetry
-
-
-def _find_rules(
-    points: FloatArray,
-    cleaned: CleanedMesh,
-    costs: FloatArray | None,
-    corner_uv: FloatArray | None,
-    wanted: UnwrapOptions,
-) -> _Rules:
-    """Return where seams are wanted, given costs (f, 3) and texture coordinates (f, 3, 2) of the model."""
-    F = cleaned.F
-    cost = np.ones(F.shape) if costs is None else _turn_sides(costs, cleaned)
-    mirror, symmetry = None, Symmetry(None, 0.0, False, "")
-    uv = None if corner_uv is None else _turn_corners(corner_uv, cleaned)
-    if uv is None:
-        hinges = find_hinges(points, F)
-        if wanted.symmetry is not None and (costs is None or wanted.symmetry != "auto"):
-            mirror, symmetry = find_mirror(points, F, wanted.symmetry)
-        cost = np.maximum(cost, _LEAST_COST)
-        if not wanted.divide_for_packing:
-            cost[hinges.mark_sides(hinges.flat, len(F))] *= UNDIVIDED_COST
-        if wanted.hard_edges is not None:
-            cost[hinges.mark_sides(np.abs(hinges.angle) > np.deg2rad(wanted.hard_edges), len(F))] = DEMANDED_COST
-    return _Rules(cost, uv, mirror, symmetry)
-
-
 def _make_charts(
     points: FloatArray,
     cleaned: CleanedMesh,
-    rules: _Rules,
+    rules: Rules,
     wanted: UnwrapOptions,
     size: tuple[int, int],
     report: Callable[[str, int, int], object],
@@ -294,7 +262,7 @@ def _make_charts(
         max_stretch=bound,
         max_charts=wanted.max_charts,
         edge_costs=rules.cost,
-        uv_cuts=None if rules.uv is None else _find_uv_cuts(rules.uv, cleaned),
+        uv_cuts=rules.uv_cuts,
         uv=rules.uv,
         mirror=rules.mirror,
         choose=partial(
@@ -334,31 +302,6 @@ def _corner_positions(uv: ArrayLike, F: IntArray, n: int) -> FloatArray:
     if array.shape != (*F.shape, 2):
         raise ValueError(f"uv must have shape ({n}, 2) or ({len(F)}, 3, 2), not {array.shape}")
     return array
-
-
-def _turn_sides(costs: FloatArray, cleaned: CleanedMesh) -> FloatArray:
-    """Return the costs of the sides of the cleaned triangles."""
-    turned = costs[cleaned.triangles]
-    # Reversing a triangle exchanges its first and last side.
-    turned[cleaned.flipped] = turned[cleaned.flipped][:, ::-1]
-    return turned
-
-
-def _turn_corners(corner_uv: FloatArray, cleaned: CleanedMesh) -> FloatArray:
-    """Return the texture coordinates of the corners of the cleaned triangles."""
-    position = corner_uv[cleaned.triangles]
-    # Reversing a triangle exchanges its last two corners.
-    position[cleaned.flipped] = position[cleaned.flipped][:, (0, 2, 1)]
-    return position
-
-
-def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
-    """Return the edges (k, 2) of the cleaned mesh at which texture coordinates (f', 3, 2) differ."""
-    # Corners without coordinates count as one position.
-    position = np.nan_to_num(corner_uv, nan=np.finfo(np.float64).max) + 0.0
-    rows = np.unique(position.reshape(-1, 2), axis=0, return_inverse=True)[1]
-    side = find_differing_sides(cleaned.F, rows.reshape(-1, 3), len(cleaned.V))
-    return np.stack([cleaned.F.ravel()[side], cleaned.F[:, (1, 2, 0)].ravel()[side]], axis=1)
 
 
 def _measure(

@@ -33,6 +33,7 @@ from quasiharmonic.ui.cli.arguments import (
     flag,
     number,
     pick,
+    text,
     weld,
 )
 from quasiharmonic.util.options import UnwrapOptions
@@ -63,6 +64,13 @@ def add_parser(commands: Commands) -> None:
         edge_costs=file(
             "file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line"
         ),
+        seams=file("file of edges that become seams: two vertices, 0-based, on each line"),
+        no_seams=file("file of edges that must not become seams"),
+        labels=text(
+            "WHICH",
+            "parts of the model, between which seams cost almost nothing: groups, materials, or a file with the number "
+            "of the part of each face, one on each line",
+        ),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
     add_options(parser, "texture", "json", "surface")
@@ -77,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
     return pipeline.change_map(
         options,
         lambda mesh: _unwrap(options, mesh, began),
-        inputs=(options.edge_costs,),
+        inputs=(options.edge_costs, options.seams, options.no_seams, _labels_file(options.labels)),
         read=_read,
     )
 
@@ -105,6 +113,9 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             mesh.F,
             rotate=not options.no_rotate,
             edge_costs=_edge_costs(mesh, options.edge_costs),
+            seams=_read_integers(options.seams, 2),
+            no_seams=_read_integers(options.no_seams, 2),
+            labels=_labels(mesh, options.labels),
             uv=corner_positions(mesh) if options.keep_seams else None,
             callback=_bound_memory(show, options.memory),
             **given,
@@ -168,6 +179,42 @@ def _edge_costs(mesh: MeshData, path: Path | None) -> Any:
     given = np.isin(keys, wanted)
     costs[given] = table[order, 2][np.searchsorted(wanted[order], keys[given])]
     return polygon_costs(mesh, costs)
+
+
+def _read_integers(path: Path | None, columns: int) -> Any:
+    """Return the whole numbers of a file, (k, columns); None without a file."""
+    import numpy as np
+
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.lowlevel.textual import read_rows
+
+    if path is None:
+        return None
+    rows = read_rows(path, columns)
+    for line, row in rows:
+        if any(not value.is_integer() for value in row):
+            raise MeshFileError(path, "not a whole number", line)
+    return np.array([row for _, row in rows], dtype=np.int64).reshape(-1, columns)
+
+
+def _labels_file(which: str | None) -> Path | None:
+    """Return the file that ``--labels`` names."""
+    return None if which in (None, "groups", "materials") else Path(str(which))
+
+
+def _labels(mesh: MeshData, which: str | None) -> Any:
+    """Return the labels (f,) of the triangles that ``--labels`` names."""
+    from quasiharmonic.apps.unwrapping.model_files import statement_labels
+    from quasiharmonic.util.arrays import count_of
+
+    if which is None:
+        return None
+    if (path := _labels_file(which)) is None:
+        return statement_labels(mesh, *{"groups": ("o", "g"), "materials": ("usemtl",)}[which])
+    labels = _read_integers(path, 1)[:, 0]
+    if len(labels) != mesh.faces:
+        raise ValueError(f"{path}: {count_of('number', 'numbers', len(labels))} for {mesh.faces} faces: give one each")
+    return labels[mesh.rings.of_triangle]
 
 
 def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) -> Callable[[UnwrapStep], None] | None:
