@@ -380,6 +380,7 @@ class UnwrapOptions(Options):
     no_seams: Any = option(None)
     labels: Any = option(None)
     uv: Any = option(None)
+    faces: Any = option(None)
     seed: int = option(0, "seed of random choices (default: 0)", check=count)
     callback: Callable[[Any], object] | None = option(None, check=function)
     jobs: int | None = option(None, "number of threads (default: all cores)", check=positive_or_none)

@@ -35,7 +35,7 @@ def corner_positions(mesh: MeshData) -> FloatArray:
     Raises ValueError if the file has none.
     """
     if mesh.vt is None or mesh.FT is None:
-        raise ValueError("the file has no texture coordinates (vt) whose seams could be used: omit --keep-seams")
+        raise ValueError("the file has no texture coordinates (vt) to keep: omit --keep-seams and --faces")
     return np.where(mesh.FT[:, :, None] >= 0, mesh.vt[mesh.FT], np.nan)
 
 

@@ -23,8 +23,9 @@ from quasiharmonic.apps.unwrapping.layout import (
 )
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
-from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStep, find_status
 from quasiharmonic.apps.unwrapping.seam_rules import Rules, find_rules
+from quasiharmonic.apps.unwrapping.selection import keep_charts, read_faces, select
 from quasiharmonic.apps.unwrapping.symmetry import check_symmetry
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
@@ -66,6 +67,7 @@ class UnwrapKeywords(TypedDict, total=False):
     no_seams: ArrayLike | None
     labels: ArrayLike | None
     uv: ArrayLike | None
+    faces: ArrayLike | None
     seed: int
     callback: Callable[[UnwrapStep], object] | None
     jobs: int | None
@@ -138,6 +140,10 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     uv : (n, 2) or (f, 3, 2) array, optional
         Texture coordinates of each vertex, or of each corner, whose seams are kept. Further seams are made only in
         closed parts, in parts with handles, and where the bound requires it. By default all seams are new.
+    faces : (k,) array of int or (f,) array of bool, optional
+        Only these triangles are unwrapped. All others keep their texture coordinates ``uv``, which is required, bit for
+        bit. New charts are placed into free space of the texture, by default at the mean texel density of the others.
+        Edges between both become seams.
     seed : int
         Seed of random choices. Equal input and seed give equal results.
     callback : callable, optional
@@ -157,7 +163,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         If an array has the wrong shape, a position is not finite, an index is out of range, or no triangle has an area.
         The message names the elements. Also if pairs in ``seams`` or ``no_seams`` are no edges of the mesh, are in both
         lists, or cannot be kept. If the texture is too small for the padding of all charts, the message states the
-        smallest sufficient resolution.
+        smallest sufficient resolution, or with ``faces`` a sufficient texel density.
 
     Examples
     --------
@@ -183,13 +189,21 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             wanted.callback(UnwrapStep(phase, done, total))
 
     report("clean")
-    cleaned = clean(V, F, wanted.outward, weld=wanted.weld)
+    whole = clean(V, F, wanted.outward, weld=wanted.weld)
     # In this unit, areas neither overflow nor underflow.
-    exponent = find_exponent(cleaned.V)
+    exponent = find_exponent(whole.V)
     exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
+    cleaned, kept = whole, None
+    if wanted.faces is not None:
+        if corner_uv is None:
+            raise ValueError("faces needs uv: pass the texture coordinates that the other triangles keep")
+        kept = keep_charts(whole, read_faces(wanted.faces, len(F)), corner_uv)
+        cleaned = select(whole, kept.replaced)
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
-    rules = find_rules(points, cleaned, F, costs, corner_uv, wanted)
+    rules = find_rules(points, cleaned, F, costs, corner_uv if kept is None else None, wanted)
     bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit
+    if density is None and kept is not None:
+        density = kept.find_density(V, F, size)
     charts = _make_charts(points, cleaned, rules, wanted, size, report)
     while True:
         report("pack")
@@ -201,6 +215,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             tiles=wanted.tiles,
             rotate=wanted.rotate,
             stack=wanted.stack,
+            occupied=None if kept is None or not kept.count else (kept.layout.uv, kept.layout.rows),
         )
         report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
@@ -211,11 +226,18 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             break
         scale = packing.texels_per_unit / max(size)
         charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=rules.cost, bound=bound)
-    seams = find_seams(cleaned, layout)
+    joined = layout
+    if kept is not None:
+        joined = kept.join(layout, whole)
+        certificate = certify_charts(joined, whole.triangles, size=size, padding=padding, stacked=wanted.stack)
+    seams = find_seams(whole, joined)
     rules.wanted.check(cleaned, seams)
+    uv, rows = joined.uv, whole.restore_corners(joined.rows)
+    if kept is not None:
+        uv, rows = kept.restore(uv, rows)
     # Rows of texture coordinates are ordered by vertex, then by chart.
-    key, indices = np.unique(F * len(layout.uv) + cleaned.restore_corners(layout.rows), return_inverse=True)
-    vmapping, row = np.divmod(key, len(layout.uv))
+    key, indices = np.unique(F * len(uv) + rows, return_inverse=True)
+    vmapping, row = np.divmod(key, len(uv))
     stretch, area = _measure(points, cleaned, layout, size)
     misses = [
         Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), chart.misses)
@@ -228,19 +250,20 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     return UnwrapResult(
         vmapping=vmapping,
         indices=indices.reshape(-1, 3),
-        uvs=layout.uv[row],
-        charts=cleaned.restore_corners(np.repeat(layout.chart[:, None], 3, axis=1))[:, 0],
+        uvs=uv[row],
+        charts=whole.restore_corners(np.repeat(joined.chart[:, None], 3, axis=1))[:, 0],
         seams=seams,
         certificate=certificate,
         triangle_stretch=every,
         stretch=_summarise(stretch, area),
         misses=tuple(misses),
-        utilisation=packing.utilisation,
-        cleaned=cleaned,
-        status=UnwrapStatus.STRETCHED if misses else UnwrapStatus.UNWRAPPED,
+        utilisation=packing.utilisation + (0.0 if kept is None else kept.area / wanted.tiles),
+        cleaned=whole,
+        status=find_status(certificate, misses),
         resolution=size,
         texels_per_unit=float(np.ldexp(packing.texels_per_unit, -exponent)),
         V=V,
+        kept_charts=np.arange(len(certificate.bijective_charts)) >= len(charts),
         symmetry=check_symmetry(rules.symmetry, rules.mirror, layout.chart),
         seconds=time.perf_counter() - began,
     )

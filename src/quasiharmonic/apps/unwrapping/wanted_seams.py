@@ -41,12 +41,13 @@ class WantedSeams:
         """Raise a ValueError unless the seams (s, 2) that were found are as wanted."""
         n = len(cleaned.representatives)
         present = pair_keys(cleaned.representatives[found], n)
-        wrong = self.no_seams[np.isin(pair_keys(self.no_seams, n), present)]
+        keys, times = np.unique(_cleaned_keys(cleaned), return_counts=True)
+        unwanted = pair_keys(self.no_seams, n)
+        wrong = self.no_seams[np.isin(unwanted, present) & np.isin(unwanted, keys)]
         if len(wrong):
             raise ValueError(
                 f"{edge_names(wrong)} of no_seams must be cut, or their part of the surface has no map: omit some"
             )
-        keys, times = np.unique(_cleaned_keys(cleaned), return_counts=True)
         wanted = pair_keys(self.seams, n)
         wrong = self.seams[np.isin(wanted, keys[times > 1]) & ~np.isin(wanted, present)]
         if len(wrong):

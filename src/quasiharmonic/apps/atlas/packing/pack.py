@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.copies import Copy, Motion, find_copies
-from quasiharmonic.apps.atlas.packing.layout import MAX_SIZE, Layout, find_layout, find_sufficient_size, least_scale
+from quasiharmonic.apps.atlas.packing.layout import (
+    MAX_SIZE,
+    Layout,
+    find_layout,
+    find_layout_around,
+    find_sufficient_size,
+    least_scale,
+)
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -84,6 +91,7 @@ def pack_charts(
     tiles: int = 1,
     rotate: bool = True,
     stack: bool = False,
+    occupied: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Packing:
     """Pack charts into one or several textures by their shapes, as large as possible and at one texel density.
 
@@ -106,6 +114,8 @@ def pack_charts(
         Allow rotations.
     stack : bool
         Place congruent charts, and mirrored ones, at the same position.
+    occupied : (uv, F), optional
+        Texture coordinates (m, 2) and triangles (k, 3) of charts that stay. The others keep the padding to them.
 
     Returns
     -------
@@ -136,7 +146,20 @@ def pack_charts(
         raise ValueError(
             f"with {texels_per_unit:g} texels per unit, all charts are smaller than a texel: use more texels per unit"
         )
-    layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+    if occupied is not None:
+        at = map_array("occupied", occupied[0])
+        shape = make_shape(at * size, triangle_array(occupied[1], len(at)))
+        layout = find_layout_around(shape, shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+        if layout is None:
+            largest = find_layout_around(shape, shapes, size, spaced, tiles, rotate=rotate, scale=None)
+            density = None if largest is None else float(np.ldexp(largest.scale, -exponent))
+            raise ValueError(
+                f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels "
+                f"{'does' if len(shapes) == 1 else 'do'} not fit into the free part of {size[0]} × {size[1]} texels: "
+                + ("use more tiles or less padding" if density is None else f"texels_per_unit={density:.6g} suffices")
+            )
+    else:
+        layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
     if layout is None:
         width, height = find_sufficient_size(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
         if max(width, height) > MAX_SIZE:

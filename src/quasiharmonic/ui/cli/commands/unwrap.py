@@ -71,6 +71,10 @@ def add_parser(commands: Commands) -> None:
             "parts of the model, between which seams cost almost nothing: groups, materials, or a file with the number "
             "of the part of each face, one on each line",
         ),
+        faces=file(
+            "file of face numbers, 0-based, one on each line: unwrap only these, and keep the texture coordinates of "
+            "all others"
+        ),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
     add_options(parser, "texture", "json", "surface")
@@ -85,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
     return pipeline.change_map(
         options,
         lambda mesh: _unwrap(options, mesh, began),
-        inputs=(options.edge_costs, options.seams, options.no_seams, _labels_file(options.labels)),
+        inputs=(options.edge_costs, options.seams, options.no_seams, options.faces, _labels_file(options.labels)),
         read=_read,
     )
 
@@ -116,7 +120,8 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             seams=_read_integers(options.seams, 2),
             no_seams=_read_integers(options.no_seams, 2),
             labels=_labels(mesh, options.labels),
-            uv=corner_positions(mesh) if options.keep_seams else None,
+            uv=corner_positions(mesh) if options.keep_seams or options.faces else None,
+            faces=_faces(mesh, options.faces),
             callback=_bound_memory(show, options.memory),
             **given,
         )
@@ -215,6 +220,17 @@ def _labels(mesh: MeshData, which: str | None) -> Any:
     if len(labels) != mesh.faces:
         raise ValueError(f"{path}: {count_of('number', 'numbers', len(labels))} for {mesh.faces} faces: give one each")
     return labels[mesh.rings.of_triangle]
+
+
+def _faces(mesh: MeshData, path: Path | None) -> Any:
+    """Return a mask (f,) of the triangles of the faces that a file lists."""
+    from quasiharmonic.util.arrays import check_range, mark
+
+    if path is None:
+        return None
+    listed = _read_integers(path, 1)[:, 0]
+    check_range(str(path), listed, mesh.faces, "face", "faces")
+    return mark(mesh.faces, listed)[mesh.rings.of_triangle]
 
 
 def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) -> Callable[[UnwrapStep], None] | None:
