@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.layout import ChartLayout, find_differing_sides
 from quasiharmonic.energies.deformation import signed_areas
@@ -78,13 +80,19 @@ class KeptCharts:
     rows : (k,) int64
         Triangles that stay, as rows of the cleaned mesh, ascending.
     layout : ChartLayout
-        Their charts.
+        Their charts. Parts of one chart that are not connected any more count as one.
+    before : ChartLayout
+        The charts including what is replaced.
+    triangles : (l,) int64
+        Triangles of the model in ``before``.
     """
 
     replaced: BoolArray
     corner_uv: FloatArray
     rows: IntArray
     layout: ChartLayout
+    before: ChartLayout
+    triangles: IntArray
 
     @property
     def count(self) -> int:
@@ -123,6 +131,26 @@ class KeptCharts:
         joined.mirrored[theirs], joined.mirrored[mine] = new.mirrored, kept.mirrored
         return joined
 
+    def certify(
+        self, joined: ChartLayout, cleaned: CleanedMesh, *, size: tuple[int, int], padding: float, stacked: bool
+    ) -> UnwrapCertificate:
+        """Certify new and kept charts together.
+
+        Parts that stay may touch at a vertex. They are sound if their charts were.
+        """
+        verify = partial(certify_charts, size=size, padding=padding, stacked=stacked)
+        found = verify(joined, cleaned.triangles)
+        if found.bijective or not self.count:
+            return found
+        before = verify(self.before, self.triangles)
+        good, new = found.bijective_charts.copy(), len(found.bijective_charts) - self.count
+        good[new:] |= before.bijective_charts[: self.count]
+        pairs = before.overlapping[(before.overlapping < self.count).all(axis=1)] + new
+        pairs = pairs[~found.bijective_charts[pairs].all(axis=1)]
+        return replace(
+            found, bijective_charts=good, overlapping=np.unique(np.concatenate([found.overlapping, pairs]), axis=0)
+        )
+
     def restore(self, uv: FloatArray, rows: IntArray) -> tuple[FloatArray, IntArray]:
         """Return texture coordinates (m, 2) and their rows (f, 3), with the given coordinates of triangles that stay.
 
@@ -143,16 +171,31 @@ def keep_charts(cleaned: CleanedMesh, replaced: BoolArray, corner_uv: FloatArray
             f"uv has no texture coordinates for {names_of('triangle', 'triangles', missing)}, which faces does not "
             "select: add them to faces"
         )
-    rows = np.flatnonzero(~replaced[cleaned.triangles])
-    F = cleaned.F[rows]
-    at = corner_uv[cleaned.triangles[rows]]
-    turned = cleaned.flipped[rows]
+    there = np.isfinite(corner_uv[cleaned.triangles]).all(axis=(1, 2))
+    F = cleaned.F[there]
+    at = corner_uv[cleaned.triangles[there]]
+    turned = cleaned.flipped[there]
     at[turned] = at[turned][:, (0, 2, 1)]
     number = np.unique(at.reshape(-1, 2), axis=0, return_inverse=True)[1].reshape(-1, 3)
-    cut = np.zeros(F.size, dtype=np.bool_)
-    cut[find_differing_sides(F, number, len(cleaned.V))] = True
-    split, chart = fans(F, cut.reshape(-1, 3))
+    cut = mark(F.size, find_differing_sides(F, number, len(cleaned.V))).reshape(-1, 3)
+    split, chart = fans(F, cut)
+    stays = ~replaced[cleaned.triangles[there]]
+    # Charts of which nothing stays are last.
+    left = mark(int(chart.max(initial=-1)) + 1, chart[stays])
+    chart = np.argsort(np.argsort(~left, kind="stable"))[chart]
+    return KeptCharts(
+        replaced,
+        corner_uv,
+        np.flatnonzero(there)[stays],
+        _lay_out(fans(F[stays], cut[stays])[0], at[stays], chart[stays]),
+        _lay_out(split, at, chart),
+        cleaned.triangles[there],
+    )
+
+
+def _lay_out(split: IntArray, at: FloatArray, chart: IntArray) -> ChartLayout:
+    """Return the layout of charts with triangles (k, 3), positions (k, 3, 2) and the chart (k,) of each triangle."""
     uv = np.empty((int(split.max(initial=-1)) + 1, 2))
     uv[split] = at
     mirrored: BoolArray = np.bincount(chart, signed_areas(split, to_complex(uv))) < 0
-    return KeptCharts(replaced, corner_uv, rows, ChartLayout(split, uv, chart, mirrored[chart]))
+    return ChartLayout(split, uv, chart, mirrored[chart])

@@ -229,7 +229,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     joined = layout
     if kept is not None:
         joined = kept.join(layout, whole)
-        certificate = certify_charts(joined, whole.triangles, size=size, padding=padding, stacked=wanted.stack)
+        certificate = kept.certify(joined, whole, size=size, padding=padding, stacked=wanted.stack)
     seams = find_seams(whole, joined)
     rules.wanted.check(cleaned, seams)
     uv, rows = joined.uv, whole.restore_corners(joined.rows)
