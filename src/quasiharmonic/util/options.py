@@ -116,10 +116,15 @@ def stretch_bound(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a finite number of at least 1, not {value!r}")
 
 
-def degrees_or_none(name: str, value: Any) -> None:
-    """Check an angle between two normals in degrees, or None."""
-    if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= 180):
-        raise ValueError(f"{name} must be an angle in degrees, above 0 and at most 180, not {value!r}")
+def hard_edges(name: str, value: Any) -> None:
+    """Check an angle between two normals in degrees, a list of edges, or None."""
+    from quasiharmonic.util.arrays import describe
+
+    if value is None or (hasattr(value, "__len__") and not isinstance(value, str)):
+        return
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= 180:
+        said = repr(value) if isinstance(value, Real | str) else describe(value)
+        raise ValueError(f"{name} must be an angle in degrees, above 0 and at most 180, edges or 'file', not {said}")
 
 
 def share(name: str, value: Any) -> None:
@@ -350,9 +355,7 @@ class UnwrapOptions(Options):
         check=stretch_bound,
     )
     max_charts: int | None = option(None, "maximum number of charts (default: no limit)", check=positive_or_none)
-    hard_edges: float | None = option(
-        None, "seams at all edges with a larger angle between the normals, in degrees", check=degrees_or_none
-    )
+    hard_edges: Any = option(None, check=hard_edges)
     symmetry: str | None = option(
         "auto",
         "mirror seams and charts in the middle plane normal to an axis (default: auto, where the model is symmetric)",

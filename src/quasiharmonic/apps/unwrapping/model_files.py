@@ -42,16 +42,21 @@ def corner_positions(mesh: MeshData) -> FloatArray:
 def statement_labels(mesh: MeshData, *keywords: str) -> IntArray:
     """Return a label (f,) for each triangle, equal where the last statements with these keywords in the file are equal.
 
-    The keywords are those of OBJ files: ``o`` and ``g`` for groups, ``usemtl`` for materials, ``s`` for smoothing.
+    The keywords are those of OBJ files: ``o`` and ``g`` for groups, ``usemtl`` for materials.
     """
-    labels, names = np.zeros((mesh.faces, len(keywords)), dtype=np.int64), dict[bytes, int]()
+    columns = [label_statements(mesh, keyword)[0] for keyword in keywords]
+    number: IntArray = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    return number
+
+
+def label_statements(mesh: MeshData, keyword: str) -> tuple[IntArray, dict[bytes, int]]:
+    """Return the number (f,) of the name in the last statement before each triangle, 0 for none, and these numbers."""
+    labels, names = np.zeros(mesh.faces, dtype=np.int64), dict[bytes, int]()
     for line, at in zip(mesh.statements.split(b"\n"), mesh.statement_faces.tolist(), strict=False):
-        keyword, _, name = line.partition(b" ")
-        if keyword.decode(errors="replace") in keywords:
-            column = keywords.index(keyword.decode())
-            labels[max(at, 0) :, column] = names.setdefault(name.strip(), len(names) + 1)
-    number: IntArray = np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
-    return number[mesh.rings.of_triangle]
+        word, _, name = line.partition(b" ")
+        if word == keyword.encode():
+            labels[max(at, 0) :] = names.setdefault(name.strip(), len(names) + 1)
+    return labels[mesh.rings.of_triangle], names
 
 
 def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from numbers import Real
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +12,13 @@ from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges, find_hinges
 from quasiharmonic.apps.unwrapping.layout import find_differing_sides
 from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, find_mirror
-from quasiharmonic.apps.unwrapping.wanted_seams import WantedSeams, extend_seams, read_wanted_seams
+from quasiharmonic.apps.unwrapping.wanted_seams import (
+    WantedSeams,
+    extend_seams,
+    mark_edges,
+    read_edges,
+    read_wanted_seams,
+)
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, index_array
 from quasiharmonic.util.options import UnwrapOptions
 
@@ -75,7 +82,7 @@ def find_rules(
         If lists of edges or labels are wrong.
     """
     wanted = read_wanted_seams(options.seams, options.no_seams, F, cleaned.representatives)
-    demanded, kept = wanted.mark(cleaned)
+    demanded, kept = mark_edges(cleaned, wanted.seams), mark_edges(cleaned, wanted.no_seams)
     labels = None if options.labels is None else _read_labels(options.labels, len(F))[cleaned.triangles]
     cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)
     cost = np.maximum(cost, _LEAST_COST)
@@ -94,12 +101,11 @@ def find_rules(
             mirror, symmetry = find_mirror(points, cleaned.F, options.symmetry)
         if not options.divide_for_packing:
             cost[hinges.mark_sides(hinges.flat, len(cleaned.F))] *= UNDIVIDED_COST
-        if options.hard_edges is not None:
-            demanded |= hinges.mark_sides(np.abs(hinges.angle) > np.deg2rad(options.hard_edges), len(cleaned.F)) & ~kept
+        demanded |= _mark_hard_edges(options.hard_edges, hinges, cleaned, F) & ~kept
     if mirror is not None:
         demanded, kept = (_mirror_sides(sides, hinges, mirror, cleaned.F) for sides in (demanded, kept))
     cost[kept] = _KEPT_COST
-    if len(wanted.seams):
+    if len(wanted.seams) or not isinstance(options.hard_edges, Real | None):
         demanded = extend_seams(points, cleaned.F, hinges, demanded, np.where(kept, np.inf, cost))
     cost[demanded] = DEMANDED_COST
     if uv_cuts is not None:
@@ -114,6 +120,15 @@ def _read_labels(values: ArrayLike, count: int) -> IntArray:
     if labels.shape != (count,):
         raise ValueError(f"labels must have shape ({count},), one for each triangle, not {labels.shape}")
     return labels
+
+
+def _mark_hard_edges(given: Any, hinges: Hinges, cleaned: CleanedMesh, F: IntArray) -> BoolArray:
+    """Return a mask (f', 3) of the sides at hard edges, given by an angle in degrees or listed."""
+    if given is None:
+        return np.zeros(cleaned.F.shape, dtype=np.bool_)
+    if isinstance(given, Real):
+        return hinges.mark_sides(np.abs(hinges.angle) > np.deg2rad(float(given)), len(cleaned.F))
+    return mark_edges(cleaned, read_edges("hard_edges", given, F, cleaned.representatives))
 
 
 def _mirror_sides(sides: BoolArray, hinges: Hinges, mirror: Mirror, F: IntArray) -> BoolArray:

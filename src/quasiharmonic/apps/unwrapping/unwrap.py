@@ -15,6 +15,7 @@ from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
+from quasiharmonic.apps.unwrapping.hard_edges import reads_hard_edges
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
     choose_packed,
@@ -58,7 +59,7 @@ class UnwrapKeywords(TypedDict, total=False):
     stack: bool
     outward: bool
     weld: bool | float
-    hard_edges: float | None
+    hard_edges: float | str | ArrayLike | None
     symmetry: str | None
     packing_loss: float
     divide_for_packing: bool
@@ -73,6 +74,7 @@ class UnwrapKeywords(TypedDict, total=False):
     jobs: int | None
 
 
+@reads_hard_edges
 @accepts_mesh
 @reports_progress
 @takes(UnwrapOptions, UnwrapKeywords)
@@ -110,8 +112,10 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     weld : bool or float
         Whether vertices at equal positions count as one, or a distance relative to the diagonal of the bounding box
         within which they do; see `clean`. The result has the numbering of the input.
-    hard_edges : float, optional
-        All edges with a larger angle between the normals, in degrees, become seams, as baked normal maps need it.
+    hard_edges : float, (k, 2) array of int, or "file", optional
+        All edges with a larger angle between the normals, in degrees, become seams, as baked normal maps need it; or
+        the listed edges. For a `MeshData` or a file, ``"file"`` means the edges with split normals or, without normals,
+        between smoothing groups. Edges in ``no_seams`` are left out.
     symmetry : str or None
         Axis normal to the plane of symmetry, ``"x"``, ``"y"`` or ``"z"``; ``"auto"`` takes the first one that fits.
         Seams and charts are mirrored if every vertex has a mirror image, to 1e-6 of the diagonal of the model's box,

@@ -32,11 +32,6 @@ class WantedSeams:
         """Whether there are no such edges."""
         return not (len(self.seams) or len(self.no_seams))
 
-    def mark(self, cleaned: CleanedMesh) -> tuple[BoolArray, BoolArray]:
-        """Return masks (f', 3) of the sides of the cleaned mesh that must be seams, and of those that must not."""
-        keys, n = _cleaned_keys(cleaned), len(cleaned.representatives)
-        return np.isin(keys, pair_keys(self.seams, n)), np.isin(keys, pair_keys(self.no_seams, n))
-
     def check(self, cleaned: CleanedMesh, found: IntArray) -> None:
         """Raise a ValueError unless the seams (s, 2) that were found are as wanted."""
         n = len(cleaned.representatives)
@@ -56,25 +51,33 @@ class WantedSeams:
 
 def read_wanted_seams(seams: ArrayLike | None, no_seams: ArrayLike | None, F: IntArray, joint: IntArray) -> WantedSeams:
     """Check both lists of edges, given the model's triangles (f, 3) and the representative (n,) of each vertex."""
-    n = len(joint)
-    there = edge_keys(joint[F], joint[F[:, (1, 2, 0)]], n)
-    found = []
-    for name, given in (("seams", seams), ("no_seams", no_seams)):
-        edges = index_array(name, [] if given is None else given)
-        if not edges.size:
-            edges = edges.reshape(0, 2)
-        if edges.ndim != 2 or edges.shape[1] != 2:
-            raise ValueError(f"{name} must have shape (k, 2), two vertices each, not {edges.shape}")
-        check_range(name, edges, n)
-        merged = np.sort(joint[edges], axis=1)
-        absent = ~np.isin(pair_keys(merged, n), there) | (merged[:, 0] == merged[:, 1])
-        if absent.any():
-            raise ValueError(f"{name}: {edge_names(edges[absent])}: not an edge of the mesh")
-        found.append(np.unique(merged, axis=0))
-    both = found[0][np.isin(pair_keys(found[0], n), pair_keys(found[1], n))]
+    must, must_not = read_edges("seams", seams, F, joint), read_edges("no_seams", no_seams, F, joint)
+    both = must[np.isin(pair_keys(must, len(joint)), pair_keys(must_not, len(joint)))]
     if len(both):
         raise ValueError(f"{edge_names(both)}: both in seams and in no_seams")
-    return WantedSeams(*found)
+    return WantedSeams(must, must_not)
+
+
+def read_edges(name: str, given: ArrayLike | None, F: IntArray, joint: IntArray) -> IntArray:
+    """Return edges (k, 2) by representatives, each once, after checking them; see `read_wanted_seams`."""
+    n = len(joint)
+    edges = index_array(name, [] if given is None else given)
+    if not edges.size:
+        edges = edges.reshape(0, 2)
+    if edges.ndim != 2 or edges.shape[1] != 2:
+        raise ValueError(f"{name} must have shape (k, 2), two vertices each, not {edges.shape}")
+    check_range(name, edges, n)
+    merged = np.sort(joint[edges], axis=1)
+    there = edge_keys(joint[F], joint[F[:, (1, 2, 0)]], n)
+    absent = ~np.isin(pair_keys(merged, n), there) | (merged[:, 0] == merged[:, 1])
+    if absent.any():
+        raise ValueError(f"{name}: {edge_names(edges[absent])}: not an edge of the mesh")
+    return np.unique(merged, axis=0)
+
+
+def mark_edges(cleaned: CleanedMesh, edges: IntArray) -> BoolArray:
+    """Return a mask (f', 3) of the sides of the cleaned mesh at edges (k, 2), given by representatives."""
+    return np.isin(_cleaned_keys(cleaned), pair_keys(edges, len(cleaned.representatives)))
 
 
 def _cleaned_keys(cleaned: CleanedMesh) -> IntArray:

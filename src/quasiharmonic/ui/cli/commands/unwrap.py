@@ -29,6 +29,7 @@ from quasiharmonic.ui.cli.arguments import (
     byte_count,
     count,
     declared,
+    degrees,
     file,
     flag,
     number,
@@ -63,6 +64,12 @@ def add_parser(commands: Commands) -> None:
         keep_seams=flag("keep the seams of the input's texture coordinates (vt), and add seams only where necessary"),
         edge_costs=file(
             "file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line"
+        ),
+        hard_edges=number(
+            _hard_edges,
+            "seams at all edges with a larger angle between the normals, in degrees; file: at those with split normals "
+            "or between smoothing groups",
+            metavar="ANGLE",
         ),
         seams=file("file of edges that become seams: two vertices, 0-based, on each line"),
         no_seams=file("file of edges that must not become seams"),
@@ -104,6 +111,7 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
     """Unwrap a mesh."""
+    from quasiharmonic.apps.unwrapping.hard_edges import find_hard_edges
     from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.util.arrays import count_of
@@ -117,6 +125,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             mesh.F,
             rotate=not options.no_rotate,
             edge_costs=_edge_costs(mesh, options.edge_costs),
+            hard_edges=find_hard_edges(mesh) if options.hard_edges == "file" else options.hard_edges,
             seams=_read_integers(options.seams, 2),
             no_seams=_read_integers(options.no_seams, 2),
             labels=_labels(mesh, options.labels),
@@ -155,6 +164,11 @@ def _resolution(text: str) -> tuple[int, int]:
     if len(sides) > 2:
         raise argparse.ArgumentTypeError(f"{text} is neither N nor WIDTHxHEIGHT")
     return sides[0], sides[-1]
+
+
+def _hard_edges(text: str) -> float | str:
+    """Convert an angle, or leave the word file; for argparse."""
+    return text if text == "file" else degrees(text)
 
 
 def _words(step: UnwrapStep) -> str:
