@@ -97,6 +97,26 @@ def test_edges_that_must_not_be_seams():
     assert not any(are_among(before[::8], after.seams))
 
 
+def cone(n, rows):
+    """A cone with its base, which unroll together only where they share one edge."""
+    points, F = tube(n, rows)
+    points[:, :2] *= 1 - points[:, 2:] / (rows + 1)
+    rim = np.arange(n)
+    ends = rim + (rows * n), (rim + 1) % n + rows * n
+    top = np.stack([*ends, np.full(n, len(points))], axis=1)
+    base = np.stack([(rim + 1) % n, rim, np.full(n, len(points) + 1)], axis=1)
+    return np.concatenate([points, [[0, 0, rows + 1], [0, 0, 0]]]), np.concatenate([F, top, base])
+
+
+def test_pieces_that_cannot_be_joined_at_all_edges_are_stretched():
+    V, F = cone(16, 3)
+    kept = np.stack([np.arange(6), np.arange(1, 7)], axis=1)
+    assert any(are_among(kept, unwrap(V, F, resolution=256).seams))
+    result = unwrap(V, F, resolution=256, no_seams=kept)
+    assert result.success
+    assert not any(are_among(kept, result.seams))
+
+
 def test_edges_of_merged_vertices_are_found():
     V, F = box(3)
     apart, own = V[F].reshape(-1, 3), np.arange(F.size).reshape(-1, 3)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges, find_hinges
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, find_hinges
 from quasiharmonic.apps.unwrapping.layout import find_differing_sides
 from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, find_mirror
 from quasiharmonic.apps.unwrapping.wanted_seams import (
@@ -24,8 +24,8 @@ from quasiharmonic.util.options import UnwrapOptions
 
 # Smaller factors on the cost of seams count as this one.
 _LEAST_COST = 1e-6
-# Factor on the cost of seams between two labels, and at edges that must not be seams.
-_COST_BETWEEN_LABELS, _KEPT_COST = 1e-3, 1e4
+# Factor on the cost of seams between two labels.
+_COST_BETWEEN_LABELS = 1e-3
 
 
 class Rules(NamedTuple):
@@ -104,7 +104,7 @@ def find_rules(
         demanded |= _mark_hard_edges(options.hard_edges, hinges, cleaned, F) & ~kept
     if mirror is not None:
         demanded, kept = (_mirror_sides(sides, hinges, mirror, cleaned.F) for sides in (demanded, kept))
-    cost[kept] = _KEPT_COST
+    cost[kept] = KEPT_COST
     if len(wanted.seams) or not isinstance(options.hard_edges, Real | None):
         demanded = extend_seams(points, cleaned.F, hinges, demanded, np.where(kept, np.inf, cost))
     cost[demanded] = DEMANDED_COST
