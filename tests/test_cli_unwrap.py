@@ -377,3 +377,11 @@ def test_wrong_files_of_seams_and_labels(model, tmp_path, capsys, option, text, 
     assert run("unwrap", model, "-o", tmp_path / "out.obj", option, tmp_path / "labels.txt") == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out.obj").exists()
+
+
+@pytest.mark.slow
+def test_up_on_the_command_line(model, tmp_path):
+    out = tmp_path / "out.obj"
+    assert run("unwrap", model, "-o", out, "--resolution", 256, "--up=-z") == 0
+    expected = unwrap(V, F, resolution=256, up="-z")
+    np.testing.assert_array_equal(io.read_mesh(out).corner_uv, expected.uvs[expected.indices])

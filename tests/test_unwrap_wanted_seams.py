@@ -50,6 +50,15 @@ def tube(n, rows):
     )
 
 
+def mirrored(V, F, axis):
+    """The upper half of a symmetric model along an axis, and its mirror image."""
+    middle = (V[:, axis].min() + V[:, axis].max()) / 2
+    half = F[(V[F][:, :, axis] >= middle - 1e-9).all(axis=1)]
+    images = np.where(np.arange(3) == axis, 2 * middle - V, V)
+    image = np.linalg.norm(V[None] - images[:, None], axis=2).argmin(axis=1)
+    return np.concatenate([half, image[half[:, ::-1]]])
+
+
 MODELS = {"box": box(4), "tube": tube(12, 4), "torus": torus(24, 10, 1.5), "starfish": starfish(3, 6)}
 
 
@@ -140,10 +149,7 @@ def test_demanded_edges_with_given_coordinates():
 @pytest.mark.slow
 def test_symmetric_models_get_the_mirror_images_of_demanded_edges():
     V, F = box(4)
-    half = F[(V[F][:, :, 0] >= 2).all(axis=1)]
-    mirrored = V * [-1, 1, 1] + [4, 0, 0]
-    image_of = (V[None] == mirrored[:, None]).all(axis=2).argmax(axis=1)
-    F = np.concatenate([half, image_of[half[:, ::-1]]])
+    F = mirrored(V, F, 0)
     edge = np.flatnonzero((V == [4, 2, 1]).all(axis=1) | (V == [4, 2, 2]).all(axis=1))
     result = unwrap(V, F, resolution=256, symmetry="x", seams=[edge])
     image = np.flatnonzero((V == [0, 2, 1]).all(axis=1) | (V == [0, 2, 2]).all(axis=1))
@@ -208,3 +214,36 @@ def test_pieces_are_joined_across_labels_last():
     border = edges[np.array(are_among(edges, all_edges(F[labels == 0])))]
     plain, result = (unwrap(V, F, resolution=256, labels=given) for given in (None, labels))
     assert sum(are_among(border, result.seams)) > sum(are_among(border, plain.seams))
+
+
+@pytest.mark.parametrize(("up", "height"), [("z", -1), ("-z", 1)])
+def test_a_lying_tube_is_cut_where_it_faces_down(up, height):
+    V, F = tube(24, 5)
+    V = V[:, (2, 0, 1)]
+    result = unwrap(V, F, resolution=128, up=up, symmetry=None)
+    assert result.n_charts == 1
+    assert (height * V[result.seams][:, :, 2] > 0.5).all()
+
+
+@pytest.mark.parametrize("turn", [0, 1])
+def test_a_star_shaped_tube_is_cut_in_concave_edges(turn):
+    V, F = tube(10, 2)
+    radius = np.where((np.arange(30) + turn) % 2 == 0, 1.0, 0.6)
+    V = V * radius[:, None] ** [1, 1, 0]
+    plain, result = (unwrap(V, F, resolution=128, up=up, packing_loss=1, symmetry=None) for up in (None, "z"))
+    assert radius[plain.seams].max() == 1
+    assert radius[result.seams].max() == 0.6
+
+
+def test_seams_of_a_model_that_is_mirrored_upwards_do_not_prefer_places_below():
+    V, F = tube(24, 5)
+    lying = V[:, (2, 0, 1)]
+    F = mirrored(lying, F, 2)
+    plain, result = (unwrap(lying, F, resolution=128, symmetry="z", up=up) for up in (None, "z"))
+    assert result.symmetry.applied
+    np.testing.assert_array_equal(result.seams, plain.seams)
+
+
+def test_a_wrong_direction_is_named():
+    with pytest.raises(ValueError, match="up"):
+        unwrap(*MODELS["tube"], up="w")

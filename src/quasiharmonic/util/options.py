@@ -25,6 +25,7 @@ STRATEGIES = "speed", "paper"
 MAX_ITERATIONS = 2000
 REFERENCES = "equilateral", "rest", "corrected"
 SYMMETRIES = "auto", "x", "y", "z"
+UPS = "x", "y", "z", "-x", "-y", "-z"
 LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 
 
@@ -139,6 +140,14 @@ def mirror_axis(name: str, value: Any) -> None:
         from quasiharmonic.util.arrays import check_choice
 
         check_choice(name, value, SYMMETRIES)
+
+
+def direction_or_none(name: str, value: Any) -> None:
+    """Check the direction of an axis, or None."""
+    if value is not None:
+        from quasiharmonic.util.arrays import check_choice
+
+        check_choice(name, value, UPS)
 
 
 def reference_name(name: str, value: Any) -> None:
@@ -361,6 +370,12 @@ class UnwrapOptions(Options):
         "mirror seams and charts in the middle plane normal to an axis (default: auto, where the model is symmetric)",
         check=mirror_axis,
         choices=(*SYMMETRIES, "none"),
+    )
+    up: str | None = option(
+        None,
+        "axis that points up: seams prefer places below and in concave edges, as --up z or --up=-z (default: none)",
+        check=direction_or_none,
+        choices=UPS,
     )
     packing_loss: float = option(
         0.02,

@@ -26,6 +26,9 @@ from quasiharmonic.util.options import UnwrapOptions
 _LEAST_COST = 1e-6
 # Factor on the cost of seams between two labels.
 _COST_BETWEEN_LABELS = 1e-3
+# Factor on the cost of seams on places that face down, below this slope, and in concave edges beyond this angle.
+_COST_BELOW, _SLOPE = 0.9, -0.5
+_COST_CONCAVE, _CONCAVE = 0.9, np.pi / 6
 
 
 class Rules(NamedTuple):
@@ -102,6 +105,8 @@ def find_rules(
         if not options.divide_for_packing:
             cost[hinges.mark_sides(hinges.flat, len(cleaned.F))] *= UNDIVIDED_COST
         demanded |= _mark_hard_edges(options.hard_edges, hinges, cleaned, F) & ~kept
+    if options.up is not None:
+        _prefer_hidden(cost, points, cleaned.F, hinges, options.up, symmetry)
     if mirror is not None:
         demanded, kept = (_mirror_sides(sides, hinges, mirror, cleaned.F) for sides in (demanded, kept))
     cost[kept] = KEPT_COST
@@ -120,6 +125,21 @@ def _read_labels(values: ArrayLike, count: int) -> IntArray:
     if labels.shape != (count,):
         raise ValueError(f"labels must have shape ({count},), one for each triangle, not {labels.shape}")
     return labels
+
+
+def _prefer_hidden(
+    cost: FloatArray, points: FloatArray, F: IntArray, hinges: Hinges, up: str, symmetry: Symmetry
+) -> None:
+    """Lower the costs (f, 3) of seams where the surface faces down, and in concave edges."""
+    cost[hinges.mark_sides(hinges.angle < -_CONCAVE, len(F))] *= _COST_CONCAVE
+    if symmetry.applied and symmetry.axis == up[-1]:
+        # Seams below are mirrored to the upper side.
+        return
+    normal = np.cross(points[F[:, 1]] - points[F[:, 0]], points[F[:, 2]] - points[F[:, 0]])
+    length = np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)
+    height = (-1 if up[0] == "-" else 1) * normal[:, "xyz".index(up[-1])] / length
+    below = (height[hinges.first] + height[hinges.second]) / 2 < _SLOPE
+    cost[hinges.mark_sides(below, len(F))] *= _COST_BELOW
 
 
 def _mark_hard_edges(given: Any, hinges: Hinges, cleaned: CleanedMesh, F: IntArray) -> BoolArray:

@@ -61,6 +61,7 @@ class UnwrapKeywords(TypedDict, total=False):
     weld: bool | float
     hard_edges: float | str | ArrayLike | None
     symmetry: str | None
+    up: str | None
     packing_loss: float
     divide_for_packing: bool
     edge_costs: ArrayLike | None
@@ -122,6 +123,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         and every triangle. Curved parts are not if triangles of theirs cross the plane, or if their seams would be
         much longer. `UnwrapResult.symmetry` says what was done. Without effect if ``uv`` is given, and ``"auto"`` also
         with ``edge_costs``, ``seams``, ``no_seams`` or ``labels``.
+    up : str, optional
+        Direction that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. Seams then cost a tenth
+        less where the surface faces down, and a tenth less in concave edges. By default visibility has no influence.
     packing_loss : float
         Flat and developable parts are joined across edges, for fewer charts and shorter seams, as long as the estimated
         share of the texture that they use falls by at most this value below the best one.
