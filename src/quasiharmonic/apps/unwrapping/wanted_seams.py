@@ -41,7 +41,7 @@ class WantedSeams:
         wrong = self.no_seams[np.isin(unwanted, present) & np.isin(unwanted, keys)]
         if len(wrong):
             raise ValueError(
-                f"{edge_names(wrong)} of no_seams must be cut, or their part of the surface has no map: omit some"
+                f"{edge_names(wrong)} of no_seams became seams: no charts without them were found, omit some"
             )
         wanted = pair_keys(self.seams, n)
         wrong = self.seams[np.isin(wanted, keys[times > 1]) & ~np.isin(wanted, present)]
