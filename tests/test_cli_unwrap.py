@@ -345,3 +345,57 @@ def test_straighten_makes_strips_rectangles(tmp_path, capsys):
     (strip,) = json.loads((tmp_path / "report.json").read_text())["strips"]
     assert (strip["columns"] * strip["rows"], strip["straightened"]) == (40, True)
     assert "1 of 1 strip straightened" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_seams_of_files_of_edges(model, tmp_path):
+    plain = unwrap(V, F, resolution=256)
+    kept, wanted = plain.seams[:2], np.array([F[0, :2], F[-1, :2]])
+    np.savetxt(tmp_path / "seams.txt", wanted, fmt="%d")
+    np.savetxt(tmp_path / "no_seams.txt", kept, fmt="%d")
+    out, report = tmp_path / "out.obj", tmp_path / "report.json"
+    files = ["--seams", tmp_path / "seams.txt", "--no-seams", tmp_path / "no_seams.txt"]
+    assert run("unwrap", model, "-o", out, "--resolution", 256, "--json", report, *files) == 0
+    expected = unwrap(V, F, resolution=256, seams=wanted, no_seams=kept)
+    np.testing.assert_array_equal(io.read_mesh(out).corner_uv, expected.uvs[expected.indices])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["groups", "materials", "file"])
+def test_labels_of_the_file_or_of_a_list(tmp_path, which):
+    keyword = {"groups": "g", "materials": "usemtl", "file": "#"}[which]
+    corners = [f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in F.tolist()]
+    labels = (V[F].mean(axis=1)[:, 0] > 0).astype(int)
+    faces = [f"{keyword} part{k}\n{corner}" for k, corner in zip(labels.tolist(), corners, strict=True)]
+    (tmp_path / "model.obj").write_text("".join([*(f"v {x!r} {y!r} {z!r}\n" for x, y, z in V.tolist()), *faces]))
+    np.savetxt(tmp_path / "labels.txt", labels, fmt="%d")
+    given = tmp_path / "labels.txt" if which == "file" else which
+    out = tmp_path / "out.obj"
+    assert run("unwrap", tmp_path / "model.obj", "-o", out, "--resolution", 256, "--labels", given) == 0
+    expected = unwrap(V, F, resolution=256, labels=labels)
+    np.testing.assert_array_equal(io.read_mesh(out).corner_uv, expected.uvs[expected.indices])
+    assert not np.array_equal(expected.charts, unwrap(V, F, resolution=256).charts)
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "words"),
+    [
+        ("--labels", "1\n2\n", "labels.txt: 2 numbers for"),
+        ("--labels", "0.5\n", "not a whole number"),
+        ("--seams", "0 1 2\n", "not 2 numbers"),
+        ("--no-seams", "0 100000\n", "--no-seams refers to vertex 100000"),
+    ],
+)
+def test_wrong_files_of_seams_and_labels(model, tmp_path, capsys, option, text, words):
+    (tmp_path / "labels.txt").write_text(text)
+    assert run("unwrap", model, "-o", tmp_path / "out.obj", option, tmp_path / "labels.txt") == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out.obj").exists()
+
+
+@pytest.mark.slow
+def test_up_on_the_command_line(model, tmp_path):
+    out = tmp_path / "out.obj"
+    assert run("unwrap", model, "-o", out, "--resolution", 256, "--up=-z") == 0
+    expected = unwrap(V, F, resolution=256, up="-z")
+    np.testing.assert_array_equal(io.read_mesh(out).corner_uv, expected.uvs[expected.indices])

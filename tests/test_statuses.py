@@ -97,5 +97,6 @@ def test_the_statuses_of_every_function_with_a_status_are_listed():
 def test_the_statuses_of_unwrap_are_listed():
     rows = re.findall(r"^\| `(\w+)` \| (yes|no) \| [^|]+ \|$", PAGE, re.MULTILINE)
     assert [name for name, _ in rows] == [status.name for status in UnwrapStatus]
-    verified = {status.name for status in UnwrapStatus if status.value.startswith("Every chart is bijective")}
+    said = "Every chart is bijective", "Every new chart is bijective"
+    verified = {status.name for status in UnwrapStatus if status.value.startswith(said)}
     assert {name for name, success in rows if success == "yes"} == verified

@@ -25,6 +25,7 @@ STRATEGIES = "speed", "paper"
 MAX_ITERATIONS = 2000
 REFERENCES = "equilateral", "rest", "corrected"
 SYMMETRIES = "auto", "x", "y", "z"
+UPS = "x", "y", "z", "-x", "-y", "-z"
 LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 
 
@@ -116,10 +117,15 @@ def stretch_bound(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a finite number of at least 1, not {value!r}")
 
 
-def degrees_or_none(name: str, value: Any) -> None:
-    """Check an angle between two normals in degrees, or None."""
-    if value is not None and (isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= 180):
-        raise ValueError(f"{name} must be an angle in degrees, above 0 and at most 180, not {value!r}")
+def hard_edges(name: str, value: Any) -> None:
+    """Check an angle between two normals in degrees, a list of edges, or None."""
+    from quasiharmonic.util.arrays import describe
+
+    if value is None or (hasattr(value, "__len__") and not isinstance(value, str)):
+        return
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= 180:
+        said = repr(value) if isinstance(value, Real | str) else describe(value)
+        raise ValueError(f"{name} must be an angle in degrees, above 0 and at most 180, edges or 'file', not {said}")
 
 
 def share(name: str, value: Any) -> None:
@@ -144,6 +150,14 @@ def stacking(name: str, value: Any) -> None:
         check_choice(name, value, ("mirrored",))
     else:
         switch(name, value)
+
+
+def direction_or_none(name: str, value: Any) -> None:
+    """Check the direction of an axis, or None."""
+    if value is not None:
+        from quasiharmonic.util.arrays import check_choice
+
+        check_choice(name, value, UPS)
 
 
 def reference_name(name: str, value: Any) -> None:
@@ -360,14 +374,18 @@ class UnwrapOptions(Options):
         check=stretch_bound,
     )
     max_charts: int | None = option(None, "maximum number of charts (default: no limit)", check=positive_or_none)
-    hard_edges: float | None = option(
-        None, "seams at all edges with a larger angle between the normals, in degrees", check=degrees_or_none
-    )
+    hard_edges: Any = option(None, check=hard_edges)
     symmetry: str | None = option(
         "auto",
         "mirror seams and charts in the middle plane normal to an axis (default: auto, where the model is symmetric)",
         check=mirror_axis,
         choices=(*SYMMETRIES, "none"),
+    )
+    up: str | None = option(
+        None,
+        "axis that points up: seams prefer places below and in concave edges, as --up z or --up=-z (default: none)",
+        check=direction_or_none,
+        choices=UPS,
     )
     packing_loss: float = option(
         0.02,
@@ -389,7 +407,11 @@ class UnwrapOptions(Options):
     outward: bool = option(False, "treat closed components that are inside out as turned outward", check=switch)
     weld: Any = option(True, check=welding)
     edge_costs: Any = option(None)
+    seams: Any = option(None)
+    no_seams: Any = option(None)
+    labels: Any = option(None)
     uv: Any = option(None)
+    faces: Any = option(None)
     seed: int = option(0, "seed of random choices (default: 0)", check=count)
     time_limit: float | None = option(
         None, "end the search for few charts after this many seconds, and keep the best charts", check=seconds

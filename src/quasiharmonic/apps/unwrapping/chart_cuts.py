@@ -7,7 +7,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
-from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
+from quasiharmonic.apps.unwrapping.hinges import KEPT_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
@@ -181,7 +181,9 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     k, lowest, highest = len(chart.F), *_BAND
     group = _group_undivided(chart.cost, graph)
     if not group.any():
-        # The chart is a single polygon, which can only be divided between its triangles.
+        # The chart is a single polygon or flat face, which can only be divided between its triangles.
+        group = _group_undivided(chart.cost, graph, KEPT_COST)
+    if not group.any():
         group = np.arange(k)
     t = _mean_of_groups(t, group)
     inside = np.abs(t - 0.5)
@@ -222,13 +224,13 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     return line
 
 
-def _group_undivided(cost: FloatArray, graph: EdgeGraph) -> IntArray:
+def _group_undivided(cost: FloatArray, graph: EdgeGraph, least: float = UNDIVIDED_COST) -> IntArray:
     """Label (k,) of the group of triangles that should stay together: its first triangle.
 
-    ``cost`` (k, 3) are the factors of the sides.
+    ``cost`` (k, 3) are the factors of the sides; triangles stay together at factors of at least ``least``.
     """
     first, second, edge = _pairs(graph)
-    dear = mark(len(graph.ends), graph.side.T[cost >= UNDIVIDED_COST])
+    dear = mark(len(graph.ends), graph.side.T[cost >= least])
     joined = dear[edge]
     return label_components(first[joined], second[joined], len(cost))
 

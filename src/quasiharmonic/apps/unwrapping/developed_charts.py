@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, find_hinges
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, find_hinges
 from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
@@ -16,6 +17,8 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
 
 # Pieces are joined in several rounds. In each, unions are at most so long, in sides of the texture, and their boxes may
 # exceed those of their parts by a fraction.
+# Limits at which charts are joined only where they must be.
+_ONLY_FORCED = (0.0, -1.0)
 _ROUNDS = ((0.25, 0.02), (0.45, 0.02), (0.8, 0.02))
 
 
@@ -35,7 +38,8 @@ def develop_charts(
     F : (f, 3) int64
     cost : (f, 3) float64
         Factor on the cost of cutting each side of each triangle. Pieces are joined across sides with factors of at
-        least `UNDIVIDED_COST` unless they overlap, and never at factors of at most `DEMANDED_COST`.
+        least `UNDIVIDED_COST` unless they overlap, and never at factors of at most `DEMANDED_COST`. Pieces that cannot
+        be joined at a factor of at least `KEPT_COST` count as curved.
     choose : callable
         Chooses from several lists of charts, whose number decreases.
     check_wanted : callable
@@ -61,6 +65,19 @@ def develop_charts(
     weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other]) / 2
     together = hinges.touch(cost >= UNDIVIDED_COST)
     model.list_contacts(~demanded)
+    kept = hinges.touch(cost >= KEPT_COST)
+    if kept.any():
+        own = replace(pieces, label=pieces.label.copy(), place=pieces.place.copy(), glued=pieces.glued.copy())
+        model.join(weight, kept, *_ONLY_FORCED, check_wanted)
+        torn = kept & ~pieces.glued
+        lost = np.unique(pieces.label[np.concatenate([hinges.first[torn], hinges.second[torn]])])
+        if lost[lost >= 0].size:
+            pieces = own.without(hinges, np.isin(pieces.label, lost))
+            model = PaperModel(F, hinges, pieces, area / 2, mirror)
+            model.list_contacts(~demanded)
+            model.join(weight, kept, *_ONLY_FORCED, check_wanted)
+        if not pieces.count:
+            return pieces.label >= 0, []
     known: dict[int, Chart] = {}
     found = [_list_charts(F, model, pieces, known)]
     for longest, loss in _ROUNDS:

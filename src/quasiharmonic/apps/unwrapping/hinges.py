@@ -14,6 +14,8 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 #: Triangles on the two sides of an edge with at least this cost factor stay together, such as those of a polygon.
 UNDIVIDED_COST = 1e3
+#: Edges with at least this cost factor must not be seams. The diagonals of flat polygons have smaller factors.
+KEPT_COST = 1e7
 #: Sides with at most this cost factor must be seams.
 DEMANDED_COST = 1e-9
 # Two triangles lie in one plane if no corner of one is farther from the plane of the other than this, relative to the

@@ -9,7 +9,7 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.util.arrays import FloatArray, mark
+from quasiharmonic.util.arrays import FloatArray, IntArray, mark
 
 # Factor on the cost of a seam inside a polygon, which the file cannot store.
 _INSIDE_POLYGON = 1e3
@@ -35,8 +35,28 @@ def corner_positions(mesh: MeshData) -> FloatArray:
     Raises ValueError if the file has none.
     """
     if mesh.vt is None or mesh.FT is None:
-        raise ValueError("the file has no texture coordinates (vt) whose seams could be used: omit --keep-seams")
+        raise ValueError("the file has no texture coordinates (vt) to keep: omit --keep-seams and --faces")
     return np.where(mesh.FT[:, :, None] >= 0, mesh.vt[mesh.FT], np.nan)
+
+
+def statement_labels(mesh: MeshData, *keywords: str) -> IntArray:
+    """Return a label (f,) for each triangle, equal where the last statements with these keywords in the file are equal.
+
+    The keywords are those of OBJ files: ``o`` and ``g`` for groups, ``usemtl`` for materials.
+    """
+    columns = [label_statements(mesh, keyword)[0] for keyword in keywords]
+    number: IntArray = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    return number
+
+
+def label_statements(mesh: MeshData, keyword: str) -> tuple[IntArray, dict[bytes, int]]:
+    """Return the number (f,) of the name in the last statement before each triangle, 0 for none, and these numbers."""
+    labels, names = np.zeros(mesh.faces, dtype=np.int64), dict[bytes, int]()
+    for line, at in zip(mesh.statements.split(b"\n"), mesh.statement_faces.tolist(), strict=False):
+        word, _, name = line.partition(b" ")
+        if word == keyword.encode():
+            labels[max(at, 0) :] = names.setdefault(name.strip(), len(names) + 1)
+    return labels[mesh.rings.of_triangle], names
 
 
 def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:

@@ -83,10 +83,12 @@ class PaperModel:
         self._watched: BoolArray = np.zeros(hinges.one.size, dtype=np.bool_)
         # Pairs of charts that overlap if they are joined at this number of hinges. They also do when others are added.
         self._overlapping = set[tuple[int, int, int]]()
+        self._demanded = np.flatnonzero(self._watched)
 
     def list_contacts(self, may_join: BoolArray) -> None:
-        """Find where charts may be joined, given a mask of hinges (e,)."""
+        """Find where charts may be joined, given a mask of hinges (e,). All others stay open."""
         label, hinges = self._pieces.label, self._hinges
+        self._demanded = np.flatnonzero(~may_join)
         one, other = label[hinges.first], label[hinges.second]
         self._watched = may_join & (one >= 0) & (other >= 0) & (one != other)
         between = np.flatnonzero(self._watched)
@@ -232,9 +234,23 @@ class PaperModel:
     def _is_simple(self, rows: IntArray) -> bool:
         """Whether some triangles, joined at the glued hinges, have boundaries that stay apart."""
         own = self.split(rows)
+        if self._closes_demanded(rows, own):
+            return False
         uv = np.empty((int(own.max()) + 1, 2))
         uv[own] = to_points(self._pieces.place[rows].ravel()).reshape(-1, 3, 2)
         return not check_loops(boundary_loops(own, len(uv)), np.rint(uv / self._unit) * self._unit)[1]
+
+    def _closes_demanded(self, rows: IntArray, own: IntArray) -> bool:
+        """Whether the two sides of a demanded seam have equal vertices ``own`` (k, 3) at both ends."""
+        if not self._demanded.size:
+            return False
+        order = np.argsort(rows)
+        sides = np.stack([self._hinges.one[self._demanded], self._hinges.other[self._demanded]])
+        at = np.minimum(np.searchsorted(rows[order], sides // 3), len(rows) - 1)
+        place = 3 * order[at] + sides % 3
+        here = (rows[order[at]] == sides // 3).all(axis=0)
+        tail, head = own.ravel()[place], own[:, (1, 2, 0)].ravel()[place]
+        return bool((here & (tail[0] == head[1]) & (head[0] == tail[1])).any())
 
     def split(self, rows: IntArray) -> IntArray:
         """Return some triangles (k, 3) by vertices of their own, joined at the glued hinges only."""

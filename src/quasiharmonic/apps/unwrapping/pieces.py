@@ -77,6 +77,12 @@ class Pieces:
         """Number of pieces."""
         return int(self.label.max(initial=-1)) + 1
 
+    def without(self, hinges: Hinges, curved: BoolArray) -> Pieces:
+        """Return the pieces without some whole ones, whose triangles (f,) then count as curved."""
+        label = np.where(curved, -1, self.label)
+        label[label >= 0] = np.unique(label[label >= 0], return_inverse=True)[1]
+        return Pieces(label, np.where(curved[:, None], 0.0, self.place), self.glued & ~curved[hinges.first])
+
 
 class _Parts:
     """Parts of a surface (f, 3) whose triangles are connected by joined hinges (e,)."""

@@ -14,7 +14,7 @@ from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
 from quasiharmonic.io.adapters.trimesh import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
-from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, find_exponent, names_of
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, find_exponent, names_of
 from quasiharmonic.util.outcome import Outcome
 
 if TYPE_CHECKING:
@@ -38,6 +38,19 @@ class UnwrapStatus(Enum):
         "Every chart is bijective and no two charts overlap, verified exactly. The time limit ended the search for few "
         "charts: see unfinished. Allow more time."
     )
+    KEPT_FAULTS = (
+        "Every new chart is bijective and overlaps no sound chart, verified exactly. Some kept charts are not "
+        "bijective or overlap each other: see certificate. Add their triangles to faces to replace them."
+    )
+
+
+def find_status(certificate: UnwrapCertificate, misses: list[Miss], ended: bool) -> UnwrapStatus:
+    """Return the status of a result in which all new charts are bijective; ``ended`` by the time limit or not."""
+    if not certificate.bijective:
+        return UnwrapStatus.KEPT_FAULTS
+    if ended:
+        return UnwrapStatus.TIME_LIMIT
+    return UnwrapStatus.STRETCHED if misses else UnwrapStatus.UNWRAPPED
 
 
 class Stretch(NamedTuple):
@@ -104,16 +117,16 @@ class UnwrapResult(Outcome):
         Texture coordinates in the unit square, or in the squares of several tiles. They are multiples of a power of
         two that single precision stores exactly, also with v reversed as in glTF.
     charts : (f,) int64
-        Chart of each triangle, from 0.
+        Chart of each triangle, from 0. With ``faces``, new charts come first.
     seams : (s, 2) int64
         Edges of the model along which the map is cut, by vertices, smaller vertex first, ascending. Of several edges
         whose vertices were merged, the first one is listed.
     certificate : UnwrapCertificate
         The exact verdict on ``uvs``.
     triangle_stretch : (f,) float64
-        Stretch of each triangle; NaN for triangles without area.
+        Stretch of each triangle; NaN for triangles without area and for kept ones.
     stretch : Stretch
-        Median, 99 % and worst stretch.
+        Of the new charts: median, 99 % and worst stretch.
     misses : tuple of Miss
         Charts that exceed the bound on the stretch, largest excess first; empty if it is kept.
     utilisation : float
@@ -124,7 +137,9 @@ class UnwrapResult(Outcome):
     resolution : (int, int)
         Width and height of the texture in texels.
     texels_per_unit : float
-        Texels per unit of length of the model.
+        Texels per unit of length of the model, in new charts.
+    kept_charts : (c,) bool
+        Charts whose texture coordinates were kept; see ``faces``.
     V : (n, 2) or (n, 3) float64
         Positions of the model's vertices.
     strips : tuple of Strip
@@ -153,6 +168,7 @@ class UnwrapResult(Outcome):
     status: UnwrapStatus
     resolution: tuple[int, int]
     texels_per_unit: float
+    kept_charts: BoolArray
     V: FloatArray
     strips: tuple[Strip, ...]
     symmetry: Symmetry
@@ -164,8 +180,12 @@ class UnwrapResult(Outcome):
 
     @property
     def success(self) -> bool:
-        """Whether every chart is bijective and no two charts overlap; charts may still exceed the bound (`misses`)."""
-        return self.certificate.bijective
+        """Whether every new chart is bijective and overlaps no other chart.
+
+        Charts may still exceed the bound (`misses`). Faults of kept charts count only in ``certificate.bijective``.
+        """
+        sound = bool(self.certificate.bijective_charts[~self.kept_charts].all())
+        return sound and bool(self.kept_charts[self.certificate.overlapping].all())
 
     @property
     def n_charts(self) -> int:
@@ -197,6 +217,8 @@ class UnwrapResult(Outcome):
             f"{100 * self.utilisation:.1f} % of the texture used, {self.texels_per_unit:.4g} texels per unit",
             f"certificate: {self.certificate.summary()}",
         ]
+        if kept := int(self.kept_charts.sum()):
+            lines.append(f"{count_of('chart', 'charts', kept)} kept, {self.n_charts - kept} new")
         lines += describe_symmetry(self.symmetry)
         if self.strips:
             lines.append(_describe_strips(self.strips))
@@ -221,6 +243,7 @@ class UnwrapResult(Outcome):
         return {
             **super().to_dict(),
             "charts": self.n_charts,
+            "kept_charts": int(self.kept_charts.sum()),
             "seam_edges": len(self.seams),
             "seam_length": self.seam_length,
             "stretch": _finite(self.stretch),

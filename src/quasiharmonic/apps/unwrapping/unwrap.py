@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, TypedDict, Unpack
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,20 +18,21 @@ from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
 from quasiharmonic.apps.unwrapping.draft import Draft
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, find_hinges
+from quasiharmonic.apps.unwrapping.hard_edges import reads_hard_edges
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
     choose_packed,
-    find_differing_sides,
     find_seams,
     join_charts,
 )
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.mirrored_charts import pair_charts
-from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStep, find_status
+from quasiharmonic.apps.unwrapping.seam_rules import Rules, find_rules
+from quasiharmonic.apps.unwrapping.selection import keep_charts, read_faces, select
 from quasiharmonic.apps.unwrapping.straightening import Strip, straighten_strips
-from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, check_symmetry, find_mirror
+from quasiharmonic.apps.unwrapping.symmetry import check_symmetry
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.run import run_until
@@ -50,10 +51,6 @@ from quasiharmonic.util.progress import reports_progress
 
 # Positions beyond this power of two, or all below its reciprocal, are scaled.
 _MAX_EXPONENT = 300
-# Angles between normals, in radians, that differ by at most this value count as equal, as files round positions.
-_SAME_ANGLE = 1e-4
-# Smaller factors on the cost of seams count as this one.
-_LEAST_COST = 1e-6
 # After a time limit, charts are completed, packed and certified in about the time that the preparation takes.
 _RESERVED = 1.0
 # Then so many charts are packed by their shapes, and further ones as boxes.
@@ -73,19 +70,25 @@ class UnwrapKeywords(TypedDict, total=False):
     stack: bool | str
     outward: bool
     weld: bool | float
-    hard_edges: float | None
+    hard_edges: float | str | ArrayLike | None
     symmetry: str | None
+    up: str | None
     packing_loss: float
     divide_for_packing: bool
     straighten: bool
     edge_costs: ArrayLike | None
+    seams: ArrayLike | None
+    no_seams: ArrayLike | None
+    labels: ArrayLike | None
     uv: ArrayLike | None
+    faces: ArrayLike | None
     seed: int
     time_limit: float | None
     callback: Callable[[UnwrapStep], object] | None
     jobs: int | None
 
 
+@reads_hard_edges
 @accepts_mesh
 @reports_progress
 @takes(UnwrapOptions, UnwrapKeywords)
@@ -124,14 +127,19 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     weld : bool or float
         Whether vertices at equal positions count as one, or a distance relative to the diagonal of the bounding box
         within which they do; see `clean`. The result has the numbering of the input.
-    hard_edges : float, optional
-        All edges with a larger angle between the normals, in degrees, become seams, as baked normal maps need it.
+    hard_edges : float, (k, 2) array of int, or "file", optional
+        All edges with a larger angle between the normals, in degrees, become seams, as baked normal maps need it; or
+        the listed edges. For a `MeshData` or a file, ``"file"`` means the edges with split normals or, without normals,
+        between smoothing groups. Edges in ``no_seams`` are left out.
     symmetry : str or None
         Axis normal to the plane of symmetry, ``"x"``, ``"y"`` or ``"z"``; ``"auto"`` takes the first one that fits.
         Seams and charts are mirrored if every vertex has a mirror image, to 1e-6 of the diagonal of the model's box,
         and every triangle. Curved parts are not if triangles of theirs cross the plane, or if their seams would be
         much longer. `UnwrapResult.symmetry` says what was done. Without effect if ``uv`` is given, and ``"auto"`` also
-        with ``edge_costs``.
+        with ``edge_costs``, ``seams``, ``no_seams`` or ``labels``.
+    up : str, optional
+        Direction that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. Seams then cost a tenth
+        less where the surface faces down, and a tenth less in concave edges. By default visibility has no influence.
     packing_loss : float
         Flat and developable parts are joined across edges, for fewer charts and shorter seams, as long as the estimated
         share of the texture that they use falls by at most this value below the best one.
@@ -146,9 +154,22 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Positive factor on the cost of a seam at each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
         Large values keep seams away from visible parts. Values of at least 1,000 keep two triangles together where
         possible, such as the triangles of a polygon.
+    seams : (k, 2) array of int, optional
+        Edges that become seams, by vertices, such as `UnwrapResult.seams`. Where they end inside a flat or developable
+        part, they are extended to its border or to another seam. A single edge elsewhere is extended by one edge.
+        Boundary edges have no effect.
+    no_seams : (k, 2) array of int, optional
+        Edges that must not become seams.
+    labels : (f,) array of int, optional
+        Part of the model to which each triangle belongs, such as a material. Seams between parts cost almost nothing,
+        and charts are joined across them last.
     uv : (n, 2) or (f, 3, 2) array, optional
         Texture coordinates of each vertex, or of each corner, whose seams are kept. Further seams are made only in
         closed parts, in parts with handles, and where the bound requires it. By default all seams are new.
+    faces : (k,) array of int or (f,) array of bool, optional
+        Only these triangles are unwrapped. All others keep their texture coordinates ``uv``, which is required, bit for
+        bit. New charts are placed into free space of the texture, by default at the mean texel density of the others.
+        Edges between both become seams.
     seed : int
         Seed of random choices. Equal input and seed give equal results, unless the time limit ends the search.
     time_limit : float, optional
@@ -170,8 +191,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     ------
     ValueError
         If an array has the wrong shape, a position is not finite, an index is out of range, or no triangle has an area.
-        The message names the elements. If the texture is too small for the padding of all charts, the message states
-        the smallest sufficient resolution.
+        The message names the elements. Also if pairs in ``seams`` or ``no_seams`` are no edges of the mesh, are in both
+        lists, or cannot be kept. If the texture is too small for the padding of all charts, the message states the
+        smallest sufficient resolution, or with ``faces`` a sufficient texel density.
 
     Examples
     --------
@@ -197,20 +219,28 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             wanted.callback(UnwrapStep(phase, done, total))
 
     report("clean")
-    cleaned = clean(V, F, wanted.outward, weld=wanted.weld)
+    whole = clean(V, F, wanted.outward, weld=wanted.weld)
     # In this unit, areas neither overflow nor underflow.
-    exponent = find_exponent(cleaned.V)
+    exponent = find_exponent(whole.V)
     exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
+    cleaned, kept = whole, None
+    if wanted.faces is not None:
+        if corner_uv is None:
+            raise ValueError("faces needs uv: pass the texture coordinates that the other triangles keep")
+        kept = keep_charts(whole, read_faces(wanted.faces, len(F)), corner_uv)
+        cleaned = select(whole, kept.replaced)
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
-    rules = _find_rules(points, cleaned, costs, corner_uv, wanted)
+    rules = find_rules(points, cleaned, F, costs, corner_uv if kept is None else None, wanted)
     bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit
+    if density is None and kept is not None:
+        density = kept.find_density(V, F, size)
     draft, grown, strips = Draft(), np.zeros(len(cleaned.F), dtype=bool), list[Strip]()
     spent = time.perf_counter() - began
     left = None if wanted.time_limit is None else wanted.time_limit - (1 + _RESERVED) * spent
     made = run_until(left, lambda: _make_charts(points, cleaned, rules, wanted, size, draft, report))
     ended = made is None
     if made is None:
-        charts, grown = draft.complete(points, cleaned.F, rules.cost, rules.cuts, bound)
+        charts, grown = draft.complete(points, cleaned.F, rules.cost, rules.uv_cuts, bound)
     else:
         charts, strips = made
     while True:
@@ -225,6 +255,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             stack=bool(wanted.stack),
             kinds=pair_charts(charts, rules.mirror) if wanted.stack == "mirrored" else None,
             closely=_PACKED_CLOSELY if ended else BITMAPS,
+            occupied=None if kept is None or not kept.count else (kept.layout.uv, kept.layout.rows),
         )
         report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
@@ -235,9 +266,18 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             break
         scale = packing.texels_per_unit / max(size)
         charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=rules.cost, bound=bound)
+    joined = layout
+    if kept is not None:
+        joined = kept.join(layout, whole)
+        certificate = kept.certify(joined, whole, size=size, padding=padding, stacked=wanted.stack)
+    seams = find_seams(whole, joined)
+    rules.wanted.check(cleaned, seams)
+    uv, rows = joined.uv, whole.restore_corners(joined.rows)
+    if kept is not None:
+        uv, rows = kept.restore(uv, rows)
     # Rows of texture coordinates are ordered by vertex, then by chart.
-    key, indices = np.unique(F * len(layout.uv) + cleaned.restore_corners(layout.rows), return_inverse=True)
-    vmapping, row = np.divmod(key, len(layout.uv))
+    key, indices = np.unique(F * len(uv) + rows, return_inverse=True)
+    vmapping, row = np.divmod(key, len(uv))
     stretch, area = _measure(points, cleaned, layout, size)
     misses = [
         Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), chart.misses)
@@ -250,19 +290,20 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     return UnwrapResult(
         vmapping=vmapping,
         indices=indices.reshape(-1, 3),
-        uvs=layout.uv[row],
-        charts=cleaned.restore_corners(np.repeat(layout.chart[:, None], 3, axis=1))[:, 0],
-        seams=find_seams(cleaned, layout),
+        uvs=uv[row],
+        charts=whole.restore_corners(np.repeat(joined.chart[:, None], 3, axis=1))[:, 0],
+        seams=seams,
         certificate=certificate,
         triangle_stretch=every,
         stretch=_summarise(stretch, area),
         misses=tuple(misses),
-        utilisation=packing.utilisation,
-        cleaned=cleaned,
-        status=UnwrapStatus.TIME_LIMIT if ended else UnwrapStatus.STRETCHED if misses else UnwrapStatus.UNWRAPPED,
+        utilisation=packing.utilisation + (0.0 if kept is None else kept.area / wanted.tiles),
+        cleaned=whole,
+        status=find_status(certificate, misses, ended),
         resolution=size,
         texels_per_unit=float(np.ldexp(packing.texels_per_unit, -exponent)),
         V=V,
+        kept_charts=np.arange(len(certificate.bijective_charts)) >= len(charts),
         strips=tuple(strip._replace(triangle=int(cleaned.triangles[strip.triangle])) for strip in strips),
         symmetry=check_symmetry(rules.symmetry, rules.mirror, layout.chart),
         seconds=time.perf_counter() - began,
@@ -270,58 +311,10 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     )
 
 
-class _Rules(NamedTuple):
-    """Where seams are wanted on a cleaned mesh.
-
-    Attributes
-    ----------
-    cost : (f, 3) float64
-        Factor on the cost of a seam at each side; see `find_charts`.
-    uv : (f, 3, 2) float64 or None
-        Texture coordinates whose seams are kept.
-    cuts : (l, 2) int64 or None
-        These seams.
-    mirror : Mirror or None
-        Mirror images, if the model is symmetric.
-    symmetry : Symmetry
-    """
-
-    cost: FloatArray
-    uv: FloatArray | None
-    cuts: IntArray | None
-    mirror: Mirror | None
-    symmetry: Symmetry
-
-
-def _find_rules(
-    points: FloatArray,
-    cleaned: CleanedMesh,
-    costs: FloatArray | None,
-    corner_uv: FloatArray | None,
-    wanted: UnwrapOptions,
-) -> _Rules:
-    """Return where seams are wanted, given costs (f, 3) and texture coordinates (f, 3, 2) of the model."""
-    F = cleaned.F
-    cost = np.ones(F.shape) if costs is None else _turn_sides(costs, cleaned)
-    mirror, symmetry = None, Symmetry(None, 0.0, False, "")
-    uv = None if corner_uv is None else _turn_corners(corner_uv, cleaned)
-    if uv is None:
-        hinges = find_hinges(points, F)
-        if wanted.symmetry is not None and (costs is None or wanted.symmetry != "auto"):
-            mirror, symmetry = find_mirror(points, F, wanted.symmetry)
-        cost = np.maximum(cost, _LEAST_COST)
-        if not wanted.divide_for_packing:
-            cost[hinges.mark_sides(hinges.flat, len(F))] *= UNDIVIDED_COST
-        if wanted.hard_edges is not None:
-            sharp = np.abs(hinges.angle) > np.deg2rad(wanted.hard_edges) + _SAME_ANGLE
-            cost[hinges.mark_sides(sharp, len(F))] = DEMANDED_COST
-    return _Rules(cost, uv, None if uv is None else _find_uv_cuts(uv, cleaned), mirror, symmetry)
-
-
 def _make_charts(
     points: FloatArray,
     cleaned: CleanedMesh,
-    rules: _Rules,
+    rules: Rules,
     wanted: UnwrapOptions,
     size: tuple[int, int],
     draft: Draft,
@@ -331,7 +324,7 @@ def _make_charts(
     bound, tiles, most = float(wanted.max_stretch), wanted.tiles, wanted.max_charts
     straight, strips = list[Chart](), list[Strip]()
     if wanted.straighten:
-        straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.cuts, bound, most)
+        straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others = np.flatnonzero(rest), straight
     charts = find_charts(
@@ -340,7 +333,7 @@ def _make_charts(
         max_stretch=bound,
         max_charts=None if most is None else most - len(straight),
         edge_costs=rules.cost[rest],
-        uv_cuts=rules.cuts,
+        uv_cuts=rules.uv_cuts,
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
         draft=draft,
@@ -383,31 +376,6 @@ def _corner_positions(uv: ArrayLike, F: IntArray, n: int) -> FloatArray:
     if array.shape != (*F.shape, 2):
         raise ValueError(f"uv must have shape ({n}, 2) or ({len(F)}, 3, 2), not {array.shape}")
     return array
-
-
-def _turn_sides(costs: FloatArray, cleaned: CleanedMesh) -> FloatArray:
-    """Return the costs of the sides of the cleaned triangles."""
-    turned = costs[cleaned.triangles]
-    # Reversing a triangle exchanges its first and last side.
-    turned[cleaned.flipped] = turned[cleaned.flipped][:, ::-1]
-    return turned
-
-
-def _turn_corners(corner_uv: FloatArray, cleaned: CleanedMesh) -> FloatArray:
-    """Return the texture coordinates of the corners of the cleaned triangles."""
-    position = corner_uv[cleaned.triangles]
-    # Reversing a triangle exchanges its last two corners.
-    position[cleaned.flipped] = position[cleaned.flipped][:, (0, 2, 1)]
-    return position
-
-
-def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
-    """Return the edges (k, 2) of the cleaned mesh at which texture coordinates (f', 3, 2) differ."""
-    # Corners without coordinates count as one position.
-    position = np.nan_to_num(corner_uv, nan=np.finfo(np.float64).max) + 0.0
-    rows = np.unique(position.reshape(-1, 2), axis=0, return_inverse=True)[1]
-    side = find_differing_sides(cleaned.F, rows.reshape(-1, 3), len(cleaned.V))
-    return np.stack([cleaned.F.ravel()[side], cleaned.F[:, (1, 2, 0)].ravel()[side]], axis=1)
 
 
 def _measure(

@@ -45,12 +45,24 @@ def draw(shape: Shape, direction: complex, scale: float, radius: float) -> BoolA
     return found
 
 
+def draw_in_place(shape: Shape, rows: int, columns: int, radius: float) -> BoolArray:
+    """Cells (rows, columns) of a rectangle at the origin within a distance of a shape; the unit is a cell."""
+    near = radius + 1
+    tails, heads = shape.tails, shape.heads
+    lowest, highest = np.minimum(tails.imag, heads.imag), np.maximum(tails.imag, heads.imag)
+    leftmost, rightmost = np.minimum(tails.real, heads.real), np.maximum(tails.real, heads.real)
+    beside = (highest < -near) | (lowest > rows + near) | (rightmost < -near) | (leftmost > columns + near)
+    found = _fill(tails, heads, rows, columns)
+    _mark_near(found, tails[~beside], heads[~beside], radius)
+    return found
+
+
 def _fill(tails: ComplexArray, heads: ComplexArray, h: int, w: int) -> BoolArray:
     """Cells around whose centres the edges wind."""
     up = heads.imag > tails.imag
     lower, upper = np.where(up, tails, heads), np.where(up, heads, tails)
     # Rows of centres y with lower ≤ y < upper.
-    first, end = np.ceil(lower.imag - 0.5).astype(np.int64), np.ceil(upper.imag - 0.5).astype(np.int64)
+    first, end = (np.clip(np.ceil(ends.imag - 0.5), 0, h).astype(np.int64) for ends in (lower, upper))
     edge, step = enumerate_each(end - first)
     row = first[edge] + step
     ahead = upper[edge] - lower[edge]
@@ -70,10 +82,13 @@ def _mark_near(cells: BoolArray, tails: ComplexArray, heads: ComplexArray, radiu
     reach = radius**2 + _SPACING**2 / 4
     i, j = np.floor(samples.imag).astype(np.int64), np.floor(samples.real).astype(np.int64)
     y, x = samples.imag - i, samples.real - j
-    padded = np.zeros((h + 2 * (k := int(sqrt(reach)) + 2), w + 2 * k), dtype=bool)
-    flat, place = padded.ravel(), (i + k) * padded.shape[1] + j + k
+    k = int(sqrt(reach)) + 2
+    inside = (i > -k) & (i < h + k) & (j > -k) & (j < w + k)
+    i, j, y, x = i[inside], j[inside], y[inside], x[inside]
+    padded = np.zeros((h + 4 * k, w + 4 * k), dtype=bool)
+    flat, place = padded.ravel(), (i + 2 * k) * padded.shape[1] + j + 2 * k
     for di in range(-k + 1, k):
         vertical: FloatArray = (di + 0.5 - y) ** 2
         for dj in range(-k + 1, k):
             flat[place[vertical + (dj + 0.5 - x) ** 2 <= reach] + di * padded.shape[1] + dj] = True
-    cells |= padded[k : k + h, k : k + w]
+    cells |= padded[2 * k : 2 * k + h, 2 * k : 2 * k + w]

@@ -8,7 +8,7 @@ from math import ceil, hypot, pi, sqrt
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw
+from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw, draw_in_place
 from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board
 from quasiharmonic.apps.atlas.packing.contact import Spot
 from quasiharmonic.apps.atlas.packing.shapes import Shape
@@ -40,6 +40,10 @@ _TURNS = 16
 _ANGLES, _ANGLE_PRECISION = 256, 1e-6
 #: Largest side of a texture in texels: single precision stores no more positions.
 MAX_SIZE = 1 << 24
+# Cells around charts that stay are first as large as otherwise, then smaller by this factor.
+_FINER = 1, 4
+# Largest number of times that the scale there is halved, and then bisected.
+_HALVINGS, _BISECTIONS = 24, 5
 # Relative precision of the scale of many charts.
 _COARSE = 0.04
 # Relative precision of the sufficient size.
@@ -122,6 +126,56 @@ def find_layout(
             return fine.enlarge_finely(order) or layout
         expected /= _MORE_CELLS
     return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
+
+
+def find_layout_around(
+    occupied: Shape,
+    shapes: Sequence[Shape],
+    size: tuple[int, int],
+    padding: float,
+    tiles: int,
+    *,
+    rotate: bool,
+    scale: float | None,
+) -> Layout | None:
+    """Place shapes into the free part of tiles, at a given scale or at the largest one that is found.
+
+    Parameters
+    ----------
+    occupied : Shape
+        What is in the tiles, in texels. Tile ``k`` starts at ``(k % 10, k // 10)`` times ``size``.
+    shapes, size, padding, tiles, rotate, scale
+        See `find_layout`.
+
+    Returns
+    -------
+    Layout
+        None if the shapes do not fit.
+    """
+
+    def place(scale: float) -> Layout | None:
+        if not _may_fit(shapes, size, tiles, scale):
+            return None
+        for finer in _FINER:
+            search = _Search(shapes, size, padding, tiles, scale, rotate=rotate, occupied=occupied, finer=finer)
+            if (found := search.place_in(search.cells)) is not None:
+                return found
+        return None
+
+    if scale is not None:
+        return place(scale)
+    high = max(size) * max(1.0, sqrt(tiles)) / min(sum(shape.area for shape in shapes) ** 0.5, 1 / least_scale(shapes))
+    best, low = None, high
+    for _ in range(_HALVINGS):
+        high, low = low, low / 2
+        best = place(low)
+        if best is not None:
+            break
+    for _ in range(_BISECTIONS if best is not None else 0):
+        middle = sqrt(low * high)
+        found = place(middle)
+        low, high, best = (low, middle, best) if found is None else (middle, high, found)
+    return best
 
 
 def estimate_use(shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool) -> float:
@@ -248,16 +302,19 @@ class _Search:
         bitmaps: int = BITMAPS,
         given: ComplexArray | None = None,
         skewed: bool = True,
+        occupied: Shape | None = None,
+        finer: int = 1,
     ) -> None:
         self._size, self._tiles, self._padding = size, tiles, padding
         few = len(shapes) <= _MANY
-        cells = (_CELLS if given is None else _FINE_CELLS) if few else _CELLS_OF_MANY
+        cells = finer * ((_CELLS if given is None else _FINE_CELLS) if few else _CELLS_OF_MANY)
         number = _FEW if few else _FEW_OF_MANY
         self.cells = ceil(min(cells * max(1.0, sqrt(len(shapes) / tiles / number)), _MOST_CELLS))
         # Length of a cell's side.
         self._cell = max(size) / self.cells / scale
         radius = _MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
         self._windows = not few
+        self._occupied, self._radius = occupied, radius
         self.areas = np.array([shape.area for shape in shapes])
         # Shapes of equal area stay in their order, whatever the rounding.
         self._order = np.argsort(-np.round(self.areas / (self.areas.max() or 1.0), 9), kind="stable")
@@ -347,8 +404,16 @@ class _Search:
         boards: list[Board] = []
 
         def open_board() -> Board:
-            boards.append(Board(rows, columns, windows=self._windows))
-            return boards[-1]
+            board = Board(rows, columns, windows=self._windows)
+            if self._occupied is not None:
+                tile = len(boards)
+                corner = complex(tile % 10 * self._size[0], tile // 10 * self._size[1])
+                board.put(draw_in_place(self._occupied.move(-corner, 1 / texels), rows, columns, self._radius), 0, 0)
+            boards.append(board)
+            return board
+
+        while self._occupied is not None and len(boards) < self._tiles:
+            open_board()
 
         def find(bitmaps: Bitmaps) -> tuple[int, Spot] | None:
             for tile, board in enumerate(boards):

@@ -16,6 +16,7 @@ from quasiharmonic.apps.atlas.packing.layout import (
     MAX_SIZE,
     Layout,
     find_layout,
+    find_layout_around,
     find_sufficient_size,
     least_scale,
 )
@@ -93,6 +94,7 @@ def pack_charts(
     stack: bool = False,
     kinds: Sequence[int] | None = None,
     closely: int = BITMAPS,
+    occupied: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Packing:
     """Pack charts into one or several textures by their shapes, as large as possible and at one texel density.
 
@@ -119,6 +121,8 @@ def pack_charts(
         A number for each chart. Charts with different numbers are not stacked.
     closely : int
         Number of charts that are placed by their shapes; all others are placed as boxes, which is faster.
+    occupied : (uv, F), optional
+        Texture coordinates (m, 2) and triangles (k, 3) of charts that stay. The others keep the padding to them.
 
     Returns
     -------
@@ -153,7 +157,20 @@ def pack_charts(
         raise ValueError(
             f"with {texels_per_unit:g} texels per unit, all charts are smaller than a texel: use more texels per unit"
         )
-    layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted, bitmaps=closely)
+    if occupied is not None:
+        at = map_array("occupied", occupied[0])
+        shape = make_shape(at * size, triangle_array(occupied[1], len(at)))
+        layout = find_layout_around(shape, shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+        if layout is None:
+            largest = find_layout_around(shape, shapes, size, spaced, tiles, rotate=rotate, scale=None)
+            density = None if largest is None else float(np.ldexp(largest.scale, -exponent))
+            raise ValueError(
+                f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels "
+                f"{'does' if len(shapes) == 1 else 'do'} not fit into the free part of {size[0]} × {size[1]} texels: "
+                + ("use more tiles or less padding" if density is None else f"texels_per_unit={density:.6g} suffices")
+            )
+    else:
+        layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted, bitmaps=closely)
     if layout is None:
         width, height = find_sufficient_size(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
         if max(width, height) > MAX_SIZE:

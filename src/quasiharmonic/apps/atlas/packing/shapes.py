@@ -53,6 +53,11 @@ class Shape:
         seen = self.hull * direction.conjugate()
         return float(np.ptp(seen.real)), float(np.ptp(seen.imag))
 
+    def move(self, shift: complex, scale: float) -> Shape:
+        """Return the shape after a shift and then a scaling."""
+        tails, heads, hull = ((points + shift) * scale for points in (self.tails, self.heads, self.hull))
+        return Shape(tails, heads, hull, self.area * scale**2, self.direction, self.straight)
+
     def box_centre(self, direction: complex) -> complex:
         """Centre of the box with a side along a unit vector, relative to this direction."""
         seen = self.hull * direction.conjugate()

@@ -29,10 +29,12 @@ from quasiharmonic.ui.cli.arguments import (
     byte_count,
     choice,
     declared,
+    degrees,
     file,
     flag,
     number,
     pick,
+    text,
     texture_size,
     weld,
 )
@@ -71,6 +73,23 @@ def add_parser(commands: Commands) -> None:
         edge_costs=file(
             "file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line"
         ),
+        hard_edges=number(
+            _hard_edges,
+            "seams at all edges with a larger angle between the normals, in degrees; file: at those with split normals "
+            "or between smoothing groups",
+            metavar="ANGLE",
+        ),
+        seams=file("file of edges that become seams: two vertices, 0-based, on each line"),
+        no_seams=file("file of edges that must not become seams"),
+        labels=text(
+            "WHICH",
+            "parts of the model, between which seams cost almost nothing: groups, materials, or a file with the number "
+            "of the part of each face, one on each line",
+        ),
+        faces=file(
+            "file of face numbers, 0-based, one on each line: unwrap only these, and keep the texture coordinates of "
+            "all others"
+        ),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
     add_options(parser, "texture", "json", "surface")
@@ -85,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     return pipeline.change_map(
         options,
         lambda mesh: _unwrap(options, mesh, began),
-        inputs=(options.edge_costs,),
+        inputs=(options.edge_costs, options.seams, options.no_seams, options.faces, _labels_file(options.labels)),
         read=_read,
     )
 
@@ -100,6 +119,7 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
     """Unwrap a mesh."""
+    from quasiharmonic.apps.unwrapping.hard_edges import find_hard_edges
     from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions, is_written
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.util.arrays import count_of
@@ -113,7 +133,12 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             mesh.F,
             rotate=not options.no_rotate,
             edge_costs=_edge_costs(mesh, options.edge_costs),
-            uv=corner_positions(mesh) if options.keep_seams else None,
+            hard_edges=find_hard_edges(mesh) if options.hard_edges == "file" else options.hard_edges,
+            seams=_read_integers(options.seams, 2),
+            no_seams=_read_integers(options.no_seams, 2),
+            labels=_labels(mesh, options.labels),
+            uv=corner_positions(mesh) if options.keep_seams or options.faces else None,
+            faces=_faces(mesh, options.faces),
             callback=_bound_memory(show, options.memory),
             **given,
         )
@@ -139,6 +164,11 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         return account
 
     return pipeline.Changed(unwrapped, describe)
+
+
+def _hard_edges(text: str) -> float | str:
+    """Convert an angle, or leave the word file; for argparse."""
+    return text if text == "file" else degrees(text)
 
 
 def _words(step: UnwrapStep) -> str:
@@ -168,6 +198,53 @@ def _edge_costs(mesh: MeshData, path: Path | None) -> Any:
     given = np.isin(keys, wanted)
     costs[given] = table[order, 2][np.searchsorted(wanted[order], keys[given])]
     return polygon_costs(mesh, costs)
+
+
+def _read_integers(path: Path | None, columns: int) -> Any:
+    """Return the whole numbers of a file, (k, columns); None without a file."""
+    import numpy as np
+
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.lowlevel.textual import read_rows
+
+    if path is None:
+        return None
+    rows = read_rows(path, columns)
+    for line, row in rows:
+        if any(not value.is_integer() for value in row):
+            raise MeshFileError(path, "not a whole number", line)
+    return np.array([row for _, row in rows], dtype=np.int64).reshape(-1, columns)
+
+
+def _labels_file(which: str | None) -> Path | None:
+    """Return the file that ``--labels`` names."""
+    return None if which in (None, "groups", "materials") else Path(str(which))
+
+
+def _labels(mesh: MeshData, which: str | None) -> Any:
+    """Return the labels (f,) of the triangles that ``--labels`` names."""
+    from quasiharmonic.apps.unwrapping.model_files import statement_labels
+    from quasiharmonic.util.arrays import count_of
+
+    if which is None:
+        return None
+    if (path := _labels_file(which)) is None:
+        return statement_labels(mesh, *{"groups": ("o", "g"), "materials": ("usemtl",)}[which])
+    labels = _read_integers(path, 1)[:, 0]
+    if len(labels) != mesh.faces:
+        raise ValueError(f"{path}: {count_of('number', 'numbers', len(labels))} for {mesh.faces} faces: give one each")
+    return labels[mesh.rings.of_triangle]
+
+
+def _faces(mesh: MeshData, path: Path | None) -> Any:
+    """Return a mask (f,) of the triangles of the faces that a file lists."""
+    from quasiharmonic.util.arrays import check_range, mark
+
+    if path is None:
+        return None
+    listed = _read_integers(path, 1)[:, 0]
+    check_range(str(path), listed, mesh.faces, "face", "faces")
+    return mark(mesh.faces, listed)[mesh.rings.of_triangle]
 
 
 def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) -> Callable[[UnwrapStep], None] | None:
