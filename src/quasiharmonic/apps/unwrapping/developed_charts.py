@@ -16,7 +16,9 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
 
 # Pieces are joined in several rounds. In each, unions are at most so long, in sides of the texture, and their boxes may
 # exceed those of their parts by a fraction.
-_ROUNDS = ((0.25, 0.02), (0.45, 0.02), (0.8, 0.02))
+_ROUNDS = ((0.25, 0.02), (0.45, 0.02), (0.8, 0.02), (0.8, 0.3), (1.2, 1.0))
+# More charts are not joined to unions with much larger boxes, because their layouts are not compared.
+_CAUTIOUS, _FEW = 0.02, 150
 
 
 def develop_charts(
@@ -63,6 +65,8 @@ def develop_charts(
     model.list_contacts(~demanded)
     found = [_list_charts(F, model, pieces)]
     for longest, loss in _ROUNDS:
+        if loss > _CAUTIOUS and len(found[-1]) > _FEW:
+            break
         model.join(weight, together, longest, loss, check_wanted)
         found.append(_list_charts(F, model, pieces))
     return pieces.label >= 0, choose(found)
