@@ -1,5 +1,8 @@
 """Unwrap hostile models: thin triangles, spheres of NumPy's kind, boxes, voxels, profiles, soups, rough surfaces.
 
+Others are hard-surface models with noise, almost symmetric models, dented spheres, long strips, reliefs, plates with
+holes, and twisted bands.
+
     python benchmarks/hostile_models.py -n 2000
 
 Every model is unwrapped with five bounds in turn. A *failure* is an exception other than a ValueError for a model
@@ -19,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+import hard_models
 from hard_models import Mesh, blocks, split_edges
 from quasiharmonic import unwrap
 
@@ -111,8 +115,61 @@ def rough(random: np.random.Generator) -> Mesh:
     return surface_net(field, [-1.9] * 3, [1.9] * 3, float(random.choice([0.4, 0.25, 0.15])))
 
 
+def almost_flat(random: np.random.Generator) -> Mesh:
+    """A model of flat faces with noise of 1e-7 to 1e-3 of its size."""
+    made = (hard_models.stairs, hard_models.channel, hard_models.house, hard_models.plate, hard_models.gear)
+    V, F = split_edges(*made[random.integers(5)](), int(random.integers(0, 2)))
+    size = float(np.linalg.norm(np.ptp(V, axis=0)))
+    return V + 10.0 ** random.uniform(-7, -3) * size * random.normal(size=V.shape), F
+
+
+def almost_symmetric(random: np.random.Generator) -> Mesh:
+    """A model of mirrored parts, some vertices of which may be moved by up to 1e-3 of its size."""
+    half = hard_models.moved(hard_models.together(box(random), profile(random)), [2, 0, 0])
+    body = hard_models.robot()
+    V, F = hard_models.together(body, hard_models.mirrored(half))
+    moved = random.random((len(V), 1)) < random.choice([0, 0.01, 1])
+    return V + moved * 10.0 ** random.uniform(-8, -3) * random.normal(size=V.shape), F
+
+
+def dented(random: np.random.Generator) -> Mesh:
+    """A sphere with creases all over."""
+    return hard_models.golf_ball(random, int(random.integers(1, 4)), random.uniform(0.01, 0.3))
+
+
+def long_strip(random: np.random.Generator) -> Mesh:
+    """A belt or a tube that is longer than the texture."""
+    n = int(random.integers(20, 200))
+    if random.random() < 0.5:
+        return hard_models.tube(int(random.integers(3, 20)), random.uniform(0.05, 0.5), n / 4, n)
+    x = np.cumsum(random.uniform(0.2, 1, n))
+    wave = np.stack([x, 0 * x, np.sin(x) * random.uniform(0, 1)], axis=1)
+    return hard_models.sheet(np.stack([wave, wave + np.array([0, 1, 0])], axis=1))
+
+
+def relief(random: np.random.Generator) -> Mesh:
+    """Hundreds of small flats, many of which touch themselves or others in vertices and at edges."""
+    return hard_models.terrain(int(random.integers(4, 16)), random)
+
+
+def holes(random: np.random.Generator) -> Mesh:
+    """A plate with up to a hundred holes, or a flat sheet with up to a thousand."""
+    across, deep = random.integers(1, 11, 2).tolist()
+    if random.random() < 0.5:
+        V, F = hard_models.pierced(4 * across, 3 * deep, random.uniform(0.01, 0.49), 8)
+        return V, F[random.random(len(F)) < random.choice([1.0, 0.9])]
+    return hard_models.plate(across, deep, random.uniform(0.01, 0.49), 10.0 ** random.uniform(-3, 0), 8)
+
+
+def twisted(random: np.random.Generator) -> Mesh:
+    """A band of flats that is closed after up to five half turns."""
+    n = int(random.integers(3, 60))
+    return hard_models.twisted_band(n, half_turns=int(random.integers(0, 6)), width=random.uniform(0.05, 0.9))
+
+
 FAMILIES: tuple[Callable[[np.random.Generator], Mesh], ...] = (
     sphere, voxels, box, profile, thin, soup, scales, rough,
+    almost_flat, almost_symmetric, dented, long_strip, relief, holes, twisted,
 )  # fmt: skip
 
 

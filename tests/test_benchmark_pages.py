@@ -86,3 +86,22 @@ def test_unwraps_beside_those_of_blender():
     assert min(slower) > 5
     assert max(slower) < 36
     assert (less, fuller) == (8, 2)
+
+
+def test_hard_surface_models_beside_other_programs():
+    """What the guide states about its table."""
+    text = (DOCS / "speed" / "hard_surface.md").read_text(encoding="utf-8")
+    _, _, table = text.partition("\n\n")
+    head, _, *lines = ([cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines())
+    rows = [dict(zip(head, line, strict=True)) for line in lines]
+    medians, rows = rows[:2], rows[2:]
+    assert [row["program"] for row in medians] == ["to uvunwrap", "to xatlas"]
+    for row in medians:
+        assert float(row["charts"]) <= 0.6
+        assert float(row["seams"]) <= 0.8
+        assert 3.5 <= float(row["CPU s"]) <= 7.5
+    mine, peers = ({row["model"]: row for row in rows if row["program"] == way} for way in ("`unwrap`", "uvunwrap"))
+    assert len(mine) == 13
+    assert all(row["certified"] == "yes" and row["whole"] == row["stretch, 99 %"] == "1.00" for row in mine.values())
+    fuller = {name for name in mine if float(peers[name]["used"]) > float(mine[name]["used"])}
+    assert fuller == {"gear", "tube with caps", "hexagonal prism"}

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic import is_injective, surfaces, unwrap
-from quasiharmonic.apps.atlas.packing import layout
+from quasiharmonic.apps.atlas.packing import bitmap_search
 from quasiharmonic.atlas import pack_charts
 
 shapely = pytest.importorskip("shapely")
@@ -259,13 +259,13 @@ def test_invalid_calls(change, message):
 
 def test_tiles_that_are_not_needed_cost_no_time(monkeypatch):
     opened = []
-    board = layout.Board
+    board = bitmap_search.Board
 
     def counted(*arguments, **named):
         opened.append(arguments)
         return board(*arguments, **named)
 
-    monkeypatch.setattr(layout, "Board", counted)
+    monkeypatch.setattr(bitmap_search, "Board", counted)
     points, F = np.array([[0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
     few = pack_charts([(points, F)] * 3, resolution=64, tiles=3)
     count = len(opened)
@@ -297,8 +297,8 @@ def test_small_charts_fill_many_tiles_in_order():
 def test_extreme_densities_are_refused_without_drawing(monkeypatch, density, words):
     points, F = np.array([[0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
     drawn = []
-    draw = layout.draw
-    monkeypatch.setattr(layout, "draw", lambda *a: drawn.append(draw(*a)) or drawn[-1])
+    draw = bitmap_search.draw
+    monkeypatch.setattr(bitmap_search, "draw", lambda *a: drawn.append(draw(*a)) or drawn[-1])
     with pytest.raises(ValueError, match=words):
         pack_charts([(points, F)] * 3, resolution=128, texels_per_unit=density)
     assert sum(bitmap.size for bitmap in drawn) < 2e8

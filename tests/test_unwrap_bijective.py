@@ -50,7 +50,9 @@ def test_a_sphere_in_single_precision():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", ["voxels", "profile", "box", "scales"])
+@pytest.mark.parametrize(
+    "family", ["voxels", "profile", "box", "scales", "almost_flat", "almost_symmetric", "long_strip", "twisted"]
+)
 @pytest.mark.parametrize("bound", [1.1, 1.2])
 def test_hostile_models_at_tight_bounds(family, bound):
     # Of each family the first models of at most 500 triangles.

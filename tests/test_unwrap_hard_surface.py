@@ -135,7 +135,7 @@ def test_a_cone_has_one_straight_cut(n):
     assert is_isometric(V, F, result)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("across", "deep", "corners"), [(3, 1, 16), (2, 3, 12), (8, 5, 4)])
 def test_plates_keep_their_holes(across, deep, corners):
     V, F = models.plate(across, deep, thick=0.05, corners=corners)
@@ -146,6 +146,15 @@ def test_plates_keep_their_holes(across, deep, corners):
         rows = result.indices[(V[F][:, :, 2] == z).all(axis=1)]
         assert euler_characteristic(rows) == 1 - across * deep
     assert cut_flat_edges(V, F, result.indices).tolist() == []
+
+
+@pytest.mark.slow
+def test_a_sheet_with_five_hundred_holes_is_one_chart():
+    V, F = models.pierced(25, 20, corners=8)
+    result = unwrap(V, F, resolution=2048)
+    assert (result.n_charts, len(result.seams), result.success) == (1, 0, True)
+    assert euler_characteristic(result.indices) == 1 - 500
+    assert is_isometric(V, F, result)
 
 
 @pytest.mark.slow
@@ -176,7 +185,7 @@ def test_edges_that_are_exactly_as_sharp_are_not_hard(name):
     np.testing.assert_array_equal(result.seams, without.seams)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["channel", "stairs", "gear", "plate", "house"])
 def test_a_larger_loss_gives_fewer_charts(name):
     V, F = DEVELOPABLE[name]
@@ -209,7 +218,7 @@ def test_a_belt_longer_than_the_texture_is_divided_into_whole_quadrilaterals():
     assert straight_share(result.indices, result.uvs) >= 0.999
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_rough_spheres_have_few_charts(seed):
     V, F = models.golf_ball(np.random.default_rng(seed))

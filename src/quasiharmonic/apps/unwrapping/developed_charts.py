@@ -17,9 +17,11 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
 
 # Pieces are joined in several rounds. In each, unions are at most so long, in sides of the texture, and their boxes may
 # exceed those of their parts by a fraction.
+_ROUNDS = ((0.25, 0.02), (0.45, 0.02), (0.8, 0.02), (0.8, 0.3), (1.2, 1.0))
+# More charts are not joined to unions with much larger boxes, because their layouts are not compared.
+_CAUTIOUS, _FEW = 0.02, 150
 # Limits at which charts are joined only where they must be.
 _ONLY_FORCED = (0.0, -1.0)
-_ROUNDS = ((0.25, 0.02), (0.45, 0.02), (0.8, 0.02))
 
 
 def develop_charts(
@@ -81,6 +83,8 @@ def develop_charts(
     known: dict[int, Chart] = {}
     found = [_list_charts(F, model, pieces, known)]
     for longest, loss in _ROUNDS:
+        if loss > _CAUTIOUS and len(found[-1]) > _FEW:
+            break
         model.join(weight, together, longest, loss, check_wanted)
         found.append(_list_charts(F, model, pieces, known))
     return pieces.label >= 0, choose(found)

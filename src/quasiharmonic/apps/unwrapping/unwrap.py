@@ -11,7 +11,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.atlas.packing.layout import BITMAPS
+from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS
 from quasiharmonic.apps.atlas.packing.pack import check_texture, pack_charts
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, Layout
 from quasiharmonic.apps.atlas.packing.copies import Copy, Motion, find_copies
 from quasiharmonic.apps.atlas.packing.layout import (
-    BITMAPS,
     MAX_SIZE,
-    Layout,
     find_layout,
     find_layout_around,
     find_sufficient_size,

@@ -1,0 +1,238 @@
+"""Bitmaps of all charts, placed on boards of variable size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil, pi, sqrt
+
+import numpy as np
+
+from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw, draw_in_place
+from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board
+from quasiharmonic.apps.atlas.packing.contact import Spot
+from quasiharmonic.apps.atlas.packing.shapes import Shape
+from quasiharmonic.util.arrays import ComplexArray, IntArray
+from quasiharmonic.util.progress import heartbeat
+
+# Cells along a tile for at most so many charts, and on the finer board for the final layout. More charts get
+# proportionally smaller cells, up to a limit.
+_CELLS, _FINE_CELLS, _FEW = 128, 384, 36
+_CELLS_OF_MANY, _FEW_OF_MANY, MOST_CELLS = 128, 20, 2048
+# Directions of each chart: sixteen for at most so many charts, then eight. More than the second number get four, and
+# their boards are searched window by window.
+_MOST_DIRECTIONS, MANY = 20, 50
+# Range of the scale on the finer board, relative to that on the coarser one.
+_FINE_GAIN, _FINE_LOSS = 1.06, 1.01
+#: Charts beyond this number are placed as boxes, the smallest ones.
+BITMAPS = 500
+# The number of cells along a tile varies between these multiples of the expected number.
+_FEWEST_CELLS, MORE_CELLS = 0.8, 1.25
+# Placements tried with other orders of the charts, in all.
+_TRIALS = 300
+# Relative precision of the scale of many charts.
+_COARSE = 0.04
+# Spread of the logarithm of the areas by which charts are ordered in these trials.
+_SPREAD = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where shapes are placed.
+
+    Attributes
+    ----------
+    scale : float
+        Texels per unit of length.
+    directions : (n,) complex128
+        Unit vector of each shape that becomes the x-axis.
+    centres : (n,) complex128
+        Centre of each rotated shape's box in its tile, in texels.
+    tiles : (n,) int64
+    """
+
+    scale: float
+    directions: ComplexArray
+    centres: ComplexArray
+    tiles: IntArray
+
+
+class BitmapSearch:
+    """Bitmaps of all shapes with cells of a fixed size in units of length, and boards of variable size."""
+
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        size: tuple[int, int],
+        padding: float,
+        tiles: int,
+        scale: float,
+        *,
+        rotate: bool,
+        bitmaps: int = BITMAPS,
+        given: ComplexArray | None = None,
+        skewed: bool = True,
+        occupied: Shape | None = None,
+        finer: int = 1,
+    ) -> None:
+        self._size, self._tiles, self._padding = size, tiles, padding
+        few = len(shapes) <= MANY
+        cells = finer * ((_CELLS if given is None else _FINE_CELLS) if few else _CELLS_OF_MANY)
+        number = _FEW if few else _FEW_OF_MANY
+        self.cells = ceil(min(cells * max(1.0, sqrt(len(shapes) / tiles / number)), MOST_CELLS))
+        # Length of a cell's side.
+        self._cell = max(size) / self.cells / scale
+        radius = MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
+        self._windows = not few
+        self._occupied, self._radius = occupied, radius
+        self.areas = np.array([shape.area for shape in shapes])
+        # Shapes of equal area stay in their order, whatever the rounding.
+        self._order = np.argsort(-np.round(self.areas / (self.areas.max() or 1.0), 9), kind="stable")
+        self._few = bitmaps
+        large, small = self._order[:bitmaps], self._order[bitmaps:]
+        turns = np.exp(0.125j * pi * (np.arange(4) if len(shapes) <= _MOST_DIRECTIONS else np.arange(0, 4, 2)))
+        turns = turns if few and skewed else turns[:1]
+        self._bitmaps: dict[int, Bitmaps] = {}
+        self._halves: dict[tuple[int, int], Bitmaps] = {}
+        # Where the last of several shapes was placed, by the number of cells and the order of these shapes.
+        self._spots: dict[tuple[int, ...], tuple[int, Spot] | None] = {}
+        for i in large.tolist():
+            if given is not None or not rotate:
+                directions = np.ones(1, dtype=complex) if given is None else given[i : i + 1]
+                self._bitmaps[i] = Bitmaps(directions, [draw(shapes[i], directions[0], 1 / self._cell, radius)])
+            else:
+                self._bitmaps[i] = self._draw(shapes[i], turns, radius)
+        # Small shapes lie in their smallest boxes.
+        self._lying = np.array([_find_lying(shapes[i]) if rotate else 1 + 0j for i in small.tolist()])
+        sides = [shapes[i].extent(direction)[::-1] for i, direction in zip(small, self._lying, strict=True)]
+        self._boxes = np.array(sides).reshape(-1, 2) / self._cell
+
+    def _draw(self, shape: Shape, turns: ComplexArray, radius: float) -> Bitmaps:
+        """Draw a shape with each of its sides up, after each of several rotations of its smallest box."""
+        directions, cells = [], []
+        for direction in shape.direction * (turns[:1] if shape.straight else turns):
+            bitmap = draw(shape, direction, 1 / self._cell, radius)
+            for quarters in range(4):
+                directions.append(direction * 1j**quarters)
+                cells.append(np.rot90(bitmap, quarters))
+        return Bitmaps(np.array(directions), cells)
+
+    def _select(self, i: int, part: int) -> Bitmaps:
+        """Return the bitmaps of a shape in all directions, 0, or in one half of them, 1 or 2."""
+        if part == 0:
+            return self._bitmaps[i]
+        if (i, part) not in self._halves:
+            self._halves[i, part] = self._bitmaps[i].half(part - 1)
+        return self._halves[i, part]
+
+    def enlarge(self, trials: int = _TRIALS) -> tuple[Layout, IntArray] | None:
+        """Find the smallest board on which few bitmaps fit; the layout on it, and the order of the shapes."""
+        low, high = int(_FEWEST_CELLS * self.cells), int(MORE_CELLS * self.cells)
+        best = self.place_in(high)
+        if best is None:
+            return None
+        while high - low > 1:
+            middle = (low + high) // 2
+            found = self.place_in(middle)
+            low, high, best = (middle, high, best) if found is None else (low, middle, found)
+        generator, best_order = np.random.default_rng(0), self._order
+        for _ in range(trials // len(self.areas)):
+            order = np.argsort(-self.areas * np.exp(generator.normal(0, _SPREAD, len(self.areas))), kind="stable")
+            parts = generator.integers(0, 3, len(self.areas))
+            while (found := self.place_in(high - 1, order, parts)) is not None:
+                high, best, best_order = high - 1, found, order
+        return best, best_order
+
+    def enlarge_finely(self, order: IntArray) -> Layout | None:
+        """Find a small board for bitmaps in a given order that fit at about the expected scale."""
+        best = None
+        low, high = int(self.cells / _FINE_GAIN), ceil(self.cells * _FINE_LOSS)
+        while high - low > 1:
+            middle = (low + high) // 2
+            found = self.place_in(middle, order)
+            low, high, best = (middle, high, best) if found is None else (low, middle, found)
+        return best
+
+    def enlarge_coarsely(self) -> Layout | None:
+        """Find a small board for many bitmaps."""
+        low, high, best = int(_FEWEST_CELLS * self.cells), int(MORE_CELLS * self.cells), None
+        while best is None or high - low > _COARSE * high:
+            middle = (low + high) // 2
+            found = self.place_in(middle)
+            low, high, best = (middle, high, best) if found is None else (low, middle, found)
+            if best is None and high - low <= 1:
+                return None
+        return best
+
+    def place_in(self, cells: int, order: IntArray | None = None, parts: IntArray | None = None) -> Layout | None:
+        """Place the bitmaps on boards with a number of cells along the longer side; None if one does not fit.
+
+        ``parts`` (n,) restricts the directions of each shape to one half, 1 or 2, or not, 0.
+        """
+        texels = max(self._size) / cells
+        columns, rows = (int(side / texels * (1 + 1e-12)) for side in self._size)
+        boards: list[Board] = []
+
+        def open_board() -> Board:
+            board = Board(rows, columns, windows=self._windows)
+            if self._occupied is not None:
+                tile = len(boards)
+                corner = complex(tile % 10 * self._size[0], tile // 10 * self._size[1])
+                board.put(draw_in_place(self._occupied.move(-corner, 1 / texels), rows, columns, self._radius), 0, 0)
+            boards.append(board)
+            return board
+
+        while self._occupied is not None and len(boards) < self._tiles:
+            open_board()
+
+        def find(bitmaps: Bitmaps) -> tuple[int, Spot] | None:
+            for tile, board in enumerate(boards):
+                if spot := board.find(bitmaps):
+                    return tile, spot
+            spot = open_board().find(bitmaps) if len(boards) < self._tiles else None
+            return None if spot is None else (len(boards) - 1, spot)
+
+        n = len(self.areas)
+        directions, centres, tiles = np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64)
+        placed: tuple[int, ...] = (cells,)
+        for i in (self._order[: self._few] if order is None else order).tolist():
+            heartbeat()
+            part = 0 if parts is None else int(parts[i])
+            bitmaps = self._select(i, part)
+            # Orders of few shapes often begin alike.
+            placed = (*placed, i, part)
+            if placed not in self._spots:
+                self._spots[placed] = find(bitmaps)
+            found = self._spots[placed]
+            if found is None:
+                return None
+            tile, spot = found
+            while tile >= len(boards):
+                open_board()
+            bitmap = bitmaps.cells[spot.direction]
+            boards[tile].put(bitmap, spot.row, spot.column)
+            directions[i], tiles[i] = bitmaps.directions[spot.direction], tile
+            centres[i] = complex(spot.column + bitmap.shape[1] / 2, spot.row + bitmap.shape[0] / 2) * texels
+        rest = self._order[self._few :]
+        directions[rest] = self._lying
+        boxes = np.ceil(self._boxes + self._padding / texels).astype(np.int64)
+        waiting = np.arange(len(rest))
+        for tile in range(self._tiles):
+            if not waiting.size:
+                break
+            board = boards[tile] if tile < len(boards) else open_board()
+            corners = board.fill_rows(boxes[waiting])
+            done = waiting[corners[:, 0] >= 0]
+            tiles[rest[done]] = tile
+            centres[rest[done]] = (corners[corners[:, 0] >= 0] + boxes[done] / 2) @ [1j, 1] * texels
+            if tile + 1 == len(boards) and not done.size:
+                break
+            waiting = waiting[corners[:, 0] < 0]
+        return None if waiting.size else Layout(texels / self._cell, directions, centres, tiles)
+
+
+def _find_lying(shape: Shape) -> complex:
+    """Direction of the longer side of the smallest box."""
+    direction = shape.direction
+    width, height = shape.extent(direction)
+    return direction if width >= height else direction * 1j
