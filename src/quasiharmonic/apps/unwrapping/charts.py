@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from operator import itemgetter
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,7 +46,7 @@ def find_charts(
     edge_costs: FloatArray | None = None,
     uv_cuts: ArrayLike | None = None,
     uv: FloatArray | None = None,
-    choose: Callable[[list[list[Chart]]], list[Chart]] | None = None,
+    choose: Callable[[list[list[Chart]], FloatArray, FloatArray], list[Chart]] | None = None,
     mirror: Mirror | None = None,
     draft: Draft | None = None,
     seed: int = 0,
@@ -81,7 +80,8 @@ def find_charts(
         Existing texture coordinates of the corners, with ``uv_cuts`` as seams; NaN where there are none. A part of them
         that is bijective, with stretches up to 3, is the initial map of its chart.
     choose : callable, optional
-        Chooses from several lists of charts of the developable parts, whose number decreases; by default the last one.
+        Chooses from several lists of charts of the developable parts, whose number decreases, given positions and costs
+        of these parts; by default the last one.
     mirror : Mirror, optional
         Mirror images, if seams and charts are to be mirrored. Curved parts are mirrored unless a triangle of theirs
         crosses the plane, or the seams there would grow by more than a quarter.
@@ -167,12 +167,16 @@ def _doubled_areas(V: FloatArray, F: IntArray) -> FloatArray:
     return doubled
 
 
+def _choose_last(found: list[list[Chart]], V: FloatArray, cost: FloatArray) -> list[Chart]:
+    return found[-1]
+
+
 def _develop(
     V: FloatArray,
     F: IntArray,
     cost: FloatArray,
     max_charts: int | None,
-    choose: Callable[[list[list[Chart]]], list[Chart]] | None,
+    choose: Callable[[list[list[Chart]], FloatArray, FloatArray], list[Chart]] | None,
     workers: Workers,
     mirror: Mirror | None,
 ) -> tuple[BoolArray, list[Chart]]:
@@ -186,7 +190,7 @@ def _develop(
         V,
         F[rows],
         cost[rows],
-        choose or itemgetter(-1),
+        choose or _choose_last,
         workers.check_wanted,
         None if mirror is None else mirror.select(rows),
     )

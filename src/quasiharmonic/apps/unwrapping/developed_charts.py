@@ -28,7 +28,7 @@ def develop_charts(
     V: FloatArray,
     F: IntArray,
     cost: FloatArray,
-    choose: Callable[[list[list[Chart]]], list[Chart]],
+    choose: Callable[[list[list[Chart]], FloatArray, FloatArray], list[Chart]],
     check_wanted: Callable[[], object],
     mirror: Mirror | None = None,
 ) -> tuple[BoolArray, list[Chart]]:
@@ -87,7 +87,7 @@ def develop_charts(
             break
         model.join(weight, together, longest, loss, check_wanted)
         found.append(_list_charts(F, model, pieces, known))
-    return pieces.label >= 0, choose(found)
+    return pieces.label >= 0, choose(found, V, cost)
 
 
 def _list_charts(F: IntArray, model: PaperModel, pieces: Pieces, known: dict[int, Chart]) -> list[Chart]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,24 +52,39 @@ _MOST_COMPARED, _GOOD_USE = 150, 0.83
 
 
 def choose_packed(
-    found: list[list[Chart]], *, size: tuple[int, int], padding: float, tiles: int, rotate: bool, loss: float
+    found: list[list[Chart]],
+    V: FloatArray,
+    cost: FloatArray,
+    *,
+    divide: Callable[[list[Chart], FloatArray, FloatArray], list[Chart]],
+    size: tuple[int, int],
+    padding: float,
+    tiles: int,
+    rotate: bool,
+    loss: float,
 ) -> list[Chart]:
     """Return the last of several lists of charts that uses the texture at most by ``loss`` worse than the best one.
 
+    Long charts are divided before, by ``divide``, given positions (n, 3) and costs (f, 3) of the surface.
     If almost all outlines of a list lie along the axes, so must those of the list that is returned.
     """
-    use = [0.0] * len(found)
     straight = np.array([_straight_share(charts) for charts in found])
     allowed = straight >= (straight.max() - _BENT if straight.max() >= _MOSTLY_STRAIGHT else 0.0)
+    compared = list[tuple[float, list[Chart]]]()
+    count = -1
     for k in np.flatnonzero(allowed)[::-1].tolist():
-        if k + 1 < len(found) and allowed[k + 1] and len(found[k]) == len(found[k + 1]):
-            use[k] = use[k + 1]
-        elif len(found[k]) <= _MOST_COMPARED:
-            shapes = [chart.shape for chart in found[k]]
-            use[k] = estimate_use(shapes, size, padding, tiles, rotate=rotate)
-        if use[k] >= _GOOD_USE - loss:
+        if len(found[k]) == count:
+            continue
+        count = len(found[k])
+        charts = divide(found[k], V, cost)
+        few = len(charts) <= _MOST_COMPARED
+        shapes = [chart.shape for chart in charts]
+        use = estimate_use(shapes, size, padding, tiles, rotate=rotate) if few else 0.0
+        compared.append((use, charts))
+        if use >= _GOOD_USE - loss:
             break
-    return found[int(np.flatnonzero(allowed & (np.array(use) >= max(use) - loss))[-1])]
+    best = max(use for use, _ in compared)
+    return next(charts for use, charts in compared if use >= best - loss)
 
 
 def _straight_share(charts: list[Chart]) -> float:

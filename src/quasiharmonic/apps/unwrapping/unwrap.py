@@ -327,6 +327,9 @@ def _make_charts(
         straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others = np.flatnonzero(rest), straight
+    divide = partial(
+        divide_long_charts, bound=bound, size=size, tiles=tiles, max_charts=most, for_packing=wanted.divide_for_packing
+    )
     charts = find_charts(
         points,
         cleaned.F[rest],
@@ -339,6 +342,7 @@ def _make_charts(
         draft=draft,
         choose=partial(
             choose_packed,
+            divide=divide,
             size=size,
             padding=float(wanted.padding),
             tiles=tiles,
@@ -352,17 +356,7 @@ def _make_charts(
     charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
     if rules.uv is not None:
         return sorted(charts, key=lambda chart: int(chart.triangles[0])), strips
-    charts = divide_long_charts(
-        charts,
-        points,
-        rules.cost,
-        bound=bound,
-        size=size,
-        tiles=tiles,
-        max_charts=most,
-        for_packing=wanted.divide_for_packing,
-    )
-    return charts, strips
+    return divide(charts, points, rules.cost), strips
 
 
 def _corner_positions(uv: ArrayLike, F: IntArray, n: int) -> FloatArray:

@@ -14,7 +14,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 # Share of the tiles that charts with half the padding around them are expected to cover.
 _EXPECTED = 0.8
 # The same for an estimate.
-_ESTIMATED = 100
+_ESTIMATED = 20
 # Directions compared for the expected scale.
 _TURNS = 16
 # Angles compared for the direction of a single chart, and the precision of the best one.
@@ -136,16 +136,18 @@ def find_layout_around(
 
 def estimate_use(shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool) -> float:
     """Part of the tiles that shapes cover if they are placed quickly; 0 if they do not fit well."""
-    expected = _expected_scale(shapes, size, padding, tiles)
-    if expected <= least_scale(shapes):
-        return 0.0
-    search = BitmapSearch(shapes, size, padding, tiles, expected, rotate=rotate, skewed=False)
-    if len(shapes) > MANY:
-        layout = search.enlarge_coarsely()
-    else:
-        found = search.enlarge(_ESTIMATED)
-        layout = None if found is None else found[0]
-    return 0.0 if layout is None else sum(search.areas) * layout.scale**2 / (tiles * size[0] * size[1])
+    expected, least = _expected_scale(shapes, size, padding, tiles), least_scale(shapes)
+    while expected > least:
+        search = BitmapSearch(shapes, size, padding, tiles, expected, rotate=rotate, skewed=False)
+        if len(shapes) > MANY:
+            layout = search.enlarge_coarsely()
+        else:
+            found = search.enlarge(_ESTIMATED)
+            layout = None if found is None else found[0]
+        if layout is not None:
+            return sum(search.areas) * layout.scale**2 / (tiles * size[0] * size[1])
+        expected /= MORE_CELLS
+    return 0.0
 
 
 def _may_fit(shapes: Sequence[Shape], size: tuple[int, int], tiles: int, scale: float) -> bool:
