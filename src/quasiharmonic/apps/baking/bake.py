@@ -177,10 +177,10 @@ def bake(old: MeshOrPath, new: MeshOrPath | UnwrapResult, **options: Unpack[Bake
     >>> from quasiharmonic import bake, io, unwrap
     >>> from quasiharmonic.surfaces import starfish
     >>> V, F = starfish(3, 12)
-    >>> old = io.MeshData(V, F, extra=np.tile([1.0, 0.5, 0.0], (len(V), 1)))
+    >>> old = io.MeshData(V, F, extra=np.tile([1.0, 0.6, 0.0], (len(V), 1)))
     >>> result = bake(old, unwrap(V, F), size=256)
     >>> result.same_mesh, result.missing, result.colour[128, 128].tolist()
-    (True, 0, [255, 128, 0, 255])
+    (True, 0, [255, 153, 0, 255])
     """
     began = time.perf_counter()
     wanted = BakeOptions(**options)

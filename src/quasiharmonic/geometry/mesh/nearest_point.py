@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.util.arrays import FloatArray, IntArray, enumerate_each
+from quasiharmonic.util.threads import count_cores, make_executor
 
 # Nearest samples of the surface that are tried first, and the factor by which their number grows.
-_FIRST = 16
+_FIRST = 24
 _GROWTH = 4
 # Largest number of samples for each triangle, on average.
-_SAMPLES = 2
+_SAMPLES = 4
 # Points per block, so that the arrays fit into the cache.
-_POINTS = 1 << 13
+_POINTS = 1 << 14
 
 
 class NearestPoint:
@@ -55,11 +56,15 @@ class NearestPoint:
 
     def find(self, points: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return triangle (k,), barycentric coordinates (k, 3) and distance (k,) of the nearest points to (k, 3)."""
-        triangle, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
+        triangle, weights = np.full(len(points), -1), np.zeros((len(points), 3))
         squared = np.full(len(points), np.inf)
-        for begin in range(0, len(points), _POINTS):
+
+        def work(begin: int) -> None:
             block = slice(begin, begin + _POINTS)
             self._find(points[block], triangle[block], weights[block], squared[block])
+
+        with make_executor(count_cores(), "quasiharmonic-nearest") as pool:
+            list(pool.map(work, range(0, len(points), _POINTS)))
         return triangle, weights, np.sqrt(squared)
 
     def _find(self, points: FloatArray, triangle: IntArray, weights: FloatArray, squared: FloatArray) -> None:
@@ -71,9 +76,10 @@ class NearestPoint:
             distance, sample = distance.reshape(-1, count), sample.reshape(-1, count)
             reach = distance - self._radius[sample]
             for j in range(count):
+                candidate = self._triangle[sample[:, j]]
                 # A triangle can only be nearer than the best one if its part around the sample is.
-                close = np.flatnonzero(reach[:, j] < np.sqrt(squared[waiting]))
-                self._improve(points, waiting[close], self._triangle[sample[close, j]], triangle, weights, squared)
+                close = np.flatnonzero((reach[:, j] < np.sqrt(squared[waiting])) & (candidate != triangle[waiting]))
+                self._improve(points, waiting[close], candidate[close], triangle, weights, squared)
             if count == many:
                 return
             waiting = waiting[distance[:, -1] < np.sqrt(squared[waiting]) + self._largest]

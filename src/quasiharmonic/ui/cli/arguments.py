@@ -145,6 +145,14 @@ def _integer(text: str, least: int) -> int:
     return value
 
 
+def texture_sides(text: str) -> tuple[int, int]:
+    """Convert N or WIDTHxHEIGHT; for argparse."""
+    sides = [count(side) for side in text.lower().split("x")]
+    if len(sides) > 2:
+        raise argparse.ArgumentTypeError(f"{text} is neither N nor WIDTHxHEIGHT")
+    return sides[0], sides[-1]
+
+
 def byte_count(text: str) -> int:
     """Convert a size such as 800M or 4G to bytes; for argparse."""
     found = re.fullmatch(r"([0-9.]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
