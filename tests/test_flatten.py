@@ -51,7 +51,7 @@ def test_a_developable_surface_is_unrolled_without_distortion():
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["half cylinder", "cone", "panel"])
 def test_developable_surfaces_take_few_steps(shape):
-    square, F = grid(90, 45)
+    square, F = grid(120, 60)
     x, y = square.T
     V = {
         "half cylinder": np.column_stack([np.cos(np.pi * x), np.sin(np.pi * x), 2 * y]),

@@ -43,7 +43,6 @@ class Bitmaps:
         self.side = max(max(bitmap.shape) for bitmap in cells)
         self.count = min(int(bitmap.sum()) for bitmap in cells)
 
-
     def half(self, which: int) -> Bitmaps:
         """Return every second bitmap, from the first or second one; all if there is only one."""
         some = slice(which, None, 2) if len(self.cells) > 1 else slice(None)
