@@ -337,7 +337,8 @@ class Flattening:
                 recent.append((measure(), descent.uv))
                 yield outcome
                 if not guarded and number % _CHECK_EVERY == 0 and self._rim.tangled_fraction(descent.uv) > _TANGLED:
-                    return
+                    if self._separate_copies(descent.uv) is None:
+                        return
 
         name = f"{'guarded' if guarded else 'free'} descent, {energy_name(options)}"
         exponent = self._piece.exponent
@@ -346,14 +347,26 @@ class Flattening:
         finally:
             # After Ctrl-C too, the current map may be better than the previous one.
             apart = guarded or not self._rim.meets_itself(descent.uv)
+            separated = None if apart else self._separate_copies(descent.uv)
             if apart:
                 self._bijective = descent.uv
+            elif separated is not None:
+                self._bijective = separated
             else:
                 self._overlaps = True
                 self._overlapping = descent.uv if status is not Status.STILL_FALLING else None
                 self._bijective = self._latest_bijective(recent, _MAX_ENERGY_RATIO * measure())
-            self._run.judge_last_stage(kept=apart)
-        return status if apart else None
+            self._run.judge_last_stage(kept=apart or separated is not None)
+        if separated is None:
+            return status if apart else None
+        energies = measure(), self._measure.value(in_units(separated, 0))
+        self._run.add_stage("copies moved apart", n_iterations=1, energy=energies)
+        self._run.record(0, energies[1], lambda: to_given_unit(separated, exponent))
+        return status
+
+    def _separate_copies(self, uv: FloatArray) -> FloatArray | None:
+        """Return a map whose copies of vertices no longer touch, or None if others meet."""
+        return self._rim.separate_copies(self._piece.V, self._piece.F, uv)
 
     def _latest_bijective(self, recent: Iterable[tuple[float, FloatArray]], most: float) -> FloatArray | None:
         """Return the latest of several maps that is bijective and has at most this energy, or else the stored map."""
