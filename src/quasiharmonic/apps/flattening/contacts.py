@@ -35,8 +35,10 @@ _REACH = 1.0
 # Pairs up to this many times the reach are also tracked during a step, which may bring them closer.
 _LOOKOUT = 2.0
 _MAX_MEETINGS = 1000
-# Copies of a vertex move into their triangles by these fractions of the smallest height there, tried in turn.
-_SEPARATIONS = 0.0, *(1e-6 * 4.0**k for k in range(9))
+# Small overlaps have less than this number of pairs of edges. Their vertices move by these fractions of the smallest
+# height of their triangles, tried in turn.
+_MAX_PULLED = 10_000
+_SHARES = 0.0, *(1e-6 * 2.0**k for k in range(17))
 #: Half the gradients of the hat functions of a triangle v, a, b with a right angle at a and legs of length 1.
 HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
 
@@ -162,15 +164,12 @@ class Rim:
         """The fraction of the boundary's vertices at intersecting edges, from the first 1,000 pairs."""
         return self.meetings(uv).size / self._vertex.size
 
-    def separate_copies(self, V: FloatArray, F: IntArray, uv: FloatArray) -> FloatArray | None:
-        """Move boundary vertices with equal rest positions apart, so that the boundary does not meet itself.
+    def pull_apart(self, F: IntArray, uv: FloatArray) -> FloatArray | None:
+        """Move boundary vertices at small overlaps into the surface until the boundary does not meet itself.
 
-        Fans of triangles that meet in a point, or the sides of a slit, touch in an isometric map. ``V`` (n, 3) are the
-        rest positions and ``F`` (f, 3) the triangles of an injective map (n, 2). Return a bijective map, or None if
-        short moves do not suffice.
+        Where two fans of triangles meet in a vertex, or along a slit, an isometric map touches itself. ``F`` (f, 3) are
+        the triangles of an injective map (n, 2). Return a bijective map, or None if short moves do not suffice.
         """
-        _, group, count = np.unique(V[self._vertex], axis=0, return_inverse=True, return_counts=True)
-        place = np.stack([np.arange(group.size), self._next], axis=1)
         w = to_complex(uv)
         here = w[self._vertex]
         ahead, behind = w[self._vertex[self._next]] - here, w[self._vertex[self._previous]] - here
@@ -180,16 +179,12 @@ class Rim:
         inward[self._vertex] = ahead / np.abs(ahead) * np.exp(1j * halfway)
         inward *= smallest_heights(w, F)
         tried, moved = np.zeros(w.size, dtype=np.int64), uv
-        while (pairs := contacts(moved, self._edges, _MAX_MEETINGS).pairs).size:
-            one, other = place[pairs].transpose(1, 0, 2)
-            copies = (group[one][:, :, None] == group[other][:, None]).any(axis=(1, 2))
-            met = np.unique(place[pairs])
-            met = self._vertex[met[count[group[met]] > 1]]
-            met = met[tried[met] < len(_SEPARATIONS) - 1]
-            if not copies.all() or not met.size:
-                return None
+        while (pairs := contacts(moved, self._edges, _MAX_PULLED).pairs).size:
+            met = np.unique(self._edges[pairs])
             tried[met] += 1
-            moved = to_points(w + np.take(_SEPARATIONS, tried) * inward)
+            if len(pairs) == _MAX_PULLED or tried.max() == len(_SHARES):
+                return None
+            moved = to_points(w + np.take(_SHARES, tried) * inward)
         return moved if is_injective(F, moved) and not self.meets_itself(moved) else None
 
     def contacts(self, w: ComplexArray) -> RimContacts:

@@ -210,7 +210,7 @@ def descend_level(
 
     if not guarded:
         free = lower(None)
-        apart = rim.separate_copies(V, level.F, free) if rim.meets_itself(free) else free
+        apart = rim.pull_apart(level.F, free) if rim.meets_itself(free) else free
         if apart is not None:
             return apart, False
     energy.energy = SymmetricDirichlet()
