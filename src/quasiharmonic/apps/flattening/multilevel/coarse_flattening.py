@@ -208,7 +208,10 @@ def descend_level(
             pass
         return descent.uv
 
-    if not guarded and not rim.meets_itself(free := lower(None)):
-        return free, False
+    if not guarded:
+        free = lower(None)
+        apart = rim.pull_apart(level.F, free) if rim.meets_itself(free) else free
+        if apart is not None:
+            return apart, False
     energy.energy = SymmetricDirichlet()
     return lower(rim), True
