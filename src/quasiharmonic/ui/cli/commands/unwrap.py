@@ -11,6 +11,7 @@ nothing written; 3 written, but the report failed. Ctrl-C writes nothing.
     qhm unwrap scan.ply --max-stretch 1.2 --resolution 4096 --padding 8 -o out.ply
     qhm unwrap model.glb --texture checkerboard -o out.glb
     qhm unwrap model.glb --bake -o out.glb
+    qhm unwrap model.glb --channel 1 -o out.glb
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from quasiharmonic.ui.cli.arguments import (
     flag,
     number,
     pick,
+    steps,
     texture_sides,
     weld,
 )
@@ -65,6 +67,15 @@ def add_parser(commands: Commands) -> None:
         edge_costs=file(
             "file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line"
         ),
+        channel=number(
+            steps,
+            "write the new texture coordinates as number N, such as 1 for lightmaps, and keep those below "
+            "(default: 0); GLB, glTF, PLY",
+            default=0,
+        ),
+        seams_channel=number(
+            steps, "which of the file's texture coordinates --keep-seams keeps (default: 0)", default=0
+        ),
         bake=flag("bake the look of the model into textures for the new texture coordinates"),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
@@ -77,6 +88,10 @@ def run(options: argparse.Namespace) -> int:
 
     began = time.perf_counter()
     io.find_format(options.output, "write_map", "seams")
+    if options.channel:
+        io.find_format(options.output, "write_map", "channels")
+    if options.channel and (options.bake or options.texture is not None):
+        raise ValueError("images are shown by the first texture coordinates: omit --bake and --texture, or --channel")
     if options.bake:
         _check_bake(options)
     return pipeline.change_map(
@@ -97,10 +112,14 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
     """Unwrap a mesh."""
+    from dataclasses import replace
+
+    from quasiharmonic import io
     from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.util.arrays import count_of
 
+    below = io.place_map(mesh, mesh, options.channel).lower_maps
     given = pick(options, "resolution", "stack", "weld", *declared(UnwrapOptions))
     if options.symmetry == "none":
         given["symmetry"] = None
@@ -110,11 +129,12 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             mesh.F,
             rotate=not options.no_rotate,
             edge_costs=_edge_costs(mesh, options.edge_costs),
-            uv=corner_positions(mesh) if options.keep_seams else None,
+            uv=corner_positions(io.select_channel(mesh, options.seams_channel)) if options.keep_seams else None,
             callback=_bound_memory(show, options.memory),
             **given,
         )
     unwrapped, divided = add_map(mesh, result)
+    unwrapped = replace(unwrapped, lower_maps=below)
     baked = _bake(options, mesh, unwrapped)
     unwrapped = unwrapped if baked is None else baked.mesh
 
