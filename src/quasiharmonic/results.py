@@ -10,6 +10,7 @@ from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
 from quasiharmonic.apps.atlas.packing.pack import Packing
 from quasiharmonic.apps.atlas.seam_cuts import CutMesh
+from quasiharmonic.apps.baking.bake import BakeResult
 from quasiharmonic.apps.displacement_fields.field_inversion import InverseField
 from quasiharmonic.apps.displacement_fields.nearest import InvertibleField
 from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, InvertibleVolume, VoxelVerdict
@@ -38,6 +39,7 @@ __all__ = [
     "Animation",
     "AnimationVerdict",
     "AtlasVerdict",
+    "BakeResult",
     "Certificate",
     "CleanedMesh",
     "CutMesh",

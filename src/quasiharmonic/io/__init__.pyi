@@ -1,6 +1,8 @@
 # The public names. `__init__.py` imports each when it is first used.
 
 from .adapters.objects import write_map as write_map
+from .channels import place_map as place_map
+from .channels import select_channel as select_channel
 from .errors import MeshFileError as MeshFileError
 from .errors import OutputError as OutputError
 from .fields import DisplacementField as DisplacementField

@@ -47,6 +47,8 @@ def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:
     OutputError
         If the file cannot be written. An existing file is then unchanged.
     """
+    if mesh.lower_maps:
+        find_format(path, "write_map", "channels")
     find_function(path, "write_map")(path, mesh)
 
 
@@ -71,10 +73,14 @@ def check_output(path: str | os.PathLike[str]) -> None:
 def read_written(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
     """Read a file that `write_mapped` wrote of ``mesh``.
 
-    As `read_mesh`, except for a FreeSurfer patch without a surface beside it, which has the mesh's triangles.
+    As `read_mesh`, except for a FreeSurfer patch without a surface beside it, which has the mesh's triangles. The
+    map is in the channel of the mesh's map.
     """
+    from quasiharmonic.io.channels import select_channel
+
     read = find_format(path, "read").read_written
-    return read_mesh(path) if read is None else read(path, mesh)
+    found = read_mesh(path) if read is None else read(path, mesh)
+    return select_channel(found, len(mesh.lower_maps)) if mesh.lower_maps else found
 
 
 def not_held(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:

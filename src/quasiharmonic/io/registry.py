@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FilePath = str | os.PathLike[str]
 #: Something that a format can do: the name of a field of `Format` that is set.
-Feature = Literal["read", "write_map", "seams", "image", "single_file", "read_elements", "encode_values"]
+Feature = Literal["read", "write_map", "seams", "image", "channels", "single_file", "read_elements", "encode_values"]
 
 # What files of a format without the feature cannot do, for error messages.
 _FAULTS: dict[Feature, str] = {
@@ -33,6 +33,7 @@ _FAULTS: dict[Feature, str] = {
     "write_map": "cannot be written",
     "seams": "cannot store seams",
     "image": "cannot store an image",
+    "channels": "cannot store several texture coordinates of one corner",
     "single_file": "may refer to further files",
     "read_elements": "cannot be read as a mesh of finite elements",
     "encode_values": "cannot store values per triangle",
@@ -65,6 +66,8 @@ class Format:
         Whether the file has texture coordinates, so that a vertex can have several.
     image : bool
         Whether the file can have a texture image.
+    channels : bool
+        Whether the file can have several texture coordinates for each corner.
     companions : callable, optional
         Returns the paths of further files that ``write_map`` writes for a texture.
     single_file : bool
@@ -86,6 +89,7 @@ class Format:
     list_losses: Callable[[MeshData], list[str]] | None = None
     seams: bool = False
     image: bool = False
+    channels: bool = False
     companions: Callable[[FilePath, Texture], tuple[Path, ...]] | None = None
     single_file: bool = True
     requires: str | None = None
@@ -125,6 +129,7 @@ FORMATS: tuple[Format, ...] = (
         name="PLY",
         suffix=".ply",
         seams=True,
+        channels=True,
         **import_later("formats.ply", read="read_ply", write_map="write_ply", list_losses="not_in_ply"),
         **import_later("formats.per_triangle", encode_values="encode_ply"),
     ),
@@ -134,6 +139,7 @@ FORMATS: tuple[Format, ...] = (
             suffix=suffix,
             seams=True,
             image=True,
+            channels=True,
             single_file=suffix == ".glb",
             **import_later("formats.gltf.reader", read="read_gltf"),
             **import_later("formats.gltf.writer", write_map="write_gltf", list_losses="not_in_gltf"),

@@ -77,6 +77,18 @@ def _(rng):
     return rng.permutation(loops), np.zeros(6, dtype=np.int64), np.zeros(6, dtype=np.int64)
 
 
+@arguments_of("improve_nearest")
+def _(rng):
+    """Triangles of which some are degenerate, and points that already have a nearest one."""
+    corners = rng.normal(size=(30, 3, 3))
+    corners[::7, 2] = corners[::7, 1]
+    corners[3] = corners[3, 0]
+    reach = rng.uniform(0, 1, (50, 6))
+    known = np.full(50, -1), np.zeros((50, 3)), np.full(50, np.inf)
+    known[0][:20], known[2][:20] = rng.integers(0, 30, 20), rng.uniform(0, 1, 20)
+    return rng.normal(size=(50, 3)), corners, rng.integers(0, 30, (50, 6)), reach, *known
+
+
 @arguments_of("sure_signs")
 def _(rng):
     """Integer triangles, many of zero area, and some with NaN or infinite coordinates."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic.util.arrays import FloatArray, IntArray, enumerate_each
+from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.threads import count_cores, make_executor
 
 # Nearest samples of the surface that are tried first, and the factor by which their number grows.
@@ -13,7 +14,7 @@ _GROWTH = 4
 # Largest number of samples for each triangle, on average.
 _SAMPLES = 4
 # Points per block, so that the arrays fit into the cache.
-_POINTS = 1 << 14
+_POINTS = 1 << 13
 
 
 class NearestPoint:
@@ -75,30 +76,37 @@ class NearestPoint:
             distance, sample = self._tree.query(points[waiting], count)
             distance, sample = distance.reshape(-1, count), sample.reshape(-1, count)
             reach = distance - self._radius[sample]
-            for j in range(count):
-                candidate = self._triangle[sample[:, j]]
-                # A triangle can only be nearer than the best one if its part around the sample is.
-                close = np.flatnonzero((reach[:, j] < np.sqrt(squared[waiting])) & (candidate != triangle[waiting]))
-                self._improve(points, waiting[close], candidate[close], triangle, weights, squared)
+            best, nearest, apart = triangle[waiting], weights[waiting], squared[waiting]
+            improve_nearest(points[waiting], self._corners, self._triangle[sample], reach, best, nearest, apart)
+            triangle[waiting], weights[waiting], squared[waiting] = best, nearest, apart
             if count == many:
                 return
             waiting = waiting[distance[:, -1] < np.sqrt(squared[waiting]) + self._largest]
             count = min(_GROWTH * count, many)
 
-    def _improve(
-        self,
-        points: FloatArray,
-        which: IntArray,
-        candidate: IntArray,
-        triangle: IntArray,
-        weights: FloatArray,
-        squared: FloatArray,
-    ) -> None:
-        """Replace the nearest points of some points by those of candidates, where these are nearer."""
-        found, distance = nearest_in_triangles(points[which], self._corners[candidate])
-        better = distance < squared[which]
-        which = which[better]
-        triangle[which], weights[which], squared[which] = candidate[better], found[better], distance[better]
+
+@compiled
+def improve_nearest(
+    points: FloatArray,
+    corners: FloatArray,
+    candidate: IntArray,
+    reach: FloatArray,
+    triangle: IntArray,
+    weights: FloatArray,
+    squared: FloatArray,
+) -> None:
+    """Replace the nearest points of a surface to points (n, 3) by those of candidate triangles that are nearer.
+
+    Triangle, weights and squared distance (n,) are changed. ``corners`` (f, 3, 3) are those of the surface. Candidates
+    (n, k) are tried in their order if a bound on their distance, ``reach`` (n, k), is below the smallest one so far.
+    """
+    for j in range(candidate.shape[1]):
+        one = candidate[:, j]
+        close = np.flatnonzero((reach[:, j] < np.sqrt(squared)) & (one != triangle))
+        found, distance = nearest_in_triangles(points[close], corners[one[close]])
+        better = distance < squared[close]
+        which = close[better]
+        triangle[which], weights[which], squared[which] = one[which], found[better], distance[better]
 
 
 def nearest_in_triangles(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -14,12 +14,13 @@ from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encod
 from quasiharmonic.io.formats.vertex_data import colours_of, normal_lines, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
-from quasiharmonic.io.models.meshdata import Carried, MeshData, polygon_mesh, vertex_places
+from quasiharmonic.io.models.meshdata import Carried, MeshData, polygon_mesh, vertex_places, with_corner_map
 from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 
 # Property names of texture coordinates, at vertices and at the corners of faces.
 _PLACES = ("s", "t"), ("u", "v"), ("texture_u", "texture_v")
 _CORNER_PLACES = "texcoord"
+_SECOND_PLACES = "texcoord1"
 _RINGS = "vertex_indices", "vertex_index"
 _COLOUR = "red", "green", "blue", "alpha"
 _NORMAL = "nx", "ny", "nz"
@@ -53,6 +54,7 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
 
     Texture coordinates are read from the faces' ``texcoord`` (a pair for each corner, so that seams are possible).
     Without it, they are read from the vertices' ``s`` and ``t``, ``u`` and ``v``, or ``texture_u`` and ``texture_v``.
+    The faces' ``texcoord1`` is a second channel, see `select_channel`.
 
     Returns
     -------
@@ -74,7 +76,8 @@ def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """Write a mesh as a binary PLY file, atomically.
 
     Positions and texture coordinates are doubles. Texture coordinates are the vertices' ``s`` and ``t``, or the faces'
-    ``texcoord`` if there are seams or corners without texture coordinates. A mesh that was read from a PLY file keeps
+    ``texcoord`` if there are seams or corners without texture coordinates. Those of a second channel are the faces'
+    ``texcoord1``. A mesh that was read from a PLY file keeps
     all other data of that file, and its positions unchanged. Other meshes keep normals and colours that are unique per
     vertex.
 
@@ -88,7 +91,13 @@ def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
         tables = carried.tables
     else:
         tables = PlyTables((_vertices(mesh), _faces(mesh)))
-    write_whole(path, encode_tables(_with_places(tables, mesh)))
+    if not mesh.lower_maps:
+        tables = _with_places(tables, mesh)
+    elif len(mesh.lower_maps) == 1:
+        tables = _with_second_places(_with_places(tables, with_corner_map(mesh, mesh.lower_maps[0])), mesh)
+    else:
+        raise ValueError("PLY files have two texture coordinates at most: write .glb")
+    write_whole(path, encode_tables(tables))
 
 
 def not_in_ply(mesh: MeshData) -> list[str]:
@@ -196,14 +205,47 @@ def _with_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
     return replace(tables, elements=tuple(elements))
 
 
-def _corner_places(mesh: MeshData) -> Column:
+def _with_second_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
+    """Return the tables with the texture coordinates of a mesh as the second ones."""
+    elements = []
+    for element in tables.elements:
+        columns = [column for column in element.columns if column.name != _SECOND_PLACES]
+        if element.name == "face":
+            columns.append(_corner_places(mesh, _SECOND_PLACES))
+        elements.append(replace(element, columns=tuple(columns)))
+    return replace(tables, elements=tuple(elements))
+
+
+def read_second_places(mesh: MeshData, carried: CarriedPly) -> FloatArray | None:
+    """Return the second texture coordinates (f, 3, 2), NaN for none; None if the file has none.
+
+    ValueError if a face has another number of them than of corners.
+    """
+    face = carried.tables.find("face")
+    column = None if face is None else face.find(_SECOND_PLACES)
+    if column is None or column.sizes is None:
+        return None
+    sizes = mesh.rings.sizes
+    if not ((column.sizes == 2 * sizes) | (column.sizes == 0)).all():
+        raise ValueError(f"{mesh.source}: a face has another number of {_SECOND_PLACES} than twice its corners")
+    pairs = np.full((len(mesh.rings.corners), 2), np.nan)
+    pairs[repeat_each(column.sizes > 0, sizes)] = column.values.astype(np.float64).reshape(-1, 2)
+    # A face has each vertex once.
+    keys = repeat_each(np.arange(len(sizes)), sizes) * len(mesh.V) + mesh.F.ravel()[mesh.rings.corners]
+    order = np.argsort(keys)
+    wanted = mesh.rings.of_triangle[:, None] * len(mesh.V) + mesh.F
+    found: FloatArray = pairs[order[np.searchsorted(keys[order], wanted)]]
+    return found
+
+
+def _corner_places(mesh: MeshData, name: str = _CORNER_PLACES) -> Column:
     """Return a pair for each corner of the faces that have texture coordinates."""
     pairs, sizes = mesh.corner_uv.reshape(-1, 2)[mesh.rings.corners], mesh.rings.sizes
     face = repeat_each(np.arange(len(sizes)), sizes)
     bare = np.unique(face[np.isnan(pairs[:, 0])])
     count = 2 * sizes
     count[bare] = 0
-    return Column(_CORNER_PLACES, pairs[~np.isin(face, bare)].ravel(), count)
+    return Column(name, pairs[~np.isin(face, bare)].ravel(), count)
 
 
 def _vertices(mesh: MeshData) -> Element:

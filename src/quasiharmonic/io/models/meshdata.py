@@ -100,6 +100,9 @@ class MeshData:
         All other data of the file, for a writer of the same format; None if there is no other data.
     texture : Texture or None
         An image to write with the map, in formats that support textures.
+    lower_maps : tuple of (f, 3, 2) float64
+        Texture coordinates of the corners in the channels below that of the map, which is number ``len(lower_maps)``:
+        ``TEXCOORD_0``, ``TEXCOORD_1``, … of glTF.
     """
 
     V: FloatArray
@@ -118,6 +121,7 @@ class MeshData:
     source: str = "mesh"
     carried: Carried | None = None
     texture: Texture | None = None
+    lower_maps: tuple[FloatArray, ...] = ()
 
     def __post_init__(self) -> None:
         """Convert the arrays to the types and shapes above; raise `ValueError` for invalid ones."""
@@ -208,6 +212,16 @@ def polygon_mesh(
         polygons=polygons,
         **rest,
     )
+
+
+def with_corner_map(mesh: MeshData, corners: FloatArray) -> MeshData:
+    """Return a mesh with texture coordinates (f, 3, 2) of its corners, NaN for none; equal ones of a vertex are one."""
+    known = ~np.isnan(corners[:, :, 0])
+    rows = np.column_stack([mesh.F[known], corners[known] + 0.0])
+    unique, which = np.unique(rows, axis=0, return_inverse=True)
+    FT = np.full(mesh.F.shape, -1)
+    FT[known] = which.reshape(-1)
+    return replace(mesh, vt=unique[:, 1:], FT=FT, map_lines=None, lower_maps=())
 
 
 def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:

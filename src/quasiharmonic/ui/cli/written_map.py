@@ -153,7 +153,7 @@ def add_old_textures(facts: dict[str, Any], lines: list[str], before: MeshData, 
     from quasiharmonic import io
     from quasiharmonic.io.errors import printable
 
-    if after.texture is not None or not (named := io.texture_names(before)):
+    if after.texture is not None or after.lower_maps or not (named := io.texture_names(before)):
         return
     if np.array_equal(before.corner_uv, after.corner_uv, equal_nan=True):
         return

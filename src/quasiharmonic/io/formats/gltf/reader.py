@@ -240,6 +240,14 @@ def _attribute(
     return numbers, known
 
 
+def read_channel(carried: CarriedGltf, channel: int) -> FloatArray | None:
+    """Return the texture coordinates (f, 3, 2) of a channel, v upwards, NaN for none; None if no triangle has it."""
+    name = f"TEXCOORD_{channel}"
+    if not any(name in pool.attributes for pool in carried.pools):
+        return None
+    return read_corners(carried, name, 2) * [1, -1] + [0, 1]
+
+
 def read_corners(carried: CarriedGltf, name: str, width: int | None) -> FloatArray:
     """Return an attribute at the corners of all triangles, (f, 3, width) float64; NaN where there is none.
 

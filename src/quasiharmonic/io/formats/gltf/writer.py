@@ -86,6 +86,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     """Return the document that was read, with the texture coordinates of a mesh."""
     document = carried.document.copy()
     users, all_places = _users(carried), _convert_places(mesh.corner_uv)
+    name = _channel_name(mesh)
     for number, pool in enumerate(carried.pools):
         parts, faces = carried.parts_of(number), carried.faces_of(number)
         primitives = [document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in parts]
@@ -96,19 +97,24 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
             raise ValueError("some faces of a primitive have no texture coordinates, which glTF does not support")
         rows, origin, corner = _split(carried.rows[faces] - pool.first, _bits(places), pool.count)
         table = places.reshape(-1, 2)[corner]
-        if PLACES in pool.attributes:
-            old = document.reals(pool.attributes[PLACES])[origin]
+        if name in pool.attributes:
+            old = document.reals(pool.attributes[name])[origin]
             table = np.where(corner[:, None] < 0, old.astype(np.float32), table)
         if len(origin) > pool.count:
-            _extend(document, pool, primitives, origin, users)
+            _extend(document, pool, primitives, origin, users, name)
             bounds = np.cumsum([part.end - part.begin for part in parts])[:-1]
             for primitive, own in zip(primitives, np.split(rows, bounds), strict=True):
                 primitive["mode"] = 4
                 primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
-        _set_numbers(document, [primitive["attributes"] for primitive in primitives], PLACES, table, users)
-        if _has_moved(carried, number, all_places):
+        _set_numbers(document, [primitive["attributes"] for primitive in primitives], name, table, users)
+        if name == PLACES and _has_moved(carried, number, all_places):
             _drop_tangents(primitives)
     return document
+
+
+def _channel_name(mesh: MeshData) -> str:
+    """Return the name of the attribute of the map."""
+    return f"TEXCOORD_{len(mesh.lower_maps)}"
 
 
 def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
@@ -120,6 +126,8 @@ def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
 
 def _has_old_tangents(carried: CarriedGltf, mesh: MeshData) -> bool:
     """Whether the file has tangents, and the mesh has other texture coordinates."""
+    if _channel_name(mesh) != PLACES:
+        return False
     places = _convert_places(mesh.corner_uv)
     tangents = [number for number, pool in enumerate(carried.pools) if "TANGENT" in pool.attributes]
     return not np.isnan(places).all() and any(_has_moved(carried, number, places) for number in tangents)
@@ -171,10 +179,15 @@ def _bits(coordinates: NDArray[np.float32]) -> IntArray:
 
 
 def _extend(
-    document: Document, pool: VertexPool, primitives: list[dict[str, Any]], origin: IntArray, users: dict[int, int]
+    document: Document,
+    pool: VertexPool,
+    primitives: list[dict[str, Any]],
+    origin: IntArray,
+    users: dict[int, int],
+    changed: str,
 ) -> None:
-    """Copy the attributes of a pool's vertices to their copies."""
-    attributes = [(name, accessor) for name, accessor in pool.attributes.items() if name != PLACES]
+    """Copy the attributes of a pool's vertices, except the changed one, to their copies."""
+    attributes = [(name, accessor) for name, accessor in pool.attributes.items() if name != changed]
     shared = [([primitive["attributes"] for primitive in primitives], attributes)]
     for t, target in enumerate(pool.targets):
         shared.append(([primitive["targets"][t] for primitive in primitives], list(target.items())))
@@ -237,7 +250,8 @@ def _new(mesh: MeshData) -> Document:
         "meshes": [{"primitives": []}],
     }
     document = Document(tree, [])
-    places = _convert_places(mesh.corner_uv)
+    maps = [_convert_places(corners) for corners in (*mesh.lower_maps, mesh.corner_uv)]
+    places = np.concatenate(maps, axis=2)
     bare = np.asarray(np.isnan(places).any(axis=(1, 2)))
     places[bare] = 0
     normals, colours = normals_of(mesh), colours_of(mesh)
@@ -252,12 +266,15 @@ def _new(mesh: MeshData) -> Document:
         attributes["NORMAL"] = document.add(_single("a normal", normals[line.ravel()[corner]]))
     if colours is not None:
         attributes["COLOR_0"] = document.add(colours[origin].astype(np.float32))
-    placed = document.add(places.reshape(-1, 2)[corner]) if not bare.all() else None
+    placed = {}
+    if not bare.all():
+        table = places.reshape(-1, places.shape[2])[corner]
+        placed = {f"TEXCOORD_{k}": document.add(table[:, 2 * k : 2 * k + 2]) for k in range(len(maps))}
     names: list[str] = []
     for begin, end, name, plain in _runs(mesh, bare):
         primitive: dict[str, Any] = {"attributes": dict(attributes), "mode": 4}
-        if placed is not None and not plain:
-            primitive["attributes"][PLACES] = placed
+        if not plain:
+            primitive["attributes"] |= placed
         primitive["indices"] = document.add(_indices(rows[begin:end], len(origin)), indices=True)
         if name is not None:
             if name not in names:

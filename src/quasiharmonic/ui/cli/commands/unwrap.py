@@ -11,6 +11,7 @@ nothing written; 3 written, but the report failed. Ctrl-C writes nothing.
     qhm unwrap scan.ply --max-stretch 1.2 --resolution 4096 --padding 8 -o out.ply
     qhm unwrap model.glb --texture checkerboard -o out.glb
     qhm unwrap model.glb --bake -o out.glb
+    qhm unwrap model.glb --channel 1 -o out.glb
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from quasiharmonic.ui.cli.arguments import (
     flag,
     number,
     pick,
+    steps,
     text,
     texture_size,
     weld,
@@ -92,6 +94,15 @@ def add_parser(commands: Commands) -> None:
             "file of face numbers, 0-based, one on each line: unwrap only these, and keep the texture coordinates of "
             "all others"
         ),
+        channel=number(
+            steps,
+            "write the new texture coordinates as number N, such as 1 for lightmaps, and keep those below "
+            "(default: 0); GLB, glTF, PLY",
+            default=0,
+        ),
+        seams_channel=number(
+            steps, "which of the file's texture coordinates --keep-seams keeps (default: 0)", default=0
+        ),
         bake=flag("bake the look of the model into textures for the new texture coordinates"),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
@@ -104,6 +115,10 @@ def run(options: argparse.Namespace) -> int:
 
     began = time.perf_counter()
     io.find_format(options.output, "write_map", "seams")
+    if options.channel:
+        io.find_format(options.output, "write_map", "channels")
+    if options.channel and (options.bake or options.texture is not None):
+        raise ValueError("images are shown by the first texture coordinates: omit --bake and --texture, or --channel")
     if options.bake:
         _check_bake(options)
     return pipeline.change_map(
@@ -124,11 +139,15 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
     """Unwrap a mesh."""
+    from dataclasses import replace
+
+    from quasiharmonic import io
     from quasiharmonic.apps.unwrapping.hard_edges import find_hard_edges
     from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions, is_written
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.util.arrays import count_of
 
+    below = io.place_map(mesh, mesh, options.channel).lower_maps
     given = pick(options, "resolution", "stack", "weld", *declared(UnwrapOptions))
     if options.symmetry == "none":
         given["symmetry"] = None
@@ -142,12 +161,17 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             seams=_read_integers(options.seams, 2),
             no_seams=_read_integers(options.no_seams, 2),
             labels=_labels(mesh, options.labels),
-            uv=corner_positions(mesh) if options.keep_seams or options.faces else None,
+            uv=(
+                corner_positions(io.select_channel(mesh, options.seams_channel))
+                if options.keep_seams or options.faces
+                else None
+            ),
             faces=_faces(mesh, options.faces),
             callback=_bound_memory(show, options.memory),
             **given,
         )
     unwrapped, divided = add_map(mesh, result)
+    unwrapped = replace(unwrapped, lower_maps=below)
     baked = _bake(options, mesh, unwrapped)
     unwrapped = unwrapped if baked is None else baked.mesh
 

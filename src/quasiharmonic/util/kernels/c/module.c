@@ -9,6 +9,7 @@
     with(laplacian) \
     with(loops) \
     with(mixtures) \
+    with(nearest_point) \
     with(nested_grid) \
     with(newton_system) \
     with(pattern) \
