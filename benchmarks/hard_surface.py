@@ -1,6 +1,6 @@
 """Compare `unwrap` on hard-surface models with uvunwrap and xatlas.
 
-    python benchmarks/hard_surface.py [-o docs/speed/hard_surface.md]
+    python benchmarks/hard_surface.py [-o docs/speed/hard_surface.md] [--picture docs/images/hard_surface.png]
 
 Requires uvunwrap and xatlas (``pip install '.[bench]'``). All programs pack charts for a texture of 1,024 texels with a
 padding of 4. Columns are those of `unwrapping.py`, and two more: "whole" is the share of the edges inside flat faces,
@@ -11,7 +11,7 @@ of the texture. The first rows are medians over the models of the ratio of `unwr
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from unwrapping import PADDING, RESOLUTION, Corners, Unwrap, by_xatlas, cpu_seco
 
 # Largest angles in degrees between triangles in one plane, and between a straight side and an axis.
 _FLAT, _SKEW = 1e-4, 1.0
+_DRAWN = "L bracket with a fillet", "stairs", "house", "plate with holes", "tube with caps", "robot"
 _COLUMNS = "charts", "seams", "used", "stretch, 99 %", "whole", "straight", "CPU s"
 
 
@@ -81,18 +82,43 @@ def all_models() -> Iterator[tuple[str, Mesh]]:
     yield "blocks", models.terrain(6, np.random.default_rng(1))
 
 
+def draw(layouts: dict[tuple[str, str], Corners], names: Sequence[str], ways: Sequence[str], path: Path) -> None:
+    """Draw the layouts of some models (columns) by several programs (rows), each triangle by its normal."""
+    import matplotlib.pyplot as plt
+    from matplotlib.collections import PolyCollection
+
+    meshes = dict(all_models())
+    figure, axes = plt.subplots(len(ways), len(names), figsize=(2.4 * len(names), 2.5 * len(ways)))
+    for row, way in zip(axes, ways, strict=True):
+        for axis, name in zip(row, names, strict=True):
+            V, F = meshes[name]
+            normal = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
+            normal /= np.linalg.norm(normal, axis=1)[:, None]
+            uv = layouts[name, way]
+            uv = uv * (RESOLUTION if uv.max() <= 1 else 1)
+            axis.add_collection(PolyCollection(uv, facecolors=0.55 + 0.4 * normal, edgecolors="black", linewidths=0.15))
+            axis.set(xlim=(0, RESOLUTION), ylim=(0, RESOLUTION), aspect="equal", xticks=[], yticks=[])
+            axis.set_title(f"{name}, {way.strip('`')}", fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, help="write the table here as well")
+    parser.add_argument("--picture", type=Path, help="draw some layouts side by side")
     options = parser.parse_args()
     ways: dict[str, Unwrap] = {"`unwrap`": ours, "uvunwrap": by_uvunwrap, "xatlas": by_xatlas}
     unwrap(*surfaces.disk(4), resolution=64)  # imports are not timed
     rows, figures = list[str](), dict[str, list[list[float]]]()
+    layouts: dict[tuple[str, str], Corners] = {}
     for name, (V, F) in all_models():
         for way, method in ways.items():
             began = cpu_seconds()
             corners = method(V, F)
             seconds = cpu_seconds() - began
+            layouts[name, way] = corners
             found, (whole, straight) = measure(V, F, corners), shares(V, F, corners)
             values = [found.charts, found.seams, found.used, found.at_99, whole, straight, seconds]
             figures.setdefault(way, []).append(values)
@@ -110,6 +136,8 @@ def main() -> None:
     print(table)
     if options.output is not None:
         options.output.write_text(table, encoding="utf-8")
+    if options.picture is not None:
+        draw(layouts, _DRAWN, list(ways), options.picture)
 
 
 if __name__ == "__main__":

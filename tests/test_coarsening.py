@@ -302,6 +302,20 @@ class TestSearch:
         assert coarse_mesh(shifted) is coarse
 
     @pytest.mark.slow
+    def test_the_coarse_map_takes_three_polishing_steps(self, posed, monkeypatch):
+        taken = []
+
+        def polish_map(*given):
+            polished = polish(*given)
+            taken.append(polished.n_iterations)
+            return polished
+
+        polish = search.polish_map
+        monkeypatch.setattr(search, "polish_map", polish_map)
+        assert solve(posed).injective
+        assert taken == [3]
+
+    @pytest.mark.slow
     def test_handles_pins_and_holes(self):
         V, F = random_annulus(4000, seed=3)
         fixed = np.append(boundary_of(F), [int(np.argmin(np.abs(V - (0, 0.7)).sum(axis=1)))])

@@ -48,6 +48,22 @@ def test_a_developable_surface_is_unrolled_without_distortion():
     np.testing.assert_allclose(flat, edge, rtol=2e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", ["half cylinder", "cone", "panel"])
+def test_developable_surfaces_take_few_steps(shape):
+    square, F = grid(120, 60)
+    x, y = square.T
+    V = {
+        "half cylinder": np.column_stack([np.cos(np.pi * x), np.sin(np.pi * x), 2 * y]),
+        "cone": np.column_stack([0.6 * (1 + y) * np.cos(5 * x), 0.6 * (1 + y) * np.sin(5 * x), 0.8 * y]),
+        "panel": np.column_stack([2 * x, y, 0.6 * x + 0.2 * y]),
+    }[shape]
+    result = flatten(V, F)
+    assert result.status is Status.POLISHED
+    assert mean_energy(V, F, result.uv) < 1e-12
+    assert result.n_iterations <= 12
+
+
 @pytest.mark.parametrize("energy", ["symmetric-dirichlet", "mips", "blend", "arap-barrier"])
 def test_energies_fall_and_maps_stay_bijective(energy):
     V, F = cat(12)

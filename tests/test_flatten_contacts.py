@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from quasiharmonic import boundary_loops, certify
+from quasiharmonic import boundary_loops, certify, flatten
 from quasiharmonic.apps.flattening.contacts import HATS, Rim, RimContacts
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
@@ -147,6 +147,62 @@ def test_touching_in_one_point_counts_as_overlap():
     assert not rim.meets_itself(V)
     V[2 * 41] = V[2 * 41 + 40]
     assert rim.meets_itself(V)
+
+
+def pinched():
+    """A square with a hole in which two fans of triangles meet in a point; their copies of the vertex."""
+    V, F = grid(8, 8)
+    middle = V[F].mean(axis=1)
+    corners = [5 / 16, 5 / 16], [7 / 16, 7 / 16]
+    F = F[~np.any([(np.abs(middle - corner) < 1 / 16).all(axis=1) for corner in corners], axis=0)]
+    (pinch,) = np.flatnonzero((V == 3 / 8).all(axis=1))
+    fan = (V[F].mean(axis=1) @ [1, -1] > 0)[:, None]
+    return np.vstack([V, V[pinch]]), np.where(fan & (pinch == F), len(V), F), [pinch, len(V)]
+
+
+@pytest.mark.parametrize("overlap", [0.0, 1e-12, 1e-3])
+def test_copies_of_a_vertex_that_touch_are_pulled_apart(overlap):
+    V, F, copies = pinched()
+    uv = V.copy()
+    uv[copies] += overlap * np.array([[1, -1], [-1, 1]])
+    rim = Rim(boundary_loops(F, len(V)))
+    assert rim.meets_itself(uv)
+    apart = rim.pull_apart(F, uv)
+    assert certify(F, apart).bijective
+    moved = np.linalg.norm(apart - uv, axis=1)
+    assert moved.max() < max(4 * overlap, 1e-6)
+    assert np.isin(copies, np.flatnonzero(moved)).all()
+
+
+def test_sides_of_a_slit_are_pulled_apart():
+    V, F = grid(8, 8)
+    slit = np.flatnonzero((V[:, 1] == 0.5) & (V[:, 0] > 0.5))
+    below = V[F].mean(axis=1)[:, 1] < 0.5
+    copy = np.arange(len(V))
+    copy[slit] = len(V) + np.arange(slit.size)
+    V, F = np.vstack([V, V[slit]]), np.where(below[:, None], copy[F], F)
+    rim = Rim(boundary_loops(F, len(V)))
+    assert rim.meets_itself(V)
+    assert certify(F, rim.pull_apart(F, V)).bijective
+
+
+def test_large_overlaps_are_not_pulled_apart():
+    V, F = horseshoe(-0.03)
+    assert Rim(boundary_loops(F, len(V))).pull_apart(F, V) is None
+
+
+@pytest.mark.parametrize(("seed", "guarded"), [(3, False), (12, False), (22, True)])
+def test_a_surface_with_a_pinch_is_guarded_only_if_its_overlap_is_large(seed, guarded):
+    V, F, copies = pinched()
+    height = 0.005 * np.random.default_rng(seed).normal(size=len(V) - 1)
+    V = np.column_stack([V, np.append(height, height[copies[0]])])
+    result = flatten(V, F)
+    assert result.certificate.bijective
+    names = [stage.name.split(",")[0] for stage in result.stages]
+    assert names[:3] == ["start", "free descent", "overlaps pulled apart"]
+    assert names[3:] == ["guarded descent"] * guarded
+    assert result.stages[-1].energy[1] == result.history[-1].energy
+    assert result.history[-1].energy < 1.2 * result.stages[1].energy[1]
 
 
 @pytest.mark.parametrize("surface", [horseshoe(0.02), annulus(8)], ids=["disk", "annulus"])

@@ -87,6 +87,7 @@ def test_the_statuses_of_every_function_with_a_status_are_listed():
             "InvertibleField",
             "RefinedProblem",
             "UnwrapResult",
+            "BakeResult",
             "TetrahedraResult",
             "InvertibleVolume",
         )

@@ -67,7 +67,7 @@ def test_new_charts_have_the_mean_density_of_the_others():
 
 def test_charts_that_do_not_fit_are_an_error_with_a_sufficient_density():
     with pytest.raises(ValueError, match=r"free part of 256 × 256 texels: texels_per_unit=[\d.]+ suffices") as caught:
-        unwrap(V, F, resolution=256, uv=UV, faces=SOME, texels_per_unit=60)
+        unwrap(V, F, resolution=256, uv=UV, faces=SOME, texels_per_unit=90)
     density = float(str(caught.value).split("texels_per_unit=")[1].split()[0])
     assert unwrap(V, F, resolution=256, uv=UV, faces=SOME, texels_per_unit=density).success
 

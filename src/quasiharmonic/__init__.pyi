@@ -28,6 +28,8 @@ from .apps.air_mesh import AirMesh as AirMesh
 from .apps.animation.frame_sequence import animate as animate
 from .apps.animation.frames import Animation as Animation
 from .apps.atlas.seam_cuts import cut_open as cut_open
+from .apps.baking.bake import BakeResult as BakeResult
+from .apps.baking.bake import bake as bake
 from .apps.displacement_fields.field_inversion import InverseField as InverseField
 from .apps.displacement_fields.field_inversion import inverse_field as inverse_field
 from .apps.displacement_fields.nearest import (

@@ -134,6 +134,17 @@ def share(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a number from 0 to 1, not {value!r}")
 
 
+def texture_size(name: str, value: Any) -> None:
+    """Check the side of a texture in texels, or its width and height: at most 8192."""
+    from quasiharmonic.util.arrays import check_integer
+
+    sides = tuple(value) if isinstance(value, tuple | list) else (value, value)
+    for side in sides:
+        check_integer(name, side, minimum=1)
+    if len(sides) != 2 or max(sides) > 8192:
+        raise ValueError(f"{name} must be a number of texels, or width and height, at most 8192, not {value!r}")
+
+
 def mirror_axis(name: str, value: Any) -> None:
     """Check the axis of a plane of symmetry, ``"auto"``, or None."""
     if value is not None:
@@ -362,6 +373,21 @@ class AnimationOptions(SolverOptions):
     fill_gaps: bool = option(False, check=switch)
     start: Any = option(None)
     max_iterations: int = option(MAX_ITERATIONS, check=positive)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BakeOptions(Options):
+    """Options of `quasiharmonic.bake`."""
+
+    size: Any = option(2048, check=texture_size)
+    samples: int = option(1, "samples along each side of a texel, whose mean it gets (default: 1)", check=positive)
+    padding: int = option(16, "texels beside charts that get the values of the nearest ones (default: 16)", check=count)
+    max_distance: float = option(
+        0.05,
+        "how far the old model may be from the new one, relative to the diagonal of its bounding box (default: 0.05)",
+        check=tolerance,
+    )
+    jpeg: bool = option(False, "write colours without opacity as JPEG (default: PNG)", check=switch)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

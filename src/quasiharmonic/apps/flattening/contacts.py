@@ -25,15 +25,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from quasiharmonic.energies.energies import QuadraticForm
+from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops, contacts
 from quasiharmonic.geometry.exact.predicates import box_pairs_between
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, sum_at, to_points
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, sum_at, to_complex, to_points
 
 # Reach of the barrier, relative to the local edge length of the boundary.
 _REACH = 1.0
 # Pairs up to this many times the reach are also tracked during a step, which may bring them closer.
 _LOOKOUT = 2.0
 _MAX_MEETINGS = 1000
+# Small overlaps have less than this number of pairs of edges. Their vertices move by these fractions of the smallest
+# height of their triangles, tried in turn.
+_MAX_PULLED = 10_000
+_SHARES = 0.0, *(1e-6 * 2.0**k for k in range(17))
 #: Half the gradients of the hat functions of a triangle v, a, b with a right angle at a and legs of length 1.
 HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
 
@@ -159,6 +164,29 @@ class Rim:
         """The fraction of the boundary's vertices at intersecting edges, from the first 1,000 pairs."""
         return self.meetings(uv).size / self._vertex.size
 
+    def pull_apart(self, F: IntArray, uv: FloatArray) -> FloatArray | None:
+        """Move boundary vertices at small overlaps into the surface until the boundary does not meet itself.
+
+        Where two fans of triangles meet in a vertex, or along a slit, an isometric map touches itself. ``F`` (f, 3) are
+        the triangles of an injective map (n, 2). Return a bijective map, or None if short moves do not suffice.
+        """
+        w = to_complex(uv)
+        here = w[self._vertex]
+        ahead, behind = w[self._vertex[self._next]] - here, w[self._vertex[self._previous]] - here
+        # The direction halfway between both boundary edges, through the surface.
+        halfway = 0.5 * (np.angle(-behind / ahead) + np.pi)
+        inward = np.zeros(w.size, dtype=np.complex128)
+        inward[self._vertex] = ahead / np.abs(ahead) * np.exp(1j * halfway)
+        inward *= smallest_heights(w, F)
+        tried, moved = np.zeros(w.size, dtype=np.int64), uv
+        while (pairs := contacts(moved, self._edges, _MAX_PULLED).pairs).size:
+            met = np.unique(self._edges[pairs])
+            tried[met] += 1
+            if len(pairs) == _MAX_PULLED or tried.max() == len(_SHARES):
+                return None
+            moved = to_points(w + np.take(_SHARES, tried) * inward)
+        return moved if is_injective(F, moved) and not self.meets_itself(moved) else None
+
     def contacts(self, w: ComplexArray) -> RimContacts:
         """Return pairs that are close to each other across the outside of the surface; the map's boundary is simple."""
         p = w[self._vertex]
@@ -200,6 +228,15 @@ class Rim:
         convex = (ahead.conj() * behind).imag > 0
         inside: BoolArray = np.where(convex, left & right, left | right)
         return inside
+
+
+def smallest_heights(w: ComplexArray, F: IntArray) -> FloatArray:
+    """The smallest height of a map's triangles at each vertex; (n,) float64."""
+    least = np.full(w.size, np.inf)
+    for corner, after, before in F[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].transpose(1, 2, 0):
+        side = w[before] - w[after]
+        np.minimum.at(least, corner, ((w[after] - w[corner]).conj() * side).imag / np.abs(side))
+    return least
 
 
 def nearest_on_edges(v: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[FloatArray, ComplexArray, FloatArray]:

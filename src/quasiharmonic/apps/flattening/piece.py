@@ -47,6 +47,8 @@ _MAX_ENERGY_RATIO = 10.0
 _CHECK_EVERY = 8
 # It stops if edges at this fraction of the boundary vertices intersect: such boundaries do not separate again.
 _TANGLED = 0.1
+# A map whose overlaps were pulled apart is the result if its energy has grown by at most this factor, plus this amount.
+_MAX_PULLED_RATIO, _LEAST_PULLED = 1.001, 1e-6
 # Descents from different initial maps agree if their energies differ by at most this fraction.
 _AGREE = 0.1
 # A descent that has not converged after this number of steps is checked for collapse.
@@ -336,7 +338,10 @@ class Flattening:
             for number, outcome in enumerate(itertools.islice(course, options.max_iterations), 1):
                 recent.append((measure(), descent.uv))
                 yield outcome
-                if not guarded and number % _CHECK_EVERY == 0 and self._rim.tangled_fraction(descent.uv) > _TANGLED:
+                tangled = (
+                    not guarded and number % _CHECK_EVERY == 0 and self._rim.tangled_fraction(descent.uv) > _TANGLED
+                )
+                if tangled and self._rim.pull_apart(self._piece.F, descent.uv) is None:
                     return
 
         name = f"{'guarded' if guarded else 'free'} descent, {energy_name(options)}"
@@ -346,14 +351,23 @@ class Flattening:
         finally:
             # After Ctrl-C too, the current map may be better than the previous one.
             apart = guarded or not self._rim.meets_itself(descent.uv)
+            pulled = None if apart else self._rim.pull_apart(self._piece.F, descent.uv)
             if apart:
                 self._bijective = descent.uv
+            elif pulled is not None:
+                self._bijective = pulled
             else:
                 self._overlaps = True
                 self._overlapping = descent.uv if status is not Status.STILL_FALLING else None
                 self._bijective = self._latest_bijective(recent, _MAX_ENERGY_RATIO * measure())
-            self._run.judge_last_stage(kept=apart)
-        return status if apart else None
+            self._run.judge_last_stage(kept=apart or pulled is not None)
+        if pulled is None:
+            return status if apart else None
+        before, after = measure(), self._measure.value(in_units(pulled, 0))
+        self._run.add_stage("overlaps pulled apart", n_iterations=1, energy=(before, after))
+        self._run.record(0, after, lambda: to_given_unit(pulled, exponent))
+        # If the pulled triangles are distorted too much, a guarded descent continues from there.
+        return status if after <= _MAX_PULLED_RATIO * before + _LEAST_PULLED else None
 
     def _latest_bijective(self, recent: Iterable[tuple[float, FloatArray]], most: float) -> FloatArray | None:
         """Return the latest of several maps that is bijective and has at most this energy, or else the stored map."""

@@ -138,6 +138,8 @@ class InverseMap(ReadOnly):
         check_finite("V", "vertex", "vertices", self.V[np.unique(self.F)])
         self._seal()
         self._locator = PointLocator(self.uv[self.F])
+        # The triangles of the locator, by rows of the map, and those of the surface: the same, except at seams.
+        self._located, self._rows = self.F, self.F
 
     def _read_only(self) -> tuple[FloatArray, IntArray, FloatArray]:
         return self.V, self.F, self.uv
@@ -163,6 +165,7 @@ class InverseMap(ReadOnly):
         barycentric = np.full((len(rows), 3), np.nan)
         found = np.flatnonzero(triangle >= 0)
         barycentric[found] = self._locator.barycentric(rows[found], triangle[found])
+        triangle[found], barycentric[found] = self._number(triangle[found], barycentric[found])
         shape = positions.shape[:-1]
         return SurfacePoints(triangle.reshape(shape), barycentric.reshape(*shape, 3))
 
@@ -187,25 +190,29 @@ class InverseMap(ReadOnly):
         lost = np.flatnonzero(~at.found.ravel() & np.isfinite(positions).all(axis=-1).ravel())
         if not lost.size:
             return at
-        edges = boundary_edges(self.F, len(self.uv))
+        edges = boundary_edges(self._located, len(self.uv))
         # Scaled, so that squared lengths stay within the range of doubles.
         size = np.abs(self.uv[edges]).max()
         row, share = nearest_segment(positions.reshape(-1, 2)[lost] / size, *(self.uv[edges] / size).swapaxes(0, 1))
         triangle, barycentric = at.triangle.copy().ravel(), at.barycentric.copy().reshape(-1, 3)
         which, corner = self._edge_triangles(edges)
-        triangle[lost] = which[row]
-        barycentric[lost] = 0
-        barycentric[lost, corner[row]] = 1 - share
-        barycentric[lost, (corner[row] + 1) % 3] = share
+        weights = np.zeros((len(lost), 3))
+        weights[np.arange(len(lost)), corner[row]] = 1 - share
+        weights[np.arange(len(lost)), (corner[row] + 1) % 3] = share
+        triangle[lost], barycentric[lost] = self._number(which[row], weights)
         return SurfacePoints(triangle.reshape(at.triangle.shape), barycentric.reshape(at.barycentric.shape))
 
     def _edge_triangles(self, edges: IntArray) -> tuple[IntArray, IntArray]:
         """The triangle of each boundary edge, and the corner at which the edge starts."""
         n = len(self.uv)
-        keys = (self.F * n + self.F[:, (1, 2, 0)]).ravel()
+        keys = (self._located * n + self._located[:, (1, 2, 0)]).ravel()
         order = np.argsort(keys)
         found = order[np.searchsorted(keys[order], edges[:, 0] * n + edges[:, 1])]
         return found // 3, found % 3
+
+    def _number(self, triangle: IntArray, barycentric: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Return points in triangles of the locator as points of the surface."""
+        return triangle, barycentric
 
     def vertices(self) -> SurfacePoints:
         """Return the vertices as points of the surface; triangle -1 for vertices without triangles."""
@@ -222,8 +229,8 @@ class InverseMap(ReadOnly):
         The result is clipped to the bounding box of each triangle, so points on a side along an axis stay on it. Raises
         ValueError as `values`.
         """
-        positions = self.values(at, self.uv)
-        corners = self.uv[self.F[np.asarray(at.triangle)]]
+        positions = self.values(at, self.uv[self._rows], per="corner")
+        corners = self.uv[self._rows[np.asarray(at.triangle)]]
         return np.clip(positions, corners.min(axis=-2), corners.max(axis=-2))
 
     def surface(self, at: SurfacePoints) -> FloatArray:

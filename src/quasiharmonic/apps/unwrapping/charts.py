@@ -16,6 +16,7 @@ from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.draft import Draft
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
+from quasiharmonic.apps.unwrapping.layout import LayoutChoice
 from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unfolding import unfold
@@ -46,7 +47,7 @@ def find_charts(
     edge_costs: FloatArray | None = None,
     uv_cuts: ArrayLike | None = None,
     uv: FloatArray | None = None,
-    choose: Callable[[list[list[Chart]], FloatArray, FloatArray], list[Chart]] | None = None,
+    choose: LayoutChoice | None = None,
     mirror: Mirror | None = None,
     draft: Draft | None = None,
     seed: int = 0,
@@ -79,9 +80,9 @@ def find_charts(
     uv : (f, 3, 2) float64, optional
         Existing texture coordinates of the corners, with ``uv_cuts`` as seams; NaN where there are none. A part of them
         that is bijective, with stretches up to 3, is the initial map of its chart.
-    choose : callable, optional
-        Chooses from several lists of charts of the developable parts, whose number decreases, given positions and costs
-        of these parts; by default the last one.
+    choose : LayoutChoice, optional
+        How to choose from several lists of charts of the developable parts; by default, these parts are joined as much
+        as possible.
     mirror : Mirror, optional
         Mirror images, if seams and charts are to be mirrored. Curved parts are mirrored unless a triangle of theirs
         crosses the plane, or the seams there would grow by more than a quarter.
@@ -167,16 +168,12 @@ def _doubled_areas(V: FloatArray, F: IntArray) -> FloatArray:
     return doubled
 
 
-def _choose_last(found: list[list[Chart]], V: FloatArray, cost: FloatArray) -> list[Chart]:
-    return found[-1]
-
-
 def _develop(
     V: FloatArray,
     F: IntArray,
     cost: FloatArray,
     max_charts: int | None,
-    choose: Callable[[list[list[Chart]], FloatArray, FloatArray], list[Chart]] | None,
+    choose: LayoutChoice | None,
     workers: Workers,
     mirror: Mirror | None,
 ) -> tuple[BoolArray, list[Chart]]:
@@ -190,7 +187,7 @@ def _develop(
         V,
         F[rows],
         cost[rows],
-        choose or _choose_last,
+        choose,
         workers.check_wanted,
         None if mirror is None else mirror.select(rows),
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, find_hinges
+from quasiharmonic.apps.unwrapping.layout import LayoutChoice
 from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
@@ -28,7 +29,7 @@ def develop_charts(
     V: FloatArray,
     F: IntArray,
     cost: FloatArray,
-    choose: Callable[[list[list[Chart]], FloatArray, FloatArray], list[Chart]],
+    choose: LayoutChoice | None,
     check_wanted: Callable[[], object],
     mirror: Mirror | None = None,
 ) -> tuple[BoolArray, list[Chart]]:
@@ -42,8 +43,8 @@ def develop_charts(
         Factor on the cost of cutting each side of each triangle. Pieces are joined across sides with factors of at
         least `UNDIVIDED_COST` unless they overlap, and never at factors of at most `DEMANDED_COST`. Pieces that cannot
         be joined at a factor of at least `KEPT_COST` count as curved.
-    choose : callable
-        Chooses from several lists of charts, whose number decreases.
+    choose : LayoutChoice or None
+        How to choose from several lists of charts, whose number decreases; None for the last one.
     check_wanted : callable
         Called now and then; may raise an exception.
     mirror : Mirror, optional
@@ -83,11 +84,11 @@ def develop_charts(
     known: dict[int, Chart] = {}
     found = [_list_charts(F, model, pieces, known)]
     for longest, loss in _ROUNDS:
-        if loss > _CAUTIOUS and len(found[-1]) > _FEW:
+        if loss > _CAUTIOUS and (len(found[-1]) > _FEW or (choose is not None and not choose.generous)):
             break
         model.join(weight, together, longest, loss, check_wanted)
         found.append(_list_charts(F, model, pieces, known))
-    return pieces.label >= 0, choose(found, V, cost)
+    return pieces.label >= 0, found[-1] if choose is None else choose.choose(found, V, cost)
 
 
 def _list_charts(F: IntArray, model: PaperModel, pieces: Pieces, known: dict[int, Chart]) -> list[Chart]:

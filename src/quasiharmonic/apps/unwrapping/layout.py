@@ -43,6 +43,8 @@ class ChartLayout:
         return np.where(self.mirrored[:, None], self.rows[:, ::-1], self.rows)
 
 
+# From this loss on, unions with much larger boxes are compared, too.
+_GENEROUS = 0.05
 # From this share of straight outlines on, the share may be smaller by a difference.
 _MOSTLY_STRAIGHT, _BENT = 0.85, 0.03
 # Sides are straight up to this sine of their angle with an axis.
@@ -51,40 +53,54 @@ _SKEW = 0.017
 _MOST_COMPARED, _GOOD_USE = 150, 0.83
 
 
-def choose_packed(
-    found: list[list[Chart]],
-    V: FloatArray,
-    cost: FloatArray,
-    *,
-    divide: Callable[[list[Chart], FloatArray, FloatArray], list[Chart]],
-    size: tuple[int, int],
-    padding: float,
-    tiles: int,
-    rotate: bool,
-    loss: float,
-) -> list[Chart]:
-    """Return the last of several lists of charts that uses the texture at most by ``loss`` worse than the best one.
+@dataclass(frozen=True, eq=False)
+class LayoutChoice:
+    """How to choose from several lists of charts of the same triangles.
 
-    Long charts are divided before, by ``divide``, given positions (n, 3) and costs (f, 3) of the surface.
-    If almost all outlines of a list lie along the axes, so must those of the list that is returned.
+    Attributes
+    ----------
+    divide : callable
+        Divides long charts, given positions (n, 3) and costs (f, 3) of the surface.
+    size, padding, tiles, rotate
+        See `pack_charts`.
+    loss : float
+        By which the use of the texture may be below the best one for the sake of fewer charts.
     """
-    straight = np.array([_straight_share(charts) for charts in found])
-    allowed = straight >= (straight.max() - _BENT if straight.max() >= _MOSTLY_STRAIGHT else 0.0)
-    compared = list[tuple[float, list[Chart]]]()
-    count = -1
-    for k in np.flatnonzero(allowed)[::-1].tolist():
-        if len(found[k]) == count:
-            continue
-        count = len(found[k])
-        charts = divide(found[k], V, cost)
-        few = len(charts) <= _MOST_COMPARED
-        shapes = [chart.shape for chart in charts]
-        use = estimate_use(shapes, size, padding, tiles, rotate=rotate) if few else 0.0
-        compared.append((use, charts))
-        if use >= _GOOD_USE - loss:
-            break
-    best = max(use for use, _ in compared)
-    return next(charts for use, charts in compared if use >= best - loss)
+
+    divide: Callable[[list[Chart], FloatArray, FloatArray], list[Chart]]
+    size: tuple[int, int]
+    padding: float
+    tiles: int
+    rotate: bool
+    loss: float
+
+    @property
+    def generous(self) -> bool:
+        """Whether unions with much larger boxes than their parts can be worth their use of the texture."""
+        return self.loss > _GENEROUS
+
+    def choose(self, found: list[list[Chart]], V: FloatArray, cost: FloatArray) -> list[Chart]:
+        """Return the last list that uses the texture at most by `loss` worse than the best one, long charts divided.
+
+        If almost all outlines of a list lie along the axes, so must those of the list that is returned.
+        """
+        straight = np.array([_straight_share(charts) for charts in found])
+        allowed = straight >= (straight.max() - _BENT if straight.max() >= _MOSTLY_STRAIGHT else 0.0)
+        compared = list[tuple[float, list[Chart]]]()
+        count = -1
+        for k in np.flatnonzero(allowed)[::-1].tolist():
+            if len(found[k]) == count:
+                continue
+            count = len(found[k])
+            charts = self.divide(found[k], V, cost)
+            few = len(charts) <= _MOST_COMPARED
+            shapes = [chart.shape for chart in charts]
+            use = estimate_use(shapes, self.size, self.padding, self.tiles, rotate=self.rotate) if few else 0.0
+            compared.append((use, charts))
+            if use >= _GOOD_USE - self.loss:
+                break
+        best = max(use for use, _ in compared)
+        return next(charts for use, charts in compared if use >= best - self.loss)
 
 
 def _straight_share(charts: list[Chart]) -> float:

@@ -211,7 +211,7 @@ class PaperModel:
         hinges, contact = self._hinges, self._contacts[a][b]
         contact = contact[np.argsort(-weight[contact], kind="stable")[:_TRIES]]
         z, ahead = self._pieces.place.ravel(), np.roll(self._pieces.place, -1, axis=1).ravel()
-        swapped = self._pieces.label[hinges.first[contact]] != a
+        swapped = self._pieces.label[hinges.one[contact] // 3] != a
         mine = np.where(swapped, hinges.other[contact], hinges.one[contact])
         theirs = np.where(swapped, hinges.one[contact], hinges.other[contact])
         turn = (ahead[mine] - z[mine]) / (z[theirs] - ahead[theirs])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from quasiharmonic.apps.inverse.chart_inverse import ChartInverse
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
@@ -199,6 +200,16 @@ class UnwrapResult(Outcome):
         exponent = find_exponent(self.V)
         ends = np.ldexp(self.V[self.seams], -exponent)
         return float(np.ldexp(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum(), exponent))
+
+    def inverse(self) -> ChartInverse:
+        """Return the inverse map, from the texture to the model, for points, triangles and values of the model.
+
+        Repeated and degenerate triangles have no points of their own. Where stacked charts overlap, the triangle with
+        the smallest index counts.
+        """
+        return ChartInverse(
+            self.V, self.vmapping[self.indices], self.uvs, self.indices, leave_out=self.cleaned.excluded
+        )
 
     def to_trimesh(self) -> Trimesh:
         """Return the model as a trimesh.Trimesh with texture coordinates; vertices are split at seams."""

@@ -21,7 +21,7 @@ from quasiharmonic.apps.unwrapping.draft import Draft
 from quasiharmonic.apps.unwrapping.hard_edges import reads_hard_edges
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
-    choose_packed,
+    LayoutChoice,
     find_seams,
     join_charts,
 )
@@ -340,15 +340,7 @@ def _make_charts(
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
         draft=draft,
-        choose=partial(
-            choose_packed,
-            divide=divide,
-            size=size,
-            padding=float(wanted.padding),
-            tiles=tiles,
-            rotate=wanted.rotate,
-            loss=float(wanted.packing_loss),
-        ),
+        choose=LayoutChoice(divide, size, float(wanted.padding), tiles, wanted.rotate, float(wanted.packing_loss)),
         seed=wanted.seed,
         callback=report,
         jobs=wanted.jobs,

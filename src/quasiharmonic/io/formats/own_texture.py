@@ -31,11 +31,12 @@ def own_texture(mesh: MeshData) -> Texture | None:
     if Path(mesh.source).suffix.lower() in _GLTF:
         return _of_gltf(Path(mesh.source))
     folder = Path(mesh.source).parent
-    for keyword, within, name in _images_of_libraries(mesh):
-        if keyword != b"map_Kd" or not _is_beside(folder, str(within / name)):
+    for words, within in library_entries(mesh):
+        name = within / os.fsdecode(words[-1])
+        if words[0] != b"map_Kd" or not is_beside(folder, str(name)):
             continue
         try:
-            return read_texture(folder / within / name)
+            return read_texture(folder / name)
         except MeshFileError:
             continue
     return None
@@ -53,7 +54,7 @@ def texture_names(mesh: MeshData) -> list[str]:
         except gltf.DAMAGE:
             # A damaged description of a material does not prevent other work.
             return []
-    textures = (name for keyword, _, name in _images_of_libraries(mesh) if _shows_image(keyword.lower()))
+    textures = (os.fsdecode(words[-1]) for words, _ in library_entries(mesh) if _shows_image(words[0].lower()))
     # Names in libraries can have the separators of any system.
     return list(dict.fromkeys(PureWindowsPath(name).name for name in textures))
 
@@ -62,21 +63,21 @@ def _shows_image(keyword: bytes) -> bool:
     return keyword in _FURTHER_MAPS or (keyword.startswith(b"map_") and keyword != b"map_aat")
 
 
-def _images_of_libraries(mesh: MeshData) -> Iterator[tuple[bytes, Path, str]]:
-    """Yield the entries of the OBJ file's material libraries: keyword, folder of the library, and name of the image.
+def library_entries(mesh: MeshData) -> Iterator[tuple[list[bytes], Path]]:
+    """Yield the entries of the OBJ file's material libraries: at least two words, and the folder of the library.
 
-    Only libraries in the folder of the file are opened. Their folders are relative to it.
+    Only libraries in the folder of the file are opened. Their folders are relative to it. The last word of an entry
+    about an image is its name; options such as -s precede it.
     """
     folder = Path(mesh.source).parent
     for line in mesh.statements.split(b"\n"):
-        names = [name for name in library_names(line, folder) if _is_beside(folder, name)]
+        names = [name for name in library_names(line, folder) if is_beside(folder, name)]
         for library in (folder / name for name in names if (folder / name).is_file()):
             within = library.parent.relative_to(folder)
             for entry in read_bytes(library).splitlines():
                 words = entry.split()
                 if len(words) > 1:
-                    # Options such as -s precede the name.
-                    yield words[0], within, os.fsdecode(words[-1])
+                    yield words, within
 
 
 def _names_in_gltf(tree: dict[str, Any]) -> Iterator[str]:
@@ -105,7 +106,7 @@ def _find_textures(materials: Any) -> Iterator[int]:
             yield from _find_textures([part for key, part in materials.items() if key != "extras"])
 
 
-def _is_beside(folder: Path, name: str) -> bool:
+def is_beside(folder: Path, name: str) -> bool:
     """Whether a name is that of a file in a folder or below it."""
     try:
         beside(folder, quote(name))

@@ -10,7 +10,8 @@ import numpy as np
 
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.io.models.textures import Texture
+from quasiharmonic.io.models.textures import MaterialTextures, Texture
+from quasiharmonic.util.arrays import IntArray
 
 _NAME = "map"
 
@@ -59,9 +60,13 @@ def companions(path: str | os.PathLike[str], texture: Texture) -> tuple[Path, Pa
 
 
 def materials_lost(mesh: MeshData) -> list[str]:
-    """Return a description of the file's own materials if `write_material` drops them; otherwise an empty list."""
+    """Return descriptions of the materials that `write_material` drops: the file's own, and images besides colours."""
     uses = any(line.startswith(b"usemtl") for line in mesh.statements.split(b"\n"))
-    return ["its own materials, which the image replaces"] if mesh.texture is not None and uses else []
+    lost = ["its own materials, which the image replaces"] if mesh.texture is not None and uses else []
+    texture = mesh.texture
+    if isinstance(texture, MaterialTextures) and (texture.metallic_roughness or texture.normal or texture.emission):
+        lost.append("images besides the base colour")
+    return lost
 
 
 def write_material(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> MeshData:
@@ -83,6 +88,19 @@ def write_material(path: str | os.PathLike[str], mesh: MeshData, *, durable: boo
     return replace(
         mesh, statements=b"".join(line + b"\n" for line in new), statement_faces=np.array(at, dtype=np.int64)
     )
+
+
+def label_materials(mesh: MeshData) -> tuple[IntArray, list[str | None]]:
+    """Return a number for the material of each triangle, (f,), and the names of the materials; None for no material."""
+    lines = mesh.statements.split(b"\n")[:-1]
+    first = mesh.rings.first_triangle
+    label = np.zeros(len(mesh.F), dtype=np.int64)
+    names: list[str | None] = [None]
+    for line, at in zip(lines, mesh.statement_faces.tolist(), strict=True):
+        if line.startswith(b"usemtl"):
+            names.append(line[6:].strip().decode("utf-8", "replace"))
+            label[first[max(at, 0)] :] = len(names) - 1
+    return label, names
 
 
 def _names_library(line: bytes) -> bool:

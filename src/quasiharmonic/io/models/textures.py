@@ -41,6 +41,42 @@ class Texture:
     suffix: str
 
 
+@dataclass(frozen=True)
+class MaterialTextures(Texture):
+    """The images of a material in glTF's metallic-roughness model; the bytes are those of the base colour.
+
+    Formats without such materials show the base colour alone. The images contain the factors of the material and the
+    colours of vertices.
+
+    Attributes
+    ----------
+    metallic_roughness, normal, emission : Texture or None
+        Further images. Occlusion is the red channel of the first one.
+    occlusion : bool
+        Whether there is any.
+    metallic, roughness : float
+        Factors.
+    emission_factor : tuple of 3 float
+        Emitted light, which multiplies the image if there is one; values above 1 are allowed.
+    alpha_mode : str or None
+        ``"OPAQUE"``, ``"MASK"`` or ``"BLEND"``. With None, materials that the file already has keep their mode, their
+        threshold, and whether they are shown on both sides.
+    alpha_cutoff : float
+    double_sided : bool
+    """
+
+    metallic_roughness: Texture | None = None
+    normal: Texture | None = None
+    emission: Texture | None = None
+    occlusion: bool = False
+    metallic: float = 0.0
+    roughness: float = 1.0
+    emission_factor: tuple[float, ...] = (0.0, 0.0, 0.0)
+    alpha_mode: str | None = None
+    alpha_cutoff: float = 0.5
+    double_sided: bool = True
+
+
 def read_texture(path: str | os.PathLike[str]) -> Texture:
     """Read a PNG or JPEG image.
 

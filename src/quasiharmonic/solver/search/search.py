@@ -46,6 +46,8 @@ LOCAL_REPAIRS = LineShift(resume=True), LocalRepair(tries=15, resume=True)
 _COARSE_STAGES = *LOCAL_REPAIRS, Untangling(resume=True), *LOCAL_REPAIRS
 # Newton steps towards the map of least area if no injective map exists; later steps cause no visible change.
 _AREA_STEPS = 30
+# Newton steps on a coarse map. Fine vertices crowd in thin coarse triangles, so a few steps avoid much later work.
+_POLISHING_STEPS = 3
 
 
 def allowed_repairs(problem: Problem, max_iterations: int) -> int:
@@ -237,8 +239,7 @@ def search_coarse(problem: Problem, first: Descent, options: MapOptions) -> tupl
     status = search.run([first, *_COARSE_STAGES])
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
-        # Fine vertices crowd in thin coarse triangles. A few polishing steps avoid much later work.
-        polishing = PolishOptions(energy="mips", max_iterations=10, linear_solver=options.linear_solver)
+        polishing = PolishOptions(energy="mips", max_iterations=_POLISHING_STEPS, linear_solver=options.linear_solver)
         status = Status.INTERRUPTED
         with search.work.until_interrupted():
             polish = polish_map(problem.domain, uv, polishing)

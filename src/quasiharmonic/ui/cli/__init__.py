@@ -34,6 +34,7 @@ GROUPS = {
         "map": "map a mesh into the plane without inverted triangles",
         "flatten": "flatten a surface with a free boundary, without overlap",
         "unwrap": "compute texture coordinates for any model, packed into a texture",
+        "bake": "bake the look of a model into textures for new texture coordinates",
         "polish": "lower the distortion of an injective map, and keep it injective",
         "harmonise": "lower an energy without a barrier, and keep the map injective",
         "repair": "untangle the inverted triangles of a UV map, with a fixed boundary",

@@ -61,11 +61,24 @@ def read_mesh(options: argparse.Namespace, path: Path) -> MeshData:
     return replace(io.read_mesh(path), texture=texture)
 
 
+def check_image_output(options: argparse.Namespace) -> None:
+    """Check that the output can have baked textures, and that their files would replace no other file.
+
+    ValueError or OSError as `read_mesh`.
+    """
+    from quasiharmonic import io
+
+    companions = io.find_format(options.output, "write_map", "image").companions
+    if companions is not None:
+        for kind in ("image/png", ".png"), ("image/jpeg", ".jpg"):
+            _check_companions(options, companions(options.output, io.Texture(b"", *kind)))
+
+
 def _check_companions(options: argparse.Namespace, companions: tuple[Path, ...]) -> None:
     """Raise ValueError if a companion file of the output would replace an input or another output."""
     from quasiharmonic import io
 
-    taken = (getattr(options, name, None) for name in ("input", "texture", "plot", "json"))
+    taken = (getattr(options, name, None) for name in ("input", "new", "texture", "plot", "json"))
     named = {Path(str(path)).resolve() for path in taken if path is not None}
     for path in companions:
         io.check_writable(path)

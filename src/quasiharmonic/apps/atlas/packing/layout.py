@@ -14,7 +14,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 # Share of the tiles that charts with half the padding around them are expected to cover.
 _EXPECTED = 0.8
 # The same for an estimate.
-_ESTIMATED = 20
+_ESTIMATED = 100
 # Directions compared for the expected scale.
 _TURNS = 16
 # Angles compared for the direction of a single chart, and the precision of the best one.

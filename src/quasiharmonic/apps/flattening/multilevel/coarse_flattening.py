@@ -15,6 +15,7 @@ from itertools import islice
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
@@ -39,8 +40,9 @@ _MIN_WEIGHT = 0.02
 _BAD = 20.0
 # Rings of triangles around bad triangles that belong to a patch.
 _RINGS = 2
-# Patches are not smoothed if they cover more than this fraction of the mesh.
+# If patches cover more than this fraction of the mesh, only triangles beyond this quantile of the density are bad.
 _MAX_SHARE = 0.4
+_WORST = 0.99
 _MAX_STEPS = 20
 _MOVE_TOLERANCE = 1e-2
 #: Number of vertices of the coarsest mesh.
@@ -68,7 +70,7 @@ def smooth_map(
         better = energy.value(after) < energy.value(before)
     start = (after if better else before).view(np.float64).reshape(-1, 2)
     opened = _descend_on_patches(V, F, start, energy, linear_solver)
-    return start if Rim(loops).meets_itself(opened) else opened
+    return _undo_overlaps(F, Rim(loops), start, opened)
 
 
 def thick_energy(V: FloatArray, F: IntArray) -> DeformationEnergy:
@@ -109,16 +111,32 @@ def _smooth_interior(V: FloatArray, F: IntArray, loops: Sequence[IntArray], w: C
     return w
 
 
+def _undo_overlaps(F: IntArray, rim: Rim, start: FloatArray, opened: FloatArray) -> FloatArray:
+    """Return patches of a map whose boundary meets itself to their positions in a bijective map."""
+    opened, moved = opened.copy(), (opened != start).any(axis=1)
+    tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
+    joined = moved[tail] & moved[head]
+    graph = csr_array((np.ones(joined.sum()), (tail[joined], head[joined])), shape=(len(moved), len(moved)))
+    patch = connected_components(graph, directed=False)[1]
+    while (met := rim.meetings(opened)).size:
+        back = moved & mark(len(moved), patch[met[moved[met]]])[patch]
+        opened[back], moved[back] = start[back], False
+    return start if rim.meets_itself(opened) else opened
+
+
 def _descend_on_patches(
     V: FloatArray, F: IntArray, uv: FloatArray, energy: DeformationEnergy, linear_solver: str
 ) -> FloatArray:
     """Descend on patches around the worst triangles, with all other vertices fixed; the boundary may overlap itself."""
     with np.errstate(all="ignore"):
         density = energy.energy.density(energy.deform(in_units(uv, 0)))
-    loose = mark(len(V), F[density > _BAD * np.quantile(density, 0.75)])
-    for _ in range(_RINGS):
-        loose[F[has_marked_corner(F, loose)]] = True
-    patches = F[has_marked_corner(F, loose)]
+    for bad in _BAD * np.quantile(density, 0.75), np.quantile(density, _WORST):
+        loose = mark(len(V), F[density > bad])
+        for _ in range(_RINGS):
+            loose[F[has_marked_corner(F, loose)]] = True
+        patches = F[has_marked_corner(F, loose)]
+        if len(patches) < _MAX_SHARE * len(F):
+            break
     if not 0 < len(patches) < _MAX_SHARE * len(F):
         return uv
     vertices, flat = np.unique(patches, return_inverse=True)
@@ -208,7 +226,10 @@ def descend_level(
             pass
         return descent.uv
 
-    if not guarded and not rim.meets_itself(free := lower(None)):
-        return free, False
+    if not guarded:
+        free = lower(None)
+        apart = rim.pull_apart(level.F, free) if rim.meets_itself(free) else free
+        if apart is not None:
+            return apart, False
     energy.energy = SymmetricDirichlet()
     return lower(rim), True

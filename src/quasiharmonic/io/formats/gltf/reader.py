@@ -240,6 +240,16 @@ def _attribute(
     return numbers, known
 
 
+def read_corners(carried: CarriedGltf, name: str, width: int | None) -> FloatArray:
+    """Return an attribute at the corners of all triangles, (f, 3, width) float64; NaN where there is none.
+
+    ``width`` None is the largest number of numbers for a vertex. Raises one of `DAMAGE`.
+    """
+    table, known = _attribute(carried.document, carried.pools, name, width)
+    table[~known] = np.nan
+    return table[carried.rows]
+
+
 def _positions(document: Document, pools: list[VertexPool]) -> tuple[FloatArray, FloatArray]:
     """Return positions (v, 3) in the scene, and the mesh (v,) of each."""
     points, _ = _attribute(document, pools, "POSITION", 3)

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
+from quasiharmonic.io.formats.gltf.painting import paint
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
 from quasiharmonic.io.formats.vertex_data import colours_of, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
-from quasiharmonic.io.models.materials import materials_lost
+from quasiharmonic.io.models.materials import label_materials, materials_lost
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.io.models.textures import Texture
+from quasiharmonic.io.models.textures import MaterialTextures
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of
 
 _EXACT = 2.0**-53
@@ -46,14 +47,15 @@ def write_gltf(path: str | os.PathLike[str], mesh: MeshData) -> None:
     else:
         document = _new(mesh)
     if mesh.texture is not None:
-        _paint(document, mesh.texture)
+        paint(document, mesh.texture)
     check_path("path", path)
     write_whole(path, document.encode(binary=Path(path).suffix.lower() == ".glb"))
 
 
 def not_in_gltf(mesh: MeshData) -> list[str]:
     """Return descriptions of the mesh data that a glTF file will not contain."""
-    carried, lost = mesh.carried, materials_lost(mesh)
+    carried = mesh.carried
+    lost = [] if isinstance(mesh.texture, MaterialTextures) else materials_lost(mesh)
     if isinstance(carried, CarriedGltf) and carried.fits(mesh):
         missing = embed_pictures(carried.document.copy(), carried.folder)
         if _has_old_tangents(carried, mesh):
@@ -130,20 +132,6 @@ def _has_moved(carried: CarriedGltf, number: int, places: NDArray[np.float32]) -
         return True
     old = carried.document.reals(pool.attributes[PLACES]).astype(np.float32)
     return not np.array_equal(old[carried.rows[faces] - pool.first], places[faces])
-
-
-def _paint(document: Document, texture: Texture) -> None:
-    """Show a texture on all triangles with texture coordinates."""
-    tree = document.tree
-    colour = {"index": len(tree.setdefault("textures", []))}
-    tree["textures"].append({"source": len(tree.setdefault("images", []))})
-    tree["images"].append({"bufferView": document.add_bytes(texture.data), "mimeType": texture.media_type})
-    look = {"baseColorTexture": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    tree.setdefault("materials", []).append({"name": "map", "pbrMetallicRoughness": look, "doubleSided": True})
-    for shape in tree["meshes"]:
-        for primitive in shape["primitives"]:
-            if PLACES in primitive["attributes"]:
-                primitive["material"] = len(tree["materials"]) - 1
 
 
 def _users(carried: CarriedGltf) -> dict[int, int]:
@@ -290,14 +278,7 @@ def _runs(mesh: MeshData, bare: BoolArray) -> Iterator[tuple[int, int, str | Non
 
     Each run is its first triangle, its end, its material, and whether it has no texture coordinates.
     """
-    lines = mesh.statements.split(b"\n")[:-1]
-    uses = [(line, int(at)) for line, at in zip(lines, mesh.statement_faces, strict=True) if line.startswith(b"usemtl")]
-    first = mesh.rings.first_triangle
-    label = np.zeros(len(mesh.F), dtype=np.int64)
-    names: list[str | None] = [None]
-    for line, at in uses:
-        names.append(line[6:].strip().decode("utf-8", "replace"))
-        label[first[max(at, 0)] :] = len(names) - 1
+    label, names = label_materials(mesh)
     change = np.flatnonzero((np.diff(label) != 0) | (np.diff(bare) != 0)) + 1
     edges = [0, *change.tolist(), len(mesh.F)]
     for begin, end in pairwise(edges):

@@ -10,6 +10,7 @@ nothing written; 3 written, but the report failed. Ctrl-C writes nothing.
     qhm unwrap model.obj -o out.glb
     qhm unwrap scan.ply --max-stretch 1.2 --resolution 4096 --padding 8 -o out.ply
     qhm unwrap model.glb --texture checkerboard -o out.glb
+    qhm unwrap model.glb --bake -o out.glb
 """
 
 from __future__ import annotations
@@ -38,9 +39,10 @@ from quasiharmonic.ui.cli.arguments import (
     texture_size,
     weld,
 )
-from quasiharmonic.util.options import UnwrapOptions
+from quasiharmonic.util.options import BakeOptions, UnwrapOptions
 
 if TYPE_CHECKING:
+    from quasiharmonic.apps.baking.bake import BakeResult
     from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStep
     from quasiharmonic.io import MeshData
     from quasiharmonic.ui.cli.arguments import Commands
@@ -90,6 +92,7 @@ def add_parser(commands: Commands) -> None:
             "file of face numbers, 0-based, one on each line: unwrap only these, and keep the texture coordinates of "
             "all others"
         ),
+        bake=flag("bake the look of the model into textures for the new texture coordinates"),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
     )
     add_options(parser, "texture", "json", "surface")
@@ -101,6 +104,8 @@ def run(options: argparse.Namespace) -> int:
 
     began = time.perf_counter()
     io.find_format(options.output, "write_map", "seams")
+    if options.bake:
+        _check_bake(options)
     return pipeline.change_map(
         options,
         lambda mesh: _unwrap(options, mesh, began),
@@ -143,6 +148,8 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             **given,
         )
     unwrapped, divided = add_map(mesh, result)
+    baked = _bake(options, mesh, unwrapped)
+    unwrapped = unwrapped if baked is None else baked.mesh
 
     def describe(written: MeshData) -> pipeline.Account:
         same = is_written(written, result)
@@ -155,6 +162,9 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             "seconds": time.perf_counter() - began,
         }
         lines = [f"wrote {options.output}: {result.message}", result.summary(), *_cleaning(result)]
+        if baked is not None:
+            facts["bake"] = baked.to_dict()
+            lines.append(baked.summary())
         if divided:
             lines.append(f"{count_of('polygon', 'polygons', divided)} written as triangles, because seams cross them")
         account = pipeline.Account(facts, lines, result.success and same)
@@ -169,6 +179,25 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
 def _hard_edges(text: str) -> float | str:
     """Convert an angle, or leave the word file; for argparse."""
     return text if text == "file" else degrees(text)
+
+
+def _check_bake(options: argparse.Namespace) -> None:
+    """Raise ValueError if the look cannot be baked with these options."""
+    if options.texture is not None:
+        raise ValueError("--bake makes the texture: omit --texture")
+    if options.tiles > 1:
+        raise ValueError("--bake makes one texture: omit --tiles")
+    BakeOptions(size=options.resolution)
+    pipeline.check_image_output(options)
+
+
+def _bake(options: argparse.Namespace, mesh: MeshData, unwrapped: MeshData) -> BakeResult | None:
+    """Bake the look of the mesh for its new texture coordinates, if ``--bake`` is given."""
+    if not options.bake:
+        return None
+    from quasiharmonic.apps.baking.bake import bake
+
+    return bake(mesh, unwrapped, size=options.resolution)
 
 
 def _words(step: UnwrapStep) -> str:

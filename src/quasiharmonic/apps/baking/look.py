@@ -1,0 +1,134 @@
+"""What a surface shows at its points: colours, metallic-roughness values, emitted light and normals, linear."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from quasiharmonic.apps.baking.images import Bytes, decode, sample
+from quasiharmonic.apps.baking.tangents import TangentFrames
+from quasiharmonic.io.errors import printable
+from quasiharmonic.io.models.appearance import Appearance, ImageUse, NamedImage, Role, SurfaceMaterial
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+# Roles whose images are sRGB.
+_SRGB = "colour", "emission"
+
+
+class SurfaceLook:
+    """Evaluates an `Appearance`; ``problems`` lists what it cannot show.
+
+    Points are triangles (k,) and barycentric coordinates (k, 3).
+    """
+
+    def __init__(self, appearance: Appearance) -> None:
+        self.materials = appearance.materials
+        self.problems = list(appearance.problems)
+        self._appearance = appearance
+        # Images in the order of their first use; each is decoded once.
+        self._pixels: dict[NamedImage, Bytes | None] = {}
+        for use in (use for material in self.materials for use in material.textures.values()):
+            if use.image not in self._pixels:
+                self._pixels[use.image] = self._decode(use.image)
+            if use.channel not in appearance.coordinates:
+                name = printable(use.image.name)
+                self.problems.append(f"texture {name} needs texture coordinates {use.channel}, which are missing")
+
+    def _decode(self, image: NamedImage) -> Bytes | None:
+        try:
+            return decode(image.data)
+        except ValueError as error:
+            self.problems.append(f"texture {printable(image.name)} {error}")
+            return None
+
+    def has(self, *roles: Role) -> bool:
+        """Whether a material has an image with one of these roles that can be shown."""
+        return any(self._use(material, role) is not None for material in self.materials for role in roles)
+
+    def _use(self, material: SurfaceMaterial, role: Role) -> ImageUse | None:
+        use = material.textures.get(role)
+        if use is None or self._pixels[use.image] is None or use.channel not in self._appearance.coordinates:
+            return None
+        return use
+
+    def colours(self, triangle: IntArray, barycentric: FloatArray) -> FloatArray:
+        """Return base colours and opacity (k, 4)."""
+        out = self._product("colour", [material.colour for material in self.materials], triangle, barycentric)
+        if (corners := self._appearance.colours) is not None:
+            out *= np.einsum("kc,kcd->kd", barycentric, corners[triangle])
+        opaque = np.array([material.alpha_mode == "OPAQUE" for material in self.materials])
+        out[opaque[self._appearance.of_triangle[triangle]], 3] = 1
+        return out
+
+    def metallic_roughness(self, triangle: IntArray, barycentric: FloatArray) -> FloatArray:
+        """Return occlusion, roughness and metallic values (k, 3)."""
+        factors = [(1.0, material.roughness, material.metallic, 1.0) for material in self.materials]
+        out = self._product("metallic_roughness", factors, triangle, barycentric)[:, :3]
+        out[:, 0] = 1
+        for rows, material, use in self._parts("occlusion", triangle):
+            if use is not None:
+                shown = self._sample(use, "occlusion", triangle[rows], barycentric[rows], 1.0)[:, 0]
+                out[rows, 0] = 1 + material.occlusion_strength * (shown - 1)
+        return out
+
+    def emission(self, triangle: IntArray, barycentric: FloatArray) -> FloatArray:
+        """Return emitted light (k, 3)."""
+        factors = [(*material.emission, 1.0) for material in self.materials]
+        return self._product("emission", factors, triangle, barycentric)[:, :3]
+
+    def normals(self, triangle: IntArray, barycentric: FloatArray, frames: TangentFrames) -> FloatArray:
+        """Return normals (k, 3) in space, not of unit length."""
+        local = np.zeros((len(triangle), 3))
+        local[:, 2] = 1
+        for rows, material, use in self._parts("normal", triangle):
+            if use is not None:
+                shown = self._sample(use, "normal", triangle[rows], barycentric[rows], (0.5, 0.5, 1.0, 1.0))[:, :3]
+                local[rows] = (2 * shown - 1) * [material.normal_scale, material.normal_scale, 1]
+        return np.einsum("kc,kcd->kd", local, frames.at(triangle, barycentric))
+
+    def normal_coordinates(self) -> FloatArray:
+        """Return the texture coordinates (f, 3, 2) of the normal maps, v downwards; NaN where there is none."""
+        out = np.full((len(self._appearance.of_triangle), 3, 2), np.nan)
+        for rows, _, use in self._parts("normal", np.arange(len(out))):
+            if use is not None:
+                out[rows] = self._appearance.coordinates[use.channel][rows] @ use.transform[:, :2].T
+        return out
+
+    def _product(
+        self, role: Role, factors: Sequence[tuple[float, ...]], triangle: IntArray, barycentric: FloatArray
+    ) -> FloatArray:
+        """Return the factors (k, 4) of the materials, times their images."""
+        out = np.array(factors)[self._appearance.of_triangle[triangle]]
+        for rows, _, use in self._parts(role, triangle):
+            if use is not None:
+                out[rows] *= self._sample(use, role, triangle[rows], barycentric[rows], 1.0)
+        return out
+
+    def _parts(
+        self, role: Role, triangle: IntArray
+    ) -> Iterator[tuple[IntArray | slice, SurfaceMaterial, ImageUse | None]]:
+        """Yield rows of the points of each material, the material, and its image with a role."""
+        if len(self.materials) == 1:
+            yield slice(None), self.materials[0], self._use(self.materials[0], role)
+            return
+        of_point = self._appearance.of_triangle[triangle]
+        for k, material in enumerate(self.materials):
+            if (use := self._use(material, role)) is not None:
+                yield np.flatnonzero(of_point == k), material, use
+
+    def _sample(
+        self,
+        use: ImageUse,
+        role: Role,
+        triangle: IntArray,
+        barycentric: FloatArray,
+        missing: float | tuple[float, ...],
+    ) -> FloatArray:
+        """Return the values (k, 4) of an image at points; ``missing`` where there are no texture coordinates."""
+        corners, pixels = self._appearance.coordinates[use.channel], self._pixels[use.image]
+        assert pixels is not None
+        uv = sum(barycentric[:, i, None] * corners[triangle, i] for i in range(3))
+        values: FloatArray = sample(pixels, use, np.asarray(uv), srgb=role in _SRGB).astype(np.float64)
+        values[np.isnan(values[:, 0])] = missing
+        return values
