@@ -55,7 +55,7 @@ def test_command_line(model, tmp_path, words, count):
 
 
 def test_bad_input_is_named(model):
-    with pytest.raises(ValueError, match="stack must be one of mirrored, not 'both'"):
+    with pytest.raises(ValueError, match="stack must be True, False or 'mirrored', not 'both'"):
         unwrap(*model, stack="both")
     square = np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
     with pytest.raises(ValueError, match="kinds must have 2 numbers, one per chart, not 1"):

@@ -155,12 +155,8 @@ def mirror_axis(name: str, value: Any) -> None:
 
 def stacking(name: str, value: Any) -> None:
     """Check which charts are stacked: a boolean or ``"mirrored"``."""
-    if isinstance(value, str):
-        from quasiharmonic.util.arrays import check_choice
-
-        check_choice(name, value, ("mirrored",))
-    else:
-        switch(name, value)
+    if not isinstance(value, bool) and value != "mirrored":
+        raise ValueError(f"{name} must be True, False or 'mirrored', not {value!r}")
 
 
 def direction_or_none(name: str, value: Any) -> None:

@@ -32,6 +32,7 @@ def divide_long_charts(
     tiles: int,
     max_charts: int | None,
     for_packing: bool = False,
+    density: float | None = None,
 ) -> list[Chart]:
     """Divide charts across their middle until each fits into a texture that the charts cover well.
 
@@ -54,6 +55,8 @@ def divide_long_charts(
         Maximum number of charts.
     for_packing : bool
         Whether charts without stretch and rectangles are divided like the others, and not only where they are too long.
+    density : float, optional
+        Texels per unit of length, if they are given.
 
     Returns
     -------
@@ -63,6 +66,8 @@ def divide_long_charts(
     area = sum(_area(chart) for chart in charts)
     ratio = max(size) / min(size)
     side = float(np.sqrt(area * ratio / (_EXPECTED * tiles)))
+    if density is not None:
+        side = min(side, max(size) / density)
     done: list[Chart] = []
     waiting = list(charts)
     while waiting:

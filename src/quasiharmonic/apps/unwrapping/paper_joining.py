@@ -83,6 +83,8 @@ class PaperModel:
         self._watched: BoolArray = np.zeros(hinges.one.size, dtype=np.bool_)
         # Pairs of charts that overlap if they are joined at this number of hinges. They also do when others are added.
         self._overlapping = set[tuple[int, int, int]]()
+        # The largest limit of boxes at which pairs of charts, with their versions, could not be joined.
+        self._loose: dict[tuple[int, ...], float] = {}
         self._demanded = np.flatnonzero(self._watched)
 
     def list_contacts(self, may_join: BoolArray) -> None:
@@ -169,7 +171,9 @@ class PaperModel:
     def _try(self, a: int, b: int, weight: FloatArray, limits: tuple[float, float]) -> bool:
         """Move chart ``b`` to chart ``a`` and join them, if their union is good."""
         contact = self._contacts[a][b]
-        if (a, b, contact.size) in self._overlapping:
+        longest, boxes = limits
+        state = (a, b, self._version[a], self._version[b])
+        if (a, b, contact.size) in self._overlapping or boxes <= self._loose.get(state, 0.0):
             return False
         motion = self._find_motion(a, b, weight)
         one, other = self._charts[a], self._charts[b]
@@ -179,9 +183,11 @@ class PaperModel:
             np.concatenate([one.triangles, other.triangles]),
             np.concatenate([one.hull, motion[0] * other.hull + motion[1]]),
         )
-        longest, boxes = limits
-        longest = _AS_LONG * max(longest, one.longest, other.longest)
-        if union.box > boxes * (one.box + other.box) or union.longest > longest:
+        # Boxes that are too large in one round are too large in the next one, unless its limit is higher.
+        if union.box > boxes * (one.box + other.box):
+            self._loose[state] = boxes
+            return False
+        if union.longest > _AS_LONG * max(longest, one.longest, other.longest):
             return False
         before = place[other.triangles]
         place[other.triangles] = moved

@@ -234,10 +234,11 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit
     if density is None and kept is not None:
         density = kept.find_density(V, F, size)
+    density = None if density is None else float(np.ldexp(density, exponent))
     draft, grown, strips = Draft(), np.zeros(len(cleaned.F), dtype=bool), list[Strip]()
     spent = time.perf_counter() - began
     left = None if wanted.time_limit is None else wanted.time_limit - (1 + _RESERVED) * spent
-    made = run_until(left, lambda: _make_charts(points, cleaned, rules, wanted, size, draft, report))
+    made = run_until(left, lambda: _make_charts(points, cleaned, rules, wanted, size, density, draft, report))
     ended = made is None
     if made is None:
         charts, grown = draft.complete(points, cleaned.F, rules.cost, rules.uv_cuts, bound)
@@ -249,7 +250,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             [(chart.uv, chart.F) for chart in charts],
             resolution=size,
             padding=padding,
-            texels_per_unit=None if density is None else float(np.ldexp(density, exponent)),
+            texels_per_unit=density,
             tiles=wanted.tiles,
             rotate=wanted.rotate,
             stack=bool(wanted.stack),
@@ -317,6 +318,7 @@ def _make_charts(
     rules: Rules,
     wanted: UnwrapOptions,
     size: tuple[int, int],
+    density: float | None,
     draft: Draft,
     report: Callable[[str, int, int], object],
 ) -> tuple[list[Chart], list[Strip]]:
@@ -328,7 +330,13 @@ def _make_charts(
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others = np.flatnonzero(rest), straight
     divide = partial(
-        divide_long_charts, bound=bound, size=size, tiles=tiles, max_charts=most, for_packing=wanted.divide_for_packing
+        divide_long_charts,
+        bound=bound,
+        size=size,
+        tiles=tiles,
+        max_charts=most,
+        for_packing=wanted.divide_for_packing,
+        density=density,
     )
     charts = find_charts(
         points,
