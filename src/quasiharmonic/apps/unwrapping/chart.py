@@ -9,6 +9,7 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
@@ -52,6 +53,18 @@ class Chart:
     def isometric(self) -> bool:
         """Whether the chart has no stretch."""
         return bool((self.stretch == 1).all())
+
+    def take(self, rows: IntArray) -> list[Chart]:
+        """Return the connected parts of some triangles, by their places (k,) in the chart, as charts."""
+        split, component = fans(self.F[rows])
+        parts = []
+        for number in range(int(component.max()) + 1):
+            own, corner = renumber(split[component == number], self.F[rows[component == number]])
+            some = rows[component == number]
+            origin = self.F[some].ravel()[corner]
+            found = self.triangles[some], own, self.vertices[origin], self.uv[origin], self.stretch[some]
+            parts.append(Chart(*found, self.misses, self.straight))
+        return parts
 
     def open(self, V: FloatArray, cost: FloatArray) -> WorkingChart:
         """Return the chart for further cuts, given positions (n, 3) and costs (f, 3) of the whole mesh."""

@@ -8,6 +8,8 @@ import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
+from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, find_pairs
+from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.progress import heartbeat
 
@@ -66,8 +68,10 @@ def divide_long_charts(
     area = sum(_area(chart) for chart in charts)
     ratio = max(size) / min(size)
     side = float(np.sqrt(area * ratio / (_EXPECTED * tiles)))
+    longest_flat = _LONGEST_FLAT * side
     if density is not None:
         side = min(side, max(size) / density)
+        longest_flat = min(longest_flat, max(size) / density)
     done: list[Chart] = []
     waiting = list(charts)
     while waiting:
@@ -77,11 +81,12 @@ def divide_long_charts(
         if full or len(chart.F) < 2 or not _is_too_long(chart, side, area, for_packing):
             done.append(chart)
             continue
-        parts = _divide(chart, V, cost, bound)
         if _is_fixed(chart, for_packing):
-            parts = _keep_shorter(chart, parts)
-            if not parts and _length(chart) > _LONGEST_FLAT * side:
-                parts = _keep_shorter(chart, _divide(chart, V, np.ones(cost.shape), bound))
+            parts = _halve(chart, cost)
+            if not parts and _length(chart) > longest_flat:
+                parts = _halve(chart, cost / UNDIVIDED_COST)
+        else:
+            parts = _divide(chart, V, cost, bound)
         if parts:
             waiting += parts
         else:
@@ -97,9 +102,25 @@ def _divide(chart: Chart, V: FloatArray, cost: FloatArray, bound: float) -> list
     return [chart.part(part, bound) for part in divide(working, bound)]
 
 
-def _keep_shorter(chart: Chart, parts: list[Chart]) -> list[Chart]:
-    """Return the parts of a chart, or none if they are hardly shorter."""
-    return parts if parts and max(map(_length, parts)) <= _SHORTER * _length(chart) else []
+def _halve(chart: Chart, cost: FloatArray) -> list[Chart]:
+    """Divide a chart at the middle of its longer side; return no parts if they would be hardly shorter.
+
+    Triangles with sides that are too dear to cut stay together.
+    """
+    shape = chart.shape
+    width, height = shape.extent(shape.direction)
+    along = shape.direction if width >= height else 1j * shape.direction
+    at = (chart.uv @ [1, 1j] / along).real
+    one, other = find_pairs(chart.F)
+    dear = (cost[chart.triangles] >= UNDIVIDED_COST).ravel()
+    joined = dear[one] | dear[other]
+    group = label_components(one[joined] // 3, other[joined] // 3, len(chart.F))
+    middle = np.bincount(group, at[chart.F].mean(axis=1)) / np.maximum(np.bincount(group), 1)
+    first = middle[group] < (at.min() + at.max()) / 2
+    if first.all() or not first.any():
+        return []
+    parts = [part for rows in (np.flatnonzero(first), np.flatnonzero(~first)) for part in chart.take(rows)]
+    return parts if max(map(_length, parts)) <= _SHORTER * _length(chart) else []
 
 
 def _area(chart: Chart) -> float:

@@ -17,7 +17,6 @@ from quasiharmonic.apps.unwrapping.chart_maps import WORST_STRETCH
 from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.apps.unwrapping.rounding import grid_unit
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
-from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 # Enlarged triangles are at least this number of units high. Rounding can invert triangles that are lower than the
@@ -96,23 +95,7 @@ def _divide(
         along = chart.uv[chart.F].mean(axis=1)
         along = along[:, np.argmax(np.ptp(along, axis=0))]
         bad = np.argsort(np.argsort(along, kind="stable")) < len(along) // 2
-    return [part for rows in (np.flatnonzero(bad), np.flatnonzero(~bad)) for part in _take(chart, rows)]
-
-
-def _take(chart: Chart, rows: IntArray) -> list[Chart]:
-    """Return the connected parts of some triangles of a chart, as charts."""
-    split, component = fans(chart.F[rows])
-    parts = []
-    for number in range(int(component.max()) + 1):
-        own, corner = renumber(split[component == number], chart.F[rows[component == number]])
-        some = rows[component == number]
-        origin = chart.F[some].ravel()[corner]
-        parts.append(
-            Chart(
-                chart.triangles[some], own, chart.vertices[origin], chart.uv[origin], chart.stretch[some], chart.misses
-            )
-        )
-    return parts
+    return [part for rows in (np.flatnonzero(bad), np.flatnonzero(~bad)) for part in chart.take(rows)]
 
 
 def _enlarge(chart: Chart, factor: float, V: FloatArray, cost: FloatArray) -> Chart:

@@ -235,10 +235,12 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     if density is None and kept is not None:
         density = kept.find_density(V, F, size)
     density = None if density is None else float(np.ldexp(density, exponent))
+    # Beside kept charts, there is no telling how long charts may be.
+    given = density if kept is None else None
     draft, grown, strips = Draft(), np.zeros(len(cleaned.F), dtype=bool), list[Strip]()
     spent = time.perf_counter() - began
     left = None if wanted.time_limit is None else wanted.time_limit - (1 + _RESERVED) * spent
-    made = run_until(left, lambda: _make_charts(points, cleaned, rules, wanted, size, density, draft, report))
+    made = run_until(left, lambda: _make_charts(points, cleaned, rules, wanted, size, given, draft, report))
     ended = made is None
     if made is None:
         charts, grown = draft.complete(points, cleaned.F, rules.cost, rules.uv_cuts, bound)
