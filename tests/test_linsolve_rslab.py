@@ -116,6 +116,21 @@ def damaged(monkeypatch):
     return damage
 
 
+def test_the_pattern_is_analysed_by_the_first_factorisation(damaged, monkeypatch):
+    calls = []
+    library = rslab.library()
+    analyze = library.analyze
+    monkeypatch.setattr(
+        library, "analyze", lambda *pattern, **settings: calls.append(1) or analyze(*pattern, **settings)
+    )
+    solver = rslab.Rslab([0, 2, 3], [0, 1, 1])
+    assert not calls
+    for scale in (1.0, 2.0):
+        solver.factor(scale * np.array([2.0, -1.0, 2.0]))
+        np.testing.assert_allclose(solver.solve([scale, scale]), [1.0, 1.0])
+    assert calls == [1]
+
+
 def raising(error):
     def fail(*_):
         raise error

@@ -60,18 +60,28 @@ class Rslab(LinearSolver):
     takes_order = False
 
     def _analyse(self) -> None:
+        # Raises an ImportError here if rslab cannot be loaded. The first factorisation analyses, because the Laplacian
+        # of a mesh that is searched on a coarse one is often never factored.
+        self._try(library)
+        self._symbolic: Any = None
+        self._numeric: Any = None
+        self._fallback: LinearSolver | None = None
+        self._is_analysed = False
+
+    def _find_symbolic(self) -> Any:
+        """Analyse the pattern; None if rslab fails."""
         from scipy.sparse import csc_matrix
 
         # The upper triangle by rows is the lower triangle by columns, which rslab reads.
         pattern = csc_matrix((np.ones(self.nnz), self._indices, self._indptr), shape=(self.n, self.n))
         threads = 1 if self.n < SEQUENTIAL_BELOW else _threads()
-        self._symbolic: Any = self._try(
+        return self._try(
             lambda: library().analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=_NEMIN, threads=threads)
         )
-        self._numeric: Any = None
-        self._fallback: LinearSolver | None = None
 
     def _factor(self) -> None:
+        if not self._is_analysed:
+            self._symbolic, self._is_analysed = self._find_symbolic(), True
         self._numeric = None  # releases memory for the next factor
         self._numeric = self._try(lambda: self._symbolic.factor(self._values)) if self._symbolic else None
         if self._numeric is None:
