@@ -10,10 +10,12 @@ from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
 from quasiharmonic.apps.atlas.packing.pack import Packing
 from quasiharmonic.apps.atlas.seam_cuts import CutMesh
+from quasiharmonic.apps.baking.bake import BakeResult
 from quasiharmonic.apps.displacement_fields.field_inversion import InverseField
 from quasiharmonic.apps.displacement_fields.nearest import InvertibleField
 from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, InvertibleVolume, VoxelVerdict
 from quasiharmonic.apps.gradients.derivative import Derivative
+from quasiharmonic.apps.inverse.chart_inverse import ChartInverse
 from quasiharmonic.apps.inverse.inverse_map import SurfacePoints
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
 from quasiharmonic.apps.repair.uv_repair import RepairedIsland, RepairResult
@@ -37,7 +39,9 @@ __all__ = [
     "Animation",
     "AnimationVerdict",
     "AtlasVerdict",
+    "BakeResult",
     "Certificate",
+    "ChartInverse",
     "CleanedMesh",
     "CutMesh",
     "Derivative",
