@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from dataclasses import replace
@@ -284,6 +285,25 @@ def test_references_to_nothing_are_named(tmp_path):
     result = bake(old, on_square(old, quarter), size=4)
     assert result.problems == ("texture i0 needs texture coordinates 1, which are missing",)
     assert (result.colour == 255).all()
+
+
+def test_what_is_not_baked_is_named(tmp_path):
+    coat = {"KHR_materials_clearcoat": {"clearcoatTexture": {"index": 0}, "clearcoatFactor": 0.5}}
+    textured(tmp_path / "old.glb", colour_of() | {"extensions": coat}, [png(noise(4, 4, 3))])
+    made, rest = opened((tmp_path / "old.glb").read_bytes())
+    made["extensions"] = {"KHR_materials_variants": {"variants": [{"name": "red"}]}}
+    made["buffers"][0]["uri"] = "old.bin"
+    (tmp_path / "old.bin").write_bytes(rest)
+    (tmp_path / "old.gltf").write_text(json.dumps(made))
+    old = io.read_mesh(tmp_path / "old.gltf")
+    result = bake(old, on_square(old, quarter), size=4)
+    assert result.problems == (
+        "textures of KHR_materials_clearcoat are not baked",
+        "variants of materials are not baked, and keep their textures",
+    )
+    io.write_mapped(tmp_path / "new.glb", result.mesh)
+    (material,) = opened((tmp_path / "new.glb").read_bytes())[0]["materials"]
+    assert material["extensions"] == {"KHR_materials_clearcoat": {"clearcoatFactor": 0.5}}
 
 
 def test_textures_by_the_second_coordinates(tmp_path):

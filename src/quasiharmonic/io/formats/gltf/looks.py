@@ -44,6 +44,8 @@ def gltf_appearance(carried: CarriedGltf) -> Appearance:
         opaque = np.ones((*colours.shape[:2], 4 - colours.shape[2]))
         colours = np.nan_to_num(np.concatenate([colours, opaque], axis=2), nan=1.0)
     materials = tuple(reader.read(k) for k in used)
+    if "KHR_materials_variants" in carried.document.tree.get("extensions", {}):
+        reader.problems.append("variants of materials are not baked, and keep their textures")
     return Appearance(materials, of_triangle, coordinates, colours, tuple(dict.fromkeys(reader.problems)))
 
 
