@@ -277,6 +277,23 @@ def test_help_names_what_an_option_takes(capsys):
         assert [part for part in parts if part not in said] == []
 
 
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("batch in -o out --time-limit soon", "soon is not a time in seconds"),
+        ("batch in -o out --time-limit -1", "-1 is not a time in seconds"),
+        ("batch in -o out --corner-angle wide", "wide is not an angle from 0 to 180 degrees"),
+        ("batch in -o out --corner-angle 200", "200 is not an angle from 0 to 180 degrees"),
+        ("flatten in.obj -o out.obj --rings many", "many is not an integer of at least 1"),
+        ("flatten in.obj -o out.obj --max-iterations -1", "-1 is not an integer of at least 0"),
+    ],
+)
+def test_a_wrong_number_is_named_with_what_the_option_takes(call, message, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(call.split())
+    assert capsys.readouterr().err.endswith(f": {message}\n")
+
+
 def test_polish_has_a_time_limit(star, tmp_path, capsys):
     assert run("map", star, "-o", tmp_path / "map.obj") == 0
     assert run("polish", tmp_path / "map.obj", "-o", tmp_path / "out.obj", "--time-limit", "1e-9") == 2

@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import Field, fields
 from inspect import cleandoc
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from quasiharmonic.util import options
 from quasiharmonic.util.options import Options
 
+T = TypeVar("T")
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Option: TypeAlias = dict[str, Any]  # Keywords of `add_argument`
 
@@ -133,24 +135,23 @@ def set_default(options: argparse.Namespace, name: str, default: object, *, aske
         raise ValueError(f"{option} needs {belongs}: add {belongs}, or omit {option}")
 
 
+def convert(text: str, kind: Callable[[str], T], is_valid: Callable[[T], bool], wanted: str) -> T:
+    """Convert text to a valid number; for argparse, whose own messages would name our functions."""
+    with suppress(ValueError):
+        value = kind(text)
+        if is_valid(value):
+            return value
+    raise argparse.ArgumentTypeError(f"{text} is not {wanted}")
+
+
 def steps(text: str) -> int:
     """Convert text to a nonnegative integer; for argparse."""
-    return _integer(text, 0)
+    return convert(text, int, lambda value: value >= 0, "an integer of at least 0")
 
 
 def count(text: str) -> int:
     """Convert text to a positive integer; for argparse."""
-    return _integer(text, 1)
-
-
-def _integer(text: str, least: int) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = least - 1
-    if value < least:
-        raise argparse.ArgumentTypeError(f"{text} is not an integer of at least {least}")
-    return value
+    return convert(text, int, lambda value: value > 0, "an integer of at least 1")
 
 
 def byte_count(text: str) -> int:
@@ -189,13 +190,7 @@ def weld(default: str) -> Option:
 
 def degrees(text: str) -> float:
     """Convert text to an angle in degrees, 0 to 180; for argparse."""
-    try:
-        angle = float(text)
-    except ValueError:
-        angle = -1.0
-    if not 0 <= angle <= 180:
-        raise argparse.ArgumentTypeError(f"{text} degrees: an angle from 0 to 180 is needed")
-    return angle
+    return convert(text, float, lambda angle: 0 <= angle <= 180, "an angle from 0 to 180 degrees")
 
 
 def _island_list(text: str) -> list[int]:

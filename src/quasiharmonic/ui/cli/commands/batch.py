@@ -30,6 +30,7 @@ from quasiharmonic.ui.cli.arguments import (
     add_options,
     byte_count,
     choice,
+    convert,
     count,
     declared,
     file,
@@ -277,7 +278,4 @@ def _location(text: str) -> str | Path:
 
 
 def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a time in seconds")
-    return value
+    return convert(text, float, lambda value: 0 <= value < float("inf"), "a time in seconds")
