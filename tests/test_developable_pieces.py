@@ -125,8 +125,7 @@ def test_paper_models_keep_lengths_areas_and_do_not_overlap(name, loss):
     pieces = find_pieces(V, F, hinges, np.ones(F.shape))
     before = pieces.count
     area = np.abs(doubled_areas(pieces.place)).sum() / 2
-    model = PaperModel(F, hinges, pieces, area)
-    model.list_contacts(np.ones(hinges.one.size, dtype=bool))
+    model = PaperModel(F, hinges, pieces, area, np.ones(hinges.one.size, dtype=bool))
     model.join(hinges.length, np.zeros(hinges.one.size, dtype=bool), 10.0, loss, lambda: None)
     joined = np.unique(pieces.label)
     if loss > 1:
@@ -151,8 +150,7 @@ def test_a_cube_is_unfolded_to_one_net():
     V, F = models.box()
     hinges = find_hinges(V, F)
     pieces = find_pieces(V, F, hinges, np.ones(F.shape))
-    model = PaperModel(F, hinges, pieces, 6.0)
-    model.list_contacts(np.ones(hinges.one.size, dtype=bool))
+    model = PaperModel(F, hinges, pieces, 6.0, np.ones(hinges.one.size, dtype=bool))
     model.join(hinges.length, np.zeros(hinges.one.size, dtype=bool), 10.0, 10.0, lambda: None)
     assert len(np.unique(pieces.label)) == 1
     # Six unit squares, joined at five of twelve edges.

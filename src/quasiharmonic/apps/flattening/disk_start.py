@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from quasiharmonic.geometry.mesh.fans import make_fans
+from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -47,10 +48,3 @@ def map_to_disk(
     if result.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return result.uv[: len(V)] if result.injective else None
-
-
-def surface_area(V: FloatArray, F: IntArray) -> float:
-    """Return the area of triangles F (f, 3) between points V (n, 3)."""
-    corners = V[F]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return 0.5 * float(np.linalg.norm(normals, axis=1).sum())

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.collapse import has_collapsed, thin_triangles
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.disk_start import map_to_disk, surface_area
+from quasiharmonic.apps.flattening.disk_start import map_to_disk
 from quasiharmonic.apps.flattening.layout import to_given_unit
 from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
@@ -23,6 +23,7 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, is_injective
+from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Status

@@ -23,7 +23,7 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
-from quasiharmonic.geometry.mesh.reference import rest_shapes
+from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.options import FlattenOptions
 
@@ -154,8 +154,8 @@ def smallest_angles(sides: ComplexArray) -> FloatArray:
     """Smallest angle (f,) in radians of triangles given by their sides (3, f) complex128."""
     length = np.abs(sides)
     with np.errstate(all="ignore"):
-        angles = [np.abs(np.angle(-sides[k - 1].conj() * sides[k])) for k in range(3)]
-    return np.where(length.min(axis=0) > 0, np.min(angles, axis=0), 0.0)
+        angles = corner_angles(sides)
+    return np.where(length.min(axis=0) > 0, angles.min(axis=1), 0.0)
 
 
 def measure_stretch(energy: DeformationEnergy, uv: FloatArray) -> FloatArray:

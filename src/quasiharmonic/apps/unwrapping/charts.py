@@ -24,6 +24,7 @@ from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys, pair_keys
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each, scale_to_unit
@@ -115,7 +116,7 @@ def find_charts(
     min_gain = _MIN_GAIN if uv_cuts is None else np.inf
     cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain)
     draft.charts = [*charts]
-    total = float(_doubled_areas(V, F).sum() / 2)
+    total = surface_area(V, F)
     divisible = None if max_charts is None else max_charts - len(charts)
 
     def search(parts: list[WorkingChart], most: int | None, share: float) -> list[Chart]:
@@ -160,12 +161,6 @@ def _perimeter(charts: list[WorkingChart]) -> float:
 def _ends(F: IntArray, sides: BoolArray) -> IntArray:
     """Return the edges (l, 2) at some sides (f, 3)."""
     return np.stack([F[sides], F[:, (1, 2, 0)][sides]], axis=1)
-
-
-def _doubled_areas(V: FloatArray, F: IntArray) -> FloatArray:
-    """Return twice the areas (f,) of triangles."""
-    doubled: FloatArray = np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
-    return doubled
 
 
 def _develop(
@@ -224,7 +219,7 @@ def _unfold_small(
     component = fans(F)[1]
     sides = edge_keys(F, F[:, (1, 2, 0)], len(V))
     _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
-    area = _doubled_areas(V, F)
+    area = np.linalg.norm(area_vectors(V, F), axis=1)
     chosen = (np.bincount(component) <= _SMALL) & (np.bincount(component, area) <= _SMALL_SHARE * area.sum())
     chosen[component[((times[edge].reshape(sides.shape) < 2) | demanded).any(axis=1)]] = False
     rows = np.flatnonzero(chosen[component])

@@ -14,6 +14,7 @@ from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.geometry.mesh.fans import renumber
+from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
 
 # Pieces are joined in several rounds. In each, unions are at most so long, in sides of the texture, and their boxes may
@@ -62,12 +63,9 @@ def develop_charts(
     pieces = find_pieces(V, F, hinges, cost, mirror)
     if not pieces.count:
         return pieces.label >= 0, []
-    corners = V[F]
-    area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
-    model = PaperModel(F, hinges, pieces, area / 2, mirror)
-    weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other]) / 2
+    area, weight = surface_area(V, F), hinges.price(cost)
+    model = PaperModel(F, hinges, pieces, area, ~demanded, mirror)
     together = hinges.touch(cost >= UNDIVIDED_COST)
-    model.list_contacts(~demanded)
     kept = hinges.touch(cost >= KEPT_COST)
     if kept.any():
         own = replace(pieces, label=pieces.label.copy(), place=pieces.place.copy(), glued=pieces.glued.copy())
@@ -76,8 +74,7 @@ def develop_charts(
         lost = np.unique(pieces.label[np.concatenate([hinges.first[torn], hinges.second[torn]])])
         if lost[lost >= 0].size:
             pieces = own.without(hinges, np.isin(pieces.label, lost))
-            model = PaperModel(F, hinges, pieces, area / 2, mirror)
-            model.list_contacts(~demanded)
+            model = PaperModel(F, hinges, pieces, area, ~demanded, mirror)
             model.join(weight, kept, *_ONLY_FORCED, check_wanted)
         if not pieces.count:
             return pieces.label >= 0, []

@@ -29,6 +29,16 @@ _BITS = 30
 _LEAST_AREA = 1e-9
 
 
+def ahead(side: IntArray) -> IntArray:
+    """Return the next side of the same triangle."""
+    return side + 1 - 3 * (side % 3 == 2)
+
+
+def behind(side: IntArray) -> IntArray:
+    """Return the previous side of the same triangle."""
+    return side - 1 + 3 * (side % 3 == 0)
+
+
 @dataclass(frozen=True, eq=False)
 class Hinges:
     """The interior edges (e,) of a surface.
@@ -59,6 +69,10 @@ class Hinges:
     def second(self) -> IntArray:
         """The triangles (e,) of the sides ``other``."""
         return self.other // 3
+
+    def price(self, cost: FloatArray) -> FloatArray:
+        """Return the length (e,) of each hinge times the mean of the factors (f, 3) of its two sides."""
+        return self.length * (cost.ravel()[self.one] + cost.ravel()[self.other]) / 2
 
     def touch(self, sides: BoolArray) -> BoolArray:
         """Return the hinges (e,) with one or both of their sides among some sides (f, 3)."""
@@ -92,16 +106,14 @@ def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
     normal /= np.maximum(doubled, np.finfo(float).tiny)[:, None]
     tiny = doubled <= _LEAST_AREA * doubled.sum()
     flat_P = P.reshape(-1, 3)
-    ahead = np.roll(np.arange(F.size).reshape(-1, 3), -1, axis=1).ravel()
-    apex = np.roll(np.arange(F.size).reshape(-1, 3), -2, axis=1).ravel()
     start = flat_P[one]
-    along = flat_P[ahead[one]] - start
+    along = flat_P[ahead(one)] - start
     length = np.linalg.norm(along, axis=1)
     a, b = normal[one // 3], normal[other // 3]
     sine = np.linalg.norm(np.cross(a, b), axis=1)
     angle = np.arctan2(sine, (a * b).sum(axis=1))
-    above = ((flat_P[apex[other]] - start) * a).sum(axis=1)
-    height = np.maximum(np.abs(above), np.abs(((flat_P[apex[one]] - start) * b).sum(axis=1)))
+    above = ((flat_P[behind(other)] - start) * a).sum(axis=1)
+    height = np.maximum(np.abs(above), np.abs(((flat_P[behind(one)] - start) * b).sum(axis=1)))
     flat = (height <= FLAT) & (angle <= _FLAT_ANGLE) & ~(tiny[one // 3] | tiny[other // 3])
     fraction, exponent = np.frexp(length * size)
     rounded = np.ldexp(np.rint(np.ldexp(fraction, _BITS)), exponent - _BITS)

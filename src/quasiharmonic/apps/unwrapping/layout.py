@@ -15,6 +15,15 @@ from quasiharmonic.apps.unwrapping.rounding import round_positions
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
+# From this loss on, unions with much larger boxes are compared, too.
+_GENEROUS = 0.05
+# From this share of straight outlines on, the share may be smaller by a difference.
+_MOSTLY_STRAIGHT, _BENT = 0.85, 0.03
+# Sides are straight up to this sine of their angle with an axis.
+_SKEW = 0.017
+# More charts are not packed for comparison. A layout that uses this share of the texture is good enough.
+_MOST_COMPARED, _GOOD_USE = 150, 0.83
+
 
 @dataclass(frozen=True, eq=False)
 class ChartLayout:
@@ -41,16 +50,6 @@ class ChartLayout:
     def F(self) -> IntArray:
         """The triangles (k, 3), reversed in mirrored charts."""
         return np.where(self.mirrored[:, None], self.rows[:, ::-1], self.rows)
-
-
-# From this loss on, unions with much larger boxes are compared, too.
-_GENEROUS = 0.05
-# From this share of straight outlines on, the share may be smaller by a difference.
-_MOSTLY_STRAIGHT, _BENT = 0.85, 0.03
-# Sides are straight up to this sine of their angle with an axis.
-_SKEW = 0.017
-# More charts are not packed for comparison. A layout that uses this share of the texture is good enough.
-_MOST_COMPARED, _GOOD_USE = 150, 0.83
 
 
 @dataclass(frozen=True, eq=False)

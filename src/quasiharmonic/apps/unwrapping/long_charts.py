@@ -65,7 +65,7 @@ def divide_long_charts(
     list of Chart
         Ordered by first triangle.
     """
-    area = sum(_area(chart) for chart in charts)
+    area = sum(chart.shape.area for chart in charts)
     ratio = max(size) / min(size)
     side = float(np.sqrt(area * ratio / (_EXPECTED * tiles)))
     longest_flat = _LONGEST_FLAT * side
@@ -121,10 +121,6 @@ def _halve(chart: Chart, cost: FloatArray) -> list[Chart]:
         return []
     parts = [part for rows in (np.flatnonzero(first), np.flatnonzero(~first)) for part in chart.take(rows)]
     return parts if max(map(_length, parts)) <= _SHORTER * _length(chart) else []
-
-
-def _area(chart: Chart) -> float:
-    return chart.shape.area
 
 
 def _is_too_long(chart: Chart, side: float, area: float, for_packing: bool) -> bool:

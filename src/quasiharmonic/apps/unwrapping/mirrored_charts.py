@@ -1,4 +1,4 @@
-"""Mirror images of charts, and charts that cross the plane of symmetry."""
+"""Mirror images of charts, and pairs of charts that are mirror images."""
 
 from __future__ import annotations
 

@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull, find_smallest_box
-from quasiharmonic.apps.unwrapping.hinges import Hinges
+from quasiharmonic.apps.unwrapping.hinges import Hinges, ahead
 from quasiharmonic.apps.unwrapping.pieces import Pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
+from quasiharmonic.apps.unwrapping.unrolling import SAME, meet
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.fans import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_points
 
-# Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
-_SAME = 1e-3
 # Share of the texture that charts are expected to cover.
 _EXPECTED = 0.7
 # Boundaries that are closer than this multiple of the root of the area count as touching.
@@ -62,11 +61,21 @@ class PaperModel:
         Changed: joined pieces get one label and one frame.
     area : float
         Area of the whole surface.
+    may_join : (e,) bool
+        Hinges at which pieces may be joined. All others stay open.
     mirror : Mirror, optional
         Mirror images. What is joined is then joined on both sides.
     """
 
-    def __init__(self, F: IntArray, hinges: Hinges, pieces: Pieces, area: float, mirror: Mirror | None = None) -> None:
+    def __init__(
+        self,
+        F: IntArray,
+        hinges: Hinges,
+        pieces: Pieces,
+        area: float,
+        may_join: BoolArray,
+        mirror: Mirror | None = None,
+    ) -> None:
         self._F, self._hinges, self._pieces = F, hinges, pieces
         self._mirror = mirror
         self._hinge_image = None if mirror is None else mirror.of_hinges(hinges, F)
@@ -80,18 +89,12 @@ class PaperModel:
         # Hinges between two charts, and how often each chart has changed.
         self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
         self._version = dict.fromkeys(self._charts, 0)
-        self._watched: BoolArray = np.zeros(hinges.one.size, dtype=np.bool_)
         # Pairs of charts that overlap if they are joined at this number of hinges. They also do when others are added.
         self._overlapping = set[tuple[int, int, int]]()
         # The largest limit of boxes at which pairs of charts, with their versions, could not be joined.
         self._loose: dict[tuple[int, ...], float] = {}
-        self._demanded = np.flatnonzero(self._watched)
-
-    def list_contacts(self, may_join: BoolArray) -> None:
-        """Find where charts may be joined, given a mask of hinges (e,). All others stay open."""
-        label, hinges = self._pieces.label, self._hinges
         self._demanded = np.flatnonzero(~may_join)
-        one, other = label[hinges.first], label[hinges.second]
+        one, other = pieces.label[hinges.first], pieces.label[hinges.second]
         self._watched = may_join & (one >= 0) & (other >= 0) & (one != other)
         between = np.flatnonzero(self._watched)
         low, high = np.minimum(one, other)[between], np.maximum(one, other)[between]
@@ -137,9 +140,11 @@ class PaperModel:
             return {a} if self._try(a, b, weight, limits) else set()
         label = self._pieces.label
         images = [self._mirror.triangle[self._charts[k].triangles[0]] for k in (a, b)]
-        before = self._save()
-        if not self._try(a, b, weight, limits):
+        union = self._find_union(a, b, weight, limits)
+        if union is None:
             return set()
+        before = self._save()
+        self._unite(a, b, *union)
         c, d = sorted(label[images].tolist())
         # The union may be its own image. Otherwise, the images are two charts, one of which may be the union.
         if (c == d or (d in self._contacts.get(c, ()) and self._try(c, d, weight, limits))) and self._is_mirrored():
@@ -150,10 +155,10 @@ class PaperModel:
     def _is_mirrored(self) -> bool:
         """Whether the mirror image of every glued hinge is glued."""
         glued = self._pieces.glued
-        return self._hinge_image is None or bool((glued[self._hinge_image] == glued)[self._watched].all())
+        return bool((glued[self._hinge_image] == glued)[self._watched].all())
 
     def _save(self) -> tuple[Any, ...]:
-        """Return a copy of everything that `_try` changes."""
+        """Return a copy of everything that `_unite` changes."""
         pieces = self._pieces
         contacts = {k: dict(others) for k, others in self._contacts.items()}
         arrays = [array.copy() for array in (pieces.label, pieces.place, pieces.glued, self._joined_sides)]
@@ -170,37 +175,49 @@ class PaperModel:
 
     def _try(self, a: int, b: int, weight: FloatArray, limits: tuple[float, float]) -> bool:
         """Move chart ``b`` to chart ``a`` and join them, if their union is good."""
+        union = self._find_union(a, b, weight, limits)
+        if union is not None:
+            self._unite(a, b, *union)
+        return union is not None
+
+    def _find_union(
+        self, a: int, b: int, weight: FloatArray, limits: tuple[float, float]
+    ) -> tuple[_Leaf, ComplexArray, IntArray] | None:
+        """Return the union of two charts, the places of ``b``, and the hinges that meet; None if it is not good."""
         contact = self._contacts[a][b]
         longest, boxes = limits
         state = (a, b, self._version[a], self._version[b])
         if (a, b, contact.size) in self._overlapping or boxes <= self._loose.get(state, 0.0):
-            return False
-        motion = self._find_motion(a, b, weight)
+            return None
+        turn, shift = self._find_motion(a, b, weight)
         one, other = self._charts[a], self._charts[b]
-        place = self._pieces.place
-        moved = motion[0] * place[other.triangles] + motion[1]
         union = _Leaf(
-            np.concatenate([one.triangles, other.triangles]),
-            np.concatenate([one.hull, motion[0] * other.hull + motion[1]]),
+            np.concatenate([one.triangles, other.triangles]), np.concatenate([one.hull, turn * other.hull + shift])
         )
         # Boxes that are too large in one round are too large in the next one, unless its limit is higher.
         if union.box > boxes * (one.box + other.box):
             self._loose[state] = boxes
-            return False
+            return None
         if union.longest > _AS_LONG * max(longest, one.longest, other.longest):
-            return False
-        before = place[other.triangles]
-        place[other.triangles] = moved
-        glued = contact[self._meet(contact)]
-        glued_sides = np.concatenate([self._hinges.one[glued], self._hinges.other[glued]])
-        self._joined_sides[glued_sides] = True
-        if not self._is_simple(union.triangles):
-            place[other.triangles] = before
-            self._joined_sides[glued_sides] = False
+            return None
+        place, before = self._pieces.place, self._pieces.place[other.triangles]
+        place[other.triangles] = moved = turn * before + shift
+        glued = contact[meet(place, self._hinges, contact)]
+        sides = np.concatenate([self._hinges.one[glued], self._hinges.other[glued]])
+        self._joined_sides[sides] = True
+        simple = self._is_simple(union.triangles)
+        place[other.triangles], self._joined_sides[sides] = before, False
+        if not simple:
             self._overlapping.add((a, b, contact.size))
-            return False
+            return None
+        return union, moved, glued
+
+    def _unite(self, a: int, b: int, union: _Leaf, moved: ComplexArray, glued: IntArray) -> None:
+        """Join chart ``b`` to chart ``a``, as found by `_find_union`."""
+        rows = self._charts[b].triangles
+        self._pieces.place[rows], self._pieces.label[rows] = moved, a
         self._pieces.glued[glued] = True
-        self._pieces.label[other.triangles] = a
+        self._joined_sides[self._hinges.one[glued]] = self._joined_sides[self._hinges.other[glued]] = True
         self._charts[a] = union
         self._version[a] += 1
         del self._charts[b], self._version[b]
@@ -210,32 +227,24 @@ class PaperModel:
             del self._contacts[c][b]
             mine[c] = np.concatenate([mine[c], more]) if c in mine else more
             self._contacts[c][a] = mine[c]
-        return True
 
     def _find_motion(self, a: int, b: int, weight: FloatArray) -> tuple[complex, complex]:
         """Rotation and shift of chart ``b`` at which most of the common edges, by weight, meet."""
         hinges, contact = self._hinges, self._contacts[a][b]
         contact = contact[np.argsort(-weight[contact], kind="stable")[:_TRIES]]
-        z, ahead = self._pieces.place.ravel(), np.roll(self._pieces.place, -1, axis=1).ravel()
+        z = self._pieces.place.ravel()
         swapped = self._pieces.label[hinges.one[contact] // 3] != a
         mine = np.where(swapped, hinges.other[contact], hinges.one[contact])
         theirs = np.where(swapped, hinges.one[contact], hinges.other[contact])
-        turn = (ahead[mine] - z[mine]) / (z[theirs] - ahead[theirs])
+        (start, end), (tail, head) = ((z[side], z[ahead(side)]) for side in (mine, theirs))
+        turn = (end - start) / (tail - head)
         turn /= np.abs(turn)
-        shift = z[mine] - turn * ahead[theirs]
-        moved = turn[:, None] * z[theirs] + shift[:, None], turn[:, None] * ahead[theirs] + shift[:, None]
-        apart = np.maximum(np.abs(moved[0] - ahead[mine]), np.abs(moved[1] - z[mine]))
-        met = (apart <= _SAME * hinges.length[contact]) @ weight[contact]
+        shift = start - turn * head
+        moved = turn[:, None] * tail + shift[:, None], turn[:, None] * head + shift[:, None]
+        apart = np.maximum(np.abs(moved[0] - end), np.abs(moved[1] - start))
+        met = (apart <= SAME * hinges.length[contact]) @ weight[contact]
         best = int(np.argmax(met))
         return complex(turn[best]), complex(shift[best])
-
-    def _meet(self, contact: IntArray) -> BoolArray:
-        """Return which hinges have both sides at one place."""
-        z, ahead = self._pieces.place.ravel(), np.roll(self._pieces.place, -1, axis=1).ravel()
-        one, other = self._hinges.one[contact], self._hinges.other[contact]
-        apart = np.maximum(np.abs(z[one] - ahead[other]), np.abs(ahead[one] - z[other]))
-        same: BoolArray = apart <= _SAME * self._hinges.length[contact]
-        return same
 
     def _is_simple(self, rows: IntArray) -> bool:
         """Whether some triangles, joined at the glued hinges, have boundaries that stay apart."""

@@ -18,7 +18,7 @@ from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, meet, spanning_links
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.fans import fans
-from quasiharmonic.geometry.mesh.reference import rest_shapes
+from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes, surface_area
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 from quasiharmonic.util.progress import heartbeat
@@ -40,8 +40,6 @@ _SMALL_SHARE = 0.02
 _DEFECT, _ALL_DEFECTS = 1e-3, 0.1
 # A piece may have this number of vertices with larger defects, such as the apex of a cone. They are cut open.
 _APEXES = 2
-# Factor on the cost of cutting a flat face.
-_FLAT_COST = 1e3
 # Factor on the cost of cutting an edge that is its own mirror image.
 _ON_PLANE = 0.9
 # Largest stretch of an unrolled piece.
@@ -50,8 +48,6 @@ _STRETCH = 1.001
 _TOUCHING, _APART = 1e-5, 2e-4
 # Positions are compared on a grid that contains no simple fractions.
 _OFFSET = 0.3819
-# Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
-_SAME = 1e-3
 
 
 @dataclass(eq=False)
@@ -131,9 +127,9 @@ class _Parts:
 
 def _cut_costs(hinges: Hinges, cost: FloatArray, image: IntArray | None) -> FloatArray:
     """Return what it costs to cut each hinge (e,), given factors (f, 3) and the mirror images of the hinges."""
-    dear = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other])
+    dear = hinges.price(cost)
     # A cut along an edge inside a flat face would end there.
-    dear[hinges.flat] *= _FLAT_COST
+    dear[hinges.flat] *= UNDIVIDED_COST
     if image is not None:
         dear[image == np.arange(image.size)] *= _ON_PLANE
     return dear
@@ -173,8 +169,7 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
     together, apart = hinges.touch(cost >= UNDIVIDED_COST), hinges.touch(cost <= DEMANDED_COST)
     shapes = rest_shapes(V, F)
     area = shapes.m / shapes.m.sum()
-    angles = np.stack([np.abs(np.angle(-shapes.sides[k - 1].conj() * shapes.sides[k])) for k in range(3)], axis=1)
-    doubled = np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
+    angles, whole = corner_angles(shapes.sides), surface_area(V, F)
     length = np.linalg.norm(V[F] - V[np.roll(F, -1, axis=1)], axis=2)
     found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
     for angle in (CREASE, *_ANGLES, 0.0):
@@ -191,7 +186,7 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
             chosen &= ~parts.rough | (parts.area >= _LARGE_SHARE)
             chosen = _drop_scattered(hinges, parts, chosen, rim)
         elif angle:
-            chosen &= (parts.area >= _LEAST_SHARE) & (rim**2 <= _LONGEST * parts.area * doubled.sum() / 2)
+            chosen &= (parts.area >= _LEAST_SHARE) & (rim**2 <= _LONGEST * parts.area * whole)
         if chosen.any():
             _unroll(V, F, hinges, parts, chosen, cost, found, mirror)
         if (found.label >= 0).all():
@@ -212,7 +207,8 @@ def _unroll(
     """Unroll the chosen parts (c,) and add those that do not overlap themselves to the pieces."""
     inside = parts.joined & chosen[parts.component[hinges.first]]
     place = _lay(V, F, hinges, inside)
-    met = meet(place, hinges, inside, _SAME)
+    joined = np.flatnonzero(inside)
+    met = mark(inside.size, joined[meet(place, hinges, joined)])
     wrong = mark(parts.count, parts.component[hinges.first[inside & ~met]])
     cut = np.zeros(inside.size, dtype=bool)
     image = None if mirror is None or not wrong.any() else mirror.of_hinges(hinges, F)
@@ -227,7 +223,7 @@ def _unroll(
     if cut.any():
         place = _lay(V, F, hinges, inside & ~cut)
         # Cuts to holes that need none close again.
-        met = meet(place, hinges, inside, _SAME)
+        met = mark(inside.size, joined[meet(place, hinges, joined)])
     split, component = fans(F, ~hinges.mark_sides(met, len(F)))
     rows = np.flatnonzero(chosen[parts.component])
     names, own = np.unique(split[rows], return_inverse=True)

@@ -19,6 +19,7 @@ from quasiharmonic.apps.unwrapping.wanted_seams import (
     read_edges,
     read_wanted_seams,
 )
+from quasiharmonic.geometry.mesh.reference import area_vectors
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, index_array
 from quasiharmonic.util.options import UnwrapOptions
 
@@ -137,7 +138,7 @@ def _prefer_hidden(
     if symmetry.applied and symmetry.axis == up[-1]:
         # Seams below are mirrored to the upper side.
         return
-    normal = np.cross(points[F[:, 1]] - points[F[:, 0]], points[F[:, 2]] - points[F[:, 0]])
+    normal = area_vectors(points, F)
     length = np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)
     height = (-1 if up[0] == "-" else 1) * normal[:, "xyz".index(up[-1])] / length
     below = (height[hinges.first] + height[hinges.second]) / 2 < _SLOPE

@@ -13,6 +13,7 @@ from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.layout import ChartLayout, find_differing_sides
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.reference import area_vectors
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -107,9 +108,8 @@ class KeptCharts:
     def find_density(self, V: FloatArray, F: IntArray, size: tuple[int, int]) -> float | None:
         """Return the mean of the texels per unit of length of the model, weighted by area; None if it is zero."""
         exponent = find_exponent(V)
-        corners = np.pad(np.ldexp(V, -exponent), [(0, 0), (0, 3 - V.shape[1])])[F[~self.replaced]]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(normal, axis=1) / 2
+        points = np.pad(np.ldexp(V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
+        area = np.linalg.norm(area_vectors(points, F[~self.replaced]), axis=1) / 2
         sides = self.corner_uv[~self.replaced] * size
         texels = np.abs(np.linalg.det(sides[:, 1:] - sides[:, :1])) / 2
         total = float(area.sum())

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quasiharmonic.apps.unwrapping.hinges import ahead, behind
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, repeat_each
 
@@ -269,7 +270,7 @@ def _split(F: IntArray, links: Links, turned: BoolArray, contested: IntArray) ->
     while True:
         fan = _label_corners(links, F.size)
         # Sides at one edge of the surface, in order of a side that is joined to another one.
-        ends = fan[contested], fan[_ahead(contested)]
+        ends = fan[contested], fan[ahead(contested)]
         edge = edge_keys(*ends, F.size)
         partner = np.full(F.size, F.size)
         partner[links.one], partner[links.other] = links.other, links.one
@@ -289,25 +290,15 @@ def _split(F: IntArray, links: Links, turned: BoolArray, contested: IntArray) ->
             return fan, links, np.unique(seams, axis=0)
         # Only the first pair of sides, or the first side, stays at this edge. The others get a vertex of their own.
         away = side[repeat_each(wrong, count) & (leader != repeat_each(leader[first], count))]
-        at_start = fan[away] < fan[_ahead(away)]
-        cut = mark(F.size, np.where(at_start, _behind(away), _ahead(away)))
+        at_start = fan[away] < fan[ahead(away)]
+        cut = mark(F.size, np.where(at_start, behind(away), ahead(away)))
         apart = cut[links.one] | cut[links.other]
         contested = np.union1d(contested, [links.one[apart], links.other[apart]])
         links = links.select(~apart)
 
 
-def _ahead(side: IntArray) -> IntArray:
-    """Return the next side of the same triangle."""
-    return side + 1 - 3 * (side % 3 == 2)
-
-
-def _behind(side: IntArray) -> IntArray:
-    """Return the previous side of the same triangle."""
-    return side - 1 + 3 * (side % 3 == 0)
-
-
 def _label_corners(links: Links, count: int) -> IntArray:
     """Label the corners that joined sides identify; each label is the smallest corner."""
     one, other, parallel = links
-    start, end = np.where(parallel, other, _ahead(other)), np.where(parallel, _ahead(other), other)
-    return label_components(np.concatenate([one, _ahead(one)]), np.concatenate([start, end]), count)
+    start, end = np.where(parallel, other, ahead(other)), np.where(parallel, ahead(other), other)
+    return label_components(np.concatenate([one, ahead(one)]), np.concatenate([start, end]), count)

@@ -17,7 +17,7 @@ from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, 
 from quasiharmonic.apps.unwrapping.pieces import CREASE
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, spanning_links
 from quasiharmonic.geometry.mesh.fans import fans
-from quasiharmonic.geometry.mesh.reference import rest_shapes
+from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 
@@ -96,7 +96,7 @@ def straighten_strips(
     together = diagonal | hinges.flat | hinges.touch(cost >= UNDIVIDED_COST)
     paired = mark(len(F), hinges.first[diagonal], hinges.second[diagonal])
     left = np.ones(len(F), dtype=bool)
-    weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other])
+    weight = hinges.price(cost)
     charts, strips = list[Chart](), dict[int, Strip]()
     for angle in _ANGLES:
         joined = ~apart & (together | (np.abs(hinges.angle) <= angle)) & left[hinges.first] & left[hinges.second]
@@ -126,8 +126,7 @@ def _find_diagonals(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray
 
     Inside polygons, the cost of seams is high.
     """
-    sides = rest_shapes(V, F).sides
-    angle = np.stack([np.abs(np.angle(-sides[k - 1].conj() * sides[k])) for k in range(3)], axis=1)
+    angle = corner_angles(rest_shapes(V, F).sides)
     one, other = (np.roll(angle, shift, axis=1).ravel() for shift in (0, -1))
     apex = np.roll(angle, -2, axis=1).ravel()
     corners = [apex[hinges.one], apex[hinges.other], one[hinges.one] + other[hinges.other]]

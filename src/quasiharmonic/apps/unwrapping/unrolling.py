@@ -6,9 +6,12 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from quasiharmonic.apps.unwrapping.hinges import Hinges
+from quasiharmonic.apps.unwrapping.hinges import Hinges, ahead
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+
+#: Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
+SAME = 1e-3
 
 
 def spanning_links(first: IntArray, second: IntArray, rank: FloatArray, size: int) -> BoolArray:
@@ -63,11 +66,9 @@ def lay_along(V: FloatArray, F: IntArray, one: IntArray, other: IntArray, compon
     return place
 
 
-def meet(place: ComplexArray, hinges: Hinges, chosen: BoolArray, tolerance: float) -> BoolArray:
-    """Return which of the chosen hinges (e,) have both sides at the same place, up to a part of their length."""
-    z, ahead = place.ravel(), np.roll(place, -1, axis=1).ravel()
-    one, other = hinges.one[chosen], hinges.other[chosen]
-    apart = np.maximum(np.abs(z[one] - ahead[other]), np.abs(ahead[one] - z[other]))
-    same = chosen.copy()
-    same[chosen] = apart <= tolerance * hinges.length[chosen]
+def meet(place: ComplexArray, hinges: Hinges, chosen: IntArray) -> BoolArray:
+    """Return which of some hinges (k,) have both sides at one place, up to `SAME`, given the corners' places (f, 3)."""
+    z, one, other = place.ravel(), hinges.one[chosen], hinges.other[chosen]
+    apart = np.maximum(np.abs(z[one] - z[ahead(other)]), np.abs(z[ahead(one)] - z[other]))
+    same: BoolArray = apart <= SAME * hinges.length[chosen]
     return same

@@ -10,14 +10,11 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
-from quasiharmonic.apps.unwrapping.hinges import Hinges
+from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.pieces import find_pieces
 from quasiharmonic.geometry.mesh.fans import fans
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components, pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range, edge_names, index_array, mark
-
-# Factor on the cost of a path through a flat face.
-_FLAT_COST = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +106,8 @@ def extend_seams(V: FloatArray, F: IntArray, hinges: Hinges, demanded: BoolArray
     """
     chosen = hinges.touch(demanded)
     ends = np.stack([F.ravel()[hinges.one], F[:, (1, 2, 0)].ravel()[hinges.one]], axis=1)
-    weight = hinges.length * (cost.ravel()[hinges.one] + cost.ravel()[hinges.other])
-    weight[hinges.flat] *= _FLAT_COST
+    weight = hinges.price(cost)
+    weight[hinges.flat] *= UNDIVIDED_COST
     piece = find_pieces(V, F, hinges, np.where(np.isfinite(cost), cost, 1.0)).label
     face = fans(F, ~hinges.mark_sides(hinges.flat, len(F)))[1]
     region = np.where(piece >= 0, piece, piece.max(initial=-1) + 1 + face)
@@ -130,19 +127,13 @@ def extend_seams(V: FloatArray, F: IntArray, hinges: Hinges, demanded: BoolArray
     return demanded | hinges.mark_sides(chosen, len(F))
 
 
-def _label(ends: IntArray, chosen: BoolArray, n: int) -> IntArray:
-    """Return the component (n,) of each vertex in the graph of the chosen edges."""
-    tail, head = ends[chosen].T
-    return label_components(tail, head, n)
-
-
 def _reach(tip: int, ends: IntArray, weight: FloatArray, chosen: BoolArray, border: BoolArray) -> IntArray:
     """Return the edges of the cheapest path from a tip of the chosen edges to a border vertex or to other chosen edges.
 
     The path does not touch the seam that it extends. Empty if there is none.
     """
     n = len(border)
-    label = _label(ends, chosen, n)
+    label = label_components(ends[chosen, 0], ends[chosen, 1], n)
     own = label == label[tip]
     own[tip] = False
     open_edge = np.flatnonzero(~chosen & np.isfinite(weight) & ~own[ends].any(axis=1))

@@ -279,6 +279,22 @@ class RestShapes:
         return 0.25j * self.sides[(1, 2, 0), :] / m
 
 
+def area_vectors(V: FloatArray, F: NDArray[np.integer]) -> FloatArray:
+    """Return a normal (f, 3) of each triangle F (f, 3) between points V (n, 3); its length is twice the area."""
+    corners = V[F]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def surface_area(V: FloatArray, F: NDArray[np.integer]) -> float:
+    """Return the area of triangles F (f, 3) between points V (n, 3)."""
+    return 0.5 * float(np.linalg.norm(area_vectors(V, F), axis=1).sum())
+
+
+def corner_angles(sides: ComplexArray) -> FloatArray:
+    """Return the angles (f, 3) in radians of triangles that are given by their sides (3, f), as in `RestShapes`."""
+    return np.stack([np.abs(np.angle(-sides[k - 1].conj() * sides[k])) for k in range(3)], axis=1)
+
+
 def rest_shapes(V: ArrayLike, F: NDArray[np.integer], *, lowest: float = 0.0) -> RestShapes:
     """Lay the triangles of a planar or curved mesh into the plane.
 

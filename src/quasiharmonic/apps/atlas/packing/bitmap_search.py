@@ -28,12 +28,12 @@ _FINE_GAIN, _FINE_LOSS = 1.06, 1.01
 BITMAPS = 500
 # The number of cells along a tile varies between these multiples of the expected number.
 _FEWEST_CELLS, MORE_CELLS = 0.8, 1.25
-# Placements tried with other orders of the charts, in all.
-_TRIALS = 300
-# Relative precision of the scale of many charts.
-_COARSE = 0.04
+#: Placements tried with other orders of the charts, in all.
+TRIALS = 300
 # Spread of the logarithm of the areas by which charts are ordered in these trials.
 _SPREAD = 0.3
+# Relative precision of the scale of many charts.
+_COARSE = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ class BitmapSearch:
             self._halves[i, part] = self._bitmaps[i].half(part - 1)
         return self._halves[i, part]
 
-    def enlarge(self, trials: int = _TRIALS) -> tuple[Layout, IntArray] | None:
+    def enlarge(self, trials: int) -> tuple[Layout, IntArray] | None:
         """Find the smallest board on which few bitmaps fit; the layout on it, and the order of the shapes."""
         low, high = int(_FEWEST_CELLS * self.cells), int(MORE_CELLS * self.cells)
         best = self.place_in(high)

@@ -7,13 +7,21 @@ from math import ceil, hypot, pi, sqrt
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY, MORE_CELLS, MOST_CELLS, BitmapSearch, Layout
+from quasiharmonic.apps.atlas.packing.bitmap_search import (
+    BITMAPS,
+    MANY,
+    MORE_CELLS,
+    MOST_CELLS,
+    TRIALS,
+    BitmapSearch,
+    Layout,
+)
 from quasiharmonic.apps.atlas.packing.shapes import Shape
-from quasiharmonic.util.arrays import ComplexArray, FloatArray
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 # Share of the tiles that charts with half the padding around them are expected to cover.
 _EXPECTED = 0.8
-# The same for an estimate.
+# Placements tried with other orders of the charts for an estimate, in all.
 _ESTIMATED = 100
 # Directions compared for the expected scale.
 _TURNS = 16
@@ -69,19 +77,29 @@ def find_layout(
             return None
         search = BitmapSearch(shapes, size, padding, tiles, scale, rotate=rotate, bitmaps=bitmaps)
         return search.place_in(search.cells)
+    layout, order = _enlarge(shapes, size, padding, tiles, TRIALS, rotate=rotate, bitmaps=bitmaps)
+    if layout is None:
+        return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
+    if order is None:
+        return layout
+    fine = BitmapSearch(shapes, size, padding, tiles, layout.scale, rotate=rotate, given=layout.directions)
+    return fine.enlarge_finely(order) or layout
+
+
+def _enlarge(
+    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, trials: int, **drawing: bool | int
+) -> tuple[Layout, IntArray | None] | tuple[None, None]:
+    """Place shapes at a large scale; return the layout, and the order of few shapes."""
     expected, least = _expected_scale(shapes, size, padding, tiles), least_scale(shapes)
     while expected > least:
-        search = BitmapSearch(shapes, size, padding, tiles, expected, rotate=rotate, bitmaps=bitmaps)
+        search = BitmapSearch(shapes, size, padding, tiles, expected, **drawing)  # type: ignore[arg-type]
         if len(shapes) > MANY:
-            layout = search.enlarge_coarsely()
-            if layout is not None:
-                return layout
-        elif (found := search.enlarge()) is not None:
-            layout, order = found
-            fine = BitmapSearch(shapes, size, padding, tiles, layout.scale, rotate=rotate, given=layout.directions)
-            return fine.enlarge_finely(order) or layout
+            if (layout := search.enlarge_coarsely()) is not None:
+                return layout, None
+        elif (found := search.enlarge(trials)) is not None:
+            return found
         expected /= MORE_CELLS
-    return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
+    return None, None
 
 
 def find_layout_around(
@@ -136,18 +154,9 @@ def find_layout_around(
 
 def estimate_use(shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool) -> float:
     """Part of the tiles that shapes cover if they are placed quickly; 0 if they do not fit well."""
-    expected, least = _expected_scale(shapes, size, padding, tiles), least_scale(shapes)
-    while expected > least:
-        search = BitmapSearch(shapes, size, padding, tiles, expected, rotate=rotate, skewed=False)
-        if len(shapes) > MANY:
-            layout = search.enlarge_coarsely()
-        else:
-            found = search.enlarge(_ESTIMATED)
-            layout = None if found is None else found[0]
-        if layout is not None:
-            return sum(search.areas) * layout.scale**2 / (tiles * size[0] * size[1])
-        expected /= MORE_CELLS
-    return 0.0
+    layout, _ = _enlarge(shapes, size, padding, tiles, _ESTIMATED, rotate=rotate, skewed=False)
+    area = sum(shape.area for shape in shapes)
+    return 0.0 if layout is None else area * layout.scale**2 / (tiles * size[0] * size[1])
 
 
 def _may_fit(shapes: Sequence[Shape], size: tuple[int, int], tiles: int, scale: float) -> bool:
