@@ -70,6 +70,10 @@ class Hinges:
         """The triangles (e,) of the sides ``other``."""
         return self.other // 3
 
+    def ends(self, F: IntArray) -> IntArray:
+        """Return the vertices (e, 2) of the hinges of triangles (f, 3), in the direction of the sides ``one``."""
+        return np.stack([F.ravel()[self.one], F.ravel()[ahead(self.one)]], axis=1)
+
     def price(self, cost: FloatArray) -> FloatArray:
         """Return the length (e,) of each hinge times the mean of the factors (f, 3) of its two sides."""
         return self.length * (cost.ravel()[self.one] + cost.ravel()[self.other]) / 2

@@ -90,8 +90,7 @@ def straighten_strips(
     hinges = find_hinges(V, F)
     apart = hinges.touch(cost <= DEMANDED_COST)
     if cut is not None:
-        key = edge_keys(F.ravel()[hinges.one], F[:, (1, 2, 0)].ravel()[hinges.one], len(V))
-        apart |= np.isin(key, pair_keys(cut, len(V)))
+        apart |= np.isin(pair_keys(hinges.ends(F), len(V)), pair_keys(cut, len(V)))
     diagonal = _find_diagonals(V, F, hinges, cost, apart)
     together = diagonal | hinges.flat | hinges.touch(cost >= UNDIVIDED_COST)
     paired = mark(len(F), hinges.first[diagonal], hinges.second[diagonal])

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from quasiharmonic.apps.unwrapping.hinges import Hinges
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 # A vertex has a mirror image if a vertex is this close to it, relative to the diagonal of the model's box.
@@ -67,10 +67,8 @@ class Mirror:
 
     def of_hinges(self, hinges: Hinges, F: IntArray) -> IntArray:
         """Return the image (e,) of each hinge."""
-        ends = np.stack([F.ravel()[hinges.one], F[:, (1, 2, 0)].ravel()[hinges.one]])
-        n = len(self.vertex)
-        images = self.vertex[ends]
-        key, image = edge_keys(ends[0], ends[1], n), edge_keys(images[0], images[1], n)
+        ends, n = hinges.ends(F), len(self.vertex)
+        key, image = pair_keys(ends, n), pair_keys(self.vertex[ends], n)
         order = np.argsort(key)
         found: IntArray = order[np.searchsorted(key[order], image)]
         return found

@@ -105,7 +105,7 @@ def extend_seams(V: FloatArray, F: IntArray, hinges: Hinges, demanded: BoolArray
         The demanded sides, and more.
     """
     chosen = hinges.touch(demanded)
-    ends = np.stack([F.ravel()[hinges.one], F[:, (1, 2, 0)].ravel()[hinges.one]], axis=1)
+    ends = hinges.ends(F)
     weight = hinges.price(cost)
     weight[hinges.flat] *= UNDIVIDED_COST
     piece = find_pieces(V, F, hinges, np.where(np.isfinite(cost), cost, 1.0)).label
