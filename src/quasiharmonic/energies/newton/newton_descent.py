@@ -181,10 +181,10 @@ class NewtonDescent:
                 direction, expected_decrease, small = exact, exact_decrease, 0.5 * exact_decrease <= tol * state.value
             moved = self._search(direction, expected_decrease)
             gain = state.value - self.state.value
-            if small and negative == 0 and not gain > _PESSIMISTIC_GAIN * tol * state.value:
+            if small and negative == 0 and not gain > _PESSIMISTIC_GAIN * tol * (state.value + _ZERO_ENERGY):
                 return Status.POLISHED
             if moved:
-                idle = 0 if gain > _IDLE_GAIN * tol * state.value else self.memory.idle + 1
+                idle = 0 if gain > _IDLE_GAIN * tol * (state.value + _ZERO_ENERGY) else self.memory.idle + 1
                 self.memory = replace(self.memory, idle=idle)
                 return Status.EXHAUSTED if idle >= _MAX_IDLE else None
         self.model.check_numbers(self.state)
