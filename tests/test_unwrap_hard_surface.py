@@ -358,3 +358,19 @@ def test_random_profiles(n, seed, length, rings):
     assert result.success
     assert cut_flat_edges(V, F, result.indices).tolist() == []
     assert is_isometric(V, F, result, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("gear", "most", "least"),
+    [
+        ({"teeth": 24, "tooth": 0.1, "thick": 0.2}, 12, 0.5),
+        ({"teeth": 40, "radius": 2, "tooth": 0.12, "bore": 0.5, "thick": 0.6}, 20, 0.6),
+    ],
+    ids=["two disks fill a diagonal", "teeth are joined"],
+)
+def test_gears_have_few_charts_that_fill_the_texture(gear, most, least):
+    """Two disks of equal size are as large as possible on a diagonal, where smaller ones are not placed."""
+    result = unwrap(*models.gear(**gear), resolution=1024, padding=4)
+    assert result.certificate.bijective
+    assert result.n_charts <= most
+    assert result.utilisation > least

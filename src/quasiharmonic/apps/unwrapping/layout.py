@@ -18,7 +18,7 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 # From this loss on, unions with much larger boxes are compared, too.
 _GENEROUS = 0.05
 # From this share of straight outlines on, the share may be smaller by a difference.
-_MOSTLY_STRAIGHT, _BENT = 0.85, 0.03
+_MOSTLY_STRAIGHT, _BENT = 0.87, 0.03
 # Sides are straight up to this sine of their angle with an axis.
 _SKEW = 0.017
 # More charts are not packed for comparison. A layout that uses this share of the texture is good enough.

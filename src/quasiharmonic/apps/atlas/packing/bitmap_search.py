@@ -32,8 +32,8 @@ _FEWEST_CELLS, MORE_CELLS = 0.8, 1.25
 TRIALS = 300
 # Spread of the logarithm of the areas by which charts are ordered in these trials.
 _SPREAD = 0.3
-# Relative precision of the scale of many charts.
-_COARSE = 0.04
+# Relative precision of the scale of few charts, at first, and of many.
+_MEDIUM, _COARSE = 0.03, 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,14 +127,11 @@ class BitmapSearch:
 
     def enlarge(self, trials: int) -> tuple[Layout, IntArray] | None:
         """Find the smallest board on which few bitmaps fit; the layout on it, and the order of the shapes."""
-        low, high = int(_FEWEST_CELLS * self.cells), int(MORE_CELLS * self.cells)
-        best = self.place_in(high)
+        best, high = self._scan(_MEDIUM)
         if best is None:
             return None
-        while high - low > 1:
-            middle = (low + high) // 2
-            found = self.place_in(middle)
-            low, high, best = (middle, high, best) if found is None else (low, middle, found)
+        while (found := self.place_in(high - 1)) is not None:
+            best, high = found, high - 1
         generator, best_order = np.random.default_rng(0), self._order
         for _ in range(trials // len(self.areas)):
             order = np.argsort(-self.areas * np.exp(generator.normal(0, _SPREAD, len(self.areas))), kind="stable")
@@ -155,14 +152,18 @@ class BitmapSearch:
 
     def enlarge_coarsely(self) -> Layout | None:
         """Find a small board for many bitmaps."""
-        low, high, best = int(_FEWEST_CELLS * self.cells), int(MORE_CELLS * self.cells), None
-        while best is None or high - low > _COARSE * high:
-            middle = (low + high) // 2
-            found = self.place_in(middle)
-            low, high, best = (middle, high, best) if found is None else (low, middle, found)
-            if best is None and high - low <= 1:
-                return None
-        return best
+        return self._scan(_COARSE)[0]
+
+    def _scan(self, precision: float) -> tuple[Layout | None, int]:
+        """Find a small board on which the bitmaps fit; return the layout and the number of cells.
+
+        On a larger board, they may not fit: the first ones then lie elsewhere. So all sizes are tried, smallest first.
+        """
+        cells = int(_FEWEST_CELLS * self.cells)
+        last = int(MORE_CELLS * self.cells)
+        while (best := self.place_in(cells)) is None and cells < last:
+            cells = min(cells + max(1, int(precision * cells)), last)
+        return best, cells
 
     def place_in(self, cells: int, order: IntArray | None = None, parts: IntArray | None = None) -> Layout | None:
         """Place the bitmaps on boards with a number of cells along the longer side; None if one does not fit.
