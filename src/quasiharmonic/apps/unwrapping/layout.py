@@ -19,8 +19,6 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 _GENEROUS = 0.05
 # From this share of straight outlines on, the share may be smaller by a difference.
 _MOSTLY_STRAIGHT, _BENT = 0.87, 0.03
-# Sides are straight up to this sine of their angle with an axis.
-_SKEW = 0.017
 # More charts are not packed for comparison. A layout that uses this share of the texture is good enough.
 _MOST_COMPARED, _GOOD_USE = 150, 0.83
 
@@ -85,30 +83,27 @@ class LayoutChoice:
         """
         straight = np.array([_straight_share(charts) for charts in found])
         allowed = straight >= (straight.max() - _BENT if straight.max() >= _MOSTLY_STRAIGHT else 0.0)
-        compared = list[tuple[float, list[Chart]]]()
-        count = -1
+        chosen, use, count = found[-1], -1.0, -1
         for k in np.flatnonzero(allowed)[::-1].tolist():
             if len(found[k]) == count:
                 continue
             count = len(found[k])
             charts = self.divide(found[k], V, cost)
-            few = len(charts) <= _MOST_COMPARED
-            shapes = [chart.shape for chart in charts]
-            use = estimate_use(shapes, self.size, self.padding, self.tiles, rotate=self.rotate) if few else 0.0
-            compared.append((use, charts))
+            covered = 0.0
+            if len(charts) <= _MOST_COMPARED:
+                shapes, above = [chart.shape for chart in charts], max(use + self.loss, 0.0)
+                covered = estimate_use(shapes, self.size, self.padding, self.tiles, rotate=self.rotate, above=above)
+            if use < 0 or covered > use + self.loss:
+                chosen, use = charts, covered
             if use >= _GOOD_USE - self.loss:
                 break
-        best = max(use for use, _ in compared)
-        return next(charts for use, charts in compared if use >= best - self.loss)
+        return chosen
 
 
 def _straight_share(charts: list[Chart]) -> float:
     """Share of the outlines of charts, by length, that lies along the sides of their boxes."""
-    sides = [(chart.shape.heads - chart.shape.tails) / chart.shape.direction for chart in charts]
-    along = np.concatenate([np.empty(0, dtype=np.complex128), *sides])
-    length = np.abs(along)
-    straight = np.minimum(np.abs(along.real), np.abs(along.imag)) <= _SKEW * length
-    return float(length[straight].sum() / max(length.sum(), np.finfo(float).tiny))
+    straight, length = np.sum([chart.shape.outline_lengths for chart in charts], axis=0)
+    return float(straight / max(length, np.finfo(float).tiny))
 
 
 def join_charts(charts: Sequence[Chart], packing: Packing, count: int) -> ChartLayout:

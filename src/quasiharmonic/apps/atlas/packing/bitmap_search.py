@@ -29,7 +29,7 @@ BITMAPS = 500
 # The number of cells along a tile varies between these multiples of the expected number.
 _FEWEST_CELLS, MORE_CELLS = 0.8, 1.25
 #: Placements tried with other orders of the charts, in all.
-TRIALS = 300
+TRIALS = 120
 # Spread of the logarithm of the areas by which charts are ordered in these trials.
 _SPREAD = 0.3
 # Relative precision of the scale of few charts, at first, and of many.
@@ -125,9 +125,12 @@ class BitmapSearch:
             self._halves[i, part] = self._bitmaps[i].half(part - 1)
         return self._halves[i, part]
 
-    def enlarge(self, trials: int) -> tuple[Layout, IntArray] | None:
-        """Find the smallest board on which few bitmaps fit; the layout on it, and the order of the shapes."""
-        best, high = self._scan(_MEDIUM)
+    def enlarge(self, least: float, trials: int) -> tuple[Layout, IntArray] | None:
+        """Find a small board on which few bitmaps fit, at a larger scale than the least.
+
+        Return the layout on it, and the order of the shapes.
+        """
+        best, high = self._scan(least, _MEDIUM)
         if best is None:
             return None
         while (found := self.place_in(high - 1)) is not None:
@@ -150,17 +153,17 @@ class BitmapSearch:
             low, high, best = (middle, high, best) if found is None else (low, middle, found)
         return best
 
-    def enlarge_coarsely(self) -> Layout | None:
+    def enlarge_coarsely(self, least: float) -> Layout | None:
         """Find a small board for many bitmaps."""
-        return self._scan(_COARSE)[0]
+        return self._scan(least, _COARSE)[0]
 
-    def _scan(self, precision: float) -> tuple[Layout | None, int]:
+    def _scan(self, least: float, precision: float) -> tuple[Layout | None, int]:
         """Find a small board on which the bitmaps fit; return the layout and the number of cells.
 
         On a larger board, they may not fit: the first ones then lie elsewhere. So all sizes are tried, smallest first.
         """
         cells = int(_FEWEST_CELLS * self.cells)
-        last = int(MORE_CELLS * self.cells)
+        last = int(min(MORE_CELLS * self.cells, max(self._size) / (self._cell * least)))
         while (best := self.place_in(cells)) is None and cells < last:
             cells = min(cells + max(1, int(precision * cells)), last)
         return best, cells

@@ -21,8 +21,6 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
 # Share of the tiles that charts with half the padding around them are expected to cover.
 _EXPECTED = 0.8
-# Placements tried with other orders of the charts for an estimate, in all.
-_ESTIMATED = 100
 # Directions compared for the expected scale.
 _TURNS = 16
 # Angles compared for the direction of a single chart, and the precision of the best one.
@@ -77,7 +75,9 @@ def find_layout(
             return None
         search = BitmapSearch(shapes, size, padding, tiles, scale, rotate=rotate, bitmaps=bitmaps)
         return search.place_in(search.cells)
-    layout, order = _enlarge(shapes, size, padding, tiles, TRIALS, rotate=rotate, bitmaps=bitmaps)
+    layout, order = _enlarge(
+        shapes, size, padding, tiles, least_scale(shapes), TRIALS, rotate=rotate, bitmaps=bitmaps
+    )
     if layout is None:
         return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
     if order is None:
@@ -87,16 +87,22 @@ def find_layout(
 
 
 def _enlarge(
-    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, trials: int, **drawing: bool | int
+    shapes: Sequence[Shape],
+    size: tuple[int, int],
+    padding: float,
+    tiles: int,
+    least: float,
+    trials: int,
+    **drawing: bool | int,
 ) -> tuple[Layout, IntArray | None] | tuple[None, None]:
-    """Place shapes at a large scale; return the layout, and the order of few shapes."""
-    expected, least = _expected_scale(shapes, size, padding, tiles), least_scale(shapes)
+    """Place shapes at a large scale, larger than the least; return the layout, and the order of few shapes."""
+    expected = _expected_scale(shapes, size, padding, tiles)
     while expected > least:
         search = BitmapSearch(shapes, size, padding, tiles, expected, **drawing)  # type: ignore[arg-type]
         if len(shapes) > MANY:
-            if (layout := search.enlarge_coarsely()) is not None:
+            if (layout := search.enlarge_coarsely(least)) is not None:
                 return layout, None
-        elif (found := search.enlarge(trials)) is not None:
+        elif (found := search.enlarge(least, trials)) is not None:
             return found
         expected /= MORE_CELLS
     return None, None
@@ -152,11 +158,14 @@ def find_layout_around(
     return best
 
 
-def estimate_use(shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool) -> float:
-    """Part of the tiles that shapes cover if they are placed quickly; 0 if they do not fit well."""
-    layout, _ = _enlarge(shapes, size, padding, tiles, _ESTIMATED, rotate=rotate, skewed=False)
-    area = sum(shape.area for shape in shapes)
-    return 0.0 if layout is None else area * layout.scale**2 / (tiles * size[0] * size[1])
+def estimate_use(
+    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool, above: float = 0.0
+) -> float:
+    """Part of the tiles that shapes cover if they are placed quickly; 0 if that is not above a given part."""
+    area, room = sum(shape.area for shape in shapes), tiles * size[0] * size[1]
+    least = max(least_scale(shapes), sqrt(above * room / area)) if area > 0 else np.inf
+    layout, _ = _enlarge(shapes, size, padding, tiles, least, 0, rotate=rotate, skewed=False)
+    return 0.0 if layout is None else area * layout.scale**2 / room
 
 
 def _may_fit(shapes: Sequence[Shape], size: tuple[int, int], tiles: int, scale: float) -> bool:

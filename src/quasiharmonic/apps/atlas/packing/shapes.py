@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -47,6 +48,14 @@ class Shape:
     area: float
     direction: complex
     straight: bool
+
+    @cached_property
+    def outline_lengths(self) -> tuple[float, float]:
+        """Length of the outline along the sides of the box with the shape's direction, and in all."""
+        along = (self.heads - self.tails) / self.direction
+        length = np.abs(along)
+        straight = np.minimum(np.abs(along.real), np.abs(along.imag)) <= np.sin(_SKEW) * length
+        return float(length[straight].sum()), float(length.sum())
 
     def extent(self, direction: complex) -> tuple[float, float]:
         """Width and height of the shape's box with a side along a unit vector."""
