@@ -7,6 +7,7 @@ steps and records each. Ctrl-C is caught here and nowhere else in the library: c
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -156,10 +157,11 @@ def finish(compute: Callable[[], T]) -> tuple[T, bool]:
 
 
 def run_until(seconds: float | None, compute: Callable[[], T]) -> T | None:
-    """Return the result of a computation, or None if the time limit ends it. Other interrupts propagate."""
-    if seconds is None:
-        return compute()
-    with time_limit(seconds) as limit:
+    """Return the result of a computation, or None if the time limit or `end_work` ends it.
+
+    Other interrupts propagate.
+    """
+    with time_limit(math.inf if seconds is None else seconds) as limit:
         with Run().until_interrupted():
             return compute()
         if not limit.reached:

@@ -17,7 +17,14 @@ from typing import Any, TypeVar
 F = TypeVar("F", bound=Callable[..., Any])
 
 # Names of the values that some options accept; the dictionaries with the values themselves are tested to have these.
-ENERGIES = "symmetric-dirichlet", "mips", "blend", "arap-barrier"
+#: Energies, and what each preserves.
+ENERGY_LABELS = {
+    "symmetric-dirichlet": "lengths and angles",
+    "mips": "angles",
+    "blend": "angles, some area",
+    "arap-barrier": "rigid",
+}
+ENERGIES = tuple(ENERGY_LABELS)
 FLATTENED = *ENERGIES, "distances"
 HARMONISED = "arap", "arap-unsigned", "area", "springs", *ENERGIES
 STRATEGIES = "speed", "paper"

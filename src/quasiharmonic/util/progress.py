@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, NoReturn, ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -91,6 +91,11 @@ class TimeLimit:
         if self._outer is not None:
             self._outer.check(ahead)
 
+    def end(self) -> None:
+        """End the limit now, in all threads."""
+        self._end = -np.inf
+        self.check()
+
 
 _TIME_LIMIT: ContextVar[TimeLimit | None] = ContextVar("time limit", default=None)
 
@@ -104,6 +109,14 @@ def time_limit(seconds: float) -> Iterator[TimeLimit]:
         yield limit
     finally:
         _TIME_LIMIT.reset(token)
+
+
+def end_work() -> NoReturn:
+    """End the work as a time limit does, with the best result so far; for callbacks."""
+    limit = _TIME_LIMIT.get()
+    if limit is not None:
+        limit.end()
+    raise KeyboardInterrupt
 
 
 def keep_time_limit(function: Callable[P, R]) -> Callable[P, R]:

@@ -51,7 +51,7 @@ def serve(source: str, folder: str = "") -> None:
             os._exit(0)
 
     inbox = Inbox(detach_input())
-    session = Session(tell, inbox.waiting, Storage(Path(folder)) if folder else None)
+    session = Session(tell, inbox.waiting, Storage(Path(folder)) if folder else None, inbox.stops)
     try:
         if session.restore():
             tell({"kind": "restored"}, {})
@@ -105,6 +105,10 @@ class Inbox:
             self._bytes -= size
             self._changed.notify()
             return frame
+
+    def stops(self) -> bool:
+        """Whether a waiting message asks for the best result so far."""
+        return any(frame.header.get("do") == "stop" for frame, _ in self._messages.copy())
 
     def waiting(self) -> bool:
         """Whether a waiting message makes the current computation unnecessary; `_HARMLESS` ones do not."""

@@ -22,8 +22,10 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.http11 import Request, Response
 
 from quasiharmonic.ui.studio.assets import assets
+from quasiharmonic.ui.studio.offered import offered_options
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
 from quasiharmonic.ui.studio.server.pages import Page
+from quasiharmonic.util.options import ENERGY_LABELS
 
 HOST = "127.0.0.1"
 #: Maximum size of an uploaded file in bytes.
@@ -155,7 +157,8 @@ class Studio:
         async def tell(message: bytes) -> None:
             await connection.send(message)
 
-        await tell(encode({"kind": "hello", "most_bytes": MAX_BYTES}))
+        offered = {"options": offered_options(), "energies": ENERGY_LABELS}
+        await tell(encode({"kind": "hello", "most_bytes": MAX_BYTES, **offered}))
         session = self._session_of(connection)
         await self._take_over(session)
         try:

@@ -34,7 +34,7 @@ def mapped_model(state: SessionState, texture: io.Texture | None) -> io.MeshData
     """Return the file's mesh with the map of a state and an image; RequestError if there is no map."""
     if state.mesh.uv is None:
         raise RequestError("there is no map to save yet: press Unwrap or Flatten first")
-    mesh = state.sheet.mapped_file(state.mesh)
+    mesh = state.sheet.mesh if state.recipe.of_file else state.sheet.mapped_file(state.mesh)
     return mesh if texture is None else replace(mesh, texture=texture)
 
 

@@ -14,6 +14,8 @@ from quasiharmonic.ui.studio.session.state import SessionState, bad_triangles, v
 from quasiharmonic.util.arrays import FloatArray, pad_to_space
 
 Message = tuple[Mapping[str, Any], Mapping[str, Array]]
+#: Number of the chain of edges that must not become seams.
+FORBIDDEN = 0xFFFFFFFF
 # Maximum number of islands with an entry of their own in the list of the page.
 _MAX_LISTED = 400
 
@@ -118,7 +120,9 @@ def asked_boundary(state: SessionState, targets: Mapping[int, FloatArray], origi
 
 
 def seams_message(state: SessionState) -> Message:
-    """Return the seams, each side with the number of its chain; or those that the user drew."""
-    sides = sides_of(state, find_seams(state))
+    """Return the seams, each side with the number of its chain; or those that the user drew; then forbidden edges."""
+    sides, forbidden = sides_of(state, find_seams(state)), sides_of(state, state.forbidden).edges
     header = {"kind": "seams", "drawn": state.drawn is not None, "chains": int(sides.chains.max(initial=-1)) + 1}
-    return header, {"edges": sides.edges.astype(np.uint32), "chain": sides.chains.astype(np.uint32)}
+    chains = np.concatenate([sides.chains, np.full(len(forbidden), FORBIDDEN)])
+    edges = np.concatenate([sides.edges, forbidden])
+    return header, {"edges": edges.astype(np.uint32), "chain": chains.astype(np.uint32)}

@@ -17,6 +17,7 @@ from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, mirrored_islands
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland, each_island
 from quasiharmonic.apps.atlas.seam_cuts import cut_along, cut_apart
 from quasiharmonic.apps.repair.fitting import find_corner_vertices, fit_boundary, fix_in_place
+from quasiharmonic.apps.repair.uv_repair import repair
 from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import certify
@@ -35,15 +36,22 @@ from quasiharmonic.ui.studio.session.outlines import Outline
 from quasiharmonic.ui.studio.session.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Source
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import IntArray
 
 Callback = Callable[[Step], object] | None
 
 
+class Interrupted(KeyboardInterrupt):
+    """A step was interrupted; ``mesh`` has the best map so far."""
+
+    def __init__(self, mesh: SeamedMesh) -> None:
+        super().__init__()
+        self.mesh = mesh
+
+
 def find_source(state: SessionState, *, with_map: bool) -> Source:
     """Return the file from which a step starts; ``with_map`` if the step depends on the current map."""
-    unchanged = not state.recipe.command and not state.recipe.start
-    if state.sheet.is_file and state.from_file and (unchanged or not with_map):
+    if state.sheet.is_file and state.from_file and (state.recipe.of_file or not with_map):
         return Source(state.sheet.name, None)
     return make_start(state.mesh)
 
@@ -162,12 +170,12 @@ def flatten_islands(state: SessionState, callback: Callback = None) -> SessionSt
     if state.drawn is not None:
         return _flatten_along(state, state.drawn, callback)
     mesh, only = state.mesh, choose(state)
-    pins = [int(one.island.vertices[v]) for k, one in enumerate(state.islands) for v in one.pins if k in state.selected]
-    source = find_source(state, with_map=only is not None or bool(pins))
+    pins = _list_pins(state, state.selected)
+    source = find_source(state, with_map=only is not None or pins is not None)
     cut = only is None and not all(is_flattenable(one.island) for one in state.islands)
     if cut:
         mesh = cut_apart(mesh, polygons=_polygons(state, source), disks_too=True)
-    options = {"fixed": _saved_list(pins) if pins and not cut else None}
+    options = {"fixed": None if cut else pins}
     mapped = atlas.flatten(mesh, islands=only, callback=callback, **recipes.values(options))
     words, lines = ["--cut"] if cut else [], list[str]()
     if cut:
@@ -178,35 +186,25 @@ def flatten_islands(state: SessionState, callback: Callback = None) -> SessionSt
     return replace(after, from_file=state.from_file and not cut)
 
 
-def pack_all(state: SessionState, resolution: int, padding: float) -> SessionState:
-    """Pack all islands into the unit square, at one texel density."""
-    source = find_source(state, with_map=True)
-    laid = atlas.flatten(state.mesh, start=True, max_iterations=0)
-    mesh = atlas.pack(laid.mesh, resolution=resolution, padding=padding)
-    size = {"resolution": resolution, "padding": padding}
-    words = ["--start", "--max-iterations", "0", "--pack"]
-    lines = [
-        f"flat = atlas.flatten({source.name!r}, start=True, max_iterations=0).mesh",
-        f"mesh = atlas.pack(flat{recipes.arguments(**size)})",
-    ]
-    recipe = recipes.record_call("flatten", source, "packed.obj", size, words=words, lines=lines)
-    return as_it_is(state, mesh, recipe, keep=("pins",))
+def _list_pins(state: SessionState, islands: Sequence[int]) -> Given | None:
+    """Return the pins of some islands, in the surface's numbering; None if there are none."""
+    pins = [int(state.islands[k].island.vertices[v]) for k in islands for v in state.islands[k].pins]
+    return recipes.saved_rows(FIXED, "fixed", np.array(pins)) if pins else None
 
 
-def move_islands(state: SessionState, by: FloatArray, turn: float) -> SessionState:
-    """Move the selected islands together by a vector (2,), after a rotation by ``turn`` degrees around their centre."""
-    require_map(state)
-    places = [island.uv for island in state.mesh.islands]
-    moving = np.concatenate([places[k] for k in state.selected])
-    centre = (moving.min(axis=0) + moving.max(axis=0)) / 2
-    cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-    if turn % 90 == 0:  # Quarter turns are exact.
-        cos, sin = np.rint(cos), np.rint(sin)
-    matrix = np.array([[cos, sin], [-sin, cos]])
-    for k in state.selected:
-        places[k] = (places[k] - centre) @ matrix + centre + by if turn else places[k] + by
-    mesh = state.mesh.with_places(places)
-    return as_it_is(state, mesh, saved_start(mesh), keep=("pins",))
+def repair_islands(state: SessionState, callback: Callback = None) -> SessionState:
+    """Make inverted triangles positive; boundaries, pins, and all vertices that need not move keep their positions."""
+    source, mesh = find_source(state, with_map=True), state.mesh
+    options = {"fixed": _list_pins(state, range(len(state.islands)))}
+    assert mesh.uv is not None
+    result = repair(mesh.V, mesh.F, mesh.uv, FT=mesh.FT, callback=callback, **recipes.values(options))
+    lines = [f"mesh = repair({source.name!r}{recipes.arguments(**options)}).mesh"]
+    recipe = recipes.record_call("repair", source, "repaired.obj", options, lines=lines)
+    after = as_it_is(state, result.mesh, recipe, keep=("pins",))
+    for k, (one, done) in enumerate(zip(after.islands, result.islands, strict=False)):
+        if one.result is not None and done.diagnosis is not None:
+            after = after.with_island(k, replace(one, result=replace(one.result, diagnosis=done.diagnosis)))
+    return after
 
 
 def is_flattenable(island: Island) -> bool:
@@ -221,9 +219,8 @@ def solve_smoothly(problem: Problem, callback: Callback) -> MapResult:
     result = solve(problem, max_iterations=2000, callback=callback)
     if result.status is Status.INJECTIVE:
         result = smooth(problem, result, callback=callback)
-    if result.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
-    if not result.certificate.bijective and result.diagnosis is None:
+    interrupted = result.status is Status.INTERRUPTED
+    if not interrupted and not result.certificate.bijective and result.diagnosis is None:
         result = replace(result, diagnosis=diagnose(problem))
     return result
 
@@ -233,9 +230,9 @@ def rebuild(state: SessionState, mapped: MappedAtlas, recipe: Recipe, keep: Coll
 
     Islands that were not selected and have not moved are unchanged. All islands are selected if their number changes.
     """
-    selected = state.selected if len(mapped.islands) == len(state.islands) else tuple(range(len(mapped.islands)))
     if any(one.result.status is Status.INTERRUPTED for one in mapped.islands):
-        raise KeyboardInterrupt
+        raise Interrupted(mapped.mesh)
+    selected = state.selected if len(mapped.islands) == len(state.islands) else tuple(range(len(mapped.islands)))
     islands = []
     for k, (island, one) in enumerate(zip(mapped.mesh.islands, mapped.islands, strict=True)):
         before = state.islands[k] if k < len(state.islands) else None
@@ -289,14 +286,7 @@ def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool 
     for one in chosen:
         boundary = boundary_edges(one.island.F, len(one.island.vertices))[: 0 if slide else None]
         rows.append(one.island.vertices[np.union1d(boundary, np.array(one.pins, int))])
-    return _saved_list(np.unique(np.concatenate(rows)).tolist())
-
-
-def _saved_list(vertices: list[int]) -> Given:
-    """Return fixed vertices as an argument, from a file that the page saves."""
-    content = "".join(f"{vertex}\n" for vertex in vertices).encode()
-    code = Code(f"np.loadtxt({FIXED!r}, dtype=np.int64)")
-    return Given(np.array(vertices), code, {"fixed": FIXED}, {FIXED: content})
+    return recipes.saved_rows(FIXED, "fixed", np.unique(np.concatenate(rows)))
 
 
 def _polygons(state: SessionState, source: Source) -> Any:
@@ -325,15 +315,16 @@ def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> 
     if cut:
         mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
     mapped = atlas.flatten(mesh, callback=callback)
+    saved = recipes.saved_rows(SEAMS, "seams", drawn)
     lines = [
         f"mesh = atlas.as_seamed_mesh({source.name!r})",
         "mesh = atlas.SeamedMesh(mesh.V, mesh.F)",
-        *([f"mesh = mesh.cut(np.loadtxt({SEAMS!r}, dtype=np.int64).reshape(-1, 2))"] if len(drawn) else []),
+        *([f"mesh = mesh.cut({saved.code})"] if len(drawn) else []),
         *(_cut_lines(state, source) if cut else []),
         *recipes.call_lines("flatten", "mesh", {}, None),
     ]
-    texts = {SEAMS: "".join(f"{a} {b}\n" for a, b in drawn.tolist()).encode()} if len(drawn) else {}
-    options = {"seams": Given(drawn, Code(), {"seams": SEAMS if texts else "none", "cut": cut}, texts)}
+    words = {"seams": SEAMS if len(drawn) else "none", "cut": cut}
+    options = {"seams": replace(saved, words=words, texts=saved.texts if len(drawn) else {})}
     recipe = recipes.record_call("flatten", source, "flat.obj", options, lines=lines)
     after = rebuild(state, mapped, recipe)
     return replace(after, from_file=False, selected=tuple(range(len(mapped.islands))))
@@ -351,4 +342,4 @@ def require_injective(state: SessionState) -> None:
     bad = [k for k in state.selected if not state.islands[k].injective]
     if bad:
         which = "the map has" if len(state.islands) == 1 else f"island {bad[0]} has"
-        raise RequestError(f"{which} inverted triangles: undo, or select it and press Flatten")
+        raise RequestError(f"{which} inverted triangles: press Repair, or undo")

@@ -10,15 +10,18 @@ from typing import Any
 
 from quasiharmonic.energies.polishing import SMOOTHING_STEPS
 from quasiharmonic.io import MeshData
+from quasiharmonic.util.arrays import IntArray
 
 #: Names of the files that the page saves: the map, the map from which the last step started, the fixed vertices, the
-#: seams that the user drew.
-MAP, START, FIXED, SEAMS = "map.obj", "start.obj", "fixed.txt", "seams.txt"
+#: seams that the user drew, the edges that must not become seams, the triangles to unwrap.
+MAP, START, FIXED, SEAMS, FORBIDDEN, FACES = (
+    *("map.obj", "start.obj", "fixed.txt", "seams.txt", "no_seams.txt", "faces.txt"),
+)
 # Names that scripts use, by the modules that they import them from.
 _IMPORTS = {
-    "quasiharmonic": ("BoundaryCurves", "atlas", "find_cuts", "injective_map", "io", "polish", "unwrap"),
+    "quasiharmonic": ("BoundaryCurves", "atlas", "find_cuts", "injective_map", "io", "polish", "repair", "unwrap"),
     "quasiharmonic.targets": ("boundary_to", "filled", "outline", "outline_curves"),
-    "quasiharmonic.apps.unwrapping.model_files": ("polygon_costs",),
+    "quasiharmonic.apps.unwrapping.model_files": ("polygon_costs", "statement_labels"),
 }
 
 
@@ -33,6 +36,11 @@ class Recipe:
     outline: str | None = None  # The outline of the boundary
     anew: bool = True  # Whether the map was solved from scratch
     dragged: bool = False  # Whether the map ended a drag
+
+    @property
+    def of_file(self) -> bool:
+        """Whether the map is that of the file."""
+        return not self.command and self.start is None
 
     def files(self) -> list[str]:
         """Return the names of the saved files that command and script read."""
@@ -123,6 +131,13 @@ def record_call(
 def call_lines(verb: str, mesh: str, options: Mapping[str, Any], only: Sequence[int] | None) -> list[str]:
     """Return the lines that call a function of `atlas` for some islands of ``mesh``, which is Python code."""
     return [f"result = atlas.{verb}({mesh}{arguments(**options, islands=only)})", "mesh = result.mesh"]
+
+
+def saved_rows(name: str, option: str, rows: IntArray) -> Given:
+    """Return whole numbers, (k,) or (k, 2), as the argument ``option``, from a file that the page saves."""
+    content = "".join(" ".join(map(str, row)) + "\n" for row in rows.reshape(len(rows), -1).tolist()).encode()
+    shape = ".reshape(-1, 2)" if rows.ndim == 2 else ""
+    return Given(rows, Code(f"np.loadtxt({name!r}, dtype=np.int64){shape}"), {option: name}, {name: content})
 
 
 def write_script(lines: Sequence[str]) -> str:

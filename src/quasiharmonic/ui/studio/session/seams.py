@@ -8,10 +8,11 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from quasiharmonic.apps.unwrapping.symmetry import find_mirror
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components, pair_keys
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, pad_to_space
 
 
 class SeamSides(NamedTuple):
@@ -77,11 +78,40 @@ def add_edges(seams: IntArray, more: IntArray) -> IntArray:
     return np.unique(np.sort(np.concatenate([seams, more.reshape(-1, 2)]), axis=1), axis=0)
 
 
-def erase_chain(seams: IntArray, V: FloatArray, vertex: int) -> IntArray:
-    """Return seams without the chain that is nearest to a vertex; RequestError if there are none."""
+def remove_edges(seams: IntArray, fewer: IntArray, n: int) -> IntArray:
+    """Return seams without some edges, of a surface with n vertices."""
+    return seams[~np.isin(pair_keys(seams, n), pair_keys(fewer, n))]
+
+
+def find_chain(seams: IntArray, V: FloatArray, vertex: int) -> IntArray:
+    """Return the chain of seams (k, 2) that is nearest to a vertex; RequestError if there are none."""
     if not len(seams):
-        raise RequestError("there are no seams to erase")
+        raise RequestError("there are no seams")
     middle = (V[seams[:, 0]] + V[seams[:, 1]]) / 2
     nearest = int(np.argmin(((middle - V[vertex]) ** 2).sum(axis=1)))
     chains = _label_chains(seams)
-    return seams[chains != chains[nearest]]
+    return seams[chains == chains[nearest]]
+
+
+def add_mirrored(edges: IntArray, V: FloatArray, F: IntArray, axis: str | None) -> IntArray:
+    """Return edges with their mirror images in the middle plane normal to an axis; without axis unchanged.
+
+    RequestError if the surface is not symmetric.
+    """
+    if axis is None:
+        return edges
+    mirror, found = find_mirror(pad_to_space(V), F, axis)
+    if mirror is None:
+        raise RequestError(f"the model is not symmetric in {axis}: {found.reason}. Choose another symmetry of Unwrap")
+    return add_edges(edges, mirror.vertex[edges])
+
+
+def pair_sides(state: SessionState, seams: IntArray) -> IntArray:
+    """Return both ends (k, 2, 2) of both sides of edges of seams, by vertices of the page: edge, end, side."""
+    sides, origin = sides_of(state, seams).edges, state.numbering.origin
+    swapped = origin[sides[:, 0]] > origin[sides[:, 1]]
+    ends = np.where(swapped[:, None], sides[:, ::-1], sides)
+    key = pair_keys(origin[ends], len(state.mesh.V))
+    order = np.argsort(key, kind="stable")
+    same = np.diff(key[order]) == 0
+    return np.stack([ends[order[:-1][same]], ends[order[1:][same]]], axis=2)

@@ -5,21 +5,25 @@ The module is independent of sockets and processes. The caller passes in message
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from quasiharmonic.io.models.textures import Texture, texture_of
-from quasiharmonic.ui.studio.protocol import Array, MessageFrame
-from quasiharmonic.ui.studio.session import frames, operations, validation
-from quasiharmonic.ui.studio.session.drag import DragMap, Follower, drag_weights
+from quasiharmonic.io.models.textures import texture_of
+from quasiharmonic.ui.studio.protocol import MessageFrame
+from quasiharmonic.ui.studio.session import layout, operations, validation
+from quasiharmonic.ui.studio.session.drag import Follower, drag_weights
 from quasiharmonic.ui.studio.session.exports import list_files
-from quasiharmonic.ui.studio.session.history import History
-from quasiharmonic.ui.studio.session.islands import Numbering
 from quasiharmonic.ui.studio.session.outlines import Outline, make_outline, make_polygon, read_drawing
-from quasiharmonic.ui.studio.session.seams import add_edges, erase_chain, find_seams, shortest_path
+from quasiharmonic.ui.studio.session.seams import (
+    add_edges,
+    add_mirrored,
+    find_chain,
+    find_seams,
+    remove_edges,
+    shortest_path,
+)
 from quasiharmonic.ui.studio.session.setup import (
     make_first_state,
     open_without_map,
@@ -28,56 +32,18 @@ from quasiharmonic.ui.studio.session.setup import (
     with_corner,
     with_start,
 )
-from quasiharmonic.ui.studio.session.state import DistortionMonitor, SessionState, describe_obstructions
-from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import PageSurface, make_first_sheet, read_upload
-from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
+from quasiharmonic.ui.studio.session.unwrapping import read_options, unwrap_model
+from quasiharmonic.ui.studio.session.updates import DragState, PageUpdates
 from quasiharmonic.ui.studio.session.validation import RequestError
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import IntArray
 from quasiharmonic.util.options import ENERGIES
 
 _LARGEST_TEXTURE = 16_384
 
-Tell = Callable[[Mapping[str, Any], Mapping[str, Array]], None]
 
-
-@dataclass(eq=False)
-class _DragState:
-    """State of a drag."""
-
-    island: int
-    place: FloatArray  # (2,): position where the drag started
-    share: FloatArray  # (k,): share of the motion for each fixed vertex
-    follower: Follower | None  # Computes the maps, if the drag starts from an injective map
-    goal: FloatArray | None = None  # (k, 2): current target positions of the fixed vertices
-    shown: DragMap | None = None  # The last map
-
-
-class Session:
-    """Session of one page.
-
-    ``tell`` sends a header and arrays to the page. ``waiting`` returns whether a newer message makes the current
-    computation unnecessary. With a ``storage``, each state at rest is stored.
-    """
-
-    def __init__(self, tell: Tell, waiting: Callable[[], bool] = lambda: False, storage: Storage | None = None) -> None:
-        self._tell, self._waiting = tell, waiting
-        self._history = History(storage)
-        self._numbering: Numbering | None = None
-        self._drag_state: _DragState | None = None
-        self._after = -1
-        self._origin = np.zeros(2)
-        self._working = False
-
-    @property
-    def state(self) -> SessionState:
-        """The state that the page shows."""
-        return self._history.state
-
-    @property
-    def texture(self) -> Texture | None:
-        """The image on the surface."""
-        return self._history.texture
+class Session(PageUpdates):
+    """Session of one page: handles its messages."""
 
     def open(self, sheet: PageSurface | None = None) -> None:
         """Open a model, by default a built-in one; its surface is shown before there is a map.
@@ -116,6 +82,8 @@ class Session:
             if do is None:
                 raise RequestError(f"unknown request {str(what)[:40]!r}")
             do(frame)
+        except operations.Interrupted as end:
+            self._keep_best(end)
         except KeyboardInterrupt:
             self._show()
         except Exception as error:
@@ -126,6 +94,14 @@ class Session:
             known = isinstance(error, ValueError | OSError | ArithmeticError | RuntimeError | ImportError)
             text = str(error) if known else f"unexpected {type(error).__name__}: {error}"
             self._tell({"kind": "note", "level": "error", "text": text}, {})
+
+    def _keep_best(self, end: operations.Interrupted) -> None:
+        """After Stop, keep the map that an interrupted step had, if it is injective."""
+        best = operations.as_it_is(self.state, end.mesh, operations.saved_start(end.mesh), keep=("pins",))
+        if self._stopped and best.injective:
+            self._keep(best)
+        else:
+            self._show()
 
     # --- models, selection and seams ---------------------------------------------------------------------------------
 
@@ -146,18 +122,49 @@ class Session:
         self._show()
 
     def _do_seam(self, frame: MessageFrame) -> None:
-        """Add the shortest path between two vertices to the seams."""
+        """Add the shortest path between two vertices to the seams, or to the edges that must not become seams."""
         state, mesh = self.state, self.state.mesh
         start, end = self._model_vertex(frame, "start"), self._model_vertex(frame, "vertex")
-        if start != end:
-            path = shortest_path(mesh.V, mesh.F, start, end)
-            self._keep(replace(state, drawn=add_edges(find_seams(state), path)))
+        if start == end:
+            return
+        path = self._mirrored(frame, shortest_path(mesh.V, mesh.F, start, end))
+        if frame.header.get("forbid") is True:
+            self._keep(replace(state, forbidden=add_edges(state.forbidden, path)))
+        else:
+            kept = remove_edges(state.forbidden, path, len(mesh.V))
+            self._keep(replace(state, drawn=add_edges(find_seams(state), path), forbidden=kept))
 
     def _do_erase(self, frame: MessageFrame) -> None:
-        """Remove the chain of seams nearest to a vertex."""
-        state = self.state
-        vertex = self._model_vertex(frame, "vertex")
-        self._keep(replace(state, drawn=erase_chain(find_seams(state), state.mesh.V, vertex)))
+        """Remove the nearest chain of seams, or of edges that must not become seams."""
+        state, V = self.state, self.state.mesh.V
+        seams = find_seams(state)
+        chain = find_chain(add_edges(seams, state.forbidden), V, self._model_vertex(frame, "vertex"))
+        chain = self._mirrored(frame, chain)
+        left = remove_edges(seams, chain, len(V))
+        drawn = state.drawn if len(left) == len(seams) else left
+        self._keep(replace(state, drawn=drawn, forbidden=remove_edges(state.forbidden, chain, len(V))))
+
+    def _mirrored(self, frame: MessageFrame, edges: IntArray) -> IntArray:
+        """Return edges with their mirror images, if the message names the axis of a symmetry."""
+        axis = frame.header.get("symmetry")
+        surface = self.state.sheet.surface
+        return add_mirrored(edges, surface.V, surface.F, axis if axis in ("x", "y", "z") else None)
+
+    def _do_stitch(self, frame: MessageFrame) -> None:
+        self._refuse_drawn()
+        operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
+        self._keep(layout.stitch_seam(self.state, self._model_vertex(frame, "vertex")), fit=True)
+
+    def _do_weld(self, frame: MessageFrame) -> None:
+        self._refuse_drawn()
+        operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
+        self._keep(layout.weld_seams(self.state, 1 / _read_size(frame, 2048)["resolution"]))
+
+    def _do_repair(self, frame: MessageFrame) -> None:
+        self._refuse_drawn()
+        operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
+        self._busy("repairing")
+        self._keep(operations.repair_islands(self.state, self._step))
 
     def _model_vertex(self, frame: MessageFrame, name: str) -> int:
         """Return the vertex of the model that a message names by its number on the page."""
@@ -199,26 +206,27 @@ class Session:
         self._keep(operations.flatten_islands(self.state, self._step), fit=True)
 
     def _do_unwrap(self, frame: MessageFrame) -> None:
-        max_stretch, size = float(validation.amount(frame, "max_stretch", 1, 10, 1.5)), _read_size(frame, 2048)
-        keep_seams = frame.header.get("keep_seams") is True
+        options = read_options(frame) | _read_size(frame, 2048)
+        which = {name: frame.header.get(name) is True for name in ("keep_seams", "selected")}
         self._busy("unwrapping")
-        after = unwrap_model(self.state, self._step, max_stretch=max_stretch, keep_seams=keep_seams, **size)
-        self._keep(after, fit=True)
+        self._keep(unwrap_model(self.state, self._step, **which, **options), fit=True)
 
     def _do_place(self, frame: MessageFrame) -> None:
-        """Move or rotate the selected islands."""
-        by, turn = validation.place(frame), validation.amount(frame, "turn", -360, 360, 0)
+        """Move, rotate, scale or mirror the selected islands."""
+        by, turn = validation.place(frame), float(validation.amount(frame, "turn", -360, 360, 0))
+        scale, mirror = float(validation.amount(frame, "scale", 1e-3, 1e3, 1)), frame.header.get("mirror") is True
+        texels = _read_size(frame, 2048)["resolution"] if "resolution" in frame.header else None
         # The page has already moved them.
         self._busy("moving the islands")
         self._refuse_drawn()
-        self._keep(operations.move_islands(self.state, by, float(turn)))
+        self._keep(layout.move_islands(self.state, by, turn, scale, mirror, texels))
 
     def _do_pack(self, frame: MessageFrame) -> None:
         self._refuse_drawn()
         operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
         size = _read_size(frame, 1024)
         self._busy("packing")
-        self._keep(operations.pack_all(self.state, **size), fit=True)
+        self._keep(layout.pack_all(self.state, **size), fit=True)
 
     def _do_polish(self, frame: MessageFrame) -> None:
         energy, slide = validation.text(frame, "energy"), frame.header.get("slide") is True
@@ -268,7 +276,7 @@ class Session:
         follows = one.injective and one.in_place
         follower = Follower(problem, one.result.uv, one.result.certificate) if follows else None
         place = problem.target[np.flatnonzero(problem.fixed == vertex)[0]]
-        self._drag_state = _DragState(k, place, share, follower)
+        self._drag_state = DragState(k, place, share, follower)
 
     def _do_drag(self, frame: MessageFrame) -> None:
         to, seq = validation.place(frame), validation.number(frame, "seq")
@@ -329,73 +337,6 @@ class Session:
         self._history.mark_saved()
         self._tell({"kind": "saved"}, {})
 
-    # --- updates of the page -----------------------------------------------------------------------------------------
-
-    def _step(self, step: Any) -> None:
-        """Report progress of a computation; KeyboardInterrupt if it is no longer needed."""
-        if self._waiting():
-            raise KeyboardInterrupt
-        if hasattr(step, "phase"):
-            self._tell({"kind": "progress", "phase": step.phase, "done": step.done, "total": step.total}, {})
-        else:
-            self._tell({"kind": "progress", "flips": step.inverted, "energy": _finite(step.energy)}, {})
-
-    def _keep(self, state: SessionState, *, fit: bool = False) -> None:
-        """Add a state as the last one, and show it."""
-        self._history.add(state)
-        self._show(fit=fit)
-
-    def _send_surface(self, state: SessionState) -> None:
-        self._numbering = state.numbering
-        self._measured = DistortionMonitor(state.numbering.V, state.numbering.F)
-        self._tell(*frames.surface_message(state))
-
-    def _send_image(self) -> None:
-        content, kind = (b"", "") if self.texture is None else (self.texture.data, self.texture.media_type)
-        self._tell({"kind": "image", "type": kind}, {"content": np.frombuffer(content, dtype=np.uint8)})
-
-    def _show(self, *, fit: bool = False) -> None:
-        """Send the current state to the page."""
-        state, self._working = self.state, False
-        if not state.numbering.same(self._numbering):
-            self._send_surface(state)
-            fit = True
-        if fit and state.mapped:
-            uv = state.uv
-            self._origin = (uv.min(axis=0) + uv.max(axis=0)) / 2
-        fields = frames.state_fields(state) | self._history.fields() | {"fit": fit}
-        self._tell(*frames.seams_message(state))
-        self._tell_map(fields, everything=state.mapped)
-        self._tell({"kind": "obstructions", "obstructions": describe_obstructions(state)}, {})
-        self._history.write()
-
-    def _tell_map(
-        self,
-        fields: Mapping[str, Any],
-        *,
-        seq: int = -1,
-        everything: bool = False,
-        shown: DragMap | None = None,
-        asked: FloatArray | None = None,
-    ) -> None:
-        """Send the whole map, or that of the dragged island, with its certificate; otherwise only the target."""
-        state, drag = self.state, self._drag_state
-        header = {"kind": "map", "seq": seq, "after": self._after, "fit": False, "origin": self._origin.tolist()}
-        header |= {**frames.handle_fields(state), **fields}
-        arrays: dict[str, Array] = {}
-        if everything or shown is not None:
-            dragged = None if shown is None or drag is None else (drag.island, shown)
-            more, arrays, uv = frames.map_message(state, self._origin, dragged)
-            header |= more | self._measured.look(uv, now=seq < 0)
-        targets = {} if asked is None or drag is None else {drag.island: asked}
-        if targets or (everything and not state.in_place):
-            arrays["asked"] = frames.asked_boundary(state, targets, self._origin)
-        self._tell(header, arrays)
-
-    def _busy(self, what: str) -> None:
-        self._working = True
-        self._tell({"kind": "busy", "what": what}, {})
-
 
 def _read_size(frame: MessageFrame, resolution: int) -> dict[str, Any]:
     """Return resolution, by default the given one, and padding of a texture."""
@@ -403,7 +344,3 @@ def _read_size(frame: MessageFrame, resolution: int) -> dict[str, Any]:
         "resolution": int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, resolution)),
         "padding": float(validation.amount(frame, "padding", 0, 64, 4)),
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -39,6 +39,7 @@ class SessionState:
     selected: tuple[int, ...] = (0,)  # Indices of the selected islands, ascending, at least one
     from_file: bool = True  # Whether the seams are those of the file
     drawn: IntArray | None = None  # (k, 2): edges of the seams that the user drew, if they changed
+    forbidden: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))  # (k, 2): never seams
 
     @cached_property
     def numbering(self) -> Numbering:
@@ -76,6 +77,11 @@ class SessionState:
     def uv(self) -> FloatArray:
         """The map of all islands (n, 2), in the numbering of the page."""
         return np.concatenate([place(one) for one in self.islands])
+
+    @cached_property
+    def signs(self) -> FloatArray:
+        """Factors (n, 2) from the map on the page to one in which mirrored islands are reflected."""
+        return np.concatenate([np.broadcast_to(one.sign, one.island.uv.shape) for one in self.islands])
 
     # --- the first selected island ------------------------------------------------------------------------------------
 
@@ -127,11 +133,14 @@ class DistortionMonitor:
         self._when, self._cost = -np.inf, 0.0
         self._numbers: dict[str, Any] = {}
 
-    def look(self, uv: FloatArray, *, now: bool) -> dict[str, Any]:
-        """Return energy, worst stretch, used space and scale of a map; recent values unless ``now`` is True."""
+    def look(self, uv: FloatArray, reflected: FloatArray, *, now: bool) -> dict[str, Any]:
+        """Return energy, worst stretch, used space and scale of a map; recent values unless ``now`` is True.
+
+        ``reflected`` is the map with mirrored islands reflected.
+        """
         began = time.perf_counter()
         if now or began - self._when > max(0.15, 8 * self._cost):
-            measured = distortion(self._V, self._F, uv)
+            measured = distortion(self._V, self._F, reflected)
             defined = ~np.isnan(measured.isometric)
             with np.errstate(invalid="ignore"):
                 energy = float(measured.share[defined] @ measured.symmetric_dirichlet[defined])

@@ -8,45 +8,78 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.model_files import polygon_costs
-from quasiharmonic.apps.unwrapping.result import UnwrapStep
+from quasiharmonic.apps.unwrapping.model_files import polygon_costs, statement_labels
+from quasiharmonic.apps.unwrapping.result import UnwrapStatus, UnwrapStep
 from quasiharmonic.apps.unwrapping.unwrap import unwrap
 from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.ui.studio.offered import NAMES
+from quasiharmonic.ui.studio.protocol import MessageFrame
 from quasiharmonic.ui.studio.session import recipes
-from quasiharmonic.ui.studio.session.operations import as_it_is, make_start
-from quasiharmonic.ui.studio.session.recipes import Code, Given, Source
+from quasiharmonic.ui.studio.session.operations import as_it_is, make_start, saved_start
+from quasiharmonic.ui.studio.session.recipes import FACES, FORBIDDEN, SEAMS, Code, Given, Source
 from quasiharmonic.ui.studio.session.state import SessionState
+from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.util.options import UnwrapOptions
+
+# Keywords of the statements that divide an OBJ file into parts.
+_LABELS = {"groups": ("o", "g"), "materials": ("usemtl",)}
+
+
+def read_options(frame: MessageFrame) -> dict[str, Any]:
+    """Return the options of `unwrap` that a message has; ValueError or TypeError for invalid ones."""
+    given = frame.header.get("options", {})
+    if not isinstance(given, dict) or not set(given) <= set(NAMES):
+        raise RequestError(f"options of unwrap are {', '.join(NAMES)}")
+    if given.get("labels", "groups") not in _LABELS:
+        raise RequestError(f"labels are {' or '.join(_LABELS)}")
+    if given.get("symmetry") == "none":
+        given["symmetry"] = None
+    UnwrapOptions(**given)
+    return given
 
 
 def unwrap_model(
     state: SessionState,
     callback: Callable[[UnwrapStep], object] | None = None,
     *,
-    max_stretch: float = 1.5,
-    resolution: int = 2048,
-    padding: float = 4.0,
     keep_seams: bool = False,
+    selected: bool = False,
+    **given: Any,
 ) -> SessionState:
-    """Unwrap the whole model; with ``keep_seams``, or after seams were drawn, along the current seams at least.
+    """Unwrap the model with options of `unwrap`, along the seams that the user drew at least.
 
-    The other options are those of `unwrap`.
+    With ``keep_seams`` the seams of the map are kept. With ``selected`` only the selected islands are unwrapped.
     """
     sheet = state.sheet
-    kept: SeamedMesh | None = None
-    if state.drawn is not None:
-        kept = _with_any_positions(SeamedMesh(sheet.surface.V, sheet.surface.F).cut(state.drawn))
-    elif keep_seams and state.mapped:
-        kept = state.mesh
-    options: dict[str, Any] = {"max_stretch": max_stretch, "resolution": resolution, "padding": padding}
-    if kept is None and not sheet.turned:
+    options = {"max_stretch": 1.5, "resolution": 2048, "padding": 4.0, **given}
+    if options.get("symmetry", "") is None:
+        options["symmetry"] = Given(None, Code("None"), {"symmetry": "none"})
+    some = selected and state.mapped and len(state.selected) < len(state.islands)
+    if some or (keep_seams and state.drawn is None and state.mapped):
+        mesh = state.mesh
+        assert mesh.uv is not None
+        options["uv"] = Given(mesh.uv[mesh.FT], Code("model.vt[model.FT]"), {} if some else {"keep_seams": True})
+    else:
+        mesh = SeamedMesh(sheet.surface.V, sheet.surface.F)
+    if some:
+        triangles = np.sort(np.concatenate([state.islands[k].island.triangles for k in state.selected]))
+        options["faces"] = recipes.saved_rows(FACES, "faces", triangles)
+    edited = state.drawn is not None or len(state.forbidden) > 0
+    source, V, F = make_start(mesh), mesh.V, mesh.F
+    if "uv" not in options and not sheet.turned and (sheet.is_file or not edited):
         source, V, F = Source(sheet.name, None), sheet.mesh.V, sheet.mesh.F
         if (costs := polygon_costs(sheet.mesh)) is not None:
             options["edge_costs"] = Given(costs, Code("polygon_costs(model)"))
-    else:
-        mesh = SeamedMesh(sheet.surface.V, sheet.surface.F) if kept is None else kept
-        source, V, F = make_start(mesh), mesh.V, mesh.F
-        if mesh.uv is not None:
-            options["uv"] = Given(mesh.uv[mesh.FT], Code("model.vt[model.FT]"), {"keep_seams": True})
+    if which := given.get("labels"):
+        if source.start is not None:
+            raise RequestError("parts of the file are known only in the file as opened: undo, or choose no parts")
+        words = _LABELS[which]
+        code = Code(f"statement_labels(model, {', '.join(map(repr, words))})")
+        options["labels"] = Given(statement_labels(sheet.mesh, *words), code, {"labels": which})
+    if state.drawn is not None and len(state.drawn):
+        options["seams"] = recipes.saved_rows(SEAMS, "seams", state.drawn)
+    if len(state.forbidden):
+        options["no_seams"] = recipes.saved_rows(FORBIDDEN, "no_seams", state.forbidden)
     result = unwrap(V, F, callback=callback, **recipes.values(options))
     FT = sheet.from_file(result.indices) if source.start is None else result.indices
     lines = [
@@ -55,13 +88,9 @@ def unwrap_model(
         "mesh = atlas.SeamedMesh(model.V, model.F, result.indices, result.uvs)",
     ]
     recipe = recipes.record_call("unwrap", source, "unwrapped.obj", options, lines=lines)
-    mesh = SeamedMesh(sheet.surface.V, sheet.surface.F, FT, result.uvs)
-    after = as_it_is(state, mesh, recipe)
+    mapped = SeamedMesh(sheet.surface.V, sheet.surface.F, FT, result.uvs)
+    if result.status is UnwrapStatus.TIME_LIMIT:
+        # The call was stopped, so it cannot be repeated.
+        recipe = saved_start(mapped)
+    after = as_it_is(state, mapped, recipe)
     return replace(after, from_file=False, selected=tuple(range(len(after.islands))))
-
-
-def _with_any_positions(mesh: SeamedMesh) -> SeamedMesh:
-    """Return a cut mesh with a separate position for each of its rows, so that a file keeps the seams."""
-    rows = int(mesh.FT.max()) + 1
-    number = np.arange(rows)
-    return SeamedMesh(mesh.V, mesh.F, mesh.FT, np.stack([number % 1024, number // 1024], axis=1).astype(np.float64))
