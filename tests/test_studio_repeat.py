@@ -208,7 +208,7 @@ def test_a_map_with_inverted_triangles_is_made_again_too(opened, tmp_path, monke
     check_repeated(one, tmp_path, monkeypatch, code=1)
     for what in ("pack", "polish"):
         said = one.does(what, energy="mips")[-1].header["text"]
-        assert said == "island 0 has inverted triangles: undo, or select it and press Flatten"
+        assert said == "island 0 has inverted triangles: press Repair, or undo"
 
 
 def test_the_final_map_does_not_depend_on_the_path_of_the_drag(opened):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 import socket
 import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 
 import numpy as np
 import psutil
@@ -24,7 +24,7 @@ from quasiharmonic.ui.studio.assets import assets, bundle
 from quasiharmonic.ui.studio.protocol import decode, encode
 from quasiharmonic.ui.studio.server import page_worker
 from quasiharmonic.ui.studio.server import server as served
-from quasiharmonic.util.options import ENERGIES
+from quasiharmonic.util.options import ENERGIES, UnwrapOptions
 from shared.studio_server import Running, children, hear, nobody_is_left
 
 
@@ -47,9 +47,15 @@ def test_files_are_served_only_with_the_token(running):
         assert token.encode() not in content
 
 
-def test_the_page_offers_the_energies_of_the_library():
-    offered = assets()["index.html"].content.decode().partition('id="polish-energy"')[2].partition("</select>")[0]
-    assert tuple(re.findall(r'value="([^"]*)"', offered)) == ENERGIES
+def test_the_page_offers_the_energies_and_options_of_the_library(running):
+    with running.page() as socket:
+        hello = decode(socket.recv(timeout=30)).header
+    assert tuple(hello["energies"]) == ENERGIES
+    known = {one.name: one for one in fields(UnwrapOptions)}
+    for one in hello["options"]:
+        assert one["default"] == known[one["name"]].default
+        assert one["help"]
+        assert f"{one['name']}: '" in assets()["options.js"].content.decode(), "a picture"
 
 
 @pytest.mark.parametrize(

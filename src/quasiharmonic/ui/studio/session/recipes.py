@@ -135,7 +135,8 @@ def call_lines(verb: str, mesh: str, options: Mapping[str, Any], only: Sequence[
 
 def saved_rows(name: str, option: str, rows: IntArray) -> Given:
     """Return whole numbers, (k,) or (k, 2), as the argument ``option``, from a file that the page saves."""
-    content = "".join(" ".join(map(str, row)) + "\n" for row in rows.reshape(len(rows), -1).tolist()).encode()
+    table = rows if rows.ndim == 2 else rows[:, None]
+    content = "".join(" ".join(map(str, row)) + "\n" for row in table.tolist()).encode()
     shape = ".reshape(-1, 2)" if rows.ndim == 2 else ""
     return Given(rows, Code(f"np.loadtxt({name!r}, dtype=np.int64){shape}"), {option: name}, {name: content})
 

@@ -2,8 +2,14 @@
 
 const GRIP = 14; // distance in CSS pixels within which a handle is grabbed
 const NARROW = 7; // the same for boundary vertices of several islands
+const BESIDE = 6; // distance in CSS pixels within which an island is grabbed
+const SCALE = 0.9; // factor of one step of scaling
+const VIEWS = { 1: "front", 3: "side", 7: "top" };
 const CLICK = 4; // maximum motion of a click in CSS pixels
 const ZOOM = 1.0015;
+const MANY = 300_000; // corners of triangles above which the cursor does not tell of islands
+// The point itself, then points around it.
+const AROUND = [[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1], [0.7, 0.7], [-0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]];
 
 /** Pointer and keyboard input on both panes. Without `send` vertices cannot be dragged. */
 export class Hands {
@@ -127,15 +133,15 @@ export class Hands {
     const hit = this.space()?.pick(point, scene.triangles);
     if (!hit) return;
     if (tool === "pin") this.send({ do: scene.pins.includes(hit.vertex) ? "unpin" : "pin", vertex: hit.vertex });
-    else if (tool === "corner" || tool === "erase") this.send({ do: tool, vertex: hit.vertex });
-    else if (tool === "seam") this.#seamTo(hit.vertex);
+    else if (["corner", "erase", "stitch"].includes(tool)) this.send({ do: tool, vertex: hit.vertex });
+    else if (tool === "seam" || tool === "forbid") this.#seamTo(hit.vertex, tool === "forbid");
     else if (tool === "move") this.#select(scene.islandOfTriangle(hit.triangle), event.shiftKey);
   }
 
   /** Start a seam at a vertex, or continue it to there. */
-  #seamTo(vertex) {
+  #seamTo(vertex, forbid) {
     const { scene } = this;
-    if (scene.seamStart >= 0 && scene.seamStart !== vertex) this.send({ do: "seam", start: scene.seamStart, vertex });
+    if (scene.seamStart >= 0 && scene.seamStart !== vertex) this.send({ do: "seam", start: scene.seamStart, vertex, forbid });
     scene.seamStart = vertex;
     this.redraw();
   }
@@ -163,6 +169,7 @@ export class Hands {
     else if (event.key === "+" || event.key === "=") space.zoomBy(1.15);
     else if (event.key === "-") space.zoomBy(1 / 1.15);
     else if (event.key === "0") space.reset();
+    else if (VIEWS[event.key]) space.viewFrom(VIEWS[event.key]);
     else if (event.key === "Escape") this.scene.seamStart = -1;
     else return false;
     this.redraw();
@@ -187,22 +194,38 @@ export class Hands {
   mapDown(event, point) {
     this.from = this.last = point;
     if (this.tool === "draw") return;
+    if (event.shiftKey && event.button === 0 && this.#movesIslands()) {
+      this.scene.frame = [point, point];
+      return;
+    }
     const vertex = event.button === 0 ? this.handleAt(point) : -1;
     this.scene.chosen = vertex;
     if (vertex >= 0) this.#grab(vertex);
-    else if (event.button === 0 && this.#isMovable(point)) this.lifted = [0, 0];
+    else if (event.button === 0 && this.#movesIslands()) this.#lift(this.#islandAt(point));
     this.redraw();
   }
 
-  /** Return whether a drag from a point of the map moves islands: those selected, if others are not. */
-  #isMovable(point) {
+  /** Return whether drags of the map move islands, of which there are several. */
+  #movesIslands() {
+    return this.tool === "move" && this.send && this.scene.places && this.scene.starts.length > 1;
+  }
+
+  /** Begin to move an island: with the others that are selected, or alone if it is not, or all are. */
+  #lift(island) {
     const { scene } = this;
-    if (this.tool !== "move" || !this.send || !scene.places || scene.selected.size === scene.starts.length) return false;
-    return scene.selected.has(this.#islandAt(point));
+    if (island < 0) return;
+    const chosen = scene.selected.has(island) && scene.selected.size < scene.starts.length;
+    this.lifted = [0, 0];
+    this.liftedIslands = chosen ? null : [island];
   }
 
   mapMove(event, point) {
-    if (this.lifted && event.buttons && this.from) {
+    if (this.scene.frame && event.buttons) {
+      this.scene.frame[1] = point;
+      this.redraw("plane");
+    } else if (this.lifted && event.buttons && this.from) {
+      if (Math.hypot(point[0] - this.from[0], point[1] - this.from[1]) < CLICK) return;
+      if (this.liftedIslands) this.scene.selected = new Set(this.liftedIslands);
       this.lifted = [0, 1].map((k) => ((k ? -1 : 1) * (point[k] - this.from[k])) / this.plane.pixels);
       this.lift(this.lifted);
     } else if (this.held >= 0 && event.buttons) {
@@ -212,7 +235,7 @@ export class Hands {
       this.redraw("plane");
     } else {
       const hovered = this.tool === "move" ? this.handleAt(point) : -1;
-      const free = this.#isMovable(point) ? "move" : "default";
+      const free = this.#movesIslands() && this.scene.triangles.length < MANY && this.#islandAt(point) >= 0 ? "move" : "default";
       this.panes[1].style.cursor = hovered >= 0 ? "grab" : this.tool === "draw" ? "crosshair" : free;
       if (hovered !== this.scene.hovered) {
         this.scene.hovered = hovered;
@@ -226,8 +249,16 @@ export class Hands {
     const clicked = this.from && Math.hypot(point[0] - this.from[0], point[1] - this.from[1]) < CLICK;
     const to = this.lifted;
     this.from = this.last = this.lifted = null;
-    if (to && !clicked && event.type === "pointerup") this.send({ do: "place", to });
-    else if (to && !clicked) this.lift([0, 0]);
+    const { frame } = this.scene;
+    this.scene.frame = null;
+    if (frame && !clicked) {
+      if (event.type === "pointerup") this.#selectWithin(frame);
+      return;
+    }
+    if (to && !clicked && event.type === "pointerup") {
+      if (this.liftedIslands) this.send({ do: "select", islands: this.liftedIslands });
+      this.send({ do: "place", to });
+    } else if (to && !clicked) this.lift([0, 0]);
     if (this.held >= 0) this.#letGo();
     else if (clicked && event.type === "pointerup" && this.scene.places && this.send) {
       if (this.tool === "draw") this.#drawTo(point);
@@ -235,11 +266,29 @@ export class Hands {
     }
   }
 
-  /** Return the island at a point of the map, or -1. */
+  /** Return the island at a point of the map, or just beside it; else -1. */
   #islandAt(point) {
     const { scene, plane } = this;
-    const triangle = plane.pick(point, scene.places, scene.triangles);
-    return triangle < 0 ? -1 : scene.islandOfTriangle(triangle);
+    for (const [x, y] of AROUND) {
+      const triangle = plane.pick([point[0] + BESIDE * x, point[1] + BESIDE * y], scene.places, scene.triangles);
+      if (triangle >= 0) return scene.islandOfTriangle(triangle);
+    }
+    return -1;
+  }
+
+  /** Select the islands with a vertex in a box of the screen. */
+  #selectWithin([[x, y], [right, low]]) {
+    const { scene, plane } = this;
+    const islands = scene.starts.map((_, k) => k).filter((k) => {
+      const end = scene.starts[k + 1] ?? scene.places.length / 2;
+      for (let v = scene.starts[k]; v < end; v++) {
+        const [a, b] = plane.pointOf(...scene.placeOf(v));
+        if ((a - x) * (a - right) <= 0 && (b - y) * (b - low) <= 0) return true;
+      }
+      return false;
+    });
+    if (islands.length) this.send({ do: "select", islands });
+    this.redraw();
   }
 
   mapWheel(event, point) {
@@ -256,7 +305,9 @@ export class Hands {
       [scene.chosen, scene.sketch] = [-1, []];
       if (this.lifted) this.lift([0, 0]);
       this.lifted = null;
-    } else if (event.key.toLowerCase() === "r" && this.send) this.send({ do: "place", to: [0, 0], turn: event.shiftKey ? 15 : 90 });
+    } else if ("[]".includes(event.key) && this.send) this.send({ do: "place", to: [0, 0], scale: event.key === "[" ? SCALE : 1 / SCALE });
+    else if (event.key === "m" && this.send) this.send({ do: "place", to: [0, 0], mirror: true });
+    else if (event.key.toLowerCase() === "r" && this.send) this.send({ do: "place", to: [0, 0], turn: event.shiftKey ? 15 : 90 });
     else if (event.key === "Enter" && scene.sketch.length) this.closeSketch();
     else if (event.key === "Delete" && scene.pins.includes(scene.chosen)) this.send?.({ do: "unpin", vertex: scene.chosen });
     else if (event.key === "+" || event.key === "=") plane.zoomBy(1.15, this.#middle());

@@ -23,7 +23,8 @@ export class Islands {
   /** Show the islands of a map at rest. */
   show(header) {
     const several = header.count > 1;
-    $("islands-section").hidden = !several;
+    $("islands-section").hidden = !header.mapped;
+    $("islands").hidden = $("select-all").hidden = !several;
     $("islands-count").textContent = several ? `${header.selected.length} of ${header.count} selected` : "";
     const key = JSON.stringify(header.islands);
     if (key === this.key) return;

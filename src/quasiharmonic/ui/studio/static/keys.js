@@ -1,7 +1,7 @@
 // Keyboard shortcuts of the page; those of the two panes are in hands.js.
 
 const $ = (id) => document.getElementById(id);
-const TOOLS = { v: "move", p: "pin", c: "corner", s: "seam", e: "erase", d: "draw" };
+const TOOLS = { v: "move", p: "pin", c: "corner", s: "seam", e: "erase", x: "forbid", t: "stitch", d: "draw" };
 // Fields in which keys write text.
 const TEXT = "input:not([type=radio], [type=checkbox], [type=file]), textarea, [contenteditable]";
 

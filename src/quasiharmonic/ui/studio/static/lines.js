@@ -38,6 +38,9 @@ void main() {
 /** Colours of chains, in turn. */
 export const CHAINS = ["#d6336c", "#e8590c", "#2b8a3e", "#862e9c", "#0b7285", "#c92a2a", "#5f3dc4", "#846300"];
 const DRAWN = "#ff2d95";
+// Edges that must not become seams, and the number of their chain.
+const FORBIDDEN = 0xffffffff;
+const KEPT = "#1c7ed6";
 
 const rgb = (colour) => [1, 3, 5].map((k) => parseInt(colour.slice(k, k + 2), 16) / 255);
 
@@ -86,7 +89,7 @@ export class LinePainter {
     const tint = new Float32Array(3 * this.count);
     edges.forEach((vertex, i) => at.set(positions.subarray(3 * vertex, 3 * vertex + 3), 3 * i));
     const colours = (drawn ? [DRAWN] : CHAINS).map(rgb);
-    chain.forEach((k, i) => tint.set(colours[k % colours.length], 3 * i));
+    chain.forEach((k, i) => tint.set(k === FORBIDDEN ? rgb(KEPT) : colours[k % colours.length], 3 * i));
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers.positions);
     gl.bufferData(gl.ARRAY_BUFFER, at, gl.STATIC_DRAW);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers.tint);

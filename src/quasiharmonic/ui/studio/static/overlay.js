@@ -28,6 +28,7 @@ export function drawOverlay(context, scene, space, plane, { moving = false, styl
     obstructions(context, scene, point);
     handles(context, scene, point, { numbered: true });
     if (scene.sketch.length) sketch(context, scene, plane);
+    if (scene.frame) frame(context, scene.frame, style);
     drawScale(context, plane.box, plane.pixels, ink);
     context.restore();
   }
@@ -172,6 +173,14 @@ function label(context, [x, y], text) {
   context.fillStyle = INK;
   context.strokeText(text, x + 15, y - 13);
   context.fillText(text, x + 15, y - 13);
+}
+
+function frame(context, [[x, y], [right, low]], style) {
+  context.strokeStyle = style.getPropertyValue("--accent").trim() || INK;
+  context.lineWidth = 1;
+  context.setLineDash([4, 3]);
+  context.strokeRect(x, y, right - x, low - y);
+  context.setLineDash([]);
 }
 
 function sketch(context, scene, plane) {

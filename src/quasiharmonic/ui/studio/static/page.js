@@ -2,6 +2,7 @@
 
 import { Film } from "./film.js";
 import { decodeFrame, encodeFrame } from "./frames.js";
+import { showOptions } from "./options.js";
 import { Panel } from "./panel.js";
 import { createView } from "./view.js";
 
@@ -45,13 +46,19 @@ class Page {
   }
 
   send(message, arrays) {
+    // What is drawn by hand follows the options of Unwrap, and what is moved those of the islands.
+    if (["seam", "erase"].includes(message.do)) message.symmetry = $("unwrap-symmetry").value;
+    if (message.do === "place" && $("snap").checked) message.resolution = Number($("resolution").value);
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(encodeFrame(message, arrays));
     else if (!["gone", "restarting"].includes(document.body.dataset.state)) this.panel.status.disconnected();
   }
 
   receive(frame) {
     const { header, arrays } = frame;
-    if (header.kind === "hello") this.mostBytes = header.most_bytes;
+    if (header.kind === "hello") {
+      this.mostBytes = header.most_bytes;
+      if (!$("unwrap-options").childElementCount) showOptions(header);
+    }
     else if (header.kind === "note") this.panel.status.note(header.text);
     else if (header.kind === "busy") this.panel.status.busy(header.what);
     else if (header.kind === "progress") this.panel.status.progress(header);

@@ -2,6 +2,7 @@
 
 import { Islands } from "./islands.js";
 import { listenForKeys } from "./keys.js";
+import { chosenOptions } from "./options.js";
 import { Status } from "./status.js";
 
 const $ = (id) => document.getElementById(id);
@@ -28,8 +29,17 @@ export class Panel {
       const shape = $("shape").value;
       if (shape) send({ do: "outline", to: shape === "letter" ? `letter:${$("letter").value.trim()}` : shape });
     });
-    for (const id of ["undo", "redo", "flatten", "save", "stop", "turn"]) $(id).addEventListener("click", () => send({ do: id }));
+    for (const id of ["undo", "redo", "flatten", "save", "stop", "turn", "repair"]) $(id).addEventListener("click", () => send({ do: id }));
     $("unwrap").addEventListener("click", () => this.unwrap());
+    const place = (message) => () => send({ do: "place", to: [0, 0], ...message });
+    $("smaller").addEventListener("click", place({ scale: 0.9 }));
+    $("larger").addEventListener("click", place({ scale: 1 / 0.9 }));
+    $("mirror").addEventListener("click", place({ mirror: true }));
+    $("snap").addEventListener("change", () => $("snap").checked && place({})());
+    $("weld").addEventListener("click", () => send({ do: "weld", ...this.#size() }));
+    for (const button of document.querySelectorAll(".view")) {
+      button.addEventListener("click", () => view.lookFrom(button.dataset.view));
+    }
     $("pack").addEventListener("click", () => send({ do: "pack", ...this.#size() }));
     $("glb").addEventListener("click", () => send({ do: "save", format: "glb" }));
     $("select-all").addEventListener("click", () => send({ do: "select", islands: [] }));
@@ -71,8 +81,8 @@ export class Panel {
   }
 
   unwrap() {
-    const options = { max_stretch: Number($("max-stretch").value), keep_seams: $("keep-seams").checked };
-    this.page.send({ do: "unwrap", ...options, ...this.#size() });
+    const which = { keep_seams: $("keep-seams").checked, selected: $("only-selected").checked };
+    this.page.send({ do: "unwrap", options: chosenOptions(), ...which, ...this.#size() });
   }
 
   /** Choose a tool by its name. */
@@ -120,6 +130,7 @@ export class Panel {
     $("stop").disabled = true;
     $("undo").disabled = !header.undo;
     $("redo").disabled = !header.redo;
+    $("repair-row").hidden = !header.mapped || header.injective;
     $("outward").hidden = !header.inward;
     $("outward-words").textContent = header.inward === 1 ? "A closed part of the model faces inward." : `${header.inward} closed parts of the model face inward.`;
     $("repeat").hidden = !header.command && header.mapped === false;

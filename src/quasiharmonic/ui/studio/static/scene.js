@@ -21,6 +21,7 @@ export class Scene {
     this.obstruction = null;
     this.hovered = -1;
     this.chosen = -1;
+    this.frame = null; // two opposite corners of the box that selects
     this.sketch = [];
     this.seamStart = -1;
   }
@@ -34,6 +35,20 @@ export class Scene {
     this.loops = header.loops.map((length) => boundary.slice(start, (start += length)));
     this.owners = this.loops.map((loop) => last(this.starts, loop[0]));
     this.selected = new Set(this.starts.keys());
+  }
+
+  /** Return runs of triangles that are selected or not: first corner, number of corners, selected. */
+  get runs() {
+    const runs = [];
+    this.starts.forEach((_, k) => {
+      const first = 3 * this.firstTriangles[k];
+      const end = 3 * (this.firstTriangles[k + 1] ?? this.triangles.length / 3);
+      const chosen = this.selected.has(k);
+      const last = runs.at(-1);
+      if (last?.[2] === chosen) last[1] = end - last[0];
+      else runs.push([first, end - first, chosen]);
+    });
+    return runs;
   }
 
   placeOf(vertex) {

@@ -26,6 +26,7 @@ uniform vec3 toward;
 uniform float scale;
 uniform float reach;
 uniform float squares;
+uniform float dim;
 uniform vec4 flat_colour;
 uniform vec2 origin;
 uniform sampler2D image;
@@ -73,7 +74,7 @@ void main() {
   if (colouring == 1) base = ramp(log2(stretch()) / reach);
   if (colouring == 3) base = texture(image, uv + origin).rgb;
   if (!flat_pane && !gl_FrontFacing) base *= 0.6;
-  colour = vec4(base * light, 1.0);
+  colour = vec4(mix(base * light, vec3(0.62, 0.64, 0.68), dim), 1.0);
 }`;
 
 /** Numbers of the colourings in the shader; "plain" is that of a surface without a map. */
@@ -121,7 +122,7 @@ export class Painter {
     gl.linkProgram(this.program);
     if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program));
     this.at = {};
-    for (const name of ["flat_pane", "turn", "window", "colouring", "toward", "scale", "reach", "squares", "flat_colour", "origin", "image"]) {
+    for (const name of ["flat_pane", "turn", "window", "colouring", "toward", "scale", "reach", "squares", "dim", "flat_colour", "origin", "image"]) {
       this.at[name] = gl.getUniformLocation(this.program, name);
     }
     this.buffers = {};
@@ -251,9 +252,16 @@ export class Painter {
     gl.enable(gl.POLYGON_OFFSET_FILL);
     gl.polygonOffset(1, 1);
     gl.uniform1i(this.at.colouring, COLOURINGS[look.colouring === "image" && !this.picture ? "checker" : look.colouring]);
-    const { triangles, coarse } = this.surface;
+    const { coarse } = this.surface;
     if (look.coarse && coarse) this.#draw(gl.TRIANGLES, this.buffers.coarse, coarse.length);
-    else this.#draw(gl.TRIANGLES, this.buffers.triangles, triangles.length);
+    else {
+      // Islands that are not selected are paler, in both panes.
+      for (const [first, count, chosen] of look.runs) {
+        gl.uniform1f(this.at.dim, chosen ? 0 : 0.6);
+        this.#draw(gl.TRIANGLES, this.buffers.triangles, count, first);
+      }
+      gl.uniform1f(this.at.dim, 0);
+    }
     gl.disable(gl.POLYGON_OFFSET_FILL);
     gl.uniform1i(this.at.colouring, FLAT);
     if (look.edges && !(look.coarse && coarse)) {
@@ -304,9 +312,9 @@ export class Painter {
     gl.vertexAttribPointer(location, size, gl.FLOAT, false, 0, 0);
   }
 
-  #draw(mode, buffer, count) {
+  #draw(mode, buffer, count, first = 0) {
     if (!count) return;
     this.gl.bindBuffer(this.gl.ELEMENT_ARRAY_BUFFER, buffer);
-    this.gl.drawElements(mode, count, this.gl.UNSIGNED_INT, 0);
+    this.gl.drawElements(mode, count, this.gl.UNSIGNED_INT, 4 * first);
   }
 }

@@ -38,6 +38,12 @@ export class SpaceView {
     this.shift = [...other.shift];
   }
 
+  /** Set the direction of view: "front", "side" or "top". */
+  viewFrom(name) {
+    this.yaw = name === "side" ? -Math.PI / 2 : 0;
+    this.pitch = name === "top" ? Math.PI / 2 : 0;
+  }
+
   /** Rotate by a pointer motion in CSS pixels. */
   turnBy(dx, dy) {
     this.yaw += dx * 0.01;

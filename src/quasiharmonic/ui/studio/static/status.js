@@ -7,6 +7,8 @@ const TOOL_HINTS = {
   corner: "Click the surface near its boundary: that vertex goes to the outline's next corner.",
   seam: "Click two or more vertices on the surface: the shortest path between them becomes a seam. Escape ends it.",
   erase: "Click near a seam on the surface to remove it, up to where seams meet.",
+  forbid: "Click two or more vertices on the surface: Unwrap makes no seam on the path between them (blue).",
+  stitch: "Click a seam on the surface: the smaller island moves to the larger one, and both are joined there.",
   draw: "Click the corners of a polygon in the map. To close it, click the first corner again or press Enter.",
 };
 const PHASES = {
@@ -41,6 +43,8 @@ export class Status {
     if (header.state === "settled") {
       this.header = header;
       $("progress").hidden = true;
+      clearInterval(this.ticking);
+      $("elapsed").textContent = "";
     }
     if (header.mapped === false) {
       this.#verdict("open", "…", "No map yet", "Press Unwrap for texture coordinates of the whole model.");
@@ -75,8 +79,8 @@ export class Status {
       else if (header.drawn) text = "The seams have changed: press Flatten or Unwrap to cut the surface along them.";
       else if (header.pins.length) text = "Drag a purple pin or any point of the outline in the map.";
       else if (header.corners.length) text = "Drag an orange corner, or any point of the outline, in the map. Drag the surface to rotate it.";
-      else if (header.selected.length < header.count) text = "Drag a selected island to move it; R rotates it. Drag a point of its outline to bend it.";
-      else if (header.count > 1) text = "Click an island to select it, with Shift several. Drag any point of an outline.";
+      else if (header.selected.length < header.count) text = "Drag a selected island to move it; R rotates, [ and ] scale it. Drag a point of its outline to bend it.";
+      else if (header.count > 1) text = "Drag an island to move it, or any point of an outline to bend it. Click to select, with Shift several; Shift and drag a box.";
       else text = "The boundary is free: drag any point of the outline, or pin a vertex and drag the pin.";
     }
     $("hint").textContent = text;
@@ -116,6 +120,9 @@ export class Status {
     $("stop").disabled = false;
     this.#verdict("open", "…", `Working: ${what}`, "");
     this.forget();
+    const began = performance.now();
+    clearInterval(this.ticking);
+    this.ticking = setInterval(() => ($("elapsed").textContent = `${Math.round((performance.now() - began) / 1000)} s`), 500);
     $("progress").hidden = false;
     $("progress").removeAttribute("value");
   }

@@ -2,7 +2,7 @@
 // and pass frames to `receive`.
 //
 // It handles the frames "surface", "map", "seams", "image" and "obstructions", and sends {do: "grab" | "drag" | "drop" |
-// "place" | "pin" | "unpin" | "corner" | "polygon" | "select" | "seam" | "erase"}; docs/development/page_protocol.md describes them.
+// "place" | "pin" | "unpin" | "corner" | "polygon" | "select" | "seam" | "erase" | "stitch"}; docs/development/page_protocol.md describes them.
 // Without `send` the view is read-only.
 
 import { coarsen } from "./coarse.js";
@@ -151,6 +151,7 @@ export function createView(element, options = {}) {
         turn: space.matrix,
         origin: scene.origin,
         width: SEAM * ratio,
+        runs: scene.runs,
         coarse,
       };
       for (const [name, pane] of [["space", space], ["plane", plane]]) {
@@ -378,6 +379,12 @@ export function createView(element, options = {}) {
     fit() {
       if (scene.places) plane.fit(scene.places);
       space?.reset();
+      redraw();
+    },
+
+    /** View the surface from the "front", the "side" or the "top". */
+    lookFrom(name) {
+      space?.viewFrom(name);
       redraw();
     },
 
