@@ -69,7 +69,7 @@ class SessionState:
     @cached_property
     def overlapping(self) -> IntArray:
         """Pairs (p, 2) of islands that share points of the plane."""
-        if not self.injective or len(self.islands) == 1 or len(self.islands) > _MAX_CHECKED:
+        if not self.mapped or len(self.islands) == 1 or len(self.islands) > _MAX_CHECKED:
             return np.empty((0, 2), dtype=np.int64)
         return certify_islands(self.mesh).overlapping
 
