@@ -13,9 +13,11 @@ def register() -> None:
     """Register the classes; Blender calls this when the extension is enabled."""
     for one in _CLASSES:
         bpy.utils.register_class(one)
+    panel.add_entries()
 
 
 def unregister() -> None:
     """Unregister the classes; Blender calls this when the extension is disabled."""
+    panel.remove_entries()
     for one in reversed(_CLASSES):
         bpy.utils.unregister_class(one)

@@ -21,17 +21,13 @@ from quasiharmonic.results import Step
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 from quasiharmonic.util.arrays import IntArray, count_of
-from quasiharmonic.util.options import PolishOptions
+from quasiharmonic.util.options import ENERGY_LABELS, PolishOptions
 
 from . import outline, pins, surface
 from .job import Work, Working, find_objects
 from .surface import Refused
 
-_ENERGIES = [
-    ("symmetric-dirichlet", "Lengths and angles", "Symmetric Dirichlet energy: neither stretched nor shrunk"),
-    ("mips", "Angles", "MIPS energy: angles alone"),
-    ("blend", "Worst stretch", "A blend that minds the worst triangles"),
-]
+_ENERGIES = [(name, label.capitalize(), f"The energy {name}") for name, label in ENERGY_LABELS.items()]
 
 
 class UvWorking(Working):
@@ -184,7 +180,7 @@ class QHM_OT_flatten(ChosenWorking):
         """Return the work that cuts and flattens the mesh."""
         mesh, polygons = self.read(), self.surface.polygons
         here = self.surface
-        seams = surface.marked_seams(self.data)
+        seams = surface.marked_edges(self.data, "use_seam")
         cut, pack, energy, whole = self.cut, self.pack, self.energy, self.whole or self.mode != "EDIT"
 
         def work(reports_progress: Callable[[Step], None]) -> SeamedMesh:
@@ -254,8 +250,9 @@ class QHM_OT_fit(ChosenWorking):
     curve: bpy.props.StringProperty(name="Curve", description="Name of the object")  # type: ignore[valid-type]
 
     def find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
-        """Return the active object; there is one island to fit."""
-        return [context.active_object]
+        """Return the objects to fit; the outline is not one of them."""
+        found = super().find_objects(context)
+        return [thing for thing in found if self.to != "CURVE" or thing.name != self.curve or thing == found[0]]
 
     def prepare_one(self, context: bpy.types.Context) -> Work:
         """Return the work that fits the boundary to the outline, with corners detected, and computes the map."""

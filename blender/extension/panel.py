@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 
 from . import operators
@@ -54,3 +56,32 @@ class QHM_PT_view(_Buttons, bpy.types.Panel):
 
 
 CLASSES = (QHM_PT_uv, QHM_PT_view)
+# Menus with the entry, and the keymaps with the shortcut Ctrl-Shift-U.
+_MENUS = "VIEW3D_MT_uv_map", "IMAGE_MT_uvs"
+_KEYMAPS = "Mesh", "UV Editor"
+_keys: list[Any] = []
+
+
+def _draw_entry(menu: Any, context: bpy.types.Context) -> None:
+    menu.layout.separator()
+    menu.layout.operator("uv.qhm_unwrap")
+
+
+def add_entries() -> None:
+    """Add Unwrap Model to the UV menus, and its shortcut."""
+    for name in _MENUS:
+        getattr(bpy.types, name).append(_draw_entry)
+    # Without a window there are no keys.
+    keys = bpy.context.window_manager.keyconfigs.addon
+    for name in _KEYMAPS if keys else ():
+        keymap = keys.keymaps.new(name=name)
+        _keys.append((keymap, keymap.keymap_items.new("uv.qhm_unwrap", "U", "PRESS", ctrl=True, shift=True)))
+
+
+def remove_entries() -> None:
+    """Remove what `add_entries` added."""
+    for name in _MENUS:
+        getattr(bpy.types, name).remove(_draw_entry)
+    for keymap, item in _keys:
+        keymap.keymap_items.remove(item)
+    _keys.clear()

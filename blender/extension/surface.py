@@ -129,9 +129,9 @@ def require_map(surface: Surface) -> None:
         raise Refused("the mesh has no UV map: flatten it first")
 
 
-def marked_seams(data: bpy.types.Mesh) -> IntArray:
-    """Return the edges (k, 2) marked as seams, by their vertices."""
-    marked = numbers(data.edges, "use_seam", 1, np.bool_).ravel()
+def marked_edges(data: bpy.types.Mesh, mark: str) -> IntArray:
+    """Return the edges (k, 2) with a mark, ``"use_seam"`` or ``"use_edge_sharp"``, by their vertices."""
+    marked = numbers(data.edges, mark, 1, np.bool_).ravel()
     return numbers(data.edges, "vertices", 2, np.int32).astype(np.int64)[marked]
 
 

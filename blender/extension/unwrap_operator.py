@@ -9,6 +9,7 @@ import numpy as np
 
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.util.arrays import count_of
+from quasiharmonic.util.options import SYMMETRIES
 
 from . import unwrapping
 from .job import Work, Working, find_objects
@@ -43,6 +44,25 @@ class QHM_OT_unwrap(Working):
     padding: bpy.props.FloatProperty(  # type: ignore[valid-type]
         name="Padding", description="Minimum distance of two islands in texels", default=4.0, min=0.0, soft_max=64.0
     )
+    tiles: bpy.props.IntProperty(  # type: ignore[valid-type]
+        name="UDIM Tiles", description="Number of tiles to fill, from 1001 on", default=1, min=1, soft_max=20
+    )
+    texels_per_unit: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Texel Density", description="Texels per unit of length; 0 for as many as fit", default=0.0, min=0.0
+    )
+    symmetry: bpy.props.EnumProperty(  # type: ignore[valid-type]
+        name="Symmetry",
+        description="Mirror seams and islands in the middle plane normal to an axis of the object",
+        items=[(axis, axis.title(), "") for axis in ("none", *SYMMETRIES[1:])],
+    )
+    hard_edges: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Sharp Edges", description="Edges marked as sharp become seams, as normal maps need them", default=False
+    )
+    around: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Around Others",
+        description="Place new islands into free space of the texture, beside faces that are not unwrapped",
+        default=False,
+    )
     rotate: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Rotate", description="Rotate islands to fit better", default=True
     )
@@ -62,7 +82,16 @@ class QHM_OT_unwrap(Working):
         """Return the work that unwraps the objects."""
         self._objects = find_objects(context, self.mode, self.edited)
         self._parts = parts = unwrapping.read_parts(self._objects, edited=self.mode == "EDIT")
+        # Islands with pinned UVs are not unwrapped, so the new ones must not lie over them.
+        self._around = (self.around or any(part.pinned.any() for part in parts)) and not all(
+            part.chosen.all() for part in parts
+        )
         options = {
+            "around": self._around,
+            "hard_edges": self.hard_edges,
+            "tiles": self.tiles,
+            "texels_per_unit": self.texels_per_unit or None,
+            "symmetry": None if self.symmetry == "none" else self.symmetry,
             "max_stretch": self.max_stretch,
             "max_charts": self.max_charts or None,
             "resolution": self.resolution,
@@ -75,7 +104,7 @@ class QHM_OT_unwrap(Working):
 
     def finish(self, context: bpy.types.Context, result: Any) -> None:
         """Write the texture coordinates and report them."""
-        crossed = unwrapping.write_parts(self._parts, result, mark_seams=self.mark_seams)
+        crossed = unwrapping.write_parts(self._parts, result, around=self._around, mark_seams=self.mark_seams)
         sound = result.success and not result.misses and not crossed
         self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {describe_unwrap(result, crossed)}")
         changes = ", ".join(f"{name}: {len(found)}" for name, found in result.cleaned.changes.items() if len(found))
@@ -85,13 +114,8 @@ class QHM_OT_unwrap(Working):
         if inward:
             said = f"{count_of('closed part is', 'closed parts are', inward)} inside out: use Recalculate Outside"
             self.report({"WARNING"}, f"{self.bl_label}: {said}")
-        loops = [part.surface.loops[part.chosen] for part in self._parts]
-        pinned = sum(
-            np.count_nonzero(part.surface.pinned[np.unique(own)]) for part, own in zip(self._parts, loops, strict=True)
-        )
-        if pinned:
-            said = f"{count_of('pinned UV was', 'pinned UVs were', pinned)} not kept. Flatten keeps pins"
-            self.report({"WARNING"}, f"{self.bl_label}: {said}")
+        if any(part.pinned.any() for part in self._parts):
+            self.report({"INFO"}, f"{self.bl_label}: islands with pinned UVs stay as they are")
         changed = [thing.name for thing in self._objects if thing.modifiers]
         if changed:
             names = ", ".join(changed[:3]) + (", …" if len(changed) > 3 else "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import bpy
@@ -37,8 +37,10 @@ class Part:
         Whether each triangle is unwrapped.
     V : (n, 3) float64
         Positions at the object's scale.
-    seams : (s, 2) int64
-        The marked seams.
+    seams, sharp : (s, 2) int64
+        The marked seams, and the sharp edges.
+    pinned : (f,) bool
+        Whether an island has pinned UVs; it is not unwrapped.
     """
 
     data: bpy.types.Mesh
@@ -46,11 +48,19 @@ class Part:
     chosen: BoolArray
     V: FloatArray
     seams: IntArray
+    sharp: IntArray
+    pinned: BoolArray
 
     @property
     def F(self) -> IntArray:
         """The chosen triangles (k, 3)."""
         return self.surface.mesh.F[self.chosen]
+
+    def own(self, edges: IntArray) -> IntArray:
+        """Return the edges (k, 2) among some that the chosen triangles have."""
+        n = len(self.V)
+        here = edge_keys(self.F, self.F[:, (1, 2, 0)], n)
+        return edges[np.isin(edge_keys(edges[:, 0], edges[:, 1], n), here)]
 
 
 def read_parts(objects: Sequence[bpy.types.Object], *, edited: bool) -> list[Part]:
@@ -75,17 +85,37 @@ def read_parts(objects: Sequence[bpy.types.Object], *, edited: bool) -> list[Par
             continue
         here = surface.read(data, edited=edited, chosen_only=False)
         V = here.mesh.V @ _stretch_of(np.array(thing.matrix_world)[:3, :3])
-        parts.append(Part(data, here, here.selected, V, surface.marked_seams(data)))
+        seams, sharp = (surface.marked_edges(data, name) for name in ("use_seam", "use_edge_sharp"))
+        parts.append(Part(data, here, here.selected, V, seams, sharp, _pinned_islands(here)))
     if not parts:
         hidden = edited and any(len(thing.data.polygons) for thing in objects)
         raise Refused("all faces are hidden" if hidden else "the mesh has no faces")
     if not any(part.chosen.any() for part in parts):
-        return [Part(part.data, part.surface, part.surface.shown, part.V, part.seams) for part in parts]
-    return [part for part in parts if part.chosen.any()]
+        parts = [replace(part, chosen=part.surface.shown) for part in parts]
+    parts = [part for part in parts if part.chosen.any()]
+    free = [replace(part, chosen=part.chosen & ~part.pinned) for part in parts]
+    if not any(part.chosen.any() for part in free):
+        raise Refused("all islands have pinned UVs, which stay: unpin some")
+    return free
+
+
+def _pinned_islands(here: Surface) -> BoolArray:
+    """Whether each triangle (f,) belongs to an island with a pinned UV."""
+    found = np.zeros(len(here.loops), dtype=np.bool_)
+    if here.pinned.any():
+        for island in here.mesh.islands:
+            found[island.triangles] = here.pinned[here.loops[island.triangles]].any()
+    return found
 
 
 def unwrap_parts(
-    parts: Sequence[Part], *, keep_seams: bool, callback: Callable[[Any], None], **options: Any
+    parts: Sequence[Part],
+    *,
+    keep_seams: bool,
+    hard_edges: bool,
+    around: bool,
+    callback: Callable[[Any], None],
+    **options: Any,
 ) -> UnwrapResult:
     """Unwrap all parts as one model, into one texture.
 
@@ -94,34 +124,50 @@ def unwrap_parts(
     parts : sequence of Part
     keep_seams : bool
         Cut at the marked seams of each part, or without any at the seams of its UVs.
+    hard_edges : bool
+        Cut at the sharp edges.
+    around : bool
+        Pass all triangles, of which those that are not chosen keep their UVs, and place new islands around them.
     callback : callable
     **options
         Options of `quasiharmonic.unwrap`.
     """
-    V, F, costs, uv = [], [], [], []
+    V, F, costs, uv, faces = [], [], [], [], []
+    seams, sharp = [], []
     first, right = 0, 0.0
     # Parts stand apart, because equal positions are joined. A power of two keeps the shifts exact.
     size = max(float(np.ptp(part.V, axis=0).max()) for part in parts) or 1.0
     step = 2.0 ** np.ceil(np.log2(2 * size)) if len(parts) > 1 else 0.0
     for part in parts:
         V.append(part.V + ([right - np.round(part.V[:, 0].min() / step) * step, 0, 0] if step else 0))
-        F.append(part.F + first)
-        costs.append(_edge_costs(part))
-        if keep_seams:
+        whole = replace(part, chosen=np.ones_like(part.chosen)) if around else part
+        F.append(whole.F + first)
+        costs.append(_edge_costs(whole))
+        faces.append(part.chosen)
+        seams.append(part.own(part.seams) + first)
+        sharp.append(part.own(part.sharp) + first)
+        if around:
+            old = part.surface.mesh.uv
+            uv.append(np.zeros((*part.chosen.shape, 3, 2)) if old is None else old[part.surface.loops])
+        elif keep_seams:
             uv.append(_seam_positions(part))
         first, right = first + len(part.V), right + 2 * step
     return unwrap(
         np.concatenate(V),
         np.concatenate(F),
         edge_costs=np.concatenate(costs),
-        uv=np.concatenate(uv) if keep_seams else None,
+        uv=np.concatenate(uv) if uv else None,
+        hard_edges=np.concatenate(sharp) if hard_edges else None,
+        **({"faces": np.concatenate(faces), "seams": np.concatenate(seams) if keep_seams else None} if around else {}),
         callback=callback,
         **options,
     )
 
 
-def write_parts(parts: Sequence[Part], result: UnwrapResult, *, mark_seams: bool) -> int:
+def write_parts(parts: Sequence[Part], result: UnwrapResult, *, around: bool, mark_seams: bool) -> int:
     """Write the texture coordinates of all parts; mark their seams and unmark other edges.
+
+    ``around`` is that of `unwrap_parts`.
 
     Returns
     -------
@@ -131,8 +177,12 @@ def write_parts(parts: Sequence[Part], result: UnwrapResult, *, mark_seams: bool
     layers = [surface.require_layer(part.data) for part in parts]
     excluded = np.zeros(len(result.indices), dtype=np.bool_)
     excluded[result.cleaned.excluded] = True
+    corners = result.uvs[result.indices].astype(np.float32)
+    if around:
+        chosen = np.concatenate([part.chosen for part in parts])
+        corners, excluded = corners[chosen], excluded[chosen]
     ends = np.cumsum([np.count_nonzero(part.chosen) for part in parts])[:-1]
-    corners = np.split(result.uvs[result.indices].astype(np.float32), ends)
+    corners = np.split(corners, ends)
     crossed = 0
     for part, layer, uv, without in zip(parts, layers, corners, np.split(excluded, ends), strict=True):
         loops = part.surface.loops[part.chosen]
@@ -171,9 +221,8 @@ def _edge_costs(part: Part) -> FloatArray:
 
 def _seam_positions(part: Part) -> FloatArray:
     """Return positions (k, 3, 2) that differ at the marked seams; without any, those of the UV layer."""
-    mesh, n = part.surface.mesh, len(part.V)
-    own = edge_keys(part.F, part.F[:, (1, 2, 0)], n)
-    seams = part.seams[np.isin(edge_keys(part.seams[:, 0], part.seams[:, 1], n), own)]
+    mesh = part.surface.mesh
+    seams = part.own(part.seams)
     if len(seams):
         row = SeamedMesh(mesh.V, part.F).cut(seams).FT
         return np.stack([row, np.zeros_like(row)], axis=2).astype(np.float64)

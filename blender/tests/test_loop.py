@@ -90,3 +90,49 @@ def test_every_operator_and_undo(levels, rounds):
         memory.append(resident())
     # The first quarter fills caches and the stack of undo steps.
     assert memory[-1] - memory[len(memory) // 4] < _LEAK, np.round(np.array(memory) / 2**20).tolist()
+
+
+def add_fins():
+    """Suzanne with faces added at edges, repeated, reversed and degenerate, and a loose vertex."""
+    bpy.ops.mesh.primitive_monkey_add()
+    data = bpy.context.object.data
+    V = np.array([v.co for v in data.vertices])
+    faces = [list(face.vertices) for face in data.polygons]
+    a, b = faces[10][:2]
+    bpy.data.objects.remove(bpy.context.object)
+    faces[5] = faces[5][::-1]
+    further = [faces[0][::-1], [a, b, len(V)], [b, a, len(V) + 1], [a, b, len(V) + 2]]
+    return scenes.add_mesh(np.concatenate([V, V[:3] * 1.5, [[5, 5, 5]]]), faces + further, name="fins")
+
+
+def add_soup():
+    """Quads that share positions but no vertices, some mirrored, with UVs of which some are inverted."""
+    V, flat, faces = scenes.quads(4)
+    corners = np.array(faces).ravel()
+    rows = np.arange(len(corners)).reshape(-1, 4)
+    uv = flat[corners]
+    uv[:4] = uv[3::-1]
+    return scenes.add_mesh(V[corners], [*rows[::2].tolist(), *rows[1::2, ::-1].tolist()], uv, name="soup")
+
+
+@pytest.mark.parametrize("make", [add_fins, add_soup])
+def test_every_operator_on_dirty_models_with_undo(make):
+    """An operator may refuse such a model; it then changes nothing."""
+    thing = make()
+    name, done = thing.name, []
+    assert bpy.ops.uv.qhm_unwrap() == {"FINISHED"}
+    before = state(name)
+    for act, options in [*ALL, ("unwrap", {"hard_edges": True, "symmetry": "x", "tiles": 2})]:
+        bpy.ops.ed.undo_push(message="before")
+        try:
+            done += [act] if getattr(bpy.ops.uv, f"qhm_{act}")(**options) == {"FINISHED"} else []
+        except RuntimeError as error:
+            assert "internal error" not in str(error)
+            assert state(name) == before
+            continue
+        bpy.ops.ed.undo_push(message="after")
+        bpy.ops.ed.undo()
+        if bpy.context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        assert state(name) == before
+    assert {"check", "repair", "unwrap", "reduce_stretch"} <= set(done)

@@ -107,11 +107,23 @@ def test_fit_holds_pins():
     assert scenes.verdict(thing).bijective
 
 
-def test_unwrap_reports_pins(said):
-    thing = scenes.add_quads()
+def test_unwrap_keeps_islands_with_pins_and_places_others_around_them(said):
+    thing = scenes.two_squares([0.0, 0.0])
+    uv = 0.4 * scenes.places(thing)
+    scenes.set_places(thing, uv)
+    held = np.isin(scenes.vertices_of_loops(thing), np.arange(25))
     pin(thing, [0])
-    assert bpy.ops.uv.qhm_unwrap() == {"FINISHED"}
-    assert "1 pinned UV was not kept" in said()
+    assert bpy.ops.uv.qhm_unwrap(resolution=512) == {"FINISHED"}
+    after = scenes.places(thing)
+    assert np.array_equal(after[held], uv[held])
+    assert not np.array_equal(after[~held], uv[~held])
+    verdict = scenes.verdict(thing)
+    assert verdict.bijective
+    assert not len(verdict.overlapping)
+    assert "islands with pinned UVs stay as they are" in said()
+    pin(thing, [int(np.flatnonzero(~held)[0])])
+    with pytest.raises(RuntimeError, match="all islands have pinned UVs"):
+        bpy.ops.uv.qhm_unwrap()
 
 
 def test_repair_holds_pins():
