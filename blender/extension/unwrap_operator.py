@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
+from quasiharmonic.apps.unwrapping.symmetry import describe_symmetry
 from quasiharmonic.util.arrays import count_of
 from quasiharmonic.util.options import SYMMETRIES
 
@@ -116,6 +117,9 @@ class QHM_OT_unwrap(Working):
             self.report({"WARNING"}, f"{self.bl_label}: {said}")
         if any(part.pinned.any() for part in self._parts):
             self.report({"INFO"}, f"{self.bl_label}: islands with pinned UVs stay as they are")
+        if self.symmetry != "none":
+            for line in describe_symmetry(result.symmetry):
+                self.report({"INFO"}, f"{self.bl_label}: {line}")
         changed = [thing.name for thing in self._objects if thing.modifiers]
         if changed:
             names = ", ".join(changed[:3]) + (", …" if len(changed) > 3 else "")

@@ -121,7 +121,7 @@ def test_unwrap_keeps_islands_with_pins_and_places_others_around_them(said):
     assert verdict.bijective
     assert not len(verdict.overlapping)
     assert "islands with pinned UVs stay as they are" in said()
-    pin(thing, [int(np.flatnonzero(~held)[0])])
+    pin(thing, np.arange(len(held)))
     with pytest.raises(RuntimeError, match="all islands have pinned UVs"):
         bpy.ops.uv.qhm_unwrap()
 

@@ -294,7 +294,7 @@ def test_seams_are_drawn_on_the_surface_and_erased(opened, settled, address):
     act(page, settled, lambda: click_on_surface(page, int(left)))
     page.keyboard.press("v")
     act(page, settled, lambda: page.click("#flatten"))
-    assert page.is_hidden("#islands-section")
+    assert page.is_hidden("#islands")
 
 
 def test_a_model_that_is_inside_out_is_turned(served_parts, opened, settled, models):
