@@ -71,6 +71,14 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     return np.array(array, dtype=np.int64, order="C") if copy else np.require(array, np.int64, ["C", "A"])
 
 
+def number_array(name: str, values: ArrayLike, count: int, element: str) -> IntArray:
+    """Convert an integer for each of several elements to int64 (count,); ``element`` is their name, for messages."""
+    numbers = index_array(name, values)
+    if numbers.shape != (count,):
+        raise ValueError(f"{name} must have shape ({count},), one for each {element}, not {numbers.shape}")
+    return numbers
+
+
 def _integers(values: ArrayLike, array: NDArray[Any]) -> NDArray[np.object_] | None:
     """Return integers that NumPy converted to floats or objects, as objects; None if not all values are integers."""
     if array.dtype.kind == "f" and not isinstance(values, list | tuple):

@@ -26,6 +26,7 @@ MAX_ITERATIONS = 2000
 REFERENCES = "equilateral", "rest", "corrected"
 SYMMETRIES = "auto", "x", "y", "z"
 UPS = "x", "y", "z", "-x", "-y", "-z"
+INSTANCES = "share", "own"
 LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 
 
@@ -157,6 +158,18 @@ def stacking(name: str, value: Any) -> None:
     """Check which charts are stacked: a boolean or ``"mirrored"``."""
     if not isinstance(value, bool) and value != "mirrored":
         raise ValueError(f"{name} must be True, False or 'mirrored', not {value!r}")
+
+
+def sharing(name: str, value: Any) -> None:
+    """Check what instances of a mesh do; one mesh has none."""
+    if value != "share":
+        raise ValueError(f"{name}={value!r} needs several meshes: pass a list of meshes, or a scene")
+
+
+def no_weights(name: str, value: Any) -> None:
+    """Check that one mesh has no weight."""
+    if value is not None:
+        raise ValueError(f"{name} needs several meshes: pass a list of meshes, or a scene")
 
 
 def direction_or_none(name: str, value: Any) -> None:
@@ -428,6 +441,9 @@ class UnwrapOptions(Options):
     stack: Any = option(False, check=stacking)
     outward: bool = option(False, "treat closed components that are inside out as turned outward", check=switch)
     weld: Any = option(True, check=welding)
+    meshes: Any = option(None)
+    instances: str = option("share", check=sharing)
+    weights: Any = option(None, check=no_weights)
     edge_costs: Any = option(None)
     seams: Any = option(None)
     no_seams: Any = option(None)
