@@ -5,13 +5,9 @@ One of them is pandas, for tables of results as DataFrames.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -31,7 +27,11 @@ def explain_missing(need: str, package: str) -> Iterator[None]:
 
 def with_extra(name: str) -> str:
     """Return what follows ``pip install`` to install this package again from where it came, with an extra."""
+    import json
     from importlib.metadata import PackageNotFoundError, distribution
+    from pathlib import Path
+    from urllib.parse import urlsplit
+    from urllib.request import url2pathname
 
     try:
         origin = json.loads(distribution("quasiharmonic").read_text("direct_url.json") or "{}")
