@@ -42,7 +42,9 @@ def check_placing(wanted: UnwrapOptions) -> UnwrapOptions:
 def number_tiles(tile_by: Any, count: int) -> IntArray:
     """Return the tile (f,) of each triangle of the model, from 0; ValueError if the numbers are malformed."""
     if isinstance(tile_by, str):
-        raise ValueError(f"tile_by={tile_by!r} needs materials: pass a file, a MeshData or meshes of trimesh, or numbers")
+        raise ValueError(
+            f"tile_by={tile_by!r} needs materials: pass a file, a MeshData or meshes of trimesh, or numbers"
+        )
     numbers = number_array("tile_by", tile_by, count, "triangle")
     return np.unique(numbers, return_inverse=True)[1].reshape(-1)
 
@@ -105,7 +107,7 @@ def _pack_tiles(
     placements, uvs = [], []
     for k, packing in fitted.items():
         placements += [replace(one, tile=k) for one in packing.placements]
-        uvs += [uv + [k % 10, k // 10] for uv in packing.uv]
+        uvs += [uv + np.array([k % 10, k // 10]) for uv in packing.uv]
     back = np.argsort(order)
     used = float(np.mean([packing.utilisation for packing in fitted.values()]))
     return Packing(tuple(placements[i] for i in back), tuple(uvs[i] for i in back), least, used)

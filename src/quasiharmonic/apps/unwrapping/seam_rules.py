@@ -113,9 +113,6 @@ def find_rules(
         demanded |= _mark_hard_edges(options.hard_edges, hinges, cleaned, F) & ~kept
     if options.up is not None:
         _prefer_hidden(cost, points, cleaned.F, hinges, options.up, symmetry)
-    if options.tile_by is not None:
-        tile = np.asarray(options.tile_by)[cleaned.triangles]
-        demanded |= hinges.mark_sides(tile[hinges.first] != tile[hinges.second], len(cleaned.F))
     if mirror is not None:
         demanded, kept = (_mirror_sides(sides, hinges, mirror, cleaned.F) for sides in (demanded, kept))
     cost[kept] = KEPT_COST

@@ -256,6 +256,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             raise ValueError("faces needs uv: pass the texture coordinates that the other triangles keep")
         kept = keep_charts(whole, read_faces(wanted.faces, len(F)), corner_uv)
         cleaned = select(whole, kept.replaced)
+    if tile is not None:
+        cleaned = select(whole, np.ones(len(F), dtype=np.bool_), tile)
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     rules = find_rules(points, cleaned, F, costs, corner_uv if kept is None else None, wanted)
     bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit

@@ -11,7 +11,7 @@ import numpy as np
 from quasiharmonic.apps.atlas.packing.layout import MAX_SIZE
 from quasiharmonic.apps.atlas.packing.pack import Packing, Placement
 from quasiharmonic.apps.atlas.packing.shapes import Shape
-from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, to_complex, to_points
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, count_of, to_complex, to_points
 
 # Smallest side of a chart's box in texels. Boxes begin at multiples of it, so that texels of half the resolution fit.
 _CELL = 2
@@ -22,12 +22,12 @@ _LOWER, _TRIALS, _BISECTIONS = 0.8, 60, 7
 
 
 @dataclass(frozen=True, eq=False)
-class _Boxes:
+class _TexelBoxes:
     """Boxes of charts at unit scale: sides (c, 2), their directions (c,), and which charts are rectangles (c,)."""
 
     sides: FloatArray
-    directions: FloatArray
-    rectangular: FloatArray
+    directions: ComplexArray
+    rectangular: BoolArray
 
     def stretch(self, scale: float) -> FloatArray:
         """Return the factors (c, 2) on both sides of each chart; sides of rectangles become whole texels."""
@@ -67,10 +67,10 @@ def pack_texel_boxes(
         If the charts do not fit. The message names a sufficient resolution.
     """
     shapes = [shape for _, shape in charts]
-    directions = np.array([shape.direction if rotate else 1.0 for shape in shapes])
+    directions = np.array([shape.direction if rotate else 1.0 for shape in shapes], dtype=np.complex128)
     sides = np.array([shape.extent(complex(along)) for shape, along in zip(shapes, directions, strict=True)])
     area = np.array([shape.area for shape in shapes])
-    boxes = _Boxes(sides, directions, area >= (1 - _RECTANGLE) * sides.prod(axis=1))
+    boxes = _TexelBoxes(sides, directions, area >= (1 - _RECTANGLE) * sides.prod(axis=1))
     gap = ceil(padding)
     scale = texels_per_unit or sqrt(size[0] * size[1] / max(float(sides.prod(axis=1).sum()), np.finfo(float).tiny))
     placed = _place(boxes.texels(scale), size, gap, rotate)

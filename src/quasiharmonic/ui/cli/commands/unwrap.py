@@ -163,9 +163,11 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         add_map,
         corner_positions,
         is_written,
+        material_densities,
         statement_labels,
     )
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
+    from quasiharmonic.io.errors import printable
     from quasiharmonic.util.arrays import count_of
 
     below = io.place_map(mesh, mesh, options.channel).lower_maps
@@ -209,6 +211,10 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             "seconds": time.perf_counter() - began,
         }
         lines = [f"wrote {options.output}: {result.message}", result.summary(), *_cleaning(result)]
+        if densities := material_densities(mesh, result):
+            facts["material_texels_per_unit"] = densities
+            shown = ", ".join(f"{printable(name)} {density:.4g}" for name, density in densities.items())
+            lines.append(f"texels per unit by material: {shown}")
         if baked is not None:
             facts["bake"] = baked.to_dict()
             lines.append(baked.summary())
