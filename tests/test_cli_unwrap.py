@@ -144,7 +144,7 @@ def test_memory_is_bounded_in_every_phase(model, tmp_path, monkeypatch, capsys):
         used.append(900 << 20)
         return pack_charts(*args, **options)
 
-    monkeypatch.setattr("quasiharmonic.apps.unwrapping.unwrap.pack_charts", pack)
+    monkeypatch.setattr("quasiharmonic.apps.unwrapping.placing.pack_charts", pack)
     call = ["unwrap", model, "-o", tmp_path / "out.obj", "--resolution", 256, "--memory"]
     assert run(*call, "800M") == 2
     assert "used more than 800 MiB of memory (--memory), nothing was written" in capsys.readouterr().err

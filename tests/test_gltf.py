@@ -89,7 +89,7 @@ def test_only_the_map_changes(tmp_path):
     np.testing.assert_array_equal(numbers(new, place), [[0, 1], [2, 1], [2, -1], [0, -0.5]])
     assert b"\x89PNG not looked into" in new
     assert io.not_held("out.glb", mesh) == []
-    assert io.not_held("out.obj", mesh) == ["materials", "animations", "JOINTS_0 of vertices", "TEXCOORD_1 of vertices"]
+    assert io.not_held("out.obj", mesh) == ["animations", "JOINTS_0 of vertices", "TEXCOORD_1 of vertices"]
     assert "JOINTS_0 of vertices" in io.not_held("out.ply", mesh)
 
 

@@ -446,6 +446,13 @@ class UnwrapOptions(Options):
     padding: float = option(4.0, "minimum texels between two charts (default: 4)")
     texels_per_unit: float | None = option(None, "texels per unit of length of the model (default: as many as fit)")
     tiles: int = option(1, "UDIM tiles (default: 1)", check=positive)
+    tile_by: Any = option(None)
+    lightmap: bool = option(
+        False,
+        "make texture coordinates for a lightmap: charts on whole texels, so that filters do not mix them, and places "
+        "of their own for instances",
+        check=switch,
+    )
     rotate: bool = option(True)
     stack: Any = option(False, check=stacking)
     outward: bool = option(False, "treat closed components that are inside out as turned outward", check=switch)

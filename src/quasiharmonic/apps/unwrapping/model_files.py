@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
+from quasiharmonic.geometry.mesh.reference import area_vectors
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
+from quasiharmonic.io.models.materials import label_materials
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.util.arrays import FloatArray, IntArray, mark
+from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, mark, pad_to_space
 
 # Factor on the cost of a seam inside a polygon, which the file cannot store.
 _INSIDE_POLYGON = 1e3
@@ -57,6 +59,28 @@ def label_statements(mesh: MeshData, keyword: str) -> tuple[IntArray, dict[bytes
         if word == keyword.encode():
             labels[max(at, 0) :] = names.setdefault(name.strip(), len(names) + 1)
     return labels[mesh.rings.of_triangle], names
+
+
+def material_densities(mesh: MeshData, result: UnwrapResult) -> dict[str, float]:
+    """Return the texels per unit of length of each material by its name: the root of texels per area of its surface.
+
+    Materials without area are left out. A file without materials has none.
+    """
+    label, names = label_materials(mesh)
+    measured = ~mark(len(mesh.F), result.cleaned.excluded)
+    texels = np.linalg.norm(area_vectors(pad_to_space(result.uvs * result.resolution), result.indices), axis=1)
+    # In this unit, squares neither overflow nor underflow.
+    exponent = find_exponent(mesh.V)
+    area = np.linalg.norm(area_vectors(np.ldexp(mesh.V, -exponent), mesh.F), axis=1)
+    sums = [np.zeros(len(names)), np.zeros(len(names))]
+    for total, values in zip(sums, (texels, area), strict=True):
+        np.add.at(total, label[measured], values[measured])
+    found: dict[str, list[float]] = {}
+    for name, one, other in zip(names, *sums, strict=True):
+        if name is not None and other > 0:
+            pair = found.setdefault(name, [0.0, 0.0])
+            pair[0], pair[1] = pair[0] + float(one), pair[1] + float(other)
+    return {name: float(np.ldexp((one / other) ** 0.5, -exponent)) for name, (one, other) in found.items()}
 
 
 def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
+from quasiharmonic.apps.unwrapping.model_files import label_statements
 from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStatus
 from quasiharmonic.io.adapters.accepts_mesh import AcceptsMesh
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
@@ -205,6 +206,8 @@ def accepts_scene(function: AcceptsMesh[P, UnwrapResult]) -> AcceptsScene[P]:
             return _unwrap_scene(called, given, **options)
         if isinstance(given, MeshData) and given.carried is not None and given.carried.fits(given):
             options = {"meshes": given.carried.number_meshes(), **options}
+        if isinstance(options.get("tile_by"), str) and (isinstance(given, MeshData) or hasattr(given, "visual")):
+            options = {**options, "tile_by": _number_materials([given], [len(mesh_arrays(given)[1])])}
         result = called(given, **options)
         return replace(result, source=given) if hasattr(given, "vertex_attributes") else result
 
@@ -232,12 +235,15 @@ def _unwrap_scene(
 ) -> SceneResult:
     """Unwrap several meshes into one texture."""
     check_choice("instances", instances, INSTANCES)
+    instances = "own" if options.get("lightmap") else instances
     placed, of_part = (
         _place_scene(scene, instances, weights) if _is_scene(scene) else _place_list(scene, instances, weights)
     )
     meshes = [_read(one) for one in placed]
     points = [_move(one, V) for one, (V, _) in zip(placed, meshes, strict=True)]
     vertices, triangles = [len(V) for V, _ in meshes], [len(F) for _, F in meshes]
+    if isinstance(options.get("tile_by"), str) and options["tile_by"] == "material":
+        options["tile_by"] = _number_materials([one.source for one in placed], triangles)
     first, begin = np.cumsum([0, *vertices]), np.cumsum([0, *triangles])
     atlas = unwrap(
         np.concatenate(points),
@@ -264,6 +270,21 @@ def _unwrap_scene(
         )
     named = [replace(parts[k], name=name) for name, k in of_part]
     return SceneResult(tuple(named), atlas, scene)
+
+
+def _number_materials(sources: Sequence[Any], triangles: Sequence[int]) -> IntArray:
+    """Return the number of the material (f,) of each triangle of several meshes; materials of one name are one."""
+    known, numbers = dict[object, int](), []
+    for source, count in zip(sources, triangles, strict=True):
+        if isinstance(source, MeshData):
+            label, names = label_statements(source, "usemtl")
+            keys: list[object] = [b"", *names]
+        else:
+            material = getattr(getattr(source, "visual", None), "material", None)
+            name = getattr(material, "name", None)
+            label, keys = np.zeros(count, dtype=np.int64), [id(material) if name is None else str(name).encode()]
+        numbers.append(np.array([known.setdefault(key, len(known)) for key in keys])[label])
+    return np.concatenate(numbers)
 
 
 def _place_list(scene: list[Any], instances: str, weights: Any) -> tuple[list[_Placed], list[tuple[str, int]]]:

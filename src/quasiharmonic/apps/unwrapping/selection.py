@@ -44,15 +44,19 @@ def read_faces(faces: ArrayLike, count: int) -> BoolArray:
     return mask
 
 
-def select(cleaned: CleanedMesh, chosen: BoolArray) -> CleanedMesh:
+def select(cleaned: CleanedMesh, chosen: BoolArray, apart: IntArray | None = None) -> CleanedMesh:
     """Return the part of a cleaned mesh with the chosen triangles (f,) of the model.
 
-    Its vertices are split where the part only touches itself. What concerns the model stays.
+    It is cut between triangles with different numbers ``apart`` (f,). Its vertices are split where the part only
+    touches itself. What concerns the model stays.
     """
     rows = np.flatnonzero(chosen[cleaned.triangles])
     if not rows.size:
         raise ValueError("all triangles that faces selects are degenerate or repeated: select others")
-    F, corner = renumber(fans(cleaned.F[rows])[0], cleaned.F[rows])
+    joined = (
+        cleaned.F[rows] if apart is None else cleaned.F[rows] + len(cleaned.V) * apart[cleaned.triangles[rows], None]
+    )
+    F, corner = renumber(fans(joined)[0], cleaned.F[rows])
     origin = cleaned.F[rows].ravel()[corner]
     return replace(
         cleaned,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS
-from quasiharmonic.apps.atlas.packing.pack import check_texture, pack_charts
+from quasiharmonic.apps.atlas.packing.pack import check_texture
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
@@ -28,6 +28,7 @@ from quasiharmonic.apps.unwrapping.layout import (
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.mirrored_charts import pair_charts
+from quasiharmonic.apps.unwrapping.placing import check_placing, number_tiles, place_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStep, find_status
 from quasiharmonic.apps.unwrapping.scenes import accepts_scene
 from quasiharmonic.apps.unwrapping.seam_rules import Rules, find_rules
@@ -67,6 +68,8 @@ class UnwrapKeywords(TypedDict, total=False):
     padding: float
     texels_per_unit: float | None
     tiles: int
+    tile_by: ArrayLike | str | None
+    lightmap: bool
     rotate: bool
     stack: bool | str
     outward: bool
@@ -122,6 +125,16 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Texels per unit of length of the model. Default: the largest value at which all charts fit.
     tiles : int
         Number of tiles (UDIM). Tile k is the unit square whose lower left corner is ``(k % 10, k // 10)``.
+    tile_by : (f,) array of int or "material", optional
+        The triangles with the same number get a tile of their own, in ascending order of the numbers, all tiles at one
+        density. With ``"material"``, the numbers are those of the materials of a file, a `MeshData`, or of the meshes
+        of trimesh in a list or a scene.
+    lightmap : bool
+        Whether the texture is a lightmap: boxes of charts begin at even texels, sides of rectangular charts lie between
+        texels, which changes their length by at most half a texel, and no chart is narrower than two texels. Edges of
+        more than 60° are seams, unless ``hard_edges`` is given. Instances have places of their own. The padding is at
+        least two texels; then no bilinear filter mixes charts, at the resolution or at half of it.
+        `UnwrapResult.stretch` includes the change of the lengths.
     rotate : bool
         Whether charts may be rotated to fit better.
     stack : bool or str
@@ -220,7 +233,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     began = time.perf_counter()
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    wanted = UnwrapOptions(**options)
+    wanted = check_placing(UnwrapOptions(**options))
+    tile = None if wanted.tile_by is None else number_tiles(wanted.tile_by, len(F))
     size = check_texture(
         wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, bool(wanted.stack)
     )
@@ -242,6 +256,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             raise ValueError("faces needs uv: pass the texture coordinates that the other triangles keep")
         kept = keep_charts(whole, read_faces(wanted.faces, len(F)), corner_uv)
         cleaned = select(whole, kept.replaced)
+    if tile is not None:
+        cleaned = select(whole, np.ones(len(F), dtype=np.bool_), tile)
     points = np.pad(np.ldexp(cleaned.V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     rules = find_rules(points, cleaned, F, costs, corner_uv if kept is None else None, wanted)
     bound, padding, density = float(wanted.max_stretch), float(wanted.padding), wanted.texels_per_unit
@@ -261,14 +277,12 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         charts, strips = made
     while True:
         report("pack")
-        packing = pack_charts(
-            [(chart.uv, chart.F) for chart in charts],
-            resolution=size,
-            padding=padding,
-            texels_per_unit=density,
-            tiles=wanted.tiles,
-            rotate=wanted.rotate,
-            stack=bool(wanted.stack),
+        packing = place_charts(
+            charts,
+            None if tile is None else tile[cleaned.triangles],
+            wanted,
+            size,
+            density,
             kinds=pair_charts(charts, rules.mirror) if wanted.stack == "mirrored" else None,
             closely=_PACKED_CLOSELY if ended else BITMAPS,
             occupied=None if kept is None or not kept.count else (kept.layout.uv, kept.layout.rows),

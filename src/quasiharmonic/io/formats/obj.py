@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.io.formats.obj_library import list_lost_looks, make_library
 from quasiharmonic.io.formats.objlines import REFUSED, read_obj_lines
 from quasiharmonic.io.lowlevel.atomic import no_remains, write_whole
 from quasiharmonic.io.lowlevel.textual import integer_table, number_table, read_text
@@ -66,7 +67,8 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
 
     Numbers are written so that reading them returns the same doubles. The name of a material library (``mtllib``) is
     changed so that the new file refers to the same library. With a texture, two more files are written: a library and
-    an image (`quasiharmonic.io.models.materials.companions`).
+    an image (`quasiharmonic.io.models.materials.companions`). A mesh that was read from a glTF file gets a library of
+    this name, too, and the images of its materials, ``NAME-texture-0.png`` and so on.
 
     Parameters
     ----------
@@ -84,7 +86,10 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
         If the file cannot be written. An existing file is then unchanged.
     """
     beside = () if mesh.texture is None else companions(path, mesh.texture)
-    with no_remains(*beside):
+    mesh, files = make_library(path, mesh)
+    with no_remains(*beside, *files):
+        for name, data in files.items():
+            write_whole(name, data, durable=durable)
         if mesh.texture is not None:
             mesh = write_material(path, mesh, durable=durable)
         mesh = with_libraries(path, mesh)
@@ -96,7 +101,12 @@ def not_in_obj(mesh: MeshData) -> list[str]:
     """Return descriptions of the mesh data that an OBJ file will not contain."""
     lost = materials_lost(mesh)
     further = [] if mesh.carried is None else mesh.carried.further()
-    return lost + [what for what in further if not (lost and what == "materials")]
+    looks = list_lost_looks(mesh)
+    return [
+        *lost,
+        *(looks or []),
+        *(what for what in further if what != "materials" or not (lost or looks is not None)),
+    ]
 
 
 def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:

@@ -194,11 +194,10 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
             if p == 0 and isinstance(mesh.get("name"), str):
                 statements.append((_statement("o", mesh["name"]), faces))
             if "material" in primitive:
-                material = tree["materials"][whole(primitive["material"])]
+                index = whole(primitive["material"])
                 # A single material without a name needs no statement.
-                if "name" in material or len(tree["materials"]) > 1:
-                    name = str(material.get("name", primitive["material"]))
-                    statements.append((_statement("usemtl", name), faces))
+                if "name" in tree["materials"][index] or len(tree["materials"]) > 1:
+                    statements.append((material_statement(tree, index), faces))
             triangles.append(pool.first + own)
             faces += len(own)
     return pools, parts, np.concatenate(triangles), statements
@@ -225,6 +224,11 @@ def _triangles(corners: IntArray, mode: int) -> IntArray:
     strip = np.stack([corners[i], corners[i + 1 + i % 2], corners[i + 2 - i % 2]], axis=1)
     # Degenerate triangles only join strips; drop them.
     return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
+
+
+def material_statement(tree: dict[str, Any], index: int) -> bytes:
+    """Return the statement that names a material, by its name or else its index."""
+    return _statement("usemtl", str(tree["materials"][index].get("name", index)))
 
 
 def _statement(keyword: str, name: str) -> bytes:

@@ -63,6 +63,7 @@ def add_parser(commands: Commands) -> None:
         resolution=number(
             texture_size, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)", default=(2048, 2048)
         ),
+        tile_by=choice(("material",), "give each material a UDIM tile of its own (default: all share them)"),
         no_rotate=flag("do not rotate charts to fit better"),
         stack=choice(
             ("mirrored",),
@@ -127,6 +128,8 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("images are shown by the first texture coordinates: omit --bake and --texture, or --channel")
     if options.bake:
         _check_bake(options)
+    if options.lightmap and options.input.suffix.lower() in (".glb", ".gltf"):
+        options.instances = "own"
     return pipeline.change_map(
         options,
         lambda mesh: _unwrap(options, mesh, began),
@@ -156,8 +159,15 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
 
     from quasiharmonic import io
     from quasiharmonic.apps.unwrapping.hard_edges import find_hard_edges
-    from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions, is_written
+    from quasiharmonic.apps.unwrapping.model_files import (
+        add_map,
+        corner_positions,
+        is_written,
+        material_densities,
+        statement_labels,
+    )
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
+    from quasiharmonic.io.errors import printable
     from quasiharmonic.util.arrays import count_of
 
     below = io.place_map(mesh, mesh, options.channel).lower_maps
@@ -172,6 +182,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             edge_costs=_edge_costs(mesh, options.edge_costs),
             hard_edges=find_hard_edges(mesh) if options.hard_edges == "file" else options.hard_edges,
             meshes=None if mesh.carried is None else mesh.carried.number_meshes(),
+            tile_by=None if options.tile_by is None else statement_labels(mesh, "usemtl"),
             seams=_read_integers(options.seams, 2),
             no_seams=_read_integers(options.no_seams, 2),
             labels=_labels(mesh, options.labels),
@@ -200,6 +211,10 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             "seconds": time.perf_counter() - began,
         }
         lines = [f"wrote {options.output}: {result.message}", result.summary(), *_cleaning(result)]
+        if densities := material_densities(mesh, result):
+            facts["material_texels_per_unit"] = densities
+            shown = ", ".join(f"{printable(name)} {density:.4g}" for name, density in densities.items())
+            lines.append(f"texels per unit by material: {shown}")
         if baked is not None:
             facts["bake"] = baked.to_dict()
             lines.append(baked.summary())
@@ -223,8 +238,8 @@ def _check_bake(options: argparse.Namespace) -> None:
     """Raise ValueError if the look cannot be baked with these options."""
     if options.texture is not None:
         raise ValueError("--bake makes the texture: omit --texture")
-    if options.tiles > 1:
-        raise ValueError("--bake makes one texture: omit --tiles")
+    if options.tiles > 1 or options.tile_by is not None:
+        raise ValueError("--bake makes one texture: omit --tiles and --tile-by")
     BakeOptions(size=options.resolution)
     pipeline.check_image_output(options)
 
