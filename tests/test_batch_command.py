@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from quasiharmonic.ui.cli import commands, main
+from quasiharmonic.ui.cli import commands, main, streams
 from shared.datasets import write_stars
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
@@ -64,7 +64,7 @@ class TestCommand:
         pty = pytest.importorskip("pty")
         # Print every problem, however fast they follow each other.
         monkeypatch.setattr(commands.batch, "LIVE", 0)
-        monkeypatch.setattr(commands.batch, "LOG", 0)
+        monkeypatch.setattr(streams, "LOG", 0)
         command = ["batch", str(stars), "-j", "1", "-o"]
         leader, follower = pty.openpty()
         with os.fdopen(follower, "w") as terminal, monkeypatch.context() as patch:

@@ -17,6 +17,8 @@ from quasiharmonic import flatten, harmonise, injective_map, injective_maps, kee
 from quasiharmonic.apps.gradients.layers import SolvedOptions
 from quasiharmonic.energies import polishing
 from quasiharmonic.linsolve import BACKENDS
+from quasiharmonic.solver.field.functionals import FUNCTIONALS
+from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
 from quasiharmonic.solver.search import harmonising, stages
 from quasiharmonic.ui.cli.arguments import add_options, declared
 from quasiharmonic.util import options
@@ -136,6 +138,8 @@ def test_names_are_those_of_the_values():
     assert tuple(polishing.ENERGIES) == options.ENERGIES
     assert set(options.HARMONISED) == set(harmonising.ENERGIES)
     assert tuple(stages.STRATEGIES) == options.STRATEGIES
+    assert tuple(FUNCTIONALS) == options.FUNCTIONALS
+    assert tuple(PARAMETERISATIONS) == options.PARAMETERISATIONS
     assert set(options.LINEAR_SOLVERS) == {"auto", *BACKENDS}
 
 

@@ -1,10 +1,13 @@
 """The map in a mesh file, and problems from a mesh file and a file of fixed vertices."""
 
+import json
+
 import numpy as np
 import pytest
 
-from quasiharmonic import io
+from quasiharmonic import io, solve
 from quasiharmonic.io import MeshFileError
+from quasiharmonic.ui.cli import main
 from shared.datasets import write_problem
 from shared.obj_files import SQUARE, SQUARE_VT, bits, both_readers_agree
 from shared.obj_reader import written
@@ -143,3 +146,21 @@ def test_problems_in_every_combination_of_formats(tmp_path):
     again = io.read_mesh(out)
     assert bits(again.V) == bits(found.V) == bits(V)
     assert bits(io.map_of(again)) == bits(moved)
+
+
+def test_a_folder_is_solved_by_a_single_descent(tmp_path, capsys):
+    V, F, fixed, target = star_problem(6)[:4]
+    write_problem(tmp_path / "a", V, F, fixed, target)
+    result = solve(io.read_problem(tmp_path / "a"))
+    assert result.success
+    history = result.to_dict()["history"]
+    assert [step["iteration"] for step in history] == [step.iteration for step in result.history]
+    assert json.loads(json.dumps(history))[-1]["inverted"] == 0
+    descent = "--functional", "sobolev", "--parameterisation", "si-log", "--iterations", "3"
+    command = ["map", str(tmp_path / "a"), "-o", str(tmp_path / "m.obj"), "--no-polish", *descent]
+    main([*command, "--json", str(tmp_path / "r.json")])
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [stage["name"] for stage in report["stages"]] == ["vector-adam, si-log, sobolev"]
+    assert report["n_iterations"] <= 3
+    assert main([*command, "--strategy", "paper"]) == 2
+    assert "omit --functional, or --strategy" in capsys.readouterr().err

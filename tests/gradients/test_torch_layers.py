@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic import injective_map, polish_derivative
+from quasiharmonic import injective_map, injective_maps, polish_derivative
 from quasiharmonic.apps.gradients import Doubt
+from quasiharmonic.apps.gradients import layers as shared_layers
 from shared.derivative_problems import flattened_ring, held_ring, tensors
 
 torch = pytest.importorskip("torch")
@@ -131,9 +132,9 @@ def test_errors():
     target = leaf(problem.target)
     with pytest.raises(TypeError, match=r"target must be a tensor, not ndarray"):
         layers.quasi_harmonic_map(problem, target=problem.target)
-    with pytest.raises(TypeError, match=r"target must be of torch.float64, not torch.float32: target.to\("):
-        layers.injective_map(problem, target=target.float())
-    with pytest.raises(TypeError, match=r"mu must be of torch.complex128, not torch.float64"):
+    with pytest.raises(TypeError, match=r"target must be of torch.float64 or torch.float32, not torch.float16: target"):
+        layers.injective_map(problem, target=target.half())
+    with pytest.raises(TypeError, match=r"mu must be of torch.complex128 or torch.complex64, not torch.float64"):
         layers.quasi_harmonic_map(problem, torch.zeros(len(problem.F), dtype=torch.float64))
     with pytest.raises(ValueError, match="target is on meta, but maps are computed on the CPU"):
         layers.injective_map(problem, target=target.to("meta"))
@@ -163,3 +164,38 @@ def test_a_doubtful_gradient_warns():
     maps = layers.quasi_harmonic_map(problem, leaf(mu))
     with pytest.warns(layers.DoubtfulDerivative, match=Doubt.CLIPPED.value[:20]):
         maps.sum().backward()
+
+
+def test_single_precision_is_computed_in_double():
+    problem = held_ring()
+    exact, mu = leaf(problem.target), leaf(tensors(len(problem.F)))
+    single = exact.detach().float().requires_grad_()
+    mu_single = mu.detach().to(torch.complex64).requires_grad_()
+    for function, wide, narrow in (
+        (lambda t: layers.injective_map(problem, target=t), exact, single),
+        (lambda m: layers.quasi_harmonic_map(problem, m), mu, mu_single),
+    ):
+        maps = function(narrow)
+        assert maps.dtype == torch.float32
+        torch.testing.assert_close(maps.double(), function(wide), rtol=1e-5, atol=1e-6)
+        (maps**2).sum().backward()
+        (function(wide) ** 2).sum().backward()
+        assert narrow.grad.dtype == narrow.dtype
+        torch.testing.assert_close(narrow.grad.to(wide.dtype), wide.grad, rtol=1e-3, atol=1e-4)
+    assert layers.quasi_harmonic_map(problem, mu_single, target=exact).dtype == torch.float64
+
+
+def test_a_batch_is_solved_as_a_batch(monkeypatch):
+    problem, calls = held_ring(), []
+
+    def count(problems, **given):
+        calls.append(given)
+        return injective_maps(problems, **given)
+
+    monkeypatch.setattr(shared_layers, "injective_maps", count)
+    targets = leaf(np.stack([problem.target, 1.1 * problem.target, problem.target * [1, 0.9]]))
+    maps = layers.injective_map(problem, target=targets)
+    assert len(calls) == 1
+    for uv, target in zip(maps, targets, strict=True):
+        torch.testing.assert_close(uv, layers.injective_map(problem, target=target), rtol=1e-9, atol=1e-9)
+    assert len(calls) == 1

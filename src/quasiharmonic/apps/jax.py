@@ -1,10 +1,10 @@
 """Maps as functions of JAX, with gradients.
 
-Parameters, results and errors are those of the functions of the same names in `quasiharmonic.torch`, with JAX arrays in
-place of tensors. First call ``jax.config.update("jax_enable_x64", True)``. Besides leading batch axes, `jax.vmap` adds
-one as well. Under `jax.jit` the maps are computed by a callback (`jax.pure_callback`), and JAX raises its own error
-with the message of `MapNotFound`. First derivatives are available in reverse mode (`jax.grad`, `jax.vjp`). JAX does not
-support `jax.jvp` of these functions.
+Arrays are in double or single precision (``mu`` in complex128 or complex64). Maps are computed in double precision, and
+returned in single precision if all arguments are, or JAX does not use double (``jax_enable_x64``). Besides leading
+batch axes, `jax.vmap` adds one as well. Under `jax.jit` the maps are computed by a callback (`jax.pure_callback`), and
+JAX raises its own error with the message of `MapNotFound`. First derivatives are available in reverse mode (`jax.grad`,
+`jax.vjp`). JAX does not support `jax.jvp` of these functions.
 
 All maps share one function with a custom gradient, `apply_layer`, and build on `apps.gradients.layers`.
 """
@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from threading import Lock
-from typing import Any, Unpack
+from typing import Any
 
 from quasiharmonic.util.optional import explain_missing, with_extra
 
@@ -26,35 +26,27 @@ with explain_missing("quasiharmonic.jax needs JAX", with_extra("jax")):
     import jax.numpy as jnp
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.derivative import Derivative
+from quasiharmonic.apps.gradients.layer_functions import LayerFunctions
 from quasiharmonic.apps.gradients.layers import (
     Array,
     DoubtfulDerivative,
-    FlattenedKeywords,
     Layer,
     MapNotFound,
-    SolvedKeywords,
-    SolvedOptions,
     compute_gradients,
     compute_maps,
-    make_flattened_layer,
-    make_solved_layer,
-    make_tensor_layer,
     select_arguments,
     sum_to_shape,
 )
-from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.problem import Problem
 from quasiharmonic.util.arrays import FloatArray
-from quasiharmonic.util.options import FlattenOptions, takes
 
 __all__ = ["DoubtfulDerivative", "MapNotFound", "flatten", "injective_map", "quasi_harmonic_map"]
 
 # JAX passes only arrays from the forward to the backward pass. This cache keeps the last derivatives; older ones are
 # computed again from their maps.
 _MAX_RECENT = 16
+_SINGLE = np.dtype(np.float32), np.dtype(np.complex64)
 _lock = Lock()
 _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 
@@ -66,9 +58,19 @@ def apply_layer(make: Callable[..., Layer], settings: tuple[Any, ...], arguments
     # All arrays get the same number of leading axes, so that the axis that `jax.vmap` adds is the first of each.
     axes = [np.ndim(array) - len(layer.shapes[name]) for name, array in zip(names, given, strict=True)]
     most = max(axes, default=0)
-    arrays = (jnp.expand_dims(array, tuple(range(most - own))) for array, own in zip(given, axes, strict=True))
+    single = bool(given) and all(array.dtype in _SINGLE for array in given)
+    arrays = (
+        jnp.expand_dims(jnp.asarray(array, dtype=_widest(name)), tuple(range(most - own)))
+        for name, array, own in zip(names, given, axes, strict=True)
+    )
     maps: jax.Array = _map(layer, names, *arrays)
-    return maps
+    return maps.astype(np.float32) if single else maps
+
+
+def _widest(name: str) -> np.dtype[Any]:
+    """The type in which JAX passes an argument or ``"uv"``: double precision if enabled."""
+    found: np.dtype[Any] = jax.dtypes.canonicalize_dtype(np.complex128 if name == "mu" else np.float64)
+    return found
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class _Call:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _map(layer: Layer, names: tuple[str, ...], *arrays: jax.Array) -> jax.Array:
-    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.map_shape), jnp.float64)
+    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.map_shape), _widest("uv"))
     maps: jax.Array = jax.pure_callback(_Call(_compute, layer, names), shape, *arrays, vmap_method="expand_dims")
     return maps
 
@@ -120,10 +122,11 @@ def _lead(layer: Layer, names: tuple[str, ...], arrays: tuple[jax.Array, ...]) -
 def _compute(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
     """Compute the maps, and cache their derivatives."""
     given = _by_name(names, arrays)
-    uv, derivatives = compute_maps(layer, given)
+    exact, derivatives = compute_maps(layer, given)
+    uv = exact.astype(_widest("uv"))
     with _lock:
         for item, derivative in zip(np.ndindex(uv.shape[:-2]), derivatives, strict=True):
-            _recent[_key(layer, layer.item(given, item), uv[item])] = derivative
+            _recent[_key(layer, layer.item(given, item), uv[item].astype(np.float64))] = derivative
         while len(_recent) > _MAX_RECENT:
             _recent.popitem(last=False)
     return uv
@@ -131,7 +134,8 @@ def _compute(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
 
 def _pull_back(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *arrays: Any) -> list[Array]:
     """The gradients with respect to all arguments, for the whole batch."""
-    given, uv, cotangent = _by_name(names, arrays), np.asarray(uv), np.asarray(cotangent)
+    given = _by_name(names, arrays)
+    uv, cotangent = (np.asarray(array, dtype=np.float64) for array in (uv, cotangent))
     lead = np.broadcast_shapes(uv.shape[:-2], cotangent.shape[:-2])
     uv, cotangent = (np.broadcast_to(array, (*lead, *layer.map_shape)) for array in (uv, cotangent))
     derivatives = []
@@ -142,11 +146,14 @@ def _pull_back(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *a
         derivatives.append(derivative or layer.derivative(own, uv[item]))
     found = compute_gradients(layer, derivatives, cotangent, names)
     # JAX's convention is ∂/∂Re − i ∂/∂Im.
-    return [found[name].conj() for name in names]
+    return [found[name].conj().astype(_widest(name)) for name in names]
 
 
 def _by_name(names: tuple[str, ...], arrays: tuple[Any, ...]) -> dict[str, Array]:
-    return {name: np.asarray(array) for name, array in zip(names, arrays, strict=True)}
+    return {
+        name: np.asarray(array, dtype=np.complex128 if name == "mu" else np.float64)
+        for name, array in zip(names, arrays, strict=True)
+    }
 
 
 def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer, bytes]:
@@ -158,16 +165,11 @@ def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer,
 
 
 def _check(name: str, array: Any) -> None:
-    if not jax.config.read("jax_enable_x64"):
-        raise TypeError(
-            "maps need double precision, but JAX uses single: jax.config.update('jax_enable_x64', True) before the "
-            "first array is created"
-        )
     if not isinstance(array, jax.Array | np.ndarray):
         raise TypeError(f"{name} must be an array, not {type(array).__name__}")
-    wanted = np.dtype(np.complex128 if name == "mu" else np.float64)
-    if array.dtype != wanted:
-        raise TypeError(f"{name} must be of {wanted}, not {array.dtype}: {name}.astype({str(wanted)!r})")
+    wanted = ("complex128", "complex64") if name == "mu" else ("float64", "float32")
+    if str(array.dtype) not in wanted:
+        raise TypeError(f"{name} must be of {' or '.join(wanted)}, not {array.dtype}: {name}.astype({wanted[0]!r})")
     if isinstance(array, jax.Array) and not isinstance(array, jax.core.Tracer):
         elsewhere = [device for device in array.devices() if device.platform != "cpu"]
         if elsewhere:
@@ -177,38 +179,7 @@ def _check(name: str, array: Any) -> None:
             )
 
 
-def quasi_harmonic_map(
-    problem: Problem,
-    mu: jax.Array | None = None,
-    *,
-    target: jax.Array | None = None,
-    rest: jax.Array | None = None,
-    reference: Reference = "equilateral",
-    linear_solver: str = "auto",
-) -> jax.Array:
-    """Return quasi-harmonic maps (…, n, 2) float64 of arrays, as `quasiharmonic.torch.quasi_harmonic_map`.
-
-    The gradient by ``mu`` is ``∂/∂Re μ − i ∂/∂Im μ``, JAX's convention.
-    """
-    settings = problem, reference, linear_solver
-    return apply_layer(make_tensor_layer, settings, {"mu": mu, "target": target, "rest": rest})
-
-
-@takes(SolvedOptions, SolvedKeywords)
-def injective_map(
-    problem: Problem,
-    *,
-    target: jax.Array | None = None,
-    rest: jax.Array | None = None,
-    **options: Unpack[SolvedKeywords],
-) -> jax.Array:
-    """Return polished injective maps (…, n, 2) float64 of arrays, as `quasiharmonic.torch.injective_map`."""
-    return apply_layer(make_solved_layer, (problem, options), {"target": target, "rest": rest})
-
-
-@takes(FlattenOptions, FlattenedKeywords)
-def flatten(
-    rest: jax.Array, F: ArrayLike, *, target: jax.Array | None = None, **options: Unpack[FlattenedKeywords]
-) -> jax.Array:
-    """Return maps (…, n, 2) float64 with a free boundary, as `quasiharmonic.torch.flatten`."""
-    return apply_layer(make_flattened_layer, (rest, F, target, options), {"rest": rest, "target": target})
+_functions = LayerFunctions(apply_layer)
+quasi_harmonic_map = _functions.quasi_harmonic_map
+injective_map = _functions.injective_map
+flatten = _functions.flatten

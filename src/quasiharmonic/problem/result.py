@@ -427,6 +427,9 @@ class MapResult(ReadOnly, Displayable, Outcome):
             "injective": self.injective,
             "linear_solver": self.linear_solver,
             "stages": [stage.to_dict() for stage in self.stages],
+            "history": [
+                vars(step) | {"energy": step.energy if math.isfinite(step.energy) else None} for step in self.history
+            ],
             "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
             **(self._refinement() if self.refinement_attempts else {}),
         }

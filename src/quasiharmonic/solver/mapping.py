@@ -18,6 +18,7 @@ from quasiharmonic.energies.polishing import polish_options, polish_result
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.handles import ProblemArrays
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run, run_within
@@ -143,13 +144,14 @@ def injective_map(
 
 @reports_progress
 @takes(MapOptions, MapKeywords)
-def solve(problem: Problem, **options: Unpack[MapKeywords]) -> MapResult:
+def solve(problem: Problem | ProblemArrays, **options: Unpack[MapKeywords]) -> MapResult:
     """Search for an injective map of a `Problem`.
 
     Parameters
     ----------
-    problem : Problem
-        It also names the reference triangles. The call changes only its caches, which make later solves faster.
+    problem : Problem or ProblemArrays
+        A `Problem` also names the reference triangles. The call changes only its caches, which make later solves
+        faster. Or the arrays that `quasiharmonic.io.read_problem` returns.
     strategy, polish, start, max_iterations, linear_solver, callback, record_every, time_limit, slide, refine
         See `injective_map`. With ``refine``, ``start`` and ``record_every`` apply to the given mesh.
 
@@ -165,6 +167,8 @@ def solve(problem: Problem, **options: Unpack[MapKeywords]) -> MapResult:
     ImportError
         If the named linear solver is not installed.
     """
+    if isinstance(problem, ProblemArrays):
+        problem = Problem(*problem)
     check_problem("solve", problem, ": use injective_map for the arrays V, F, fixed and target")
     checked = MapOptions(**options)
     return run_within(checked.time_limit, lambda: solve_problem(problem, checked))

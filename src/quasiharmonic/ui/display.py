@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
+from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.energies.measures import Distortion
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.problem import Problem
@@ -21,7 +22,7 @@ from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui import plot
 from quasiharmonic.ui.plot.canvas import RED, caption, new_figure, png_bytes, verdict
-from quasiharmonic.ui.plot.elements import elements_figure
+from quasiharmonic.ui.plot.elements import cut_tetrahedra, elements_figure, outline_elements
 from quasiharmonic.ui.plot.maps import map_figure
 from quasiharmonic.util.display import Displayable
 
@@ -46,7 +47,12 @@ def draw(shown: Displayable, kind: str, *, measure: str = "isometric") -> Figure
             return _result(shown, kind, measure)
         case MorphResult():
             qualities = shown.quality_before, shown.quality_after
-            return elements_figure(shown.F, (shown.points_before, shown.points), qualities, shown.inverted)
+            drawn = [outline_elements(shown.F, points) for points in (shown.points_before, shown.points)]
+            return elements_figure(drawn, qualities, shown.inverted)
+        case TetrahedraResult():
+            qualities, worst = (shown.quality_before, shown.quality_after), int(shown.quality_after.argmin())
+            drawn = [cut_tetrahedra(shown.T, points, worst) for points in (shown.points_before, shown.points)]
+            return elements_figure(drawn, qualities, shown.inverted)
         case Distortion():
             return plot.plot_distortion(shown.V, shown.F, shown.uv, measure)
         case Problem():

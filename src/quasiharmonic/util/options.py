@@ -30,6 +30,8 @@ ENERGIES = tuple(ENERGY_LABELS)
 FLATTENED = *ENERGIES, "distances"
 HARMONISED = "arap", "arap-unsigned", "area", "springs", *ENERGIES
 STRATEGIES = "speed", "paper"
+FUNCTIONALS = "neumann", "sobolev", "dirichlet", "poisson", "edge-poisson"
+PARAMETERISATIONS = "tanh", "si-log"
 #: Default maximum number of iterations of a search.
 MAX_ITERATIONS = 2000
 REFERENCES = "equilateral", "rest", "corrected"
@@ -276,6 +278,39 @@ class MapOptions(SolverOptions):
     slide: Any = option(False)
     refine: bool = option(
         False, "if no map exists, split as few inner edges as necessary (adds vertices at the end)", check=switch
+    )
+
+
+def one_of(*words: str | None) -> Callable[[str, Any], None]:
+    """Return a check of an option with one of several words."""
+
+    def check(name: str, value: Any) -> None:
+        if not isinstance(value, str | None) or value not in words:
+            raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {value!r}")
+
+    return check
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescentOptions(Options):
+    """Options of `quasiharmonic.methods.VectorAdam` as the only stage of a search; all None: a strategy."""
+
+    functional: str | None = option(
+        None,
+        "in place of a strategy: descend only this functional of the tensors (default: dirichlet)",
+        check=one_of(None, *FUNCTIONALS),
+        choices=FUNCTIONALS,
+    )
+    parameterisation: str | None = option(
+        None,
+        "in place of a strategy: parameterisation of the tensors in the descent (default: tanh)",
+        check=one_of(None, *PARAMETERISATIONS),
+        choices=PARAMETERISATIONS,
+    )
+    iterations: int | None = option(
+        None,
+        "in place of a strategy: maximum number of iterations of the descent (default: 1000)",
+        check=positive_or_none,
     )
 
 

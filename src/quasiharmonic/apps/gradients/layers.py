@@ -7,9 +7,10 @@ leading batch axes. Batches of several arguments are broadcast as in NumPy.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypedDict
+from itertools import repeat
+from typing import Any, TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +27,7 @@ from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve_problem
+from quasiharmonic.solver.search.many import ManyKeywords, injective_maps
 from quasiharmonic.util.arrays import FloatArray, index_array, real_array
 from quasiharmonic.util.options import FlattenOptions, MapOptions, Options, option
 
@@ -73,12 +75,13 @@ class Layer:
 
     ``shapes`` are the shapes of one problem's arguments, by name. ``derivative`` returns the derivative of one
     problem's map for its arguments, and for its positions (n, 2) if they are known; it raises MapNotFound if there is
-    no map.
+    no map. ``find``, if there is one, returns the results of several problems together.
     """
 
     settings: Hashable
     shapes: Mapping[str, tuple[int, ...]] = field(compare=False)
     derivative: Callable[[Mapping[str, Array], FloatArray | None], Derivative] = field(compare=False)
+    find: Callable[[Sequence[Mapping[str, Array]]], Iterator[MapResult]] | None = field(default=None, compare=False)
 
     @property
     def map_shape(self) -> tuple[int, int]:
@@ -127,8 +130,14 @@ def make_solved_layer(problem: Problem, options: SolvedKeywords) -> Layer:
         found = _check_found(solve_problem(posed, checked)) if uv is None else uv
         return differentiate_polish(posed.domain, found, polish_options(checked))
 
+    def find(items: Sequence[Mapping[str, Array]]) -> Iterator[MapResult]:
+        given = {name: getattr(checked, name) for name in ManyKeywords.__annotations__}
+        problems = (pose_problem(problem, arrays) for arrays in items)
+        return cast("Iterator[MapResult]", injective_maps(problems, **given))
+
     shapes = {"target": problem.target.shape, "rest": problem.V.shape}
-    return Layer(_to_comparable(("solved", problem, checked)), shapes, differentiate)
+    alone = start is not None or checked.slide is not False
+    return Layer(_to_comparable(("solved", problem, checked)), shapes, differentiate, None if alone else find)
 
 
 def make_flattened_layer(rest: Any, F: ArrayLike, target: Any, options: FlattenedKeywords) -> Layer:
@@ -176,9 +185,12 @@ def compute_maps(layer: Layer, arrays: Mapping[str, Array]) -> tuple[FloatArray,
     """
     lead = layer.batch(arrays)
     uv, derivatives = np.empty((*lead, *layer.map_shape)), []
-    for item in np.ndindex(lead):
+    given = [layer.item(arrays, item) for item in np.ndindex(lead)]
+    results = layer.find(given) if layer.find is not None and len(given) > 1 else repeat(None)
+    for item, own in zip(np.ndindex(lead), given, strict=True):
         try:
-            derivative = layer.derivative(layer.item(arrays, item), None)
+            result = next(results)
+            derivative = layer.derivative(own, None if result is None else _check_found(result))
         except ValueError as error:
             if lead:
                 error.add_note(f"This is item {', '.join(map(str, item))} of the batch.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quasiharmonic.apps.tetrahedra.result import summarise_qualities
+from quasiharmonic.apps.tetrahedra.result import describe_qualities, summarise_qualities
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import corner_triangles, name_elements
 from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
@@ -81,7 +81,7 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
 
     def summary(self) -> str:
         """Return a text that says whether the mesh is valid, and otherwise what is wrong."""
-        qualities = self._describe_quality()
+        qualities = self.describe_quality()
         if self.valid:
             return f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.\n{qualities}"
         lines = [f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}."]
@@ -110,14 +110,9 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         """
         return self._draw("quality")
 
-    def _describe_quality(self) -> str:
-        before, after = self.quality_before, self.quality_after
-        if not len(after):
-            return "no elements"
-        return (
-            f"Element quality, 1 at best: worst {before.min():.3g} before and {after.min():.3g} after (element "
-            f"{int(after.argmin())}), mean {before.mean():.3g} before and {after.mean():.3g} after."
-        )
+    def describe_quality(self) -> str:
+        """Return a sentence on the quality before and after, and where to remesh if it has become poor."""
+        return describe_qualities("element", self.F, self.points, self.quality_before, self.quality_after)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""

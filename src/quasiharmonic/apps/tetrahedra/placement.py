@@ -141,6 +141,7 @@ def place_vertices(
         energy=float(energy.densities(X).mean()) if certificate.positive else np.inf,
         quality_before=tetrahedron_quality(T, points),
         quality_after=tetrahedron_quality(T, begin),
+        points_before=points.copy(),
     )
 
 

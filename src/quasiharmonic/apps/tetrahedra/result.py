@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.certificate import TetrahedraCertificate
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
+from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Outcome
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _SIDES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
@@ -48,7 +52,7 @@ class TetrahedraObstruction:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TetrahedraResult(Outcome):
+class TetrahedraResult(Outcome, Displayable):
     """A tetrahedral mesh with some fixed vertices; returned by `morph` and `injective_tetrahedra`.
 
     Attributes
@@ -73,6 +77,8 @@ class TetrahedraResult(Outcome):
         Mean isotropic energy relative to the rest mesh, 1 for a rotation; infinite if a tetrahedron is not positive.
     quality_before, quality_after : (t,) float64
         `tetrahedron_quality` of every tetrahedron.
+    points_before : (n, 3) float64
+        All vertices before the morph.
     """
 
     points: FloatArray
@@ -87,6 +93,7 @@ class TetrahedraResult(Outcome):
     energy: float
     quality_before: FloatArray
     quality_after: FloatArray
+    points_before: FloatArray
 
     @property
     def inverted(self) -> IntArray:
@@ -109,13 +116,33 @@ class TetrahedraResult(Outcome):
         return self.iterations
 
     def summary(self) -> str:
-        """Describe the outcome, the certificate and the obstructions."""
+        """Describe the outcome, the certificate, the obstructions and the quality."""
         lines = [self.status.value, self.certificate.summary()]
         if self.forbidden.size:
             which = names_of("tetrahedron", "tetrahedra", self.forbidden)
             lines.append(f"Inverted or degenerate with four fixed vertices: {which}.")
         lines += [obstruction.text for obstruction in self.obstructions[:5]]
-        return "\n".join(lines)
+        return "\n".join([*lines, self.describe_quality()])
+
+    def short_repr(self) -> str:
+        """Return the first line of `summary`."""
+        return self.message
+
+    def describe_quality(self) -> str:
+        """Return a sentence on the quality before and after, and where to remesh if it has become poor."""
+        return describe_qualities("tetrahedron", self.T, self.points, self.quality_before, self.quality_after)
+
+    def plot(self) -> Figure:
+        """Draw a cut through the mesh before and after, coloured by quality, and histograms of the quality.
+
+        The cut is through the worst tetrahedron of the mesh after, normal to the shortest side of its bounding box.
+
+        Returns
+        -------
+        matplotlib Figure
+            Inverted tetrahedra are red. Notebooks display the figure directly.
+        """
+        return self._draw("quality")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""
@@ -128,6 +155,21 @@ class TetrahedraResult(Outcome):
             "energy": self.energy if np.isfinite(self.energy) else None,
             **summarise_qualities(self.quality_before, self.quality_after),
         }
+
+
+def describe_qualities(what: str, F: IntArray, points: FloatArray, before: FloatArray, after: FloatArray) -> str:
+    """Return a sentence on the qualities of elements before and after, and where to remesh if they have become poor."""
+    if not len(after):
+        return "no elements"
+    worst = int(after.argmin())
+    text = (
+        f"{what.capitalize()} quality, 1 at best: worst {before.min():.3g} before and {after[worst]:.3g} "
+        f"after ({what} {worst}), mean {before.mean():.3g} before and {after.mean():.3g} after."
+    )
+    if after[worst] < before.min() / 10:
+        place = ", ".join(f"{x:.4g}" for x in points[F[worst]].mean(axis=0))
+        text += f" Remesh around ({place}): the worst quality has fallen below a tenth of that before."
+    return text
 
 
 def summarise_qualities(before: FloatArray, after: FloatArray) -> dict[str, dict[str, float]]:

@@ -168,3 +168,5 @@ class MeshParts:
     fields: Mapping[str, Callable[[], FloatArray]]
     # Returns the bytes of the file with the first coordinates of its points replaced, by (n, 2) or (n, 3) float64
     replace_points: Callable[[FloatArray], bytes]
+    # Returns the nodes of each named set of the file, ascending. It raises `ValueError` if the sets are damaged.
+    find_sets: Callable[[], dict[str, IntArray]]

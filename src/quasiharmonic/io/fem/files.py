@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,21 @@ class FemMesh:
         if values[:, axes:].any():
             raise MeshFileError(self.source, f"the point data {name!r} have displacements out of the plane")
         return values[:, :axes].copy()
+
+    def find_set(self, name: str) -> IntArray:
+        """Return the nodes (k,) of a named set of the file, ascending; MeshFileError if there is no such set.
+
+        Gmsh: a physical group of any dimension, by its name or number. VTK: the points, or the nodes of the cells, at
+        which an array of integers is not zero; ``NAME=VALUE`` for those where it has this value. MFEM: a named set of
+        attributes of the boundary or of elements, or the number of an attribute of the boundary.
+        """
+        with reading(self.source, "the groups cannot be read: ", _DAMAGE):
+            sets = self.parts.find_sets()
+        nodes = sets.get(name)
+        if nodes is None or not nodes.size:
+            there = ", ".join(map(repr, islice(sets, 20))) + (", …" if len(sets) > 20 else "")
+            raise MeshFileError(self.source, f"there is no group {name!r}", remedy=f"available: {there or 'none'}")
+        return nodes
 
     def _finite_values(self, name: str, vertices: ArrayLike) -> FloatArray:
         """Return finite values at some points, (k, m) float64."""

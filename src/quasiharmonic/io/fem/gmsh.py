@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from itertools import groupby
+from typing import TypeAlias
 
 import numpy as np
 
@@ -20,6 +21,10 @@ _POINTS_AND_LINES = {1: 2, 8: 3, 15: 1}
 # The same for meshes in space, which may have elements of lower dimension on their boundary.
 _SOLIDS = {4: 4, 5: 8}
 _SURFACES = {**_ELEMENTS, 10: 9, 16: 8}
+# Dimension of each kind of element.
+_DIMENSIONS = {15: 0, **dict.fromkeys((1, 8), 1), **dict.fromkeys(_SURFACES, 2), **dict.fromkeys(_SOLIDS, 3)}
+# Elements of a kind: the kind, the physical group (version 2) or entity (version 4) of each, and the tags of the nodes.
+_Block: TypeAlias = tuple[int, IntArray, IntArray]
 _NAMES = {
     4: "tetrahedron",
     5: "hexahedron",
@@ -41,6 +46,8 @@ def read_gmsh(data: bytes, solid: bool = False) -> MeshParts:
     version, order, position = _format(data)
     nodes: list[tuple[IntArray, Table]] = []
     elements: list[IntArray] = []
+    blocks: list[_Block] = []
+    spans = {}
     later: dict[str, list[tuple[int, int]]] = {}
     for name, begin, end in _sections(data, position):
         if name == b"Nodes":
@@ -48,7 +55,11 @@ def read_gmsh(data: bytes, solid: bool = False) -> MeshParts:
         elif name == b"ParametricNodes":
             raise ValueError("nodes with parameters are not supported in version 2: save it as 4.1, or without them")
         elif name == b"Elements":
-            elements.append(_elements(data, begin, end, version, order, solid))
+            blocks = list(_blocks(data, begin, end, version, order, solid))
+            found = [nodes for kind, _, nodes in blocks if kind in (_SOLIDS if solid else _ELEMENTS)]
+            elements.append((join_solids if solid else join_elements)(found))
+        elif name in (b"PhysicalNames", b"Entities"):
+            spans[name] = begin, end
         elif name == b"NodeData":
             title = TableReader(data, begin, end, "<")
             if int(title.words()[0]) > 0:
@@ -82,6 +93,7 @@ def read_gmsh(data: bytes, solid: bool = False) -> MeshParts:
         np.dtype(np.float64),
         fields,
         lambda points: replace_numbers(data, place, np.tile(points, (len(nodes), 1))),
+        lambda: _find_sets(data, spans, version, order, blocks, (tags[known], known)),
     )
 
 
@@ -148,15 +160,14 @@ def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -
     return np.concatenate(numbers), stack_tables(values, 3)
 
 
-def _elements(data: bytes, begin: int, end: int, version: str, order: str | None, solid: bool) -> IntArray:
-    """Return the tags of the elements' nodes, in the format of `MeshParts.F`."""
-    wanted, join = (_SOLIDS, join_solids) if solid else (_ELEMENTS, join_elements)
-    found: list[IntArray] = []
+def _blocks(data: bytes, begin: int, end: int, version: str, order: str | None, solid: bool) -> Iterator[_Block]:
+    """Yield the blocks of elements, of all kinds."""
     if version == "2":
         head = TableReader(data, begin, end, "<")
         count = int(head.words()[0])
         if order is None:
-            return join(_element_lines(list(map(int, data[head.position : end].split())), count, solid))
+            yield from _element_lines(list(map(int, data[head.position : end].split())), count, solid)
+            return
         reader = TableReader(data, head.position, end, order)
     else:
         reader = TableReader(data, begin, end, order)
@@ -165,28 +176,80 @@ def _elements(data: bytes, begin: int, end: int, version: str, order: str | None
         # In version 2, tags of the element follow its number; it counts the elements, version 4 their blocks.
         if version == "2":
             kind, size, tags = reader.take("i4", 3).tolist()
+            group = 0
         else:
-            kind, size, tags = int(reader.take("i4", 3)[2]), int(reader.take("u8", 1)[0]), 0
+            first, second, kind = reader.take("i4", 3).tolist()
+            group = second if version == "4.1" else first
+            size, tags = int(reader.take("u8", 1)[0]), 0
         nodes = _nodes_of(kind, solid)
         table = reader.tables(size, ("u8" if version == "4.1" else "i4", 1 + tags + nodes))[0].values
-        if kind in wanted:
-            found.append(table[:, 1 + tags :].astype(np.int64))
+        groups = table[:, 1] if tags else np.full(len(table), group)
+        yield kind, groups.astype(np.int64), table[:, 1 + tags :].astype(np.int64)
         count -= max(size, 1) if version == "2" else 1
-    return join(found)
 
 
-def _element_lines(numbers: list[int], count: int, solid: bool) -> list[IntArray]:
-    """Return the elements of lines "number kind tags … nodes …" of version 2."""
-    found: list[list[int]] = []
+def _element_lines(numbers: list[int], count: int, solid: bool) -> Iterator[_Block]:
+    """Yield the elements of lines "number kind tags … nodes …" of version 2."""
+    found: list[tuple[int, int, list[int]]] = []
     at = 0
     for _ in range(count):
         check_end(at + 3, len(numbers))
         kind, stop = numbers[at + 1], at + 3 + numbers[at + 2] + _nodes_of(numbers[at + 1], solid)
-        if kind in (_SOLIDS if solid else _ELEMENTS):
-            found.append(numbers[stop - _nodes_of(kind, solid) : stop])
+        group = numbers[at + 3] if numbers[at + 2] else 0
+        found.append((kind, group, numbers[stop - _nodes_of(kind, solid) : stop]))
         at = stop
     check_end(at, len(numbers))
-    return [np.array(list(rows), dtype=np.int64) for _, rows in groupby(found, len)]
+    for kind, rows in groupby(found, lambda one: one[0]):
+        _, groups, nodes = zip(*rows, strict=True)
+        yield kind, np.array(groups, dtype=np.int64), np.array(nodes, dtype=np.int64)
+
+
+def _find_sets(
+    data: bytes,
+    spans: dict[bytes, tuple[int, int]],
+    version: str,
+    order: str | None,
+    blocks: list[_Block],
+    tags: tuple[IntArray, IntArray],
+) -> dict[str, IntArray]:
+    """Return the nodes of the physical groups by name, or by number without a name.
+
+    ``tags`` are the sorted tags of the nodes, and the nodes in this order.
+    """
+    names = {}
+    if b"PhysicalNames" in spans:
+        for line in data[slice(*spans[b"PhysicalNames"])].split(b"\n")[1:]:
+            words = line.strip().split(None, 2)
+            if len(words) == 3:
+                names[int(words[0]), int(words[1])] = words[2].strip(b'"').decode("utf-8", "replace")
+    groups: dict[tuple[int, int], list[int]] | None = None
+    if version != "2":
+        groups = _groups_of_entities(data, spans[b"Entities"], version, order) if b"Entities" in spans else {}
+    found: dict[str, list[IntArray]] = {}
+    for kind, numbers, nodes in blocks:
+        for number in np.unique(numbers).tolist():
+            own = nodes[numbers == number].ravel()
+            where = tags[1][np.searchsorted(tags[0], own).clip(max=len(tags[0]) - 1)]
+            for group in ([number] * (number != 0)) if groups is None else groups.get((_DIMENSIONS[kind], number), ()):
+                # The sign of a group in version 4 is the orientation of its elements.
+                name = names.get((_DIMENSIONS[kind], abs(group)), str(abs(group)))
+                found.setdefault(name, []).append(where)
+    return {name: np.unique(np.concatenate(parts)) for name, parts in found.items()}
+
+
+def _groups_of_entities(
+    data: bytes, span: tuple[int, int], version: str, order: str | None
+) -> dict[tuple[int, int], list[int]]:
+    """Return the physical groups of the entities of version 4, by their dimensions and tags."""
+    reader, groups = TableReader(data, *span, order), {}
+    for dimension, count in enumerate(reader.take("u8", 4).tolist()):
+        for _ in range(count):
+            tag = int(reader.take("i4", 1)[0])
+            reader.skip("f8", 3 if version == "4.1" and dimension == 0 else 6)
+            groups[dimension, tag] = reader.take("i4", int(reader.take("u8", 1)[0])).tolist()
+            if dimension:
+                reader.skip("i4", int(reader.take("u8", 1)[0]))
+    return groups
 
 
 def _nodes_of(kind: int, solid: bool) -> int:

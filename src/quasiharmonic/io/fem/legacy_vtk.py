@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from quasiharmonic.io.fem.byte_tables import MeshParts, Table, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import elements, find_counts
+from quasiharmonic.io.fem.vtk_cells import elements, find_counts, find_sets
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 _KINDS = {
@@ -58,9 +58,11 @@ class _LegacyReader:
         self._points: Table | None = None
         self._lists: list[tuple[IntArray, IntArray, int]] = []
         self._kinds: IntArray | None = None
-        self._fields: dict[str, Callable[[], FloatArray]] = {}
-        # Whether the following arrays belong to points, and their length.
-        self._of_points, self._count = False, 0
+        # Arrays at points, and at cells.
+        self._fields: dict[bool, dict[str, Callable[[], FloatArray]]] = {True: {}, False: {}}
+        # Whether the following arrays belong to points (True), cells (False) or neither (None), and their length.
+        self._of_points: bool | None = None
+        self._count = 0
 
     def parts(self, solid: bool) -> MeshParts:
         """Read all sections and return the mesh."""
@@ -75,10 +77,13 @@ class _LegacyReader:
         lists = [np.full(len(offsets) - 1, kind) for offsets, _, kind in self._lists]
         kinds = self._kinds if self._kinds is not None else np.concatenate([np.empty(0, dtype=np.int64), *lists])
         place = self._points
-        F = elements(np.concatenate(connectivity), np.concatenate(starts), kinds, len(place.values), solid)
+        corners, begins = np.concatenate(connectivity), np.concatenate(starts)
+        F = elements(corners, begins, kinds, len(place.values), solid)
         points = place.values.astype(np.float64)
         change = partial(replace_numbers, self._data, place)
-        return MeshParts(points, F, np.dtype(place.values.dtype.newbyteorder("=")), self._fields, change)
+        precision, fields = np.dtype(place.values.dtype.newbyteorder("=")), self._fields
+        sets = partial(find_sets, fields[True], fields[False], corners, begins)
+        return MeshParts(points, F, precision, fields[True], change, sets)
 
     def _section(self, name: bytes, words: list[bytes]) -> None:
         reader = self._reader
@@ -144,18 +149,19 @@ class _LegacyReader:
             words = self._reader.words()
         if len(words) == 4:
             count, self._count = self._count, int(words[2])
-            of_points, self._of_points = self._of_points, self._of_points and self._count == count
+            of_points, self._of_points = self._of_points, self._of_points if self._count == count else None
             self._array(words[0], words[3], int(words[1]))
             self._count, self._of_points = count, of_points
         elif words[:1] != [b"NULL_ARRAY"]:
             raise ValueError(f"an array of a field was expected, not {_text(words)[:60]!r}")
 
     def _array(self, name: bytes, kind: bytes, components: int) -> None:
-        """Read past values at points, cells or neither; register those at points."""
+        """Read past values at points, cells or neither; register those at points and cells."""
         start = self._reader.position
         self._skip(kind, self._count * components)
-        if self._of_points and kind.lower() in _KINDS:
-            self._fields[_decode_name(name)] = partial(self._values, start, kind.lower(), components, self._count)
+        if self._of_points is not None and kind.lower() in _KINDS:
+            fields = self._fields[self._of_points]
+            fields[_decode_name(name)] = partial(self._values, start, kind.lower(), components, self._count)
 
     def _values(self, start: int, kind: bytes, components: int, count: int) -> FloatArray:
         order = None if self._reader.text else ">"

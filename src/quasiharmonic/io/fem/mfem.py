@@ -13,6 +13,9 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.untrusted import check_end
 
 _SECTION = re.compile(rb"^[ \t]*([a-z_]+)[ \t\r]*$", re.MULTILINE)
+# Sections of named sets, without their ending, and those with the elements that they refer to.
+_SETS = {b"bdr_attribute": b"boundary", b"attribute": b"elements"}
+_SET = re.compile(rb'"([^"]*)"\s+\d+((?:\s+\d+)*)')
 # Number of vertices, and VTK's kind, of MFEM's geometries: point, segment, triangle, square, tetrahedron, cube, prism,
 # pyramid.
 _SIZES = 1, 2, 3, 4, 4, 8, 6, 5
@@ -52,7 +55,10 @@ def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
     points[:, :axes] = table.values
     begin, end = span(b"elements")
     F = elements(*_cells([int(word) for word in plain[begin:end].split()]), count, solid)
-    return MeshParts(points, F, np.dtype(np.float64), {}, partial(_replace, data, table, axes))
+    cells = {name: plain[slice(*span(name))] for name in (b"boundary", b"elements") if name in sections}
+    named = {name: plain[slice(*span(name + b"_sets"))] for name in _SETS if name + b"_sets" in sections}
+    change, find_sets = partial(_replace, data, table, axes), partial(_find_sets, cells, named)
+    return MeshParts(points, F, np.dtype(np.float64), {}, change, find_sets)
 
 
 def _line_start(data: bytes, position: int) -> int:
@@ -78,6 +84,27 @@ def _cells(numbers: list[int]) -> tuple[IntArray, IntArray, IntArray]:
         kinds.append(_KINDS[geometry])
         at += 2 + size
     return np.array(connectivity, dtype=np.int64), np.array(starts), np.array(kinds, dtype=np.int64)
+
+
+def _find_sets(cells: dict[bytes, bytes], named: dict[bytes, bytes]) -> dict[str, IntArray]:
+    """Return the vertices of the named sets of attributes, and of the attributes of the boundary, by number."""
+    of: dict[bytes, list[tuple[int, IntArray]]] = {}
+    for name, text in cells.items():
+        numbers = [int(word) for word in text.split()]
+        connectivity, starts, kinds = _cells(numbers)
+        # Before the corners of a cell are its attribute and its geometry.
+        attributes = [numbers[1 + 2 * k + int(start)] for k, start in enumerate(starts[:-1])]
+        of[name] = list(zip(attributes, np.split(connectivity, starts[1:-1]), strict=True)) if len(kinds) else []
+
+    def gather(name: bytes, wanted: set[int]) -> IntArray:
+        parts = [corners for attribute, corners in of.get(name, ()) if attribute in wanted]
+        return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *parts]))
+
+    sets = {str(one): gather(b"boundary", {one}) for one in sorted({one for one, _ in of.get(b"boundary", ())})}
+    for kind, text in named.items():
+        for name, members in _SET.findall(text):
+            sets[name.decode("utf-8", "replace")] = gather(_SETS[kind], set(map(int, members.split())))
+    return sets
 
 
 def _replace(data: bytes, table: Table, axes: int, points: FloatArray) -> bytes:

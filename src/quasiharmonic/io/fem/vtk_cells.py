@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
 
 from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
-from quasiharmonic.util.arrays import IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray
+
+#: Arrays of points or cells by name; each callable returns (n, k) values.
+Fields = Mapping[str, Callable[[], FloatArray]]
 
 #: Kinds without area: vertices, lines, lists of them, and second-order lines.
 _POINTS_AND_LINES = (1, 2, 3, 4, 21)
@@ -17,6 +22,8 @@ _SOLIDS = {10: 4, 12: 8}
 _SURFACES = (5, 6, 7, 8, 9, 22, 23, 28)
 #: What can be used instead of other cells, in the plane and in space.
 SUPPORTED = "triangles of three or six nodes or quadrilaterals", "tetrahedra of four nodes or hexahedra of eight"
+# Maximum number of different values of an array that defines sets.
+_MAX_SETS = 1000
 _NAMES = {
     6: "triangle strip",
     8: "pixel",
@@ -43,6 +50,29 @@ def find_counts(numbers: IntArray) -> IntArray | None:
         found.append(at)
         at += 1 + values[at]
     return np.array(found, dtype=np.int64) if at == len(values) else None
+
+
+def find_sets(points: Fields, cells: Fields, connectivity: IntArray, starts: IntArray) -> dict[str, IntArray]:
+    """Return the sets of points that arrays of integers at points or cells define.
+
+    ``NAME`` has the points, or the points of the cells, where the array NAME is not zero, ``NAME=VALUE`` those where it
+    has this value. Arrays of more than `_MAX_SETS` values define none.
+    """
+    sets: dict[str, IntArray] = {}
+    for fields, of_cells in ((points, False), (cells, True)):
+        for name, find in fields.items():
+            values = find()
+            if values.shape[1] != 1 or not len(values) or (values != np.rint(values)).any():
+                continue
+            values = values[:, 0]
+            nodes = np.arange(len(values))
+            if of_cells:
+                nodes, values = connectivity[: starts[-1]], np.repeat(values, np.diff(starts))
+            found = np.unique(values)
+            if len(found) <= _MAX_SETS:
+                sets[name] = np.unique(nodes[values != 0])
+                sets |= {f"{name}={value:.0f}": np.unique(nodes[values == value]) for value in found}
+    return sets
 
 
 def elements(connectivity: IntArray, starts: IntArray, kinds: IntArray, points: int, solid: bool = False) -> IntArray:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.fem.byte_tables import MeshParts, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import elements
+from quasiharmonic.io.fem.vtk_cells import elements, find_sets
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.untrusted import check_end
 
@@ -71,15 +71,25 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
     place = file.values(points, 3 * file.points).reshape(-1, 3)
     ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
     connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
-    F = elements(connectivity, np.concatenate([[0], ends]), kinds, len(place), solid)
-    fields = {name: partial(_rows, file, array) for name, array in file.point_data.items()}
-    kind = np.dtype(_KINDS[precision])
-    return MeshParts(place.astype(np.float64), F, kind, fields, partial(file.replace_points, points))
+    starts = np.concatenate([[0], ends])
+    F = elements(connectivity, starts, kinds, len(place), solid)
+    fields, of_cells = (
+        {name: partial(_rows, file, array, count) for name, array in file.last_arrays(parent).items()}
+        for parent, count in (("PointData", file.points), ("CellData", file.cells))
+    )
+    return MeshParts(
+        place.astype(np.float64),
+        F,
+        np.dtype(_KINDS[precision]),
+        fields,
+        partial(file.replace_points, points),
+        partial(find_sets, fields, of_cells, connectivity, starts),
+    )
 
 
-def _rows(file: _VtuFile, array: _Array) -> FloatArray:
+def _rows(file: _VtuFile, array: _Array, count: int) -> FloatArray:
     components = int(array.attributes.get("NumberOfComponents", "1"))
-    return file.values(array, file.points * components).astype(np.float64).reshape(-1, components)
+    return file.values(array, count * components).astype(np.float64).reshape(-1, components)
 
 
 class _VtuFile:
@@ -121,10 +131,9 @@ class _VtuFile:
             self._appended = data.index(b"_", tag.end()) + 1
             self._raw = b'"raw"' in tag.group().replace(b"'", b'"')
 
-    @property
-    def point_data(self) -> dict[str, _Array]:
-        """Arrays at points by name; the last one for several times."""
-        return {name: arrays[-1] for (parent, name), arrays in self._arrays.items() if parent == "PointData"}
+    def last_arrays(self, parent: str) -> dict[str, _Array]:
+        """Return the arrays of an element by name; the last one for several times."""
+        return {name: arrays[-1] for (of, name), arrays in self._arrays.items() if of == parent}
 
     def only(self, parent: str, name: str | None) -> _Array:
         """Return the only array of an element, or the only one with this name."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import takewhile
-from typing import ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
@@ -180,6 +180,14 @@ def paper(_: Problem) -> Stages:
 
 
 STRATEGIES: dict[str, Callable[[Problem], Stages]] = {"speed": speed, "paper": paper}
+
+
+def select_strategy(strategy: str, **descent: Any) -> str | Stages:
+    """Return a strategy, or a single descent in its place if one of the `DescentOptions` is given."""
+    given = {name: value for name, value in descent.items() if value is not None}
+    if given and strategy != "speed":
+        raise ValueError(f"a single descent replaces the strategy: omit {next(iter(given))}, or strategy")
+    return [VectorAdam(**given)] if given else strategy
 
 
 def stages_of(strategy: str | Stages, problem: Problem) -> Stages:

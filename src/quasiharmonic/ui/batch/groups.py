@@ -30,6 +30,7 @@ from quasiharmonic.solver.field.objective_batch import Patterns
 from quasiharmonic.solver.search.first_stage import SMALL, group_by_first_stage, run_first_stage
 from quasiharmonic.ui.batch import island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.options import MapOptions
 
@@ -168,7 +169,7 @@ def _with_map(mesh: io.MeshData, surface: SeamedMesh, uv: FloatArray) -> io.Mesh
 
 def _solve_first_stage(problems: dict[int, Problem], settings: dict[str, Any]) -> Iterator[tuple[int, MapResult]]:
     """Yield the problems that the first stage of their search solves, with their results."""
-    for descent, some in group_by_first_stage(problems, settings["strategy"]):
+    for descent, some in group_by_first_stage(problems, search_stages(settings)):
         patterns = Patterns(solver_for(problems[some[0]], settings["linear_solver"]))
         options = MapOptions(max_iterations=settings["max_iterations"], linear_solver=settings["linear_solver"])
         found = run_first_stage([problems[k] for k in some], descent, patterns, options)

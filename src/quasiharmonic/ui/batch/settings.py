@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cache
 from hashlib import blake2b
@@ -15,6 +14,7 @@ from typing import Any
 from quasiharmonic import __version__
 from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
 from quasiharmonic.linsolve import available
+from quasiharmonic.solver.search.stages import Stages, select_strategy
 from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.util.arrays import check_choice, describe
 from quasiharmonic.util.options import (
@@ -23,26 +23,25 @@ from quasiharmonic.util.options import (
     MAX_ITERATIONS,
     REFERENCES,
     STRATEGIES,
+    DescentOptions,
     Options,
     UnwrapOptions,
+    one_of,
     option,
     positive,
     seconds,
     switch,
 )
 
+# The settings of a single descent.
+_DESCENT = tuple(one.name for one in fields(DescentOptions))
 #: The settings that may name files.
 NAMING_FILES = "to", "font", "corners", "pieces"
 
 
-def _one_of(*words: str | None) -> Callable[[str, Any], None]:
-    """Return a check of a setting with one of several values."""
-
-    def check(name: str, value: Any) -> None:
-        if not isinstance(value, str | None) or value not in words:
-            raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {value!r}")
-
-    return check
+def search_stages(settings: dict[str, Any]) -> str | Stages:
+    """Return the strategy of settings, or the single descent in its place."""
+    return select_strategy(settings["strategy"], **{name: settings[name] for name in _DESCENT})
 
 
 def _text(name: str, value: Any) -> None:
@@ -64,7 +63,7 @@ def _unwrap_options(name: str, value: Any) -> None:
 
 
 @dataclass(frozen=True)
-class Settings(Options):
+class Settings(DescentOptions):
     """Settings that determine the result of a problem, together with its files.
 
     Attributes
@@ -96,6 +95,9 @@ class Settings(Options):
     refine : bool
         Whether edges may be split if the target has no map without; new vertices are appended.
     strategy : {"speed", "paper"}
+    functional, parameterisation : str or None
+    iterations : int or None
+        If one is given, the search is a single descent, `quasiharmonic.methods.VectorAdam` with these.
     polish : str or None
         Energy to lower once a map is injective; see `quasiharmonic.polish` for the names.
     slide : bool
@@ -122,17 +124,17 @@ class Settings(Options):
     font: str | None = option(None, check=_text)
     corner_angle: float = option(20.0, check=lambda _, angle: check_corner_angle(angle))
     flatten: bool = option(False, check=switch)
-    energy: str | None = option(None, check=_one_of(None, *FLATTENED))
+    energy: str | None = option(None, check=one_of(None, *FLATTENED))
     start: bool = option(False, check=switch)
     pack: bool = option(False, check=switch)
     cut: bool = option(False, check=switch)
     corners: str | None = option(None, check=_text)
     refine: bool = option(False, check=switch)
-    strategy: str = option("speed", check=_one_of(*STRATEGIES))
-    polish: str | None = option(None, check=_one_of(None, *ENERGIES))
+    strategy: str = option("speed", check=one_of(*STRATEGIES))
+    polish: str | None = option(None, check=one_of(None, *ENERGIES))
     slide: bool = option(False, check=switch)
     pieces: str | None = option(None, check=_text)
-    reference: str | None = option(None, check=_one_of(None, *REFERENCES))
+    reference: str | None = option(None, check=one_of(None, *REFERENCES))
     max_iterations: int = option(MAX_ITERATIONS, check=positive)
     linear_solver: str = option("auto", check=lambda name, value: check_choice(name, value, ("auto", *available())))
 
@@ -151,7 +153,7 @@ class Settings(Options):
             if others:
                 raise ValueError(f"{others[0]} does not apply to unwrap: omit one of them")
         if self.flatten:
-            for name in ("to", "corners", "refine", "strategy", "polish", "slide", "reference"):
+            for name in ("to", "corners", "refine", "strategy", *_DESCENT, "polish", "slide", "reference"):
                 if name in changed:
                     raise ValueError(
                         f"{name} needs a given boundary, but flatten leaves the boundary free: omit one of them"
@@ -160,6 +162,7 @@ class Settings(Options):
             raise ValueError("energy applies only to flatten: set flatten, or give an energy by polish")
         if self.start and (not self.flatten or self.cut):
             raise ValueError("start applies only to flatten, and new seams discard the file's map: omit start, or cut")
+        search_stages(vars(self))
         if self.slide and self.polish is None:
             raise ValueError("the boundary slides only while distortion is lowered: give an energy as well, by polish")
         if self.to is None:

@@ -39,6 +39,7 @@ from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refine.attempts import on_refinement
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.options import PolishOptions
 from quasiharmonic.util.standard_input import detach_input
 from quasiharmonic.util.untrusted import bounded
@@ -209,7 +210,7 @@ def _solve_island(
     with metadata.time_phase(record, "map"):
         result = solve(
             fitted.problem,
-            strategy=settings["strategy"],
+            strategy=search_stages(settings),
             max_iterations=settings["max_iterations"],
             linear_solver=groups.solver_for(fitted.problem, settings["linear_solver"]),
             refine=settings["refine"],

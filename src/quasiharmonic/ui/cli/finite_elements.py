@@ -88,40 +88,63 @@ def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
 
 def measure(options: argparse.Namespace) -> int:
     """Report the quality of the elements; return the exit status of ``qhm measure``."""
-    from quasiharmonic.apps.mesh_motion.quality import element_quality
-    from quasiharmonic.io.fem.files import read_fem
-
     _reject(options, ("export", "--export"), ("distances", "--distances"))
-    mesh = read_fem(options.input)
-    quality = element_quality(mesh.F, mesh.points)
+    mesh, quality = _read_quality(options.input)
     facts: dict[str, Any] = {
         "input": str(options.input),
         "elements": len(mesh.F),
         "quality": {"minimum": float(quality.min()), "mean": float(quality.mean()), "worst": int(quality.argmin())},
     }
     text = (
-        f"quality of {len(mesh.F)} elements (1: equilateral or square, 0: no area, negative: inverted): "
+        f"quality of {len(mesh.F)} elements (1: regular, 0: no area or volume, negative: inverted): "
         f"mean {quality.mean():.4g}, minimum {quality.min():.4g} at element {quality.argmin()}"
     )
     return pipeline.conclude(options, pipeline.Account(facts, [text]))
 
 
 def plot(options: argparse.Namespace) -> int:
-    """Draw the elements, inverted ones in red; return the exit status of ``qhm plot``."""
+    """Draw the elements, or a cut through tetrahedra, coloured by quality; return the exit status of ``qhm plot``."""
     import numpy as np
 
-    from quasiharmonic import io
-    from quasiharmonic.io.fem.files import read_fem
-    from quasiharmonic.ui.plot import save_map_figure
+    from quasiharmonic.ui.plot.canvas import save_picture
+    from quasiharmonic.ui.plot.elements import cut_tetrahedra, elements_figure, outline_elements
 
     if options.kind not in (None, "map"):
         raise ValueError(f"--kind {options.kind} needs a surface with a map: omit it for {options.input.suffix} files")
     _reject(options, ("texture", "--texture"), ("measure", "--measure"))
-    mesh = read_fem(options.input)
-    triangles, of, inverted = _split(mesh)
-    V, F, uv = io.without_idle(mesh.points, triangles, mesh.points)
-    save_map_figure(options.output, V, F, uv, inverted=np.flatnonzero(np.isin(of, inverted)))
+    mesh, quality = _read_quality(options.input)
+    if mesh.points.shape[1] == 3:
+        drawn = cut_tetrahedra(mesh.F, mesh.points, int(quality.argmin()))
+        inverted = np.flatnonzero(quality <= 0)
+    else:
+        drawn, inverted = outline_elements(mesh.F, mesh.points), _split(mesh)[2]
+    save_picture(options.output, elements_figure([drawn], [quality], inverted))
     return report.tell_written(options.output)
+
+
+def read_tetrahedra(path: Path) -> FemMesh | None:
+    """Read a mesh of tetrahedra; None if the file has no elements with volume, MeshFileError if it has hexahedra."""
+    from quasiharmonic.geometry.mesh.elements import split_solids
+    from quasiharmonic.io.errors import MeshFileError
+    from quasiharmonic.io.fem.files import read_volume
+
+    mesh = read_volume(path)
+    if len(split_solids(mesh.F)[1]):
+        raise MeshFileError(path, "has hexahedra", remedy="split them into tetrahedra")
+    return mesh if len(mesh.F) else None
+
+
+def _read_quality(path: Path) -> tuple[FemMesh, NDArray[np.float64]]:
+    """Read a mesh, of tetrahedra or planar, and return it with the quality (f,) of its elements."""
+    from quasiharmonic.apps.mesh_motion.quality import element_quality
+    from quasiharmonic.apps.tetrahedra.result import tetrahedron_quality
+    from quasiharmonic.io.fem.files import read_fem
+
+    solid = read_tetrahedra(path)
+    if solid is not None:
+        return solid, tetrahedron_quality(solid.F, solid.points)
+    mesh = read_fem(path)
+    return mesh, element_quality(mesh.F, mesh.points)
 
 
 def _split(mesh: FemMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

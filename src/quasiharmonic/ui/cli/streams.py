@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: Exit status of a process that wrote to a pipe without a reader: 128 plus the number of SIGPIPE.
 NO_READER = 141
+#: Seconds between two lines of progress where standard error is not a terminal.
+LOG = 10.0
 _INTERVAL = 0.1
 
 
@@ -81,15 +83,15 @@ def overwrite(text: str) -> None:
 
 @contextmanager
 def progress_line(
-    words: Callable[[Any], str] = describe_step, *, live: float = _INTERVAL, log: float | None = None
+    words: Callable[[Any], str] = describe_step, *, live: float = _INTERVAL
 ) -> Iterator[Callable[[Any], None] | None]:
     """Yield a callback that shows steps every ``live`` seconds.
 
-    If standard error is not a terminal, the callback prints a line every ``log`` seconds; without this it is None.
+    If standard error is not a terminal, the callback prints a line every `LOG` seconds; if it is closed, it is None.
     """
     terminal = sys.stderr is not None and sys.stderr.isatty()
-    interval = live if terminal else log
-    if sys.stderr is None or interval is None:
+    interval = live if terminal else LOG
+    if sys.stderr is None:
         yield None
         return
     # The first step is shown at once on a terminal only.

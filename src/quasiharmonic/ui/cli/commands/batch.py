@@ -41,7 +41,7 @@ from quasiharmonic.ui.cli.arguments import (
     texture_size,
 )
 from quasiharmonic.ui.cli.streams import tell
-from quasiharmonic.util.options import ENERGIES, FLATTENED, UnwrapOptions
+from quasiharmonic.util.options import ENERGIES, FLATTENED, DescentOptions, UnwrapOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
@@ -51,8 +51,6 @@ if TYPE_CHECKING:
 _OF_RUNS = "jobs", "time_limit"
 #: Seconds between two updates of the line on a terminal.
 LIVE = 0.1
-#: Seconds between two lines elsewhere.
-LOG = 30.0
 
 
 def add_parser(commands: Commands) -> None:
@@ -133,6 +131,7 @@ def add_parser(commands: Commands) -> None:
     }
     add_options(solver, "font", **of_outlines)
     add_options(solver, "pieces", "refine", strategy=SHARED["strategy"] | {"default": None})
+    add_options(solver, **declared(DescentOptions))
     add_options(solver, "reference", "max_iterations", "linear_solver")
     models = parser.add_argument_group("texture coordinates of each model, as for qhm unwrap")
     add_options(
@@ -170,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
     rest = pick(options, "retry", "table", "shard", "scheduler")
     time_limit = options.time_limit or None
     try:
-        with streams.progress_line(_words, live=LIVE, log=LOG) as show:
+        with streams.progress_line(_words, live=LIVE) as show:
             progress = batch.run(
                 options.source, options.output, settings, time_limit=time_limit, callback=show, **limits, **rest
             )

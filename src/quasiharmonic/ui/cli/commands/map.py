@@ -30,7 +30,7 @@ from quasiharmonic.ui.cli.arguments import (
     pick,
     set_default,
 )
-from quasiharmonic.util.options import ENERGIES, MapOptions
+from quasiharmonic.util.options import ENERGIES, DescentOptions, MapOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -76,7 +76,8 @@ def add_parser(commands: Commands) -> None:
     )
     add_options(parser, "slide", "pieces")
     solver = parser.add_argument_group("solution")
-    add_options(solver, *declared(MapOptions), "reference", "linear_solver")
+    add_options(solver, *declared(MapOptions), **declared(DescentOptions))
+    add_options(solver, "reference", "linear_solver")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -111,7 +112,9 @@ def _map(
     from quasiharmonic.problem.result import Status
     from quasiharmonic.solver.mapping import solve
     from quasiharmonic.solver.refine.attempts import on_refinement
+    from quasiharmonic.solver.search.stages import select_strategy
 
+    strategy = select_strategy(options.strategy, **pick(options, *declared(DescentOptions)))
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     targets.check_options(options, mesh, fixed)
     found = seam_options.surface(options, mesh, disks_too=False)
@@ -125,6 +128,7 @@ def _map(
         posed.append(one)
         problem = one.fitted.problem
         given = pick(options, "polish", "linear_solver", *declared(MapOptions))
+        given["strategy"] = strategy
         slide = one.slide if options.polish else False
         with streams.progress_line() as show:
             result = solve(problem, slide=slide, callback=show, **given)

@@ -9,19 +9,22 @@ otherwise; 2 wrong input or call, nothing written; 3 written, but the report fai
 
     qhm morph mesh.msh --positions boundary.csv -o moved.msh
     qhm morph mesh.vtu --field displacement --slide -o moved.vtu
+    qhm morph wing.msh --group flap --rotate 20 --centre 1,0 --steps 10 -o moved.msh
 """
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, file, flag, number, text
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, count, file, flag, number, text
+from quasiharmonic.ui.cli.finite_elements import read_tetrahedra
+from quasiharmonic.ui.cli.group_motions import MOTIONS, in_order, list_motions, move_groups
 from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:
@@ -31,14 +34,8 @@ if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.util.arrays import FloatArray, IntArray
 
-    Moved: TypeAlias = tuple[IntArray, FloatArray]  # Vertices that move, and where
-
-# Name of the quality measure by the number of nodes per element.
-_QUALITY = {
-    3: "mean-ratio quality",
-    4: "quality at the worst corner",
-    6: "mean-ratio quality times evenness of the Jacobian",
-}
+    # Vertices that move, and the function from the share of the motion to their positions
+    Moved: TypeAlias = tuple[IntArray, Callable[[float], FloatArray]]
 
 
 def add_parser(commands: Commands) -> None:
@@ -53,9 +50,15 @@ def add_parser(commands: Commands) -> None:
         metavar=("MESH", "MESH"),
     )
     # Before Python 3.14, argparse takes -1e-9 for an option.
-    parser._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+    parser._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(,.*)?$")
     add_options(
         parser.add_mutually_exclusive_group(required=True),
+        group=in_order(
+            str,
+            "NAME",
+            "move the nodes of a physical group of Gmsh or a named set; the motions that follow are applied in their "
+            "order; without any, the group stays. Repeat for several groups",
+        ),
         positions=file(
             "file of target positions: lines 'vertex,x,y', or 'vertex,x,y,z' for tetrahedra, counting from 0",
             metavar="CSV",
@@ -64,8 +67,12 @@ def add_parser(commands: Commands) -> None:
             "NAME", "point data of the mesh with the displacements of boundary vertices; the last time step counts"
         ),
     )
+    add_options(parser, **MOTIONS)
     add_options(
         parser,
+        steps=number(
+            count, "move in N equal steps, and write the series MESH.pvd of .vtu files with the quality, for ParaView"
+        ),
         energy=choice(ENERGIES, "energy to lower (default: symmetric-dirichlet)"),
         no_polish=flag("keep the first valid mesh"),
         slide=flag(
@@ -91,14 +98,21 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, morph, write, read back, certify, report."""
-    from quasiharmonic.io.fem.files import check_fem_output, read_fem, read_volume
+    from quasiharmonic.io.fem.files import check_fem_output, read_fem
+    from quasiharmonic.io.fem.vtu_series import list_series
 
     if options.no_polish and options.energy is not None:
         raise ValueError("--energy needs polishing: omit --no-polish")
-    report.check_moved(options.output, options.json, inputs=(options.input, options.positions, options.rest))
+    if options.motions and options.motions[0][0] != "group":
+        raise ValueError(f"--{options.motions[0][0]} needs a group: put --group NAME before it")
+    inputs = options.input, options.positions, options.rest
+    report.check_moved(options.output, options.json, inputs=inputs)
     check_fem_output(options.output, options.input)
-    volume = read_volume(options.input)
-    if len(volume.F):
+    if options.steps is not None:
+        series = dict.fromkeys(map(str, list_series(options.output, options.steps)))
+        report.check_new({name: Path(name) for name in series}, options.json, (*inputs, options.output))
+    volume = read_tetrahedra(options.input)
+    if volume is not None:
         return _morph_volume(options, volume)
     if options.slide_plane is not None:
         raise ValueError("--slide-plane is for tetrahedra: use --slide for planar meshes")
@@ -116,7 +130,7 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
     moved = _targets(options, mesh, lambda: rim(mesh.F), slide=options.slide)
     energy = None if options.no_polish else options.energy or "symmetric-dirichlet"
     given = {"energy": energy, "linear_solver": options.linear_solver, "slide": options.slide, "rest": rest}
-    morphed = _morph(options, mesh.points, mesh.F, moved, given)
+    morphed, notes = _morph(options, mesh, moved, given)
     assert isinstance(morphed, MorphResult)
     write_fem(options.output, mesh, morphed.points)
 
@@ -132,7 +146,7 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
             "moved": len(moved[0]),
             **pipeline.name_files(options),
         }
-        lines = _sentences(morphed, len(inverted), drift, options.output)
+        lines = [*_sentences(morphed, len(inverted), drift, options.output), *notes]
         return pipeline.Account(facts, lines, not inverted.size)
 
     return pipeline.finish(options, describe, options.output)
@@ -145,29 +159,26 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
     from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
     from quasiharmonic.apps.tetrahedra.topology import inspect_faces
-    from quasiharmonic.geometry.mesh.elements import split_solids
-    from quasiharmonic.io.errors import MeshFileError
     from quasiharmonic.io.fem.files import read_volume, write_fem
     from quasiharmonic.util.arrays import count_of
 
-    T, H = split_solids(mesh.F)
-    if len(H):
-        raise MeshFileError(options.input, "has hexahedra", remedy="split them into tetrahedra")
     if options.energy is not None:
         raise ValueError("--energy is for planar meshes: omit it for tetrahedra")
     if options.slide and options.slide_plane is not None:
         raise ValueError("--slide includes all planes: omit it, or --slide-plane")
     slide = options.slide_plane or options.slide
     rest = _rest(options.rest, mesh, read_volume)
-    moved = _targets(options, mesh, lambda: np.unique(inspect_faces(T, len(mesh.points)).boundary), slide=bool(slide))
+    moved = _targets(
+        options, mesh, lambda: np.unique(inspect_faces(mesh.F, len(mesh.points)).boundary), slide=bool(slide)
+    )
     given = {"energy": None if options.no_polish else "symmetric-dirichlet", "slide": slide, "rest": rest}
-    morphed = _morph(options, mesh.points, T, moved, given)
+    morphed, notes = _morph(options, mesh, moved, given)
     assert isinstance(morphed, TetrahedraResult)
     write_fem(options.output, mesh, morphed.points)
 
     def describe() -> pipeline.Account:
         certificate = certify_arrays(morphed.T, read_volume(options.output).points)
-        reversed_rows = int((morphed.T != T).any(axis=1).sum())
+        reversed_rows = int((morphed.T != mesh.F).any(axis=1).sum())
         facts = {
             **morphed.to_dict(),
             "certificate": certificate.to_dict(),
@@ -180,7 +191,7 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
         }
         lines = [f"wrote {options.output}: {certificate.summary()}"]
         if not certificate.injective:
-            lines.append(morphed.summary())
+            lines += morphed.summary().splitlines()[:-1]
         if reversed_rows:
             lines.append(
                 f"The file lists {count_of('tetrahedron', 'tetrahedra', reversed_rows)} in the opposite order of "
@@ -189,7 +200,7 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
             )
         if slide:
             lines.append(f"{count_of('boundary vertex', 'boundary vertices', len(morphed.sliding))} could slide")
-        lines += _qualities("mean-ratio quality", "tetrahedron", morphed.quality_before, morphed.quality_after)
+        lines += [morphed.describe_quality(), *notes]
         return pipeline.Account(facts, lines, bool(certificate.injective))
 
     return pipeline.finish(options, describe, options.output)
@@ -212,35 +223,65 @@ def _rest(path: Path | None, mesh: FemMesh, read: Callable[[Path], FemMesh]) -> 
 def _targets(
     options: argparse.Namespace, mesh: FemMesh, find_boundary: Callable[[], IntArray], *, slide: bool
 ) -> Moved:
-    """Return the vertices that move, and their target positions; with ``slide`` without those that stay."""
+    """Return the vertices that move, and their positions; with ``slide`` without those that a field leaves in place."""
+    if options.motions:
+        return move_groups(mesh, list_motions(options.motions, mesh.points.shape[1]))
     if options.field is None:
-        return _positions(options.positions, *mesh.points.shape)
-    moved = find_boundary()
-    positions = mesh.points[moved] + mesh.point_field(options.field, moved)
-    goes = (positions != mesh.points[moved]).any(axis=1) | (not slide)
-    return moved[goes], positions[goes]
+        moved, positions = _positions(options.positions, *mesh.points.shape)
+    else:
+        moved = find_boundary()
+        positions = mesh.points[moved] + mesh.point_field(options.field, moved)
+        goes = (positions != mesh.points[moved]).any(axis=1) | (not slide)
+        moved, positions = moved[goes], positions[goes]
+    return moved, lambda share: (1 - share) * mesh.points[moved] + share * positions
 
 
 def _morph(
-    options: argparse.Namespace, points: FloatArray, elements: IntArray, moved: Moved, given: dict[str, Any]
-) -> MorphResult | TetrahedraResult:
-    """Morph with progress on the terminal."""
-    from quasiharmonic.apps.mesh_motion.morphing import morph
+    options: argparse.Namespace, mesh: FemMesh, moved: Moved, given: dict[str, Any]
+) -> tuple[MorphResult | TetrahedraResult, list[str]]:
+    """Morph in as many steps as requested, with progress on the terminal, and write the series of the steps.
 
+    The result compares the last mesh with the first one. The steps end where one of them fails. Also return a sentence
+    about the series.
+    """
+    from dataclasses import replace
+
+    from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
+    from quasiharmonic.apps.mesh_motion.morphing import morph
+    from quasiharmonic.io.fem.vtu_series import list_series, write_series
+
+    (nodes, place), steps = moved, options.steps or 1
+    if steps > 1 and given["rest"] is None:
+        given = given | {"rest": mesh.points}
+    results: list[MorphResult | TetrahedraResult] = []
     with pipeline.working(options.input) as show:
-        return morph(points, elements, *moved, max_iterations=options.max_iterations, callback=show, **given)
+        for k in range(1, steps + 1):
+            before = results[-1].points if results else mesh.points
+            one = morph(
+                before, mesh.F, nodes, place(k / steps), max_iterations=options.max_iterations, callback=show, **given
+            )
+            results.append(one)
+            if not one.success:
+                break
+    first, last, notes = results[0], results[-1], []
+    if options.steps is not None:
+        elements = last.F if isinstance(last, MorphResult) else last.T
+        frames = [(mesh.points, first.quality_before), *((one.points, one.quality_after) for one in results)]
+        paths = list_series(options.output, steps)
+        write_series(paths, elements, frames)
+        notes.append(f"wrote {paths[0]}: {len(results)} of {steps} steps")
+    return replace(last, points_before=mesh.points, quality_before=first.quality_before), notes
 
 
 def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output: Path) -> list[str]:
-    before, after = morphed.quality_before, morphed.quality_after
     what = "triangle" if morphed.F.shape[1] != 4 else "quadrilateral"
-    verdict = f"{inverted} of {len(after)} {what}s are not positive" if inverted else f"every {what} is positive"
+    verdict = f"{inverted} of {len(morphed.F)} {what}s are not positive" if inverted else f"every {what} is positive"
     lines = [f"wrote {output}: {verdict}"]
     if inverted:
-        lines.append(morphed.result.status.value if morphed.valid else morphed.summary())
+        lines += [morphed.result.status.value] if morphed.valid else morphed.summary().splitlines()[:-1]
     elif not morphed.result.certificate.bijective:
         lines.append(f"but the mesh overlaps itself. {morphed.result.certificate.summary()}")
-    lines += _qualities(_QUALITY[morphed.F.shape[1]], what, before, after)
+    lines.append(morphed.describe_quality())
     if drift is not None:
         lines.append(
             f"maximum drift {drift:.3g}, relative to one step from the rest mesh"
@@ -250,14 +291,7 @@ def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output:
     return lines
 
 
-def _qualities(measure: str, what: str, before: FloatArray, after: FloatArray) -> Iterable[str]:
-    """Yield sentences on the quality of the elements before and after."""
-    for name, quality in (("before", before), ("after", after)):
-        worst = f"worst {quality.min():.3g} ({what} {int(quality.argmin())})"
-        yield f"{measure} {name}: {worst}, mean {quality.mean():.3g}"
-
-
-def _positions(path: Path, n: int, axes: int) -> Moved:
+def _positions(path: Path, n: int, axes: int) -> tuple[IntArray, FloatArray]:
     """Read lines of a vertex and its target position."""
     import numpy as np
 
