@@ -61,6 +61,11 @@ def test_the_recipe_has_the_version():
     assert f'version: "{__version__}"' in text("conda/recipe.yaml")
 
 
+def test_the_page_about_installation_lists_every_extra():
+    rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| [^|]+ \|$", text("docs/install.md"), re.MULTILINE)
+    assert sorted(rows) == sorted(PROJECT["optional-dependencies"])
+
+
 def test_licences_of_all_that_is_bundled_are_listed():
     listed = text("THIRD_PARTY.md")
     build = runpy.run_path(str(ROOT / "blender" / "build.py"))
