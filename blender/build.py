@@ -30,7 +30,7 @@ PLATFORMS = {
     "macos-x64": ["macosx_11_0_x86_64"],
     "macos-arm64": ["macosx_12_0_arm64"],
 }
-# Blender 4.5 and 5.0 come with Python 3.11. Blender 5.1 comes with Python 3.13, so the manifest excludes it.
+# Blender 4.2 to 5.0 come with Python 3.11. Blender 5.1 comes with Python 3.13, so the manifest excludes it.
 PYTHON = "3.11"
 NEEDED = ["lazy_loader>=0.4", "scipy>=1.14,<1.17", "qdldl>=0.1.7"]
 # The solver of large systems. Without it QDLDL solves them, more slowly.

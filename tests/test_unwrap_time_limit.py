@@ -124,6 +124,20 @@ def test_seams_of_given_coordinates_stay_seams():
     assert {tuple(edge) for edge in given.seams.tolist()} <= {tuple(edge) for edge in result.seams.tolist()}
 
 
+def test_a_callback_ends_the_search_with_the_best_charts():
+    ended = []
+
+    def stop(step):
+        if step.phase == "improve" and not ended:
+            ended.append(step)
+            progress.end_work()
+
+    result = unwrap(V, F, callback=stop)
+    assert len(ended) == 1
+    assert result.status is UnwrapStatus.TIME_LIMIT
+    assert result.certificate.bijective
+
+
 def test_ctrl_c_within_the_limit_propagates():
     def stop(step):
         if step.phase == "flatten":
