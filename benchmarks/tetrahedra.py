@@ -174,7 +174,8 @@ def run_problems(options: argparse.Namespace) -> None:
         # One in 31 is large, in all families: 10,000 to 100,000 tetrahedra.
         size = int(10 ** (rng.uniform(3, 4) if number % 31 else 4 + number // 31 % 10 / 9))
         case = make(family, seed, size)
-        begin = _begin(case.X, case.fixed, case.target)
+        begin = case.X.copy()
+        begin[case.fixed] = case.target
         given = case.X, case.T, case.fixed, case.target
         row = {"family": family, "seed": seed, "tetrahedra": len(case.T), "inverted": _count_inverted(case.T, begin)}
         start = injective_tetrahedra(*given, start=case.start, polish=False, max_iterations=0)
@@ -209,12 +210,6 @@ def run_problems(options: argparse.Namespace) -> None:
 def _count_inverted(T: IntArray, X: FloatArray) -> int:
     certificate = certify_tetrahedra(T, X, boundary=False)
     return len(certificate.inverted) + len(certificate.degenerate)
-
-
-def _begin(X: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
-    there = X.copy()
-    there[fixed] = target
-    return there
 
 
 def run_certificate(options: argparse.Namespace) -> None:
