@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -18,20 +17,6 @@ from quasiharmonic.solver.search import coarse, record, search
 
 # The available clocks: wall time or CPU time.
 clock = time.perf_counter
-
-NAMES = (
-    "set-up",
-    "coarsening",
-    "analysis",
-    "assembly",
-    "factor",
-    "solve",
-    "gradient",
-    "optimiser",
-    "polish",
-    "prolongation",
-    "certificate",
-)
 
 # Functions not listed here count toward the listed function that calls them.
 _CLOCKED: tuple[tuple[Any, str, str], ...] = (
@@ -54,23 +39,14 @@ _CLOCKED: tuple[tuple[Any, str, str], ...] = (
     (search, "certify", "certificate"),
     (record, "triangle_signs", "certificate"),
 )
+NAMES = tuple(dict.fromkeys(phase for *_, phase in _CLOCKED))
 
 
 class Phases:
-    """Seconds and calls by phase, measured within `clocking`.
+    """Seconds by phase, measured within `clocking`; the time of a function excludes that of those that it calls."""
 
-    The time of a function excludes that of the timed functions that it calls.
-
-    Parameters
-    ----------
-    clocked : sequence of (owner, name, phase)
-        The functions; by default those of a map, whose phases are ``NAMES``.
-    """
-
-    def __init__(self, clocked: Sequence[tuple[Any, str, str]] = _CLOCKED) -> None:
-        self._functions = clocked
-        self.seconds: dict[str, float] = {phase: 0.0 for *_, phase in clocked}
-        self.calls: dict[str, int] = defaultdict(int)
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(NAMES, 0.0)
         self._running: list[str] = []
         self._since = 0.0
 
@@ -79,7 +55,7 @@ class Phases:
         """Time every call of the listed functions within the block."""
         saved = []
         try:
-            for owner, name, phase in self._functions:
+            for owner, name, phase in _CLOCKED:
                 function = vars(owner)[name]
                 saved.append((owner, name, function))
                 if isinstance(function, cached_property):
@@ -96,7 +72,6 @@ class Phases:
     def _clocked(self, function: Callable[..., Any], phase: str) -> Callable[..., Any]:
         def clocked(*arguments: Any, **named: Any) -> Any:
             self._turn(phase)
-            self.calls[phase] += 1
             try:
                 return function(*arguments, **named)
             finally:

@@ -18,11 +18,12 @@ import numpy as np
 
 import campaign
 import problems
-from evaluation import FEASIBLE
 from quasiharmonic import MapResult, Problem, distortion, solve
 from quasiharmonic.problem.result import Stage
 from quasiharmonic.solver.search.stages import STRATEGIES
 from speed import machine
+
+FEASIBLE = "noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"
 
 
 class Outcome(NamedTuple):

@@ -1,49 +1,168 @@
-"""Tetrahedra: maps onto a given boundary, moved boundaries, and the certificate against an oracle.
+"""Tetrahedra: maps onto a given boundary with a hidden injective map, and the certificate against an oracle.
 
-    python benchmarks/tetrahedra.py problems -n 300        fixed boundary; every problem has a hidden injective map
-    python benchmarks/tetrahedra.py scenes                 six scenes, how far each method gets
-    python benchmarks/tetrahedra.py methods                Newton's method and L-BFGS on turned cavities
+    python benchmarks/tetrahedra.py problems -n 300
     python benchmarks/tetrahedra.py certificate -n 20000   tiny meshes against an oracle in rational numbers
 
-Times are CPU seconds, for Gmsh with the start of its process. If gmsh is installed, its untangler takes part in every
-fifth problem of each family and in all scenes. It is stopped after 30 CPU seconds.
+A problem has a mesh and the boundary of a hidden map. Both are made from one mesh: the hidden map by a
+diffeomorphism, the rest mesh by the same with a negative strength. Each strength is raised until a tetrahedron is
+inverted; the problem takes 95 % of it, or less if the boundary crosses itself. So the worst tetrahedra are nearly flat
+in both. Times are CPU seconds.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
-import resource
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import RBFInterpolator
-from scipy.optimize import minimize
-from scipy.sparse import coo_array
-from scipy.sparse.linalg import cg
+from scipy.spatial import Delaunay
 
-from quasiharmonic import certify_tetrahedra, injective_tetrahedra, morph
-from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, reduce_epsilon
-from quasiharmonic.apps.tetrahedra.placement import check_rest, extend_harmonically
+from quasiharmonic import certify_tetrahedra, injective_tetrahedra
 from quasiharmonic.util.arrays import FloatArray, IntArray
-from tetrahedral_problems import FAMILIES, VolumeScene, make, scenes, shell, turn
 
-# Steps of a scene per unit of its parameter.
-_STEP = 0.1
-_MAX_PARAMETER = 6.0
-# CPU seconds after which Gmsh is stopped.
-_LIMIT = 30
-# Evaluations of the energy after which L-BFGS is stopped.
-_MAX_EVALUATIONS = 4000
-# Gmsh solves one in so many problems of each family.
-_GMSH_EVERY = 5
+FAMILIES = ("flow", "twist", "bend", "spin", "folded")
+#: Positions (n, 3) after a deformation of positions (n, 3) with a strength.
+Move = Callable[[FloatArray, float], FloatArray]
+
+
+@dataclass(frozen=True)
+class VolumeProblem:
+    """A mesh, its fixed boundary, a hidden injective map, and an initial mesh, None for the harmonic map."""
+
+    X: FloatArray
+    T: IntArray
+    fixed: IntArray
+    hidden: FloatArray
+    start: FloatArray | None
+
+    @property
+    def target(self) -> FloatArray:
+        """Target positions of the fixed vertices."""
+        return self.hidden[self.fixed]
+
+
+def box(k: int, jitter: float, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
+    """A cube of side 2 around the origin of 6 k³ tetrahedra, with jittered inner vertices."""
+    X = np.stack(np.meshgrid(*[2 * np.arange(k + 1) / k - 1] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    step = np.array([(k + 1) ** 2, k + 1, 1])
+    first = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) @ step
+    T = np.concatenate([first[:, None] + np.cumsum([0, *step[list(p)]]) for p in permutations(range(3))])
+    inner = (np.abs(X) < 1).all(axis=1)
+    X[inner] += jitter / k * rng.uniform(-1, 1, (inner.sum(), 3))
+    return X, _positive(T, X)
+
+
+def ball(points: int, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
+    """A Delaunay mesh of random points in a ball, with slivers."""
+    count = max(int(3.4 * points ** (2 / 3)), 30)
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    r = np.sqrt(1 - z * z)
+    surface = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    inside = rng.normal(size=(points, 3))
+    inside *= (0.93 * rng.random(points) ** (1 / 3) / np.linalg.norm(inside, axis=1))[:, None]
+    X = np.concatenate([surface, inside])
+    return X, _positive(Delaunay(X).simplices.astype(np.int64), X)
+
+
+def shell(k: int, rng: np.random.Generator) -> tuple[FloatArray, IntArray, IntArray]:
+    """A jittered cube with a cubic cavity of a third of its width, and the vertices of the cavity."""
+    X, T = box(k, 0.3, rng)
+    half = round(k / 6) * 2 / k if k % 2 == 0 else (2 * round((k / 3 - 1) / 2) + 1) / k
+    lattice = 2 * np.stack(np.meshgrid(*[np.arange(k + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) / k - 1
+    T = T[np.abs(lattice[T].mean(axis=1)).max(axis=1) > half]
+    cavity = np.flatnonzero(np.abs(np.abs(lattice).max(axis=1) - half) < 1e-9)
+    X[cavity] = lattice[cavity]
+    return X, T, cavity
+
+
+def make(family: str, seed: int, tetrahedra: int) -> VolumeProblem:
+    """Make a problem of a family with about this number of tetrahedra."""
+    rng = np.random.default_rng([FAMILIES.index(family), seed])
+    if family == "spin":
+        X, T, _ = shell(max(round((tetrahedra / 6) ** (1 / 3)), 7), rng)
+    elif seed % 3 == 0:
+        X, T = ball(max(tetrahedra // 7, 30), rng)
+    elif seed % 3 == 1:
+        X, T = box(max(round((tetrahedra / 6) ** (1 / 3)), 3), 0.3, rng)
+    else:
+        X, T, _ = shell(max(round((tetrahedra / 6) ** (1 / 3)), 5), rng)
+    move = _family(family, rng)
+    hidden = _deform(X, T, move)
+    X = _deform(X, T, lambda Y, s: move(Y, -s))
+    fixed = np.unique(certify_tetrahedra(T, X).boundary)
+    start = None
+    if family == "folded":
+        start = hidden + 0.5 * rng.normal(size=X.shape)
+    return VolumeProblem(X, T, fixed, hidden, start)
+
+
+def _deform(X: FloatArray, T: IntArray, move: Move) -> FloatArray:
+    """Deform a mesh by 95 % of the largest strength that keeps it positive, or less so that it is injective."""
+    low, high = 0.0, 4.0
+    for _ in range(9):
+        strength = 0.5 * (low + high)
+        if certify_tetrahedra(T, move(X, strength), boundary=False).positive:
+            low = strength
+        else:
+            high = strength
+    there = move(X, 0.95 * low)
+    while not certify_tetrahedra(T, there).injective:
+        low *= 0.9
+        there = move(X, low)
+    return there
+
+
+def _family(family: str, rng: np.random.Generator) -> Move:
+    if family == "twist":
+        axis = int(rng.integers(3))
+        return lambda X, s: turn(X, 1.5 * s * X[:, axis], axis)
+    if family == "bend":
+
+        def bend(X: FloatArray, s: float) -> FloatArray:
+            angle, radius = s * X[:, 0], 1 / s + 0.8 * X[:, 1]
+            return np.stack([radius * np.sin(angle), radius * np.cos(angle) - 1 / s, X[:, 2]], axis=1)
+
+        return bend
+    if family == "spin":
+        axis = int(rng.integers(3))
+
+        def spin(X: FloatArray, s: float) -> FloatArray:
+            return turn(X, s * np.clip((1 - np.abs(X).max(axis=1)) / (2 / 3), 0, 1), axis)
+
+        return spin
+    waves, phases, ways = rng.normal(size=(6, 3)) * 1.5, rng.uniform(0, 6, 6), rng.normal(size=(6, 3))
+
+    def flow(X: FloatArray, s: float) -> FloatArray:
+        Y = X.copy()
+        for _ in range(16):
+            for wave, phase, way in zip(waves, phases, ways, strict=True):
+                # A shear: a displacement across the gradient of its phase.
+                across = np.cross(wave, way) / np.linalg.norm(wave)
+                Y = Y + s / 64 * np.sin(Y @ wave + phase)[:, None] * across
+        return Y
+
+    return flow
+
+
+def turn(X: FloatArray, angle: FloatArray, axis: int) -> FloatArray:
+    """Rotate every point around an axis by its own angle."""
+    Y = X.copy()
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    Y[:, a] = np.cos(angle) * X[:, a] - np.sin(angle) * X[:, b]
+    Y[:, b] = np.sin(angle) * X[:, a] + np.cos(angle) * X[:, b]
+    return Y
+
+
+def _positive(T: IntArray, X: FloatArray) -> IntArray:
+    u, v, w = (X[T[:, k]] - X[T[:, 0]] for k in (1, 2, 3))
+    return np.where(((u * np.cross(v, w)).sum(axis=1) < 0)[:, None], T[:, [1, 0, 2, 3]], T)
 
 
 def run_problems(options: argparse.Namespace) -> None:
@@ -55,12 +174,13 @@ def run_problems(options: argparse.Namespace) -> None:
         # One in 31 is large, in all families: 10,000 to 100,000 tetrahedra.
         size = int(10 ** (rng.uniform(3, 4) if number % 31 else 4 + number // 31 % 10 / 9))
         case = make(family, seed, size)
-        begin = _begin(case.X, case.fixed, case.target)
+        begin = case.X.copy()
+        begin[case.fixed] = case.target
         given = case.X, case.T, case.fixed, case.target
         row = {"family": family, "seed": seed, "tetrahedra": len(case.T), "inverted": _count_inverted(case.T, begin)}
         start = injective_tetrahedra(*given, start=case.start, polish=False, max_iterations=0)
         began = time.process_time()
-        result = injective_tetrahedra(*given, start=case.start, polish=options.polish)
+        result = injective_tetrahedra(*given, start=case.start, polish=False)
         row |= {
             "at_start": len(start.inverted),
             "seconds": time.process_time() - began,
@@ -69,29 +189,18 @@ def run_problems(options: argparse.Namespace) -> None:
             "iterations": result.iterations,
             "status": result.status.name,
         }
-        if options.gmsh and seed % _GMSH_EVERY == 0:
-            began = _seconds_of_children()
-            found = untangle_by_gmsh(case.T, begin)
-            fixed = np.array_equal(found[case.fixed], case.target)
-            row |= {
-                "gmsh_seconds": _seconds_of_children() - began,
-                "gmsh": fixed and bool(certify_tetrahedra(case.T, found).injective),
-            }
         rows.append(row)
         print(json.dumps(row), file=sys.stderr, flush=True)
     if options.output:
         options.output.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    print("| family | problems | certified | inverted | at the start | median s | largest s | Gmsh | its median s |")
-    print("|---" * 9 + "|")
+    print("| family | problems | certified | inverted | at the start | median s | largest s |")
+    print("|---" * 7 + "|")
     for family in (*FAMILIES, None):
         some = [row for row in rows if family in (row["family"], None)]
         seconds = [row["seconds"] for row in some]
         line = [family or "all", len(some), sum(row["certified"] for row in some)]
         line += [f"{np.median([row[name] for row in some]):.0f}" for name in ("inverted", "at_start")]
         line += [f"{np.median(seconds):.2f}", f"{max(seconds):.1f}"]
-        both = [row for row in some if "gmsh" in row]
-        line += [f"{sum(row['gmsh'] for row in both)} of {len(both)}"]
-        line += [f"{np.median([row['gmsh_seconds'] for row in both]):.1f}" if both else "–"]
         print("| " + " | ".join(map(str, line)) + " |")
     sizes = [row["tetrahedra"] for row in rows]
     already = sum(row["at_start"] == 0 for row in rows)
@@ -101,179 +210,6 @@ def run_problems(options: argparse.Namespace) -> None:
 def _count_inverted(T: IntArray, X: FloatArray) -> int:
     certificate = certify_tetrahedra(T, X, boundary=False)
     return len(certificate.inverted) + len(certificate.degenerate)
-
-
-def _begin(X: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
-    there = X.copy()
-    there[fixed] = target
-    return there
-
-
-def untangle_by_gmsh(T: IntArray, X: FloatArray) -> FloatArray:
-    """Gmsh's untangler of linear meshes; returns all vertices, unchanged ones after `_LIMIT` CPU seconds."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mesh.npz"
-        np.savez(path, T=T, X=X)
-        command = [sys.executable, __file__, "gmsh", "-o", str(path)]
-        try:
-            subprocess.run(command, check=True, capture_output=True)
-        except subprocess.CalledProcessError:
-            return X
-        with np.load(path) as found:
-            return np.asarray(found["X"])
-
-
-def _seconds_of_children() -> float:
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
-
-
-def run_gmsh(options: argparse.Namespace) -> None:
-    """Untangle the mesh of a file, in place, in a process of its own."""
-    import gmsh
-
-    resource.setrlimit(resource.RLIMIT_CPU, (_LIMIT, _LIMIT))
-    with np.load(options.output) as given:
-        T, X = given["T"], given["X"]
-    F = certify_tetrahedra(T, X, boundary=False).boundary
-    # The untangler mixes up nodes unless those of the boundary come first and all are used.
-    boundary = np.unique(F)
-    order = np.concatenate([boundary, np.setdiff1d(np.unique(T), boundary)])
-    number = np.empty(len(X), dtype=np.int64)
-    number[order] = np.arange(1, len(order) + 1)
-    gmsh.initialize(interruptible=False)
-    gmsh.option.setNumber("General.Terminal", 0)
-    tag, wall = gmsh.model.addDiscreteEntity(3), gmsh.model.addDiscreteEntity(2)
-    gmsh.model.mesh.addNodes(3, tag, np.arange(1, len(order) + 1), X[order].ravel())
-    gmsh.model.mesh.addElementsByType(wall, 2, [], number[F].ravel())
-    gmsh.model.mesh.addElementsByType(tag, 4, [], number[T].ravel())
-    gmsh.model.mesh.reclassifyNodes()
-    gmsh.model.mesh.optimize("UntangleMeshGeometry", force=True)
-    tags, found, _ = gmsh.model.mesh.getNodes()
-    X[order[np.asarray(tags, dtype=np.int64) - 1]] = found.reshape(-1, 3)
-    gmsh.finalize()
-    np.savez(options.output, X=X)
-
-
-Mover = Callable[[VolumeScene, FloatArray, IntArray, FloatArray], FloatArray]
-
-
-def _harmonic(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
-    return extend_harmonically(ShapeEnergy(scene.T, here), here, fixed, goal)
-
-
-def _elastic(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
-    """Linear elasticity with a modulus inversely proportional to the volume, Poisson's ratio 0.3."""
-    energy = ShapeEnergy(scene.T, here)
-    G, T, n = energy.gradients, scene.T, len(here)
-    lame, shear = 0.3 / (1.3 * 0.4), 1 / 2.6
-    rows, columns, values = [], [], []
-    for i in range(4):
-        for j in range(4):
-            dot = (G[i] * G[j]).sum(axis=0)
-            for a in range(3):
-                for b in range(3):
-                    rows.append(3 * T[:, i] + a)
-                    columns.append(3 * T[:, j] + b)
-                    values.append(lame * G[i, a] * G[j, b] + shear * (G[i, b] * G[j, a] + (a == b) * dot))
-    where = (np.concatenate(rows), np.concatenate(columns))
-    matrix = coo_array((np.concatenate(values), where), shape=(3 * n, 3 * n)).tocsr()
-    way = np.zeros_like(here)
-    way[fixed] = goal - here[fixed]
-    free = np.ones((n, 3), dtype=np.bool_)
-    free[fixed] = False
-    own = np.flatnonzero(free.ravel())
-    way.ravel()[own] = cg(matrix[own][:, own], -(matrix[own] @ way.ravel()), rtol=1e-8, maxiter=3000)[0]
-    return here + way
-
-
-def _rbf(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
-    there = here + RBFInterpolator(here[fixed], goal - here[fixed], kernel="thin_plate_spline", neighbors=200)(here)
-    there[fixed] = goal
-    return there
-
-
-def _morph(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
-    return morph(here, scene.T, fixed, goal, rest=scene.X, tol=1e-4).points
-
-
-def _gmsh(scene: VolumeScene, here: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
-    return untangle_by_gmsh(scene.T, _begin(here, fixed, goal))
-
-
-def run_scenes(options: argparse.Namespace) -> None:
-    """Move the body of every scene step by step until a mesh is not valid; print how far each method gets."""
-    methods: dict[str, Mover] = {"harmonic": _harmonic, "elasticity": _elastic, "RBF": _rbf, "morph": _morph}
-    if options.gmsh:
-        methods["Gmsh"] = _gmsh
-    print("| scene | tetrahedra | " + " | ".join(methods) + " | CPU s of morph per step |")
-    print("|---|---|" + "---|" * (len(methods) + 1))
-    for name, scene in scenes(options.size).items():
-        walls = np.setdiff1d(np.unique(certify_tetrahedra(scene.T, scene.X).boundary), scene.body)
-        fixed = np.concatenate([scene.body, walls])
-        reached, seconds = [], 0.0
-        for method, move in methods.items():
-            here, steps, began = scene.X, 0, time.process_time()
-            while steps * _STEP < _MAX_PARAMETER:
-                goal = np.concatenate([scene.places((steps + 1) * _STEP), scene.X[walls]])
-                there = move(scene, here, fixed, goal)
-                if not certify_tetrahedra(scene.T, there).injective:
-                    break
-                here, steps = there, steps + 1
-            reached.append(f"{steps * _STEP:.1f}{'+' if steps * _STEP >= _MAX_PARAMETER else ''}")
-            if method == "morph":
-                seconds = (time.process_time() - began) / max(steps, 1)
-        print(f"| {name} ({scene.unit}) | {len(scene.T)} | {' | '.join(reached)} | {seconds:.2f} |", flush=True)
-
-
-def run_methods(options: argparse.Namespace) -> None:
-    """Untangle turned cavities from the same start by Newton's method and by SciPy's L-BFGS; print a table."""
-    print("| tetrahedra | turn | inverted | Newton s | steps | L-BFGS s | evaluations |\n|---|---|---|---|---|---|---|")
-    for size in (8, 12, 16, 24):
-        X, T, cavity = shell(size, np.random.default_rng(0))
-        mesh = check_rest(T, X)
-        fixed = mesh.boundary_vertices
-        free = np.setdiff1d(np.unique(mesh.T), fixed)
-        for degrees in (60, 120, 150):
-            goal = X.copy()
-            goal[cavity] = turn(X[cavity], np.full(len(cavity), np.radians(degrees)), 2)
-            energy = ShapeEnergy(mesh.T, X)
-            with np.errstate(all="ignore"):
-                start = extend_harmonically(energy, X, fixed, goal[fixed])
-                inverted = int((energy.determinants(start) <= 0).sum())
-                began = time.process_time()
-                descent = TetrahedraDescent(energy, free, start)
-                steps = sum(1 for _ in descent.untangle(1000))
-                newton = time.process_time() - began
-                done = energy.determinants(descent.X).min() > 0
-                began = time.process_time()
-                evaluations = _untangle_by_lbfgs(energy, free, start)
-                lbfgs = time.process_time() - began
-            cells = [len(T), f"{degrees}°", inverted, f"{newton:.2f}", steps if done else "–", f"{lbfgs:.2f}"]
-            print("| " + " | ".join(map(str, [*cells, evaluations or "–"])) + " |", flush=True)
-
-
-def _untangle_by_lbfgs(energy: ShapeEnergy, free: IntArray, start: FloatArray) -> int:
-    """Minimise by L-BFGS for each regularisation parameter; return the evaluations, 0 if they did not suffice."""
-    X, epsilon, evaluations = start.copy(), 1.0, 0
-
-    def evaluate(x: FloatArray, epsilon: float) -> tuple[float, FloatArray]:
-        there = X.copy()
-        there[free] = x.reshape(-1, 3)
-        value, gradient = energy.gradient(there, epsilon)
-        return value, gradient[free].ravel()
-
-    while evaluations < _MAX_EVALUATIONS:
-        before = energy.value(X, epsilon)
-        steps = {"maxiter": 60}
-        found = minimize(evaluate, X[free].ravel(), args=(epsilon,), jac=True, method="L-BFGS-B", options=steps)
-        evaluations += found.nfev
-        X[free] = found.x.reshape(-1, 3)
-        least = float(energy.determinants(X).min())
-        if least > 0:
-            return evaluations
-        epsilon = reduce_epsilon(epsilon, least, found.fun / before)
-    return 0
 
 
 def run_certificate(options: argparse.Namespace) -> None:
@@ -288,21 +224,11 @@ def run_certificate(options: argparse.Namespace) -> None:
 def main() -> None:
     """Run one benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("problems", "scenes", "methods", "certificate", "gmsh"))
+    runs = {"problems": run_problems, "certificate": run_certificate}
+    parser.add_argument("what", choices=runs)
     parser.add_argument("-n", "--count", type=int, default=300)
     parser.add_argument("-o", "--output", type=Path, help="file of JSON lines for the problems")
-    parser.add_argument("--size", type=int, default=12, help="cubes along each side of a scene")
-    parser.add_argument("--no-gmsh", action="store_true", help="leave Gmsh out")
-    parser.add_argument("--polish", action="store_true", help="also lower the distortion")
     options = parser.parse_args()
-    options.gmsh = not options.no_gmsh and importlib.util.find_spec("gmsh") is not None
-    runs = {
-        "problems": run_problems,
-        "scenes": run_scenes,
-        "methods": run_methods,
-        "certificate": run_certificate,
-        "gmsh": run_gmsh,
-    }
     runs[options.what](options)
 
 

@@ -2,7 +2,7 @@
 =======================================================
 
 V₃ solves most of the thirty problems, V₁ and V₄ few; in the paper all three solve all.
-``benchmarks/lbfgs_only.py`` lists all runs.
+``benchmarks/records/letters_alone.csv`` has all runs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from quasiharmonic.solver.methods import LBFGS
 from sculptures import sculpture
 
 sys.path.append(str(BENCHMARKS))
-from lbfgs_only import LETTERS, RECORDS, by_kind, read
+from recorded import LETTERS, letters_by_kind, read_letters_alone
 
 SURFACES = "angel", "gargoyle", "rabbit", "bust", "hand"
 
@@ -25,7 +25,7 @@ SURFACES = "angel", "gargoyle", "rabbit", "bust", "hand"
 def main(output: Path, size: int = 64, surfaces: int = 5, iterations: int = 600) -> dict[str, Any]:
     figure, axes = panels(surfaces, len(LETTERS), (2.6, 3.1))
     drawn = {"of": 0, "solved": 0, "most iterations": 0}
-    numbers: dict[str, Any] = {"drawn": drawn, "recorded": by_kind(read(RECORDS))}
+    numbers: dict[str, Any] = {"drawn": drawn, "recorded": letters_by_kind(read_letters_alone())}
     for row, surface in zip(axes, SURFACES, strict=False):
         V, F = sculpture(surface, size)
         for ax, letter in zip(row, LETTERS, strict=True):

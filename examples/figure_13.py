@@ -15,7 +15,7 @@ import numpy as np
 from common import BENCHMARKS, COLORS, GREEN, INK, panels, run, save
 
 sys.path.append(str(BENCHMARKS))
-from tlc_foldover import on_common_problems, read_records, read_repeated_runs, summary
+from recorded import on_common_problems, read_records, read_repeated_runs, summary
 
 PROGRAMS = {
     "ours speed": COLORS["tanh"],

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from common import BENCHMARKS, COLORS, panels, run, save
 
 sys.path.append(str(BENCHMARKS))
-from evaluation import RECORDS, SIZES, Row, by_family, by_si_log, in_bands, number, read
+from recorded import SIZES, Row, by_family, by_si_log, in_bands, number, read_evaluation
 
 SHOWN = {"paper": COLORS["si-log"], "speed": COLORS["tanh"]}
 QUANTILES = 10, 50, 90
@@ -41,7 +41,7 @@ def draw_families(ax: Axes, rows: list[Row]) -> dict[str, list[float]]:
 
 
 def main(output: Path) -> dict[str, Any]:
-    rows = read(RECORDS)
+    rows = read_evaluation()
     figure, axes = panels(2, 2, (5.8, 4.6))
     for i, line in enumerate(axes):
         for j, ax in enumerate(line):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+import recorded
 import speed
-import tlc_foldover
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -34,7 +34,7 @@ def test_composites_fail_or_find_a_map_and_mouette_always_finds_one():
 
 def test_the_table_of_other_programs_belongs_to_the_records():
     text = (DOCS / "comparisons" / "tlc_foldover.md").read_text(encoding="utf-8")
-    assert text == tlc_foldover.table_of_records()
+    assert text == recorded.table_of_records()
 
 
 def scenes():

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from itertools import islice
 from pathlib import Path
@@ -10,15 +9,13 @@ import numpy as np
 import pytest
 
 import campaign
-import compiled_loops
-import lbfgs_only
 import problems
 import small_problems
 import speed
-import tetrahedral_problems
+import stages
+import tetrahedra
 from quasiharmonic import Problem, boundary_loops, certify, certify_tetrahedra, injective_tetrahedra, solve
 from quasiharmonic.solver.search.stages import stages_of
-from quasiharmonic.util import kernels
 
 pytestmark = pytest.mark.long
 
@@ -51,9 +48,9 @@ def test_the_name_determines_a_problem(family):
     assert not np.array_equal(first.target, problems.make(family, 6, 0.7, triangles=100).target)
 
 
-@pytest.mark.parametrize("family", tetrahedral_problems.FAMILIES)
+@pytest.mark.parametrize("family", tetrahedra.FAMILIES)
 def test_a_problem_of_tetrahedra_has_its_known_solution(family):
-    case = tetrahedral_problems.make(family, 1, 300)
+    case = tetrahedra.make(family, 1, 300)
     for points in (case.X, case.hidden):
         certificate = certify_tetrahedra(case.T, points)
         assert certificate.injective
@@ -277,18 +274,6 @@ def test_invalid_calls_of_the_speed_benchmark_are_rejected(arguments, message, t
     assert [path.name for path in tmp_path.iterdir()] == ["other.csv"]
 
 
-def test_compiled_loops_are_compared_with_numpy(tmp_path, monkeypatch):
-    folders = str(Path(compiled_loops.__file__).parent)
-    monkeypatch.setenv("PYTHONPATH", folders, prepend=os.pathsep)
-    if kernels.extension is None:
-        with pytest.raises(SystemExit, match="not built, or switched off"):
-            compiled_loops.main(["--triangles", "100"])
-        return
-    compiled_loops.main(["--triangles", "100", "--letters", "CS", "-r", "1", "-o", str(tmp_path)])
-    lines = (tmp_path / "compiled_loops.md").read_text(encoding="utf-8").splitlines()
-    assert [line.split("|")[1].strip() for line in lines[4:]] == ["cat on C", "cat on S", "geometric mean"]
-
-
 def test_speed_is_measured_merged_and_limited(tmp_path, capsys):
     """A tool that exceeds the limit gets no larger problem, including this project's own."""
     once = ["--peers", "-r", "1", "--letters", "C", "-o", str(tmp_path)]
@@ -307,20 +292,6 @@ def test_speed_is_measured_merged_and_limited(tmp_path, capsys):
     assert (tmp_path / "speed.png").stat().st_size > 0
 
 
-def test_lbfgs_only(tmp_path):
-    """A row is read back as written, and the recorded runs are complete."""
-    surface, V, F = next(lbfgs_only.made(24))
-    run = lbfgs_only.measure(surface, V, F, "A", "V₃ tanh", 100)
-    assert run.flips == 0
-    table = tmp_path / "table.csv"
-    table.write_text(",".join(run._fields) + "\n" + ",".join(map(str, run)) + "\n", encoding="utf-8")
-    assert lbfgs_only.read(table) == [run]
-    assert lbfgs_only.read(tmp_path / "none.csv") == []
-    recorded = lbfgs_only.read(lbfgs_only.RECORDS)
-    assert len({(run.surface, run.triangles, run.letter, run.column) for run in recorded}) == len(recorded)
-    assert {row["of"] for row in lbfgs_only.by_kind(recorded)["gallery"].values()} == {30}
-
-
 @pytest.mark.parametrize("name", small_problems.SETS)
 def test_sets_of_small_problems(name):
     some = list(islice(small_problems.SETS[name](200), 4))
@@ -329,3 +300,11 @@ def test_sets_of_small_problems(name):
     assert small_problems.together(some, 1) == small_problems.one_by_one(some)
     shared = all(np.array_equal(some[0][0], V) for V, _, _, _ in some)
     assert shared == (name == "one mesh")
+
+
+def test_label_and_contribution_of_a_stage():
+    outcomes = stages.outcomes(["noise:1:0.1", "comb:0:0.1"], "paper")
+    assert all(outcome.result.injective and np.isfinite(outcome.mips) for outcome in outcomes)
+    assert stages.kind(outcomes[0].result.stages[0]) == "vector-adam, si-log"
+    first = stages.stages("paper", outcomes).splitlines()[2]
+    assert first.startswith("| vector-adam, si-log | 2 |")

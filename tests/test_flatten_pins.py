@@ -293,16 +293,15 @@ def test_least_squares_of_a_similarity():
 @pytest.mark.slow
 def test_the_benchmark_makes_and_solves_problems(monkeypatch, tmp_path, capsys):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import pin_problems
     import pins
 
-    monkeypatch.setattr(pin_problems, "SMALLEST", 60)
-    monkeypatch.setattr(pin_problems, "LARGEST", 200)
-    monkeypatch.setitem(pin_problems.WEAKEST, "multiply_wound", 2.0)
-    names = pins.names(7, list(pin_problems.FAMILIES))
-    assert [name.partition(":")[0] for name in names] == list(pin_problems.FAMILIES)
+    monkeypatch.setattr(pins, "SMALLEST", 60)
+    monkeypatch.setattr(pins, "LARGEST", 200)
+    monkeypatch.setitem(pins.WEAKEST, "multiply_wound", 2.0)
+    names = pins.names(7, list(pins.FAMILIES))
+    assert [name.partition(":")[0] for name in names] == list(pins.FAMILIES)
     for name in names:
-        case, again = pin_problems.make(name), pin_problems.make(name)
+        case, again = pins.make(name), pins.make(name)
         assert certify(case.F, case.hidden).bijective
         assert np.array_equal(case.hidden[case.fixed], case.target)
         assert 1 <= len(case.fixed) <= 200

@@ -1,4 +1,4 @@
-"""The recipes in CONTRIBUTING.md run as shown, and the files that they name exist."""
+"""The recipes in `docs/development/extending.md` run as shown, and the files that they name exist."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from quasiharmonic.io import registry
 from shared.formats import try_format
 
 ROOT = Path(__file__).parent.parent
-TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "development" / "extending.md").read_text(encoding="utf-8")
 # Every block of a section belongs to its recipe.
 RECIPES = {
     title: "\n".join(blocks)
     for title, *text in (section.split("\n", 1) for section in re.split(r"^##+ ", TEXT, flags=re.MULTILINE))
     if (blocks := re.findall(r"^```python\n(.*?)^```", *text, re.MULTILINE | re.DOTALL))
 }
-PAGES = "CONTRIBUTING.md", "docs/development/architecture.md"
+PAGES = "CONTRIBUTING.md", "docs/development/extending.md", "docs/development/architecture.md"
 
 
 def test_all_recipes_are_tested():

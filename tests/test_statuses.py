@@ -42,7 +42,7 @@ def test_the_message_of_a_status_says_whether_its_maps_are_injective():
 
 
 def test_the_table_of_what_ends_a_search_names_statuses():
-    text = (Path(__file__).parent.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parent.parent / "docs" / "development" / "extending.md").read_text(encoding="utf-8")
     table = text.split("## When the search stops\n")[1].split("\n## ")[0]
     ends = [line.split(" | ")[-1] for line in table.splitlines() if line.startswith("| ")][1:]
     named = [re.findall(r"`([A-Z_]+)`", end) for end in ends]

@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 
 import problems
-import tlc_foldover
+import recorded
+from quasiharmonic import Problem, distortion, solve
 
 
 def test_records_belong_to_generated_problems():
     for name in ("comb:261122:0.5 triangles=3774", "teeth:261124:0.736 triangles=3270"):
         made, _, triangles = name.partition(" triangles=")
         case = problems.make(*problems.parse(made), triangles=int(triangles))
-        runs = [run for run in tlc_foldover.read_records() if run.problem == name]
+        runs = [run for run in recorded.read_records() if run.problem == name]
         assert {run.program for run in runs} >= {"ours speed", "TLC-PN", "TLC-QN", "SBP"}
         assert {(run.triangles, run.feasible) for run in runs} == {(len(case.F), case.feasible)}
 
 
 def test_distortion_is_recorded_exactly_for_injective_maps():
-    runs = tlc_foldover.read_records()
+    runs = recorded.read_records()
     assert len({(run.problem, run.program) for run in runs}) == len(runs)
     for run in runs:
         assert np.isfinite(run.mips) == np.isfinite(run.stretch) == run.injective
@@ -27,8 +28,8 @@ def test_distortion_is_recorded_exactly_for_injective_maps():
 
 
 def test_figures_of_the_documentation():
-    rows = tlc_foldover.on_common_problems(tlc_foldover.read_records())
-    table = tlc_foldover.summary(rows, tlc_foldover.PROGRAMS)
+    rows = recorded.on_common_problems(recorded.read_records())
+    table = recorded.summary(rows, recorded.PROGRAMS)
     solved = {name: (row["feasible solved"], row["unknown solved"]) for name, row in table.items()}
     assert solved["ours speed"] == (44, 21)
     assert solved["TLC-PN"] == (34, 20)
@@ -40,17 +41,17 @@ def test_figures_of_the_documentation():
 
 
 def test_figures_of_the_documentation_for_repeated_runs():
-    programs = (*tlc_foldover.PROGRAMS, *tlc_foldover.ANEW)
-    rows = tlc_foldover.on_common_problems([*tlc_foldover.read_records(), *tlc_foldover.read_repeated_runs()])
-    table = tlc_foldover.summary(rows, programs)
-    solved = {name: (table[name]["feasible solved"], table[name]["unknown solved"]) for name in tlc_foldover.ANEW}
+    programs = (*recorded.PROGRAMS, *recorded.ANEW)
+    rows = recorded.on_common_problems([*recorded.read_records(), *recorded.read_repeated_runs()])
+    table = recorded.summary(rows, programs)
+    solved = {name: (table[name]["feasible solved"], table[name]["unknown solved"]) for name in recorded.ANEW}
     assert solved == {"anew speed": (44, 22), "anew paper": (41, 20), "anew untangling": (43, 21)}
-    assert [table[name]["ratio"][1] for name in tlc_foldover.ANEW] == [1, 19, 6.3]
+    assert [table[name]["ratio"][1] for name in recorded.ANEW] == [1, 19, 6.3]
     assert table["anew untangling"]["MIPS"] < table["anew speed"]["MIPS"]
 
 
 def test_repeated_runs_agree_with_recorded_ones():
-    rows = tlc_foldover.on_common_problems([*tlc_foldover.read_records(), *tlc_foldover.read_repeated_runs()])
+    rows = recorded.on_common_problems([*recorded.read_records(), *recorded.read_repeated_runs()])
     for row in rows.values():
         then, now = row["ours speed"], row["anew speed"]
         assert (now.triangles, now.feasible, now.start_flipped) == (then.triangles, then.feasible, then.start_flipped)
@@ -58,18 +59,31 @@ def test_repeated_runs_agree_with_recorded_ones():
 
 
 def test_letters():
-    rows = tlc_foldover.letters()
+    rows = recorded.letters()
     assert len(rows) == 7
     assert all(float(row["ours_polished_mips"]) < float(row["foldover_free_mips"]) for row in rows)
 
 
-@pytest.mark.long
-def test_repeated_run():
-    rows = dict(list(tlc_foldover.on_common_problems(tlc_foldover.read_records()).items())[1:2])
-    ((name, row),) = rows.items()
-    (run,) = tlc_foldover.anew(rows, "speed")
-    assert run.injective
-    assert run.triangles == row["ours speed"].triangles
-    assert run.polished == pytest.approx(row["ours speed"].polished, rel=0.05)
-    table = tlc_foldover.summary({name: row | {run.program: run}}, (*tlc_foldover.PROGRAMS, run.program))
-    assert table["anew speed"]["feasible solved"] + table["anew speed"]["unknown solved"] == 1
+def test_the_evaluation_covers_two_thousand_problems_of_all_sizes():
+    rows = recorded.read_evaluation()
+    assert len({row["problem"] for row in rows}) == len(rows) >= 2000
+    assert min(len(some) for some in recorded.by_family(rows).values()) > 100
+    assert min(len(some) for some in recorded.in_bands(rows, "triangles", recorded.SIZES).values()) > 400
+    for row in rows:
+        for run in ("paper", "speed"):
+            assert (row[f"{run}_mips"] != "") == (row[f"{run}_stage"] != "0")
+
+
+def test_the_evaluation_is_reproduced():
+    (row,) = (row for row in recorded.read_evaluation() if row["problem"] == "comb:2000001:0.049 triangles=386")
+    case = problems.make("comb", 2000001, 0.049, triangles=386)
+    result = solve(Problem(case.V, case.F, case.fixed, case.target), strategy="paper")
+    assert str(result.history[0].inverted) == row["start_flipped"]
+    mips = distortion(case.V, case.F, result.uv).statistics("mips").mean
+    assert mips == pytest.approx(float(row["paper_mips"]), rel=1e-3)
+
+
+def test_the_runs_of_lbfgs_alone_are_complete():
+    runs = recorded.read_letters_alone()
+    assert len({(run.surface, run.triangles, run.letter, run.column) for run in runs}) == len(runs)
+    assert {row["of"] for row in recorded.letters_by_kind(runs)["gallery"].values()} == {30}

@@ -1,38 +1,28 @@
-"""Compare with records of TLC and Foldover-free: problems solved, time and distortion.
+"""Recorded runs of other programs, and of this one where they take hours: readers and summaries.
 
-    python benchmarks/tlc_foldover.py > docs/comparisons/tlc_foldover.md  # from the records
-    python benchmarks/tlc_foldover.py --anew speed untangling [-n 20] [-o ANEW.csv]
+    python benchmarks/recorded.py > docs/comparisons/tlc_foldover.md
 
-``--anew`` runs this package again on the same problems, in their order, and certifies the maps in the same way. It runs
-strategies, or `Untangling` alone, which descends Foldover-free's regularised energy with this package's own method.
-These seconds belong to the current machine and version. Compare them with each other; compare them with the records
-only qualitatively. ``records/README.md`` has the origin of the records.
+``records/README.md`` has the origin of the records.
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
-import sys
-import time
-from collections.abc import Iterable, Iterator, Sequence
+import gzip
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-import problems
-from quasiharmonic import Problem, distortion, polish, solve
-from quasiharmonic.solver.methods import Untangling
-from quasiharmonic.solver.search.stages import STRATEGIES
 from quasiharmonic.util.arrays import FloatArray
 
 RECORDS = Path(__file__).parent / "records"
 #: The programs in the order of the tables: those that ran every problem of the first 68.
 PROGRAMS = "ours speed", "ours quality", "TLC-PN", "TLC-QN", "SBP", "SBP until first injective"
-#: The methods that can be run again, and the names of their stored runs.
-WAYS = *STRATEGIES, "untangling"
-ANEW = tuple(f"anew {way}" for way in WAYS)
+#: The repeated runs: two strategies, and `Untangling` alone.
+ANEW = "anew speed", "anew paper", "anew untangling"
 #: What the table calls the runs of this package.
 LABELS = {
     "ours speed": "quasiharmonic, `speed`",
@@ -47,6 +37,18 @@ PROVENANCE = (
 )
 #: Less than a tick of the recording clock; ratios use this value for it.
 TICK = 0.004
+#: The letters of the paper's Figure 10.
+LETTERS = "GSRAPH"
+#: Maximum number of triangles of the gallery's surfaces at size 24; at size 64 they have more.
+SMALL = 5000
+#: Families of the recorded evaluation, and the limits of its bands of size.
+EVALUATED = (
+    *("noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"),
+    *("glyph", "polygon", "star", "sculpture"),
+)
+SIZES = 100, 300, 1000, 3000, 20_000
+#: A row of the evaluation.
+Row = dict[str, str]
 
 
 class Run(NamedTuple):
@@ -132,25 +134,6 @@ def on_common_problems(runs: Iterable[Run]) -> dict[str, dict[str, Run]]:
     return {name: row for name, row in by_problem.items() if needed <= row.keys()}
 
 
-def anew(rows: dict[str, dict[str, Run]], way: str) -> Iterator[Run]:
-    """Run this package again on the problems of some records, by a strategy or by untangling alone."""
-    strategy = [Untangling(iterations=2000)] if way == "untangling" else way
-    for name in rows:
-        made, _, triangles = name.partition(" triangles=")
-        case = problems.make(*problems.parse(made), triangles=int(triangles))
-        problem = Problem(case.V, case.F, case.fixed, case.target)
-        start = time.process_time()
-        result = solve(problem, strategy=strategy, max_iterations=2000)
-        seconds = time.process_time() - start
-        before = rows[name][PROGRAMS[0]].start_flipped
-        row: list[float] = [np.nan] * 3
-        if result.injective:
-            better = polish(case.V, case.F, result.uv, fixed=case.fixed, energy="mips")
-            found, after = (distortion(case.V, case.F, uv) for uv in (result.uv, better.uv))
-            row = [found.statistics("mips").mean, after.statistics("mips").mean, found.statistics("isometric").maximum]
-        yield Run(name, f"anew {way}", len(case.F), seconds, result.injective, case.feasible, before, *row)
-
-
 def summary(rows: dict[str, dict[str, Run]], programs: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return for each program: problems solved, its time relative to the first program, distortion where all solved.
 
@@ -215,31 +198,84 @@ def table_of_records() -> str:
     return f"{PROVENANCE}\n\n{table}"
 
 
-def main() -> None:
-    """Print the tables; with ``--anew`` solve first."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--anew", nargs="+", default=[], choices=WAYS, help="run our side again on the same problems")
-    parser.add_argument("-n", type=int, default=68, metavar="N", help="the first N problems (68)")
-    parser.add_argument("-o", "--output", type=Path, metavar="CSV", help="rows of what was run anew")
-    options = parser.parse_args()
-    if not options.anew:
-        print(table_of_records(), end="")
-        return
-    rows = dict(list(on_common_problems(read_records()).items())[: options.n])
-    programs = [*PROGRAMS]
-    runs = []
-    for way in options.anew:
-        for run in anew(rows, way):
-            runs.append(run)
-            rows[run.problem][run.program] = run
-            story = f"{run.seconds:.3g} s, {'injective' if run.injective else 'no map'}"
-            print(f"{run.program}, {run.problem}: {story}", file=sys.stderr)
-        programs.append(f"anew {way}")
-    if runs and options.output:
-        with options.output.open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file).writerows([Run._fields, *runs])
-    print(table_text(summary(rows, programs)), end="")
+class LetterRun(NamedTuple):
+    """L-BFGS alone on one surface and one letter, as stored in `letters_alone.csv`."""
+
+    surface: str
+    letter: str
+    triangles: int
+    column: str
+    iterations: int
+    flips: int
+    mips: str
+    cpu_seconds: float
+
+
+def read_letters_alone(path: Path = RECORDS / "letters_alone.csv") -> list[LetterRun]:
+    """Return the runs of L-BFGS alone."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return [
+            LetterRun(surface, letter, int(triangles), column, int(iterations), int(flips), mips, float(seconds))
+            for surface, letter, triangles, column, iterations, flips, mips, seconds in [*csv.reader(file)][1:]
+        ]
+
+
+def summarise_letters(runs: Iterable[LetterRun]) -> dict[str, dict[str, int | float]]:
+    """Return for each column the problems solved, their total, the maximum iterations and the CPU seconds."""
+    found: dict[str, dict[str, int | float]] = {}
+    for run in runs:
+        column = found.setdefault(run.column, {"of": 0, "solved": 0, "most iterations": 0, "CPU seconds": 0})
+        column["of"] += 1
+        column["CPU seconds"] = round(column["CPU seconds"] + run.cpu_seconds, 1)
+        if run.flips == 0:
+            column["solved"] += 1
+            column["most iterations"] = max(column["most iterations"], run.iterations)
+    return found
+
+
+def letters_by_kind(runs: Sequence[LetterRun]) -> dict[str, dict[str, dict[str, int | float]]]:
+    """Return the summary separately for small and large gallery surfaces and for scans."""
+    groups: dict[str, list[LetterRun]] = {"gallery": [], "gallery, small": [], "scans": []}
+    for run in runs:
+        scan = run.surface.startswith("scan of ")
+        groups["scans" if scan else "gallery" if run.triangles > SMALL else "gallery, small"].append(run)
+    return {name: summarise_letters(group) for name, group in groups.items()}
+
+
+def read_evaluation() -> list[Row]:
+    """Return the rows of `evaluation.csv.gz`, one for each problem."""
+    with gzip.open(RECORDS / "evaluation.csv.gz", "rt", encoding="utf-8", newline="") as file:
+        return [row for row in csv.DictReader(file) if row["speed_seconds"]]
+
+
+def number(rows: Iterable[Row], column: str) -> FloatArray:
+    """Return a column; empty cells become NaN."""
+    return np.array([float(row[column] or "nan") for row in rows])
+
+
+def by_si_log(rows: Iterable[Row]) -> list[Row]:
+    """Return problems for comparing si-log and tanh: both found a map, and Tutte's embedding is not injective."""
+    return [
+        row for row in rows if row["paper_stage"] == "1" and row["tanh_mips"] and int(row["start_flipped"] or 0) > 0
+    ]
+
+
+def in_bands(rows: Iterable[Row], column: str, edges: Sequence[float]) -> dict[str, list[Row]]:
+    """Return rows by band of a column's number, with the band's label as key."""
+    bands: dict[str, list[Row]] = {f"{low:,} to {high:,}": [] for low, high in pairwise(edges)}
+    for row in rows:
+        k = int(np.searchsorted(edges, float(row[column]), side="right")) - 1
+        list(bands.values())[min(max(k, 0), len(bands) - 1)].append(row)
+    return bands
+
+
+def by_family(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Return the rows of each family."""
+    families: dict[str, list[Row]] = {family: [] for family in EVALUATED}
+    for row in rows:
+        families[row["problem"].partition(":")[0]].append(row)
+    return families
 
 
 if __name__ == "__main__":
-    main()
+    print(table_of_records(), end="")
