@@ -36,9 +36,8 @@ FREE_SHARE = 0.01
 # Relative tolerance of the descents: a more accurate minimum hardly changes the stretch.
 _TOLERANCE = 1e-2
 _MAX_STEPS = 100
-# On charts of at least so many triangles, a descent ends after a step that lowers the energy by less than this share:
-# the last steps of large charts take long and change the stretch little.
-_LARGE, _SLOW = 20_000, 0.05
+# A descent ends after a step that lowers the energy by less than this share: further steps change the stretch little.
+_SLOW = 0.05
 # A mean energy below this needs no further steps.
 _NOTHING = 1e-5
 # Smallest energy at the bound that `EvenStretch` uses.
@@ -224,12 +223,11 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
     far = value > _NEAR and isinstance(density, SymmetricDirichlet)
     energy = chart.piece.energy(ReweightedDirichlet() if far else density, None)
     descent = SurfaceDescent(energy, chart.uv, "auto")
-    least = 1 - _SLOW if len(chart.F) >= _LARGE else 1.0
     before = np.inf
     try:
         for _ in itertools.islice(descend(descent, density, _TOLERANCE), _MAX_STEPS):
             check_wanted()
-            if descent.distortion < _NOTHING or descent.distortion > least * before:
+            if descent.distortion < _NOTHING or descent.distortion > (1 - _SLOW) * before:
                 break
             before = descent.distortion
     finally:
