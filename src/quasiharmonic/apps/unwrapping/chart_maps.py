@@ -116,6 +116,8 @@ class WorkingChart:
     stretch: FloatArray = field(default_factory=lambda: np.empty(0))
     crossings: IntArray = field(default_factory=lambda: np.empty((0, 4), dtype=np.int64))
     bijective: bool = False
+    # An injective map from which the first descent starts, if there is a good one.
+    start: FloatArray | None = None
     # Number of successive extensions of cuts that lowered the stretch too little.
     failures: int = 0
 
@@ -174,12 +176,12 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
     """
     if chart.uv is None:
         flat = chart.piece.planar_map()
-        uv = _initial_map(chart.piece) if flat is None else flat
+        uv = flat if flat is not None else chart.start if chart.start is not None else _initial_map(chart.piece)
         if uv is None:
             chart.stretch = np.full(len(chart.F), np.inf)
             return
         chart.use(uv)
-        if flat is None:
+        if flat is None and not (chart.start is not None and keeps_bound(chart, bound)):
             _descend(chart, SymmetricDirichlet(), check_wanted)
         if keeps_bound(chart, bound):
             return

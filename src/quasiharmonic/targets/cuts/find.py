@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from numbers import Real
 
 import numpy as np
@@ -109,19 +109,40 @@ def find_cuts(
     check_range("forbidden_edges", spared, len(V))
     if not isinstance(min_gain, Real) or not float(min_gain) > 0:
         raise ValueError(f"min_gain must be a positive number, not {min_gain!r}")
+    costs = _costs_of_sides(F, len(V), spared, edge_costs)
+    return find_cuts_by(V, F, given, costs, float(min_gain))
+
+
+def find_cuts_by(
+    V: FloatArray,
+    F: IntArray,
+    given: IntArray,
+    costs: FloatArray | None,
+    min_gain: float,
+    extend: Callable[[EdgeGraph, BoolArray, IntArray], BoolArray] | None = None,
+) -> IntArray:
+    """Find cuts as `find_cuts` does, from checked arrays.
+
+    On the coarse mesh of a large surface, ``extend`` replaces the cuts (e,) bool of an `EdgeGraph` by others, which are
+    carried to the surface. It also gets the indices (m,) of the graph's vertices.
+    """
     inner = manifold_edges(F, len(V)).interior
     # Open along the given edges. Surfaces that touch at a vertex are also separated.
     FT, origin = open_along(F, given, len(V))
     found = [inner[np.isin(_keys(inner, len(V)), _open_keys(F, FT, given, len(V)))]] if given.size else [given]
-    costs = _costs_of_sides(F, len(V), spared, edge_costs)
     rings = _RINGS if np.isfinite(min_gain) else _RINGS_OF_SHORTEST
     for vertices, triangles, T in _parts(FT, len(origin)):
         names, own = origin[vertices], None if costs is None else costs[triangles]
         if vertices.size > _LARGE:
-            cut = cut_by_levels(V[names], T, own, lambda graph: _cut_part(graph, float(min_gain)), rings)
+
+            def find(graph: EdgeGraph, some: IntArray, names: IntArray = names) -> BoolArray:
+                cut = _cut_part(graph, min_gain)
+                return cut if extend is None else extend(graph, cut, names[some])
+
+            cut = cut_by_levels(V[names], T, own, find, rings)
         else:
             graph = edge_graph(V[names], T, own)
-            cut = graph.ends[_cut_part(graph, float(min_gain))]
+            cut = graph.ends[_cut_part(graph, min_gain)]
         found.append(np.sort(names[cut], axis=1))
     return np.unique(np.concatenate(found), axis=0)
 
