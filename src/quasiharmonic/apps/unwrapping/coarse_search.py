@@ -1,4 +1,4 @@
-"""Charts of a large surface from those of a coarse mesh: their seams, and initial maps that are close to the final ones.
+"""Charts of a large surface from those of a coarse mesh: their seams, and initial maps close to the final ones.
 
 The seams of all charts of the coarse mesh are carried to the surface and shortened there. A vertex in the interior of a
 coarse chart keeps its position in that chart's map. The other vertices of a chart of the surface get the harmonic
@@ -24,7 +24,7 @@ from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, sum_at, to_complex, to_points
 
 # Numbers of fits after which a map without inverted triangles is used, and after which the search for one ends.
 _FITS, _MOST_FITS = 4, 16

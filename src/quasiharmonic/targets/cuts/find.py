@@ -29,7 +29,7 @@ from quasiharmonic.util.arrays import (
 )
 
 # A surface with more vertices is cut on a coarse mesh first.
-_LARGE = 15_000
+_LARGE = 5_000
 # `crease_costs` saves this share of the cost where the surface bends inwards by this angle or more.
 _SAVED, _CONCAVE = 0.75, np.pi / 3
 # Rings of triangles by which cuts may move on each finer mesh. Longer moves would shorten cuts at the expense of
@@ -54,7 +54,7 @@ def find_cuts(
     First, cuts are made that the topology requires. They open handles and connect boundary loops; a closed surface
     without handles is cut along a long path. Then cuts are extended to protruding or saddle-shaped parts, where a map
     would otherwise shrink or stretch most, as long as the gain justifies their length. Finally all cuts are shortened.
-    Cuts prefer creases, above all concave ones. On surfaces of more than 15,000 vertices, cuts are found on a coarse
+    Cuts prefer creases, above all concave ones. On surfaces of more than 5,000 vertices, cuts are found on a coarse
     mesh, carried to the surface, and shortened there.
 
     Parameters

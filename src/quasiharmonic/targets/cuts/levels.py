@@ -21,7 +21,7 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
 # Number of vertices of the coarse mesh.
-_COARSE = 6000
+_COARSE = 4000
 # A stretch is exchanged for paths within this many rings of triangles around it.
 _RINGS = 5
 
