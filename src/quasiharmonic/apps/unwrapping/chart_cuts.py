@@ -28,7 +28,7 @@ _BAND = (0.25, 0.75)
 # Around each end, up to this distance, triangles belong to the nearer end; the chart has area 1.
 _REACH = 0.15
 # The band of a large chart is narrowed until it has at most this number of triangles.
-_MAX_BAND = 30_000
+_MAX_BAND = 6_000
 # Number of boundary positions between which a dividing line is sought, and what a balanced line is worth.
 _SAMPLES = 256
 _BALANCE = 0.2

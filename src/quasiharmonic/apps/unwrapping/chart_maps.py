@@ -36,9 +36,8 @@ FREE_SHARE = 0.01
 # Relative tolerance of the descents: a more accurate minimum hardly changes the stretch.
 _TOLERANCE = 1e-2
 _MAX_STEPS = 100
-# On charts of at least so many triangles, a descent ends after a step that lowers the energy by less than this share:
-# the last steps of large charts take long and change the stretch little.
-_LARGE, _SLOW = 20_000, 0.05
+# A descent ends after a step that lowers the energy by less than this share: further steps change the stretch little.
+_SLOW = 0.05
 # A mean energy below this needs no further steps.
 _NOTHING = 1e-5
 # Smallest energy at the bound that `EvenStretch` uses.
@@ -117,6 +116,8 @@ class WorkingChart:
     stretch: FloatArray = field(default_factory=lambda: np.empty(0))
     crossings: IntArray = field(default_factory=lambda: np.empty((0, 4), dtype=np.int64))
     bijective: bool = False
+    # An injective map from which the first descent starts, if there is a good one.
+    start: FloatArray | None = None
     # Number of successive extensions of cuts that lowered the stretch too little.
     failures: int = 0
 
@@ -175,12 +176,12 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
     """
     if chart.uv is None:
         flat = chart.piece.planar_map()
-        uv = _initial_map(chart.piece) if flat is None else flat
+        uv = flat if flat is not None else chart.start if chart.start is not None else _initial_map(chart.piece)
         if uv is None:
             chart.stretch = np.full(len(chart.F), np.inf)
             return
         chart.use(uv)
-        if flat is None:
+        if flat is None and not (chart.start is not None and keeps_bound(chart, bound)):
             _descend(chart, SymmetricDirichlet(), check_wanted)
         if keeps_bound(chart, bound):
             return
@@ -224,12 +225,11 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
     far = value > _NEAR and isinstance(density, SymmetricDirichlet)
     energy = chart.piece.energy(ReweightedDirichlet() if far else density, None)
     descent = SurfaceDescent(energy, chart.uv, "auto")
-    least = 1 - _SLOW if len(chart.F) >= _LARGE else 1.0
     before = np.inf
     try:
         for _ in itertools.islice(descend(descent, density, _TOLERANCE), _MAX_STEPS):
             check_wanted()
-            if descent.distortion < _NOTHING or descent.distortion > least * before:
+            if descent.distortion < _NOTHING or descent.distortion > (1 - _SLOW) * before:
                 break
             before = descent.distortion
     finally:

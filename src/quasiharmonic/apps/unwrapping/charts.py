@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
+from quasiharmonic.apps.unwrapping.coarse_search import CoarseSearch
 from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.draft import Draft
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
@@ -23,10 +24,10 @@ from quasiharmonic.apps.unwrapping.unfolding import unfold
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.fans import fans, renumber, split_parts
 from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys, pair_keys
-from quasiharmonic.targets.cuts.find import find_cuts
+from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each, scale_to_unit
 
 #: Default of ``max_stretch``.
@@ -114,7 +115,9 @@ def find_charts(
         exact, charts = _lay_flat(V, F, given)
         working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
     min_gain = _MIN_GAIN if uv_cuts is None else np.inf
-    cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain)
+    coarse = uv_cuts is None and max_charts is None and not given.size
+    search_first = partial(CoarseSearch, max_stretch, workers, len(V)) if coarse else None
+    cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain, search_first=search_first)
     draft.charts = [*charts]
     total = surface_area(V, F)
     divisible = None if max_charts is None else max_charts - len(charts)
@@ -195,7 +198,7 @@ def _develop(
 
 def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:
     """Lay out the planar parts between cuts; return a mask (f,) of their triangles, and their charts."""
-    parts = _split(F, np.arange(len(F)), cut, len(V))
+    parts = split_parts(F, np.arange(len(F)), cut, len(V))
     vertices = np.concatenate([origin for _, _, origin in parts])
     first = np.cumsum([0, *(len(origin) for _, _, origin in parts)])
     rows = np.concatenate([rows for rows, _, _ in parts])
@@ -241,7 +244,7 @@ def _keep_parts(
 ) -> tuple[list[WorkingChart], IntArray]:
     """Return the parts of triangles (k,) between demanded cuts as charts, and the triangles of all other parts."""
     charts, others = list[WorkingChart](), [rows[:0]]
-    for of, own, origin in _split(F[rows], rows, cut, len(V)) if rows.size else []:
+    for of, own, origin in split_parts(F[rows], rows, cut, len(V)) if rows.size else []:
         try:
             chart = WorkingChart(of, origin, V[origin], own, cost[of])
         except ValueError:
@@ -268,36 +271,38 @@ def _try_map(chart: WorkingChart, corner_uv: FloatArray) -> None:
 
 
 def _cut(
-    V: FloatArray, F: IntArray, rows: IntArray, given: IntArray, cost: FloatArray, min_gain: float
+    V: FloatArray,
+    F: IntArray,
+    rows: IntArray,
+    given: IntArray,
+    cost: FloatArray,
+    min_gain: float,
+    search_first: Callable[[IntArray], CoarseSearch] | None,
 ) -> list[WorkingChart]:
-    """Cut triangles into disks; return them as charts without maps. ``given`` cuts are demanded."""
+    """Cut triangles into disks, or with ``search_first`` large surfaces into charts; return charts without maps.
+
+    ``given`` cuts are demanded.
+    """
     n = len(V)
     sides = edge_keys(F[rows], F[rows][:, (1, 2, 0)], n)
     there = given[np.isin(pair_keys(given, n), sides)]
     vertices, own = np.unique(F[rows], return_inverse=True)
+    coarse = None if search_first is None else search_first(vertices)
     cut = vertices[
-        find_cuts(
+        find_cuts_by(
             V[vertices],
             own.reshape(-1, 3),
-            edges=np.searchsorted(vertices, there),
-            edge_costs=cost[rows],
-            min_gain=min_gain if len(there) else _MIN_GAIN,
+            np.searchsorted(vertices, there),
+            cost[rows],
+            min_gain if len(there) else _MIN_GAIN,
+            coarse,
         )
     ]
-    parts = _split(F[rows], rows, cut, n)
-    return [WorkingChart(of, origin, V[origin], own, cost[of]) for of, own, origin in parts]
-
-
-def _split(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[tuple[IntArray, IntArray, IntArray]]:
-    """Split triangles along edges (l, 2); return rows, triangles by own vertices, and vertices of each part."""
-    sides = edge_keys(F, F[:, (1, 2, 0)], n)
-    split, component = fans(F, np.isin(sides, pair_keys(cut, n)))
-    order = np.argsort(component, kind="stable")
-    parts = []
-    for some in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
-        own, corner = renumber(split[some], F[some])
-        parts.append((rows[some], own, F[some].ravel()[corner]))
-    return parts
+    parts = split_parts(F[rows], rows, cut, n)
+    charts = [WorkingChart(of, origin, V[origin], own, cost[of]) for of, own, origin in parts]
+    if coarse is not None:
+        coarse.start(charts)
+    return charts
 
 
 def _finish(charts: list[WorkingChart], bound: float, total: float) -> list[Chart]:

@@ -30,7 +30,7 @@ _TOLERANCE = 1e-2
 # The search stops after this number of successive updates without fewer crossings.
 _MAX_STALLS = 4
 # In larger charts, only so many vertices move, those closest to overlaps.
-_MAX_FREE = 20_000
+_MAX_FREE = 5_000
 
 
 class Penetrations:

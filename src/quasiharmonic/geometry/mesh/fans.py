@@ -124,3 +124,15 @@ def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:
     """Fill loops, with the surface on their left, by triangles (k, 3) around new vertices numbered from ``n``."""
     triangles = [np.stack([np.roll(loop, -1), loop, np.full(len(loop), n + k)], axis=1) for k, loop in enumerate(loops)]
     return np.concatenate([np.zeros((0, 3), dtype=np.int64), *triangles])
+
+
+def split_parts(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[tuple[IntArray, IntArray, IntArray]]:
+    """Split triangles along edges (l, 2); return rows, triangles by own vertices, and vertices of each part."""
+    sides = edge_keys(F, F[:, (1, 2, 0)], n)
+    split, component = fans(F, np.isin(sides, pair_keys(cut, n)))
+    order = np.argsort(component, kind="stable")
+    parts = []
+    for some in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
+        own, corner = renumber(split[some], F[some])
+        parts.append((rows[some], own, F[some].ravel()[corner]))
+    return parts

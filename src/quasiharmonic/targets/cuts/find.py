@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from numbers import Real
 
 import numpy as np
@@ -29,7 +29,7 @@ from quasiharmonic.util.arrays import (
 )
 
 # A surface with more vertices is cut on a coarse mesh first.
-_LARGE = 15_000
+_LARGE = 5_000
 # `crease_costs` saves this share of the cost where the surface bends inwards by this angle or more.
 _SAVED, _CONCAVE = 0.75, np.pi / 3
 # Rings of triangles by which cuts may move on each finer mesh. Longer moves would shorten cuts at the expense of
@@ -54,7 +54,7 @@ def find_cuts(
     First, cuts are made that the topology requires. They open handles and connect boundary loops; a closed surface
     without handles is cut along a long path. Then cuts are extended to protruding or saddle-shaped parts, where a map
     would otherwise shrink or stretch most, as long as the gain justifies their length. Finally all cuts are shortened.
-    Cuts prefer creases, above all concave ones. On surfaces of more than 15,000 vertices, cuts are found on a coarse
+    Cuts prefer creases, above all concave ones. On surfaces of more than 5,000 vertices, cuts are found on a coarse
     mesh, carried to the surface, and shortened there.
 
     Parameters
@@ -109,19 +109,40 @@ def find_cuts(
     check_range("forbidden_edges", spared, len(V))
     if not isinstance(min_gain, Real) or not float(min_gain) > 0:
         raise ValueError(f"min_gain must be a positive number, not {min_gain!r}")
+    costs = _costs_of_sides(F, len(V), spared, edge_costs)
+    return find_cuts_by(V, F, given, costs, float(min_gain))
+
+
+def find_cuts_by(
+    V: FloatArray,
+    F: IntArray,
+    given: IntArray,
+    costs: FloatArray | None,
+    min_gain: float,
+    extend: Callable[[EdgeGraph, BoolArray, IntArray], BoolArray] | None = None,
+) -> IntArray:
+    """Find cuts as `find_cuts` does, from checked arrays.
+
+    On the coarse mesh of a large surface, ``extend`` replaces the cuts (e,) bool of an `EdgeGraph` by others, which are
+    carried to the surface. It also gets the indices (m,) of the graph's vertices.
+    """
     inner = manifold_edges(F, len(V)).interior
     # Open along the given edges. Surfaces that touch at a vertex are also separated.
     FT, origin = open_along(F, given, len(V))
     found = [inner[np.isin(_keys(inner, len(V)), _open_keys(F, FT, given, len(V)))]] if given.size else [given]
-    costs = _costs_of_sides(F, len(V), spared, edge_costs)
     rings = _RINGS if np.isfinite(min_gain) else _RINGS_OF_SHORTEST
     for vertices, triangles, T in _parts(FT, len(origin)):
         names, own = origin[vertices], None if costs is None else costs[triangles]
         if vertices.size > _LARGE:
-            cut = cut_by_levels(V[names], T, own, lambda graph: _cut_part(graph, float(min_gain)), rings)
+
+            def find(graph: EdgeGraph, some: IntArray, names: IntArray = names) -> BoolArray:
+                cut = _cut_part(graph, min_gain)
+                return cut if extend is None else extend(graph, cut, names[some])
+
+            cut = cut_by_levels(V[names], T, own, find, rings)
         else:
             graph = edge_graph(V[names], T, own)
-            cut = graph.ends[_cut_part(graph, float(min_gain))]
+            cut = graph.ends[_cut_part(graph, min_gain)]
         found.append(np.sort(names[cut], axis=1))
     return np.unique(np.concatenate(found), axis=0)
 

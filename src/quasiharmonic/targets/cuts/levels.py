@@ -21,13 +21,13 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
 # Number of vertices of the coarse mesh.
-_COARSE = 6000
+_COARSE = 4000
 # A stretch is exchanged for paths within this many rings of triangles around it.
 _RINGS = 5
 
 
 def cut_by_levels(
-    V: FloatArray, F: IntArray, costs: FloatArray | None, find: Callable[[EdgeGraph], BoolArray], rings: int
+    V: FloatArray, F: IntArray, costs: FloatArray | None, find: Callable[[EdgeGraph, IntArray], BoolArray], rings: int
 ) -> IntArray:
     """Cut a large connected surface.
 
@@ -39,7 +39,8 @@ def cut_by_levels(
         As for `edge_graph`. On coarse meshes, an edge has the mean of the lowest factors around the vertices that its
         ends represent.
     find : callable
-        Returns the cuts (e,) bool of an `EdgeGraph`.
+        Returns the cuts (e,) bool of an `EdgeGraph`, given the graph and the indices (m,) of its vertices. Each vertex
+        is at the mean position of the vertices that it represents.
     rings : int
         Distance to which cuts may move at each level, in rings of triangles.
 
@@ -55,8 +56,9 @@ def cut_by_levels(
     coarsening = coarsen(F, n, fixed, _COARSE)
     rim_keys = edge_keys(rim[:, 0], rim[:, 1], n)
     factors = [None] * (len(coarsening.rounds) + 1) if costs is None else _vertex_costs(F, costs, coarsening.rounds, n)
-    vertices, graph = _part(V, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
-    cut = vertices[graph.ends[find(graph)]]
+    means = _mean_positions(V, fixed, coarsening.rounds)
+    vertices, graph = _part(means, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
+    cut = vertices[graph.ends[find(graph, vertices)]]
     if not cut.size:
         return cut
     for k in reversed(range(len(coarsening.rounds))):
@@ -70,6 +72,15 @@ def cut_by_levels(
             some = costs[near] if k == 0 and costs is not None else _side_costs(factors[k], T[near])
             cut = _shorten(*_part(V, T[near], some, rim_keys), cut)
     return cut
+
+
+def _mean_positions(V: FloatArray, fixed: BoolArray, rounds: list[list[Removal]]) -> FloatArray:
+    """Return the mean position (n, d) of the vertices that each vertex represents; fixed vertices (n,) do not move."""
+    total = np.column_stack([V, np.ones(len(V))])
+    for removals in rounds:
+        for vertices, rings in removals:
+            np.add.at(total, rings[:, 0], total[vertices])
+    return np.where(fixed[:, None], V, total[:, :-1] / total[:, -1:])
 
 
 def _vertex_costs(F: IntArray, costs: FloatArray, rounds: list[list[Removal]], n: int) -> list[FloatArray]:
