@@ -14,6 +14,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.util.spelling import suggest
+
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
@@ -339,7 +341,7 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     """Raise a ValueError that lists the choices, unless the value is one of them."""
     if not isinstance(value, str) or value not in tuple(choices):
         given = repr(value) if isinstance(value, str) else describe(value)
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given}")
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given}{suggest(value, choices)}")
 
 
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:

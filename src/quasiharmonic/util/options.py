@@ -14,6 +14,8 @@ from functools import wraps
 from numbers import Real
 from typing import Any, TypeVar
 
+from quasiharmonic.util.spelling import suggest
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 # Names of the values that some options accept; the dictionaries with the values themselves are tested to have these.
@@ -230,7 +232,7 @@ def takes(options: type[Options], keywords: type) -> Callable[[F], F]:
         def call(*args: Any, **given: Any) -> Any:
             for name in given:
                 if name not in known:
-                    raise TypeError(f"{called}() got an unexpected keyword argument {name!r}")
+                    raise TypeError(f"{called}() got an unexpected keyword argument {name!r}{suggest(name, known)}")
             return function(*args, **given)
 
         call.__signature__ = signature.replace(parameters=[*own, *shown])  # type: ignore[attr-defined]

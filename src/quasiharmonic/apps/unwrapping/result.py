@@ -32,8 +32,8 @@ class UnwrapStatus(Enum):
 
     UNWRAPPED = "Every chart is bijective and no two charts overlap, verified exactly. The stretch is within the bound."
     STRETCHED = (
-        "Every chart is bijective and no two charts overlap, verified exactly. Some charts exceed the bound on the "
-        "stretch: see misses. Raise max_stretch, or max_charts if it was given."
+        "Every chart is bijective and no two charts overlap, verified exactly. Some charts are stretched by more "
+        "than the bound: see misses. They need more seams: permit more charts with max_charts, or a larger max_stretch."
     )
     TIME_LIMIT = (
         "Every chart is bijective and no two charts overlap, verified exactly. The time limit ended the search for few "
