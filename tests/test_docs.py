@@ -52,7 +52,7 @@ OPTIONAL = "no dependency, not even of the tests: .ci/optional installs it"
 @pytest.mark.long
 @pytest.mark.parametrize("code", CASES)
 def test_block_runs(code, tmp_path, monkeypatch, capsys):
-    for name in ("SimpleITK", "nibabel", "nilearn", "skfem", "datasets", "ray"):
+    for name in ("SimpleITK", "nibabel", "nilearn", "skfem", "skimage", "datasets", "ray"):
         if re.search(rf"^(import|from) {name}\b", code, re.MULTILINE):
             pytest.importorskip(name, reason=OPTIONAL)
     if "import ray" in code:

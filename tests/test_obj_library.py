@@ -21,11 +21,11 @@ def picture(kind="PNG"):
     return file.getvalue()
 
 
-def write_model(path, **second):
+def write_model(path, wrap=10497, **second):
     """Two halves with materials of one image; ``second`` has further entries of the second material."""
     made = Gltf()
     made.tree["images"] = [{"bufferView": made.view(picture()), "mimeType": "image/png"}]
-    made.tree["samplers"] = [{"wrapS": 33071, "wrapT": 33071}]
+    made.tree["samplers"] = [{"wrapS": wrap, "wrapT": wrap}]
     made.tree["textures"] = [{"source": 0}, {"source": 0, "sampler": 0}]
     made.tree["materials"] = [
         {"name": "plain one", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0}},
@@ -80,6 +80,8 @@ def test_materials_and_images_are_beside_the_file(tmp_path):
 def test_what_libraries_do_not_have_is_listed(tmp_path):
     mesh = write_model(tmp_path / "in.glb", occlusionTexture={"index": 0}, emissiveTexture={"index": 0, "texCoord": 1})
     assert io.not_held("out.obj", mesh) == ["images of materials for emission", "images of materials for occlusion"]
+    clamped = write_model(tmp_path / "in.glb", wrap=33071)
+    assert io.not_held("out.obj", clamped) == ["images that do not repeat"]
 
 
 def test_a_failure_leaves_no_files(tmp_path):

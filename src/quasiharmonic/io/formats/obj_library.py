@@ -40,8 +40,7 @@ def make_library(path: str | os.PathLike[str], mesh: MeshData) -> tuple[MeshData
             if file is None:
                 file = library.with_name(f"{library.stem}-{len(images)}{picture.suffix}")
                 images[file] = picture.data
-            clamp = " -clamp on" if "clamp" in material.textures[role].wrap else ""
-            lines.append(os.fsencode(f"{keyword}{clamp} {file.name}"))
+            lines.append(os.fsencode(f"{keyword} {file.name}"))
     if not named:
         return mesh, {}
     head, at = [os.fsencode(f"mtllib {library.name}")], [-1]
@@ -60,10 +59,11 @@ def list_lost_looks(mesh: MeshData) -> list[str] | None:
     if (carried := _find_carried(mesh)) is None:
         return None
     materials = _read_materials(carried)[1]
-    lost = {
-        role for one in materials for role in one.textures if _find_image(one, role) is None or role not in _KEYWORDS
-    }
-    return [f"images of materials for {role.replace('_', '-')}" for role in sorted(lost)]
+    uses = [(role, one, use) for one in materials for role, use in one.textures.items()]
+    lost = {role for role, one, _ in uses if role not in _KEYWORDS or _find_image(one, role) is None}
+    listed = [f"images of materials for {role.replace('_', '-')}" for role in sorted(lost)]
+    # Few readers of libraries know the options of images.
+    return listed + ["images that do not repeat"] * any(use.wrap != ("repeat", "repeat") for *_, use in uses)
 
 
 def _find_carried(mesh: MeshData) -> CarriedGltf | None:
