@@ -9,7 +9,8 @@ import sys
 
 import pytest
 
-from quasiharmonic.ui.cli import commands, main, streams
+from quasiharmonic.ui.cli import main, streams
+from quasiharmonic.ui.cli.commands import batch
 from shared.datasets import write_stars
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
@@ -63,7 +64,7 @@ class TestCommand:
     def test_on_a_terminal_and_in_a_log(self, stars, tmp_path, capsys, monkeypatch):
         pty = pytest.importorskip("pty")
         # Print every problem, however fast they follow each other.
-        monkeypatch.setattr(commands.batch, "LIVE", 0)
+        monkeypatch.setattr(batch, "LIVE", 0)
         monkeypatch.setattr(streams, "LOG", 0)
         command = ["batch", str(stars), "-j", "1", "-o"]
         leader, follower = pty.openpty()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from collections.abc import Iterable
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ def write_series(paths: list[Path], F: IntArray, frames: Iterable[tuple[FloatArr
     for path, (points, quality) in zip(parts, frames, strict=False):
         write_whole(path, _encode_grid(F, points, quality))
         written.append(path.name)
-    lines = [f'<DataSet timestep="{k}" part="0" file="{_escape(name)}"/>' for k, name in enumerate(written)]
+    lines = [f'<DataSet timestep="{k}" part="0" file={quoteattr(name)}/>' for k, name in enumerate(written)]
     text = '<VTKFile type="Collection" version="0.1">\n<Collection>\n' + "\n".join(lines)
     write_whole(collection, f"{text}\n</Collection>\n</VTKFile>\n".encode())
 
@@ -68,9 +69,3 @@ def _encode_array(name: str, values: NDArray[np.generic]) -> str:
     components = values.shape[1] if values.ndim == 2 else 1
     head = f'<DataArray type="{_TYPES[values.dtype.kind]}" Name="{name}" NumberOfComponents="{components}"'
     return f'{head} format="binary">{b64encode(len(data).to_bytes(8, "little") + data).decode()}</DataArray>\n'
-
-
-def _escape(text: str) -> str:
-    from xml.sax.saxutils import escape
-
-    return escape(text, {'"': "&quot;"})
