@@ -29,6 +29,8 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 from speed import machine
 
 FRAMES = 100
+# Relative move of a vertex from which on a scene has something to plot.
+JUMP = 1.1
 ENERGY = "symmetric-dirichlet"
 
 Scene = tuple[FloatArray, IntArray, IntArray, FloatArray]
@@ -214,15 +216,18 @@ def main() -> None:
 
 
 def draw(found: dict[str, dict[str, tuple[FloatArray, FloatArray, float]]], path: Path) -> None:
-    """Plot the relative displacements of every scene, frame by frame, for each method."""
+    """Plot the relative displacements frame by frame, for each method; scenes that have no jumps are left out."""
     from matplotlib.figure import Figure
 
+    found = {name: ways for name, ways in found.items() if np.nanmax(ways["alone"][0]) > JUMP}
     figure = Figure(figsize=(9, 2.1 * len(found)), layout="constrained")
     axes = figure.subplots(len(found), 1, squeeze=False)[:, 0]
     for ax, (name, by_way) in zip(axes, found.items(), strict=True):
         for way, color in (("alone", "#c44e52"), ("from the last", "#dd8452"), ("animate", "#4c72b0")):
             ax.semilogy(by_way[way][0], color=color, label="polished alone" if way == "alone" else way, lw=1.2)
-        ax.axhline(3, color="0.6", lw=0.8, ls="--")
+        ax.axhline(3, color="0.6", lw=0.8, ls="--", label="bound of animate")
+        ax.set_yticks([1, 3, 10], ["1", "3", "10"])
+        ax.minorticks_off()
         ax.set_ylabel(name)
     axes[0].legend(loc="upper right", fontsize=8)
     axes[0].set_title("largest move of a vertex, over the boundary's largest step", fontsize=10)
