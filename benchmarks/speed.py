@@ -350,7 +350,7 @@ def read_csv(path: Path) -> list[Record]:
 
 
 def draw(records: list[Record], path: Path) -> None:
-    """Plot seconds over triangles, both logarithmic: a dot per problem, and a line of medians per tool."""
+    """Plot seconds over triangles, both logarithmic: for each tool, the medians of the problems of a size."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -359,11 +359,11 @@ def draw(records: list[Record], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
     for tool in dict.fromkeys(record.tool for record in records):
         done = [record for record in records if record.tool == tool and record.seconds]
-        # Meshes that differ by a triangle or two count as the same size.
-        sizes = sorted({float(f"{record.triangles:.2g}") for record in done})
-        medians = [np.median([r.median for r in done if float(f"{r.triangles:.2g}") == size]) for size in sizes]
-        (line,) = axes.loglog(sizes, medians, label=tool, linewidth=2 if tool == OURS else 1.2)
-        axes.loglog([r.triangles for r in done], [r.median for r in done], ".", color=line.get_color())
+        groups = [[r for r in done if low <= r.triangles < high] for low, high in itertools.pairwise(_SIZES)]
+        points = [
+            (np.median([r.triangles for r in group]), np.median([r.median for r in group])) for group in groups if group
+        ]
+        axes.loglog(*zip(*points, strict=True), ".-", label=tool, linewidth=2 if tool == OURS else 1.2)
     axes.set(xlabel="triangles", ylabel="seconds")
     axes.grid(which="major", alpha=0.3)
     axes.legend(frameon=False)
