@@ -12,8 +12,9 @@ them exactly to their positions under the given field. κ decreases in steps, un
 Patches share one block-diagonal matrix and Newton's direction. Step length and convergence are determined per patch.
 
 The start is a map without folds that agrees with the field outside patches around the folds. The pixels of folded cells
-and some pixels around them become free. First the given map itself descends, with a penalty of ``½ (s − 2)²`` for s < 2
-in place of B, whose weight increases as long as cells fold. A patch grows if pixels at its border move. If folds
+and some pixels around them become free, with harmonic displacements. Where the result still folds, the given map itself
+descends, with a penalty of ``½ (s − 2)²`` for s < 2 in place of B, whose weight increases. The patch grows if pixels at
+its border move. If folds
 remain, the displacements around them become harmonic, and the penalty acts once more. This repeats on larger distances.
 Finally the whole field is smoothed until it does not fold; this always ends, as smoothing converges to a translation.
 
@@ -67,11 +68,10 @@ _FRACTION = 0.9
 _SHIFTS = 0.0, 1e-12, 1e-8, 1e-4
 # Approximate number of free pixels in one matrix.
 _AT_ONCE = 20_000
-# Distance in pixels around folded cells that becomes free, and around remaining ones in which displacements become
-# harmonic; the latter grows by a half if folds remain.
-_NEAR = 2
-# Distance in pixels around patches whose border moves that becomes free.
+# Distance in pixels around folded cells, and around patches whose border moves, that becomes free.
 _MARGIN = 4
+# Distance in pixels around folds in which displacements become harmonic; it grows by a half if folds remain.
+_NEAR = 2
 # Growth factor of the smoothing's standard deviation in pixels.
 _SMOOTHER = 1.2
 
@@ -276,8 +276,16 @@ def fill_patches(
     such map was found, which can only happen with fixed pixels.
     """
     w, distance, penalties = given.copy(), _NEAR, list(_PENALTIES)
+    free = grow(find_points(find_folds(grid, given, min_jacobian)), distance, fixed)
+    if not free.all():
+        _fill(grid, w, free)
+    patch = label_patches(free)
+    folded = np.isin(patch, np.unique(patch[find_points(find_folds(grid, w, min_jacobian)) & free]))
+    w[folded & free] = given[folded & free]
     wrong = find_folds(grid, w, min_jacobian)
-    free = grow(find_points(wrong), _NEAR, fixed)
+    if not wrong.any():
+        return w, patch
+    free |= grow(find_points(wrong), _MARGIN, fixed)
     while not free.all():
         for weight in penalties:
             patch = label_patches(free)
