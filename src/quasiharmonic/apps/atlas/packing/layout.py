@@ -75,9 +75,7 @@ def find_layout(
             return None
         search = BitmapSearch(shapes, size, padding, tiles, scale, rotate=rotate, bitmaps=bitmaps)
         return search.place_in(search.cells)
-    layout, order = _enlarge(
-        shapes, size, padding, tiles, least_scale(shapes), TRIALS, rotate=rotate, bitmaps=bitmaps
-    )
+    layout, order = _enlarge(shapes, size, padding, tiles, least_scale(shapes), TRIALS, rotate=rotate, bitmaps=bitmaps)
     if layout is None:
         return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
     if order is None:
