@@ -204,5 +204,5 @@ def test_frames_of_another_size():
 
 def test_without_shapely(monkeypatch):
     monkeypatch.setitem(sys.modules, "shapely", None)
-    with pytest.raises(ImportError, match=r"quasiharmonic\[shapes\]"):
+    with pytest.raises(ImportError, match=r"\[shapes\]"):
         AirMesh(*surfaces.disk(2), [square(4)])

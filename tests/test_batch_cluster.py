@@ -97,7 +97,7 @@ def test_no_scheduler(tmp_path, monkeypatch, capsys):
         assert main(["batch", str(source), "-o", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9"]) == 2
     assert "no Dask scheduler at tcp://127.0.0.1:9" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ImportError, match=r"pip install 'quasiharmonic\[dask\]'"):
+    with pytest.raises(ImportError, match=r"pip install '.*\[dask\]'"):
         batch.run(source, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
 
 

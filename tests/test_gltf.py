@@ -204,7 +204,7 @@ def test_several_meshes_in_a_scene(tmp_path):
     np.testing.assert_allclose([float(x) for x in mesh.normals.split()[1:4]], [0, 1, 0], atol=1e-15)
 
 
-def test_meshes_with_the_same_attributes_at_different_places(tmp_path):
+def test_meshes_with_the_same_attributes_have_vertices_of_their_own(tmp_path):
     made = Gltf()
     shared, half = {"POSITION": made.accessor(SQUARE)}, made.accessor(HALVES[0])
     for _ in range(3):
@@ -214,8 +214,9 @@ def test_meshes_with_the_same_attributes_at_different_places(tmp_path):
         "scenes": [{"nodes": [0, 1, 2]}],
     }
     mesh = read(made, tmp_path)
-    np.testing.assert_array_equal(mesh.V, np.concatenate([SQUARE, SQUARE + np.array([9, 0, 0])]))
-    np.testing.assert_array_equal(mesh.F, np.concatenate([HALVES[0], HALVES[0] + 4, HALVES[0]]).reshape(-1, 3))
+    np.testing.assert_array_equal(mesh.V, np.concatenate([SQUARE, SQUARE + np.array([9, 0, 0]), SQUARE]))
+    np.testing.assert_array_equal(mesh.F, np.concatenate([HALVES[0], HALVES[0] + 4, HALVES[0] + 8]).reshape(-1, 3))
+    np.testing.assert_array_equal(mesh.carried.number_meshes()[mesh.F], np.arange(3)[:, None].repeat(3, axis=1))
     io.write_mapped(
         tmp_path / "out.glb", replace(mesh, vt=np.random.default_rng(1).random((9, 2)), FT=np.arange(9).reshape(-1, 3))
     )

@@ -162,4 +162,4 @@ def test_without_nibabel_the_command_to_install_it_is_named(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "nibabel", None)
     (tmp_path / "lh.pial").write_bytes(b"\xff\xff\xfe")
     assert main(["check", str(tmp_path / "lh.pial")]) == 2
-    assert "pip install quasiharmonic[neuro]" in capsys.readouterr().err
+    assert "[neuro]'" in capsys.readouterr().err

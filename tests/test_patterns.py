@@ -171,7 +171,7 @@ def test_missing_packages_are_named(ring, tmp_path, monkeypatch, package, name, 
     for loaded in [module for module in sys.modules if module.split(".")[0] == package]:
         monkeypatch.delitem(sys.modules, loaded)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImportError, match=rf"pip install 'quasiharmonic\[{extra}\]'"):
+    with pytest.raises(ImportError, match=rf"pip install '.*\[{extra}\]'"):
         write_pattern(tmp_path / name, F, V, allowance=0.1)
     assert not list(tmp_path.iterdir())
 

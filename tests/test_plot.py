@@ -286,7 +286,7 @@ def test_animation(planar, tmp_path, suffix):
     V, F, folded = planar
     path = tmp_path / f"a.{suffix}"
     if suffix == "mp4" and shutil.which("ffmpeg") is None and find_spec("imageio_ffmpeg") is None:
-        with pytest.raises(ImportError, match=r"quasiharmonic\[video\]"):
+        with pytest.raises(ImportError, match=r"\[video\]"):
             save_animation(path, V, F, [("one", V)])
         return
     save_animation(path, V, F, ((f"frame {k}", uv) for k, uv in enumerate([folded, V, V])), frames_per_second=10)
@@ -433,12 +433,12 @@ def test_view_without_polyscope(planar, tmp_path, monkeypatch, capsys):
     files.write_obj(mesh, files.MeshData(V, F).with_map(V[:, :2]))
     for more in ([], ["--screenshot", str(tmp_path / "view.png")]):
         assert main(["view", str(mesh), *more]) == 2
-        assert "pip install 'quasiharmonic[view]'" in capsys.readouterr().err
+        assert "[view]'" in capsys.readouterr().err
     assert main(["view", str(mesh), "--screenshot", str(tmp_path / "view.xyz")]) == 2
     assert "view.xyz" in capsys.readouterr().err
 
 
 def test_window_without_polyscope(planar, monkeypatch):
     monkeypatch.setitem(sys.modules, "polyscope", None)
-    with pytest.raises(ImportError, match=r"pip install 'quasiharmonic\[view\]'"):
+    with pytest.raises(ImportError, match=r"pip install '.*\[view\]'"):
         interactive.show(*planar)

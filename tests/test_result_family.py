@@ -65,6 +65,10 @@ def make_unwrap():
     return qh.unwrap(*starfish(3, 12))
 
 
+def make_scene():
+    return qh.unwrap([disk(4), disk(6)], resolution=64)
+
+
 MAKERS = {
     "MapResult": make_map,
     "MappedAtlas": make_atlas,
@@ -76,6 +80,7 @@ MAKERS = {
     "InvertibleVolume": lambda: make_field(5, 5, 5),
     "WarpResult": make_warp,
     "UnwrapResult": make_unwrap,
+    "SceneResult": make_scene,
 }
 NAMES = {"success", "status", "message", "n_iterations", "seconds", "certificate"}
 

@@ -24,6 +24,7 @@ from quasiharmonic.apps.tetrahedra.result import TetrahedraResult, TetrahedraSta
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.scenes import ScenePart, SceneResult
 from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.warping.image_warp import WarpResult
 from quasiharmonic.energies.distances import DistanceError
@@ -68,6 +69,8 @@ __all__ = [
     "RefinementAttempt",
     "RepairResult",
     "RepairedIsland",
+    "ScenePart",
+    "SceneResult",
     "Snapshot",
     "Stage",
     "Statistics",

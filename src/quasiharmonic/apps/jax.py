@@ -19,9 +19,9 @@ from functools import partial
 from threading import Lock
 from typing import Any, Unpack
 
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.optional import explain_missing, with_extra
 
-with explain_missing("quasiharmonic.jax needs JAX", "'quasiharmonic[jax]'"):
+with explain_missing("quasiharmonic.jax needs JAX", with_extra("jax")):
     import jax
     import jax.numpy as jnp
 

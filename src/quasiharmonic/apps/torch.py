@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Unpack
 
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.optional import explain_missing, with_extra
 
-with explain_missing("quasiharmonic.torch needs PyTorch", "'quasiharmonic[torch]'"):
+with explain_missing("quasiharmonic.torch needs PyTorch", with_extra("torch")):
     import torch
     from torch.autograd.function import once_differentiable
 

@@ -171,7 +171,7 @@ def _polish(domain: Domain, uv: ArrayLike, options: PolishOptions, triangles: In
     """Polish a map; see `polish_map`."""
     chosen, linear_solver = find_energy(options.energy), options.linear_solver
     run = Run(options.callback)
-    start = check_injective(domain, uv, "polish needs an injective map")
+    start = check_injective(domain, uv, "polish needs an injective map: repair it first (repair; qhm repair)")
     track = None if options.slide is False else move_boundary(options.slide, domain, start)
     if track is not None:
         start = track.uv

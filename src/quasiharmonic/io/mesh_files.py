@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from quasiharmonic.io.lowlevel.atomic import check_writable
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.registry import find_format, find_function
+from quasiharmonic.util.optional import with_extra
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshData:
@@ -66,7 +67,7 @@ def check_output(path: str | os.PathLike[str]) -> None:
     """
     form = find_format(path, "write_map")
     if form.requires is not None and find_spec(form.requires) is None:
-        raise ImportError(f"{form.name} files need {form.requires}: pip install quasiharmonic[neuro]")
+        raise ImportError(f"{form.name} files need {form.requires}: pip install {with_extra('neuro')}")
     check_writable(path)
 
 

@@ -31,7 +31,8 @@ class Status(Enum):
     INJECTIVE = "Every triangle is strictly positive, verified exactly."
     STALLED = (
         "Stalled: some triangles are still inverted and the energy has converged to a positive value. "
-        "No known obstruction forbids a map, but this mesh and this target may still allow none."
+        "No known obstruction forbids a map, but this mesh and this target may still allow none. Permit a finer mesh "
+        "(refine=True; --refine), or move the target."
     )
     IMPOSSIBLE = (
         "No such map exists for this mesh and this target. The diagnosis names the obstructions and how to remove "

@@ -14,6 +14,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.util.spelling import suggest
+
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
@@ -69,6 +71,14 @@ def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     if array.dtype.kind == "u" and array.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{name} refers to vertex {array.max()}, which is not a valid index")
     return np.array(array, dtype=np.int64, order="C") if copy else np.require(array, np.int64, ["C", "A"])
+
+
+def number_array(name: str, values: ArrayLike, count: int, element: str) -> IntArray:
+    """Convert an integer for each of several elements to int64 (count,); ``element`` is their name, for messages."""
+    numbers = index_array(name, values)
+    if numbers.shape != (count,):
+        raise ValueError(f"{name} must have shape ({count},), one for each {element}, not {numbers.shape}")
+    return numbers
 
 
 def _integers(values: ArrayLike, array: NDArray[Any]) -> NDArray[np.object_] | None:
@@ -331,7 +341,7 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     """Raise a ValueError that lists the choices, unless the value is one of them."""
     if not isinstance(value, str) or value not in tuple(choices):
         given = repr(value) if isinstance(value, str) else describe(value)
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given}")
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given}{suggest(value, choices)}")
 
 
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:

@@ -25,9 +25,29 @@ def explain_missing(need: str, package: str) -> Iterator[None]:
         raise type(error)(f"{need}: pip install {package} ({error})") from error
 
 
+def with_extra(name: str) -> str:
+    """Return what follows ``pip install`` to install this package again from where it came, with an extra."""
+    import json
+    from importlib.metadata import PackageNotFoundError, distribution
+    from pathlib import Path
+    from urllib.parse import urlsplit
+    from urllib.request import url2pathname
+
+    try:
+        origin = json.loads(distribution("quasiharmonic").read_text("direct_url.json") or "{}")
+    except PackageNotFoundError:
+        origin = {"url": "file:"}
+    if not origin:
+        return f"'quasiharmonic[{name}]'"
+    if "vcs_info" in origin:
+        return f"'quasiharmonic[{name}] @ {origin['vcs_info']['vcs']}+{origin['url']}'"
+    path = url2pathname(urlsplit(origin["url"]).path)
+    return f"'{path}[{name}]'" if path and Path(path).exists() else f"'.[{name}]' in the folder of the source"
+
+
 def make_dataframe(columns: Mapping[str, Any], index: str) -> DataFrame:
     """Return a DataFrame of columns of equal length, with an index of the given name that counts from 0."""
-    with explain_missing("a DataFrame needs pandas", "'quasiharmonic[pandas]'"):
+    with explain_missing("a DataFrame needs pandas", with_extra("pandas")):
         import pandas
     frame = pandas.DataFrame(dict(columns))
     frame.index.name = index

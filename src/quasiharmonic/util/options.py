@@ -14,6 +14,8 @@ from functools import wraps
 from numbers import Real
 from typing import Any, TypeVar
 
+from quasiharmonic.util.spelling import suggest
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 # Names of the values that some options accept; the dictionaries with the values themselves are tested to have these.
@@ -26,6 +28,7 @@ MAX_ITERATIONS = 2000
 REFERENCES = "equilateral", "rest", "corrected"
 SYMMETRIES = "auto", "x", "y", "z"
 UPS = "x", "y", "z", "-x", "-y", "-z"
+INSTANCES = "share", "own"
 LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 
 
@@ -159,6 +162,18 @@ def stacking(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be True, False or 'mirrored', not {value!r}")
 
 
+def sharing(name: str, value: Any) -> None:
+    """Check what instances of a mesh do; one mesh has none."""
+    if value != "share":
+        raise ValueError(f"{name}={value!r} needs several meshes: pass a list of meshes, or a scene")
+
+
+def no_weights(name: str, value: Any) -> None:
+    """Check that one mesh has no weight."""
+    if value is not None:
+        raise ValueError(f"{name} needs several meshes: pass a list of meshes, or a scene")
+
+
 def direction_or_none(name: str, value: Any) -> None:
     """Check the direction of an axis, or None."""
     if value is not None:
@@ -217,7 +232,7 @@ def takes(options: type[Options], keywords: type) -> Callable[[F], F]:
         def call(*args: Any, **given: Any) -> Any:
             for name in given:
                 if name not in known:
-                    raise TypeError(f"{called}() got an unexpected keyword argument {name!r}")
+                    raise TypeError(f"{called}() got an unexpected keyword argument {name!r}{suggest(name, known)}")
             return function(*args, **given)
 
         call.__signature__ = signature.replace(parameters=[*own, *shown])  # type: ignore[attr-defined]
@@ -428,6 +443,9 @@ class UnwrapOptions(Options):
     stack: Any = option(False, check=stacking)
     outward: bool = option(False, "treat closed components that are inside out as turned outward", check=switch)
     weld: Any = option(True, check=welding)
+    meshes: Any = option(None)
+    instances: str = option("share", check=sharing)
+    weights: Any = option(None, check=no_weights)
     edge_costs: Any = option(None)
     seams: Any = option(None)
     no_seams: Any = option(None)

@@ -23,6 +23,7 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_weld,
     count_of,
+    number_array,
     triangle_array,
     vertex_array,
 )
@@ -167,7 +168,14 @@ class CleanedMesh:
 
 
 @accepts_mesh
-def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool | float = True) -> CleanedMesh:
+def clean(
+    V: ArrayLike,
+    F: ArrayLike,
+    outward: bool = False,
+    *,
+    weld: bool | float = True,
+    meshes: ArrayLike | None = None,
+) -> CleanedMesh:
     """Return the surfaces that any triangles form; every defect is cut open, oriented or listed.
 
     Degenerate and repeated triangles are excluded. Each gets a substitute, so that no triangle of the model lacks
@@ -191,6 +199,8 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool | flo
         distance relative to the diagonal of the bounding box; 0 means equal positions. Each vertex is merged with the
         vertex of the lowest index within this distance that is not merged itself, and takes its position. Triangles
         whose corners are merged are degenerate.
+    meshes : (n,) array of int, optional
+        Mesh of each vertex. Vertices of different meshes are not welded.
 
     Returns
     -------
@@ -217,7 +227,9 @@ def clean(V: ArrayLike, F: ArrayLike, outward: bool = False, *, weld: bool | flo
     check_weld(weld)
     report = inspect_mesh(V, F)
     exponent = math.frexp(float(np.abs(V).max()))[1]
-    joint = find_representatives(V, F, weld)
+    joint = find_representatives(
+        V, F, weld, None if meshes is None else number_array("meshes", meshes, len(V), "vertex")
+    )
     # In this unit, products neither overflow nor underflow.
     points = np.pad(np.ldexp(V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     points, moved, thin, degenerate, area = widen(points, joint[F], V.shape[1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from os import PathLike
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,7 +12,6 @@ from quasiharmonic.apps.unwrapping.model_files import label_statements
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.geometry.mesh.welding import find_representatives
 from quasiharmonic.io.formats.vertex_data import normals_of
-from quasiharmonic.io.mesh_files import read_mesh
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import BoolArray, IntArray
 
@@ -30,9 +28,6 @@ def reads_hard_edges(function: C) -> C:
     def call(*args: Any, **options: Any) -> Any:
         if isinstance(wanted := options.get("hard_edges"), str) and wanted == "file":
             mesh = args[0] if args else options.get("V")
-            if isinstance(mesh, str | PathLike):
-                mesh = read_mesh(mesh)
-                args, options = ((mesh, *args[1:]), options) if args else (args, options | {"V": mesh})
             if not isinstance(mesh, MeshData):
                 raise ValueError('hard_edges="file" needs the path of a file, or a MeshData: pass one, or an angle')
             options = options | {"hard_edges": find_hard_edges(mesh)}

@@ -32,8 +32,8 @@ class UnwrapStatus(Enum):
 
     UNWRAPPED = "Every chart is bijective and no two charts overlap, verified exactly. The stretch is within the bound."
     STRETCHED = (
-        "Every chart is bijective and no two charts overlap, verified exactly. Some charts exceed the bound on the "
-        "stretch: see misses. Raise max_stretch, or max_charts if it was given."
+        "Every chart is bijective and no two charts overlap, verified exactly. Some charts are stretched by more "
+        "than the bound: see misses. They need more seams: permit more charts with max_charts, or a larger max_stretch."
     )
     TIME_LIMIT = (
         "Every chart is bijective and no two charts overlap, verified exactly. The time limit ended the search for few "
@@ -153,6 +153,8 @@ class UnwrapResult(Outcome):
     unfinished : (k,) int64
         After a time limit, the charts that were grown by normals, because the search had no bijective charts within the
         bound there; they are more than necessary. Empty if the limit did not end the search.
+    source : object
+        The mesh of trimesh that was given; None for other meshes.
     """
 
     vmapping: IntArray
@@ -175,6 +177,7 @@ class UnwrapResult(Outcome):
     symmetry: Symmetry
     seconds: float
     unfinished: IntArray
+    source: Any = None
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.vmapping, self.indices, self.uvs))
@@ -212,8 +215,12 @@ class UnwrapResult(Outcome):
         )
 
     def to_trimesh(self) -> Trimesh:
-        """Return the model as a trimesh.Trimesh with texture coordinates; vertices are split at seams."""
-        return make_trimesh(self.V[self.vmapping], self.indices, self.uvs)
+        """Return the model as a trimesh.Trimesh with texture coordinates; vertices are split at seams.
+
+        If a mesh of trimesh was unwrapped, colours and attributes of its vertices, attributes of its faces, its
+        material and its metadata are kept.
+        """
+        return make_trimesh(self.V[self.vmapping], self.indices, self.uvs, like=self.source, rows=self.vmapping)
 
     def summary(self) -> str:
         """Return charts, seams, stretch and utilisation in a few lines."""

@@ -6,7 +6,6 @@ from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, find_hinges
@@ -20,7 +19,7 @@ from quasiharmonic.apps.unwrapping.wanted_seams import (
     read_wanted_seams,
 )
 from quasiharmonic.geometry.mesh.reference import area_vectors
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, index_array
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, number_array
 from quasiharmonic.util.options import UnwrapOptions
 
 # Smaller factors on the cost of seams count as this one.
@@ -89,7 +88,11 @@ def find_rules(
     """
     wanted = read_wanted_seams(options.seams, options.no_seams, F, cleaned.representatives)
     demanded, kept = mark_edges(cleaned, wanted.seams), mark_edges(cleaned, wanted.no_seams)
-    labels = None if options.labels is None else _read_labels(options.labels, len(F))[cleaned.triangles]
+    labels = (
+        None
+        if options.labels is None
+        else number_array("labels", options.labels, len(F), "triangle")[cleaned.triangles]
+    )
     cost = np.ones(cleaned.F.shape) if costs is None else _turn_sides(costs, cleaned)
     cost = np.maximum(cost, _LEAST_COST)
     hinges = find_hinges(points, cleaned.F)
@@ -120,14 +123,6 @@ def find_rules(
         sides = np.stack([cleaned.F[demanded], cleaned.F[:, (1, 2, 0)][demanded]], axis=1)
         uv_cuts = np.concatenate([uv_cuts, sides])
     return Rules(cost, uv, uv_cuts, mirror, symmetry, wanted)
-
-
-def _read_labels(values: ArrayLike, count: int) -> IntArray:
-    """Return the labels (f,) of the model's triangles, after checking them."""
-    labels = index_array("labels", values)
-    if labels.shape != (count,):
-        raise ValueError(f"labels must have shape ({count},), one for each triangle, not {labels.shape}")
-    return labels
 
 
 def _prefer_hidden(

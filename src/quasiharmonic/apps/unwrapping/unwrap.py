@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TypedDict, Unpack
@@ -29,6 +29,7 @@ from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
 from quasiharmonic.apps.unwrapping.mirrored_charts import pair_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStep, find_status
+from quasiharmonic.apps.unwrapping.scenes import accepts_scene
 from quasiharmonic.apps.unwrapping.seam_rules import Rules, find_rules
 from quasiharmonic.apps.unwrapping.selection import keep_charts, read_faces, select
 from quasiharmonic.apps.unwrapping.straightening import Strip, straighten_strips
@@ -70,6 +71,9 @@ class UnwrapKeywords(TypedDict, total=False):
     stack: bool | str
     outward: bool
     weld: bool | float
+    meshes: ArrayLike | None
+    instances: str
+    weights: Mapping[str, float] | Sequence[float] | None
     hard_edges: float | str | ArrayLike | None
     symmetry: str | None
     up: str | None
@@ -88,6 +92,7 @@ class UnwrapKeywords(TypedDict, total=False):
     jobs: int | None
 
 
+@accepts_scene
 @reads_hard_edges
 @accepts_mesh
 @reports_progress
@@ -98,7 +103,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     Parameters
     ----------
     V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
-        Positions.
+        Positions. A list of meshes or of pairs (V, F), or a scene of trimesh, is unwrapped into one texture, and the
+        result is a `SceneResult`; transformations of the scene scale the texel density.
     F : (f, 3) array of int
         Any triangles. Degenerate and repeated triangles get the texture coordinates of a neighbour. Surfaces are cut at
         edges of three or more triangles and where they cannot be oriented; see `clean`.
@@ -127,6 +133,13 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     weld : bool or float
         Whether vertices at equal positions count as one, or a distance relative to the diagonal of the bounding box
         within which they do; see `clean`. The result has the numbering of the input.
+    meshes : (n,) array of int, optional
+        Mesh of each vertex, if ``V`` and ``F`` are several meshes. Vertices of different meshes are not welded.
+    instances : str
+        Whether a mesh that is several times in the list or the scene has texture coordinates that all share
+        (``"share"``), at the density of the largest, or each has a place of its own (``"own"``).
+    weights : sequence or mapping of float, optional
+        Factors on the texel density: one for each mesh of a list, or by names of the meshes of a scene.
     hard_edges : float, (k, 2) array of int, or "file", optional
         All edges with a larger angle between the normals, in degrees, become seams, as baked normal maps need it; or
         the listed edges. For a `MeshData` or a file, ``"file"`` means the edges with split normals or, without normals,
@@ -219,7 +232,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             wanted.callback(UnwrapStep(phase, done, total))
 
     report("clean")
-    whole = clean(V, F, wanted.outward, weld=wanted.weld)
+    whole = clean(V, F, wanted.outward, weld=wanted.weld, meshes=wanted.meshes)
     # In this unit, areas neither overflow nor underflow.
     exponent = find_exponent(whole.V)
     exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0

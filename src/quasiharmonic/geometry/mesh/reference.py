@@ -268,7 +268,10 @@ class RestShapes:
         """Raise a ValueError with the triangles of zero area and the reason why areas are needed, if there are any."""
         flat = self.flat
         if flat.size:
-            raise ValueError(f"{names_of('triangle', 'triangles', flat)} of zero area in the rest mesh: {reason}")
+            raise ValueError(
+                f"{names_of('triangle', 'triangles', flat)} of zero area in the rest mesh: {reason}; remove them with "
+                "clean, or use unwrap, which excludes them"
+            )
 
     def half_gradients(self) -> ComplexArray:
         """Half the gradients ``γᵢ/2`` of the hat functions (3, f) in inverse units; NaN for triangles without area.

@@ -319,11 +319,14 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
     if found.nonmanifold.size or found.inconsistent.size or np.any(found.boundary[:, 0] == found.boundary[:, 1]):
         _check_triangles(F)
     if found.nonmanifold.size:
-        raise ValueError(f"{edge_names(found.nonmanifold)} in more than two triangles: not a surface")
+        raise ValueError(
+            f"{edge_names(found.nonmanifold)} in more than two triangles: not a surface; cut it open with clean, or "
+            "use unwrap, which does so"
+        )
     if found.inconsistent.size:
         raise ValueError(
             f"mixed winding: {edge_names(found.inconsistent)} traversed in the same direction by both triangles; "
-            "orient all triangles alike"
+            "orient all triangles alike with clean, or use unwrap, which does so"
         )
     return found
 

@@ -8,7 +8,7 @@ from quasiharmonic.geometry.mesh.topology import are_collapsed
 from quasiharmonic.util.arrays import FloatArray, IntArray, mark, names_of, scale_to_unit
 
 
-def find_representatives(V: FloatArray, F: IntArray, weld: bool | float) -> IntArray:
+def find_representatives(V: FloatArray, F: IntArray, weld: bool | float, meshes: IntArray | None = None) -> IntArray:
     """Return for each vertex the one that represents it, which has the lowest index; the vertex itself if not welded.
 
     A vertex becomes a representative if no earlier representative is within the distance. Otherwise the first such
@@ -23,6 +23,8 @@ def find_representatives(V: FloatArray, F: IntArray, weld: bool | float) -> IntA
     weld : bool or float
         False welds no vertices. True and 0 weld equal positions. Other numbers are the maximum distance of a vertex
         from its representative, relative to the diagonal of the bounding box of the triangles.
+    meshes : (n,) int64, optional
+        Mesh of each vertex. Vertices of different meshes are not welded.
 
     Returns
     -------
@@ -33,12 +35,14 @@ def find_representatives(V: FloatArray, F: IntArray, weld: bool | float) -> IntA
     if isinstance(weld, bool | np.bool_) and not weld:
         return joint
     used = np.flatnonzero(mark(len(V), F))
-    first = _find_equal(V[used])
+    of = np.zeros(len(used)) if meshes is None else meshes[used].astype(np.float64)
+    first = _find_equal(np.column_stack([V[used], of]))
     distinct = np.flatnonzero(first == np.arange(len(first)))
     if not isinstance(weld, bool | np.bool_) and len(distinct):
         # In this unit, the diagonal neither overflows nor underflows.
         points = scale_to_unit(V[used[distinct]])
-        close = _find_close(points, float(weld) * float(np.linalg.norm(np.ptp(points, axis=0))))
+        distance = float(weld) * float(np.linalg.norm(np.ptp(points, axis=0)))
+        close = _find_close(np.column_stack([points, 2 * distance * of[distinct]]), distance)
         first = distinct[close][np.searchsorted(distinct, first)]
     joint[used] = used[first]
     return joint

@@ -39,6 +39,10 @@ class Carried:
         """Return descriptions of the data besides the mesh, which only a writer of the same format keeps."""
         return []
 
+    def number_meshes(self) -> IntArray | None:
+        """Return the number of the mesh (n,) of each vertex; None if the file has one mesh."""
+        return None
+
     def fits(self, mesh: MeshData) -> bool:
         """Return whether a mesh is still the mesh of the file, whatever its map."""
         return np.array_equal(self.V, mesh.V) and np.array_equal(self.F, mesh.F)

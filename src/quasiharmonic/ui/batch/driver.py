@@ -27,6 +27,7 @@ from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
 from quasiharmonic.ui.batch.shards import WHOLE, Shard, lock_folder, lock_name, read_shard, shard_of, table_name
 from quasiharmonic.ui.batch.supervisor import Finished, resident
 from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
+from quasiharmonic.util.optional import with_extra
 from quasiharmonic.util.threads import count_cores
 
 
@@ -262,7 +263,7 @@ def _check(jobs: int | None, memory_limit: int | None, scheduler: Any) -> None:
     if jobs is not None:
         check_integer("jobs", jobs, minimum=1)
     if memory_limit is not None and scheduler is None and resident(os.getpid()) is None:
-        raise ValueError("a limit of memory needs psutil on this system: pip install 'quasiharmonic[batch]'")
+        raise ValueError(f"a limit of memory needs psutil on this system: pip install {with_extra('batch')}")
 
 
 def _check_folder(folder: Path) -> None:

@@ -15,18 +15,20 @@ The subcommands are in `commands`. The package builds on all packages below it. 
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from quasiharmonic.ui.cli.interrupts import Interrupts
 from quasiharmonic.ui.cli.report import ReportError, describe_error, in_options, use_options
 from quasiharmonic.ui.cli.streams import NO_READER, output_failed, tell
 from quasiharmonic.ui.cli.version import Version
+from quasiharmonic.util.spelling import suggest
 
 # The subcommands by group, in the order of the help. Each is a module of `commands`.
 GROUPS = {
@@ -137,6 +139,19 @@ class CommandParser(argparse.ArgumentParser):
     ) -> None:
         super().__init__(*args, **options)
         self._examples, self._groups = tuple(examples), groups or {}
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse all arguments; a subcommand reports unknown ones with its own usage and the nearest name."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            known = re.findall(r"--[a-z-]+", self.format_usage())
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{suggest(unknown[0].partition('=')[0], known)}")
+        return found, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Report a wrong call; for a wrong value, suggest the nearest one."""
+        wrong = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
+        super().error(message + (suggest(wrong[1], re.findall(r"[\w:-]+", wrong[2])) if wrong else ""))
 
     def format_help(self) -> str:
         parts = [super().format_help()]

@@ -97,10 +97,10 @@ def _declare(one: Field[Any]) -> Option:
 
 def texture_size(text: str) -> tuple[int, int]:
     """Convert N or WIDTHxHEIGHT; for argparse."""
-    sides = [count(side) for side in text.lower().split("x")]
-    if len(sides) > 2:
-        raise argparse.ArgumentTypeError(f"{text} is neither N nor WIDTHxHEIGHT")
-    return sides[0], sides[-1]
+    sides = text.lower().split("x")
+    if len(sides) > 2 or not all(side.isascii() and side.isdigit() and int(side) for side in sides):
+        raise argparse.ArgumentTypeError(f"{text} is neither N nor WIDTHxHEIGHT, such as 2048 or 2048x1024")
+    return int(sides[0]), int(sides[-1])
 
 
 def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option) -> None:

@@ -91,7 +91,8 @@ def surface(
     if islands > 1:
         found.facts["island_count"] = islands
         found.notes.append(
-            f"{islands} islands, each mapped on its own (use --seams none to map the surface as one island)"
+            f"{islands} islands, each mapped on its own"
+            + (" (use --seams none to map the surface as one island)" if options.seams != "none" else "")
         )
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 from collections.abc import Iterator
@@ -15,7 +16,8 @@ from quasiharmonic.io.errors import MeshFileError, reading
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
 from quasiharmonic.io.formats.vertex_data import normal_lines, weld
 from quasiharmonic.io.models.meshdata import Carried, MeshData
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_choice, repeat_each
+from quasiharmonic.util.options import INSTANCES
 
 PLACES = "TEXCOORD_0"
 # Modes of a glTF primitive.
@@ -76,6 +78,12 @@ class CarriedGltf(Carried):
         """Return the triangles of a pool, in the order of its primitives."""
         return np.concatenate([np.arange(part.begin, part.end) for part in self.parts_of(pool)])
 
+    def number_meshes(self) -> IntArray:
+        of_row = repeat_each([pool.mesh for pool in self.pools], [pool.count for pool in self.pools])
+        numbers = np.zeros(len(self.V), dtype=np.int64)
+        numbers[self.F] = of_row[self.rows]
+        return numbers
+
     def further(self) -> list[str]:
         tree = self.document.tree
         found = [name for name in ("materials", "animations", "skins", "cameras") if tree.get(name)]
@@ -85,17 +93,19 @@ class CarriedGltf(Carried):
         return found + [f"{name} of vertices" for name in names]
 
 
-def read_gltf(path: str | os.PathLike[str]) -> MeshData:
+def read_gltf(path: str | os.PathLike[str], *, instances: str = "share") -> MeshData:
     """Read the triangles of a glTF 2.0 file, binary (.glb) or JSON (.gltf).
 
     A vertex of a glTF file has one texture coordinate, so vertices are repeated along seams. Vertices of one mesh at
-    exactly equal positions are merged, and the texture coordinates keep the seams. Positions are those in the scene. If
-    a mesh occurs several times, its first occurrence is used.
+    exactly equal positions are merged, and the texture coordinates keep the seams. Positions are those in the scene.
 
     Parameters
     ----------
     path : str or path-like
         The file. Its buffers are in the file or in its folder; no other file is opened.
+    instances : str
+        What becomes of a mesh that occurs several times: its first occurrence is used (``"share"``), or every
+        occurrence becomes a mesh of its own, also in the file that `write_gltf` writes (``"own"``).
 
     Returns
     -------
@@ -109,9 +119,12 @@ def read_gltf(path: str | os.PathLike[str]) -> MeshData:
     MeshFileError
         If the file is not glTF 2.0, is damaged, is compressed by an extension, or has no triangles.
     """
+    check_choice("instances", instances, INSTANCES)
     document = load(path)
     # Overflow is reported later, by the checks for finite numbers.
     with reading(path, "is damaged: ", DAMAGE, describe=fault), np.errstate(over="ignore", invalid="ignore"):
+        if instances == "own":
+            _separate_instances(document.tree)
         mesh = _mesh(document, os.fspath(path))
     if mesh is None:
         raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
@@ -154,15 +167,14 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
     """Return pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
     tree, pools, parts, known = document.tree, list[VertexPool](), list[Primitive](), dict[str, int]()
     triangles, statements, vertices, faces = [np.empty((0, 3), dtype=np.int64)], [], 0, 0
-    placed = _placements(tree)
     for m, mesh in enumerate(tree.get("meshes", [])):
         for p, primitive in enumerate(mesh["primitives"]):
             attributes, targets = primitive["attributes"], primitive.get("targets", [])
             mode = primitive.get("mode", _TRIANGLES)
             if mode not in (_TRIANGLES, _STRIP, _FAN) or "POSITION" not in attributes:
                 continue
-            # Meshes at different places have different positions, even if they share attributes in the file.
-            key = json.dumps([attributes, targets, placed[m].tolist() if m in placed else []], sort_keys=True)
+            # Primitives of one mesh can share vertices; meshes do not, even if they share attributes in the file.
+            key = json.dumps([attributes, targets, m], sort_keys=True)
             if key not in known:
                 known[key] = len(pools)
                 count = _common_count(document, [attributes, *targets])
@@ -283,6 +295,18 @@ def _moved_rows(document: Document, pools: list[VertexPool]) -> Iterator[tuple[s
     for pool in pools:
         if pool.mesh in placed:
             yield pool.rows, placed[pool.mesh]
+
+
+def _separate_instances(tree: dict[str, Any]) -> None:
+    """Give every node that has the mesh of another node a copy of that mesh."""
+    meshes, seen = tree.get("meshes", []), set[int]()
+    for node in tree.get("nodes", []):
+        if "mesh" in node:
+            mesh = whole(node["mesh"])
+            if mesh in seen:
+                meshes.append(copy.deepcopy(meshes[mesh]))
+                node["mesh"] = len(meshes) - 1
+            seen.add(mesh)
 
 
 def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:

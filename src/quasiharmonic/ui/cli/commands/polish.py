@@ -40,6 +40,15 @@ if TYPE_CHECKING:
 
     Lower: TypeAlias = Callable[[SeamedMesh, dict[str, Any]], MappedAtlas]
 
+# Energies that `distortion` measures: their names in reports, and the measures.
+_MEASURED = {
+    "symmetric-dirichlet": ("symmetric Dirichlet", "symmetric_dirichlet"),
+    "mips": ("MIPS", "mips"),
+    "arap": ("ARAP", "arap"),
+    "arap-barrier": ("ARAP", "arap"),
+    "arap-unsigned": ("ARAP", "arap"),
+}
+
 
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
@@ -128,7 +137,11 @@ def lower_distortion(
             }
             lines = [report.describe_maps(after, written, options.output)]
             if written.injective:
-                lines += [*notes, _change(*measured), *([] if written.mirrored else [after.status.value])]
+                lines += [
+                    *notes,
+                    _change(options.energy, *measured),
+                    *([] if written.mirrored else [after.status.value]),
+                ]
             return pipeline.Account(facts, lines, written.injective)
 
         return pipeline.Changed(mesh.with_places(seam_options.pack_islands(options, after.mesh)), describe)
@@ -136,11 +149,12 @@ def lower_distortion(
     return pipeline.change_map(options, change, inputs=(options.fixed, *inputs))
 
 
-def _change(before: Distortion, after: Distortion) -> str:
-    """Return a sentence about the change of angle and length distortion."""
-    angles = [found.statistics("mips").mean for found in (before, after)]
+def _change(energy: str, before: Distortion, after: Distortion) -> str:
+    """Return a sentence about the change of the energy that was lowered, if it is a measure, and of lengths."""
     lengths = [found.statistics("isometric").maximum for found in (before, after)]
-    return (
-        f"MIPS from {angles[0]:.3g} to {angles[1]:.3g} on average, "
-        f"isometric distortion from {lengths[0]:.3g} to {lengths[1]:.3g} at worst"
-    )
+    words = f"isometric distortion from {lengths[0]:.3g} to {lengths[1]:.3g} at worst"
+    if energy in _MEASURED:
+        name, measure = _MEASURED[energy]
+        means = [found.statistics(measure).mean for found in (before, after)]
+        words = f"{name} from {means[0]:.3g} to {means[1]:.3g} on average, {words}"
+    return words

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli.arguments import add_command
+from quasiharmonic.util.optional import with_extra
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.cli.arguments import Commands
@@ -50,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] != "websockets":
             raise
-        raise ImportError("the page needs the package websockets: pip install 'quasiharmonic[studio]'") from error
+        raise ImportError(f"the page needs the package websockets: pip install {with_extra('studio')}") from error
 
     source = ""
     if options.input is not None:

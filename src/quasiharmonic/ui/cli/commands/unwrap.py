@@ -41,7 +41,7 @@ from quasiharmonic.ui.cli.arguments import (
     texture_size,
     weld,
 )
-from quasiharmonic.util.options import BakeOptions, UnwrapOptions
+from quasiharmonic.util.options import INSTANCES, BakeOptions, UnwrapOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.baking.bake import BakeResult
@@ -73,6 +73,12 @@ def add_parser(commands: Commands) -> None:
             default=False,
         ),
         weld=weld("yes"),
+        instances=choice(
+            INSTANCES,
+            "whether all occurrences of a mesh in a glTF file share their texture coordinates, or each becomes a mesh "
+            "of its own (default: share)",
+            default="share",
+        ),
         keep_seams=flag("keep the seams of the input's texture coordinates (vt), and add seams only where necessary"),
         edge_costs=file(
             "file of edges: two vertices, 0-based, and a positive factor on the cost of a seam there, on each line"
@@ -131,10 +137,17 @@ def run(options: argparse.Namespace) -> int:
 
 def _read(options: argparse.Namespace, source: Path) -> MeshData:
     """Read the model within the limit of memory."""
+    from quasiharmonic.io.formats.gltf.reader import read_gltf
     from quasiharmonic.util.untrusted import bounded
 
     with bounded(options.memory):
-        return pipeline.read_mesh(options, source)
+        if options.instances == "share":
+            return pipeline.read_mesh(options, source)
+        if source.suffix.lower() not in (".glb", ".gltf"):
+            raise ValueError(f"{source} has no instances: omit --instances, or give a glTF file")
+        if options.texture is not None:
+            raise ValueError("--texture makes one material for all meshes: omit --instances")
+        return read_gltf(source, instances=options.instances)
 
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
@@ -158,6 +171,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             rotate=not options.no_rotate,
             edge_costs=_edge_costs(mesh, options.edge_costs),
             hard_edges=find_hard_edges(mesh) if options.hard_edges == "file" else options.hard_edges,
+            meshes=None if mesh.carried is None else mesh.carried.number_meshes(),
             seams=_read_integers(options.seams, 2),
             no_seams=_read_integers(options.no_seams, 2),
             labels=_labels(mesh, options.labels),
