@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 from quasiharmonic import certify, inverse_field, nearest_invertible
 from quasiharmonic.apps.displacement_fields.nearest import fold_free
-from quasiharmonic.apps.displacement_fields.patch_descent import ThinBarrier
+from quasiharmonic.apps.displacement_fields.patch_descent import FoldPenalty, ThinBarrier
 from quasiharmonic.energies.derivatives import check_energy
 
 
@@ -253,3 +253,20 @@ def test_invalid_options():
         nearest_invertible(WRONG, min_jacobian="0.5")
     with pytest.raises(ValueError, match=r"fixed must be a bool array of shape \(5, 6\)"):
         nearest_invertible(WRONG, fixed=[0, 1])
+
+
+@pytest.mark.slow
+def test_deep_folds_of_smooth_noise_move_only_pixels_near_them():
+    dice = np.random.default_rng(1)
+    field = np.stack([gaussian_filter(dice.normal(size=(200, 260)), 8) for _ in range(2)], axis=-1)
+    field *= 4.11 / field.std()
+    mended = nearest_invertible(field)
+    assert mended.folds > 300
+    assert fold_free(mended.field).all()
+    assert np.array_equal(mended.field[~mended.moved_mask], field[~mended.moved_mask])
+    assert mended.moved_mask.sum() < 1200
+    assert mended.distance < 0.0385
+
+
+def test_the_penalty_of_folds_has_correct_derivatives():
+    assert check_energy(FoldPenalty(0.1, 0.4)).passed

@@ -19,7 +19,6 @@ from quasiharmonic.apps.displacement_fields.grid import (
     check_field,
     check_fixed,
     find_fixed_cells,
-    grow,
     label_patches,
     name_points,
 )
@@ -28,6 +27,7 @@ from quasiharmonic.apps.displacement_fields.patch_descent import (
     descend_patches,
     fill_patches,
     find_folds,
+    grow_pressing,
 )
 from quasiharmonic.apps.displacement_fields.voxels import (
     InvertibleVolume,
@@ -47,8 +47,6 @@ _ROUNDING = 2.0**-46
 INTERPOLATIONS = "linear", "trilinear"
 # Pixels closer than this to their original position, in pixels, return to it.
 _RETURN_DISTANCE = 1e-6
-# Patches whose border moved grow by this number of pixels.
-_MARGIN = 4
 # Maximum number of times that patches grow.
 _MAX_ROUNDS = 12
 
@@ -265,13 +263,11 @@ def _descend(grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobia
     for _ in range(_MAX_ROUNDS):
         descend_patches(grid, w, given, moving, min_jacobian)
         _return_near_pixels(grid, w, given, min_jacobian)
-        rim = (w != given) & (moving > 0) & grow(patch == 0, 1, fixed)
-        pressing = np.isin(moving, np.unique(moving[rim])) & rim.any() & (moving > 0)
-        free = (patch > 0) | grow(pressing, _MARGIN, fixed)
-        if np.array_equal(free, patch > 0):
+        grown = grow_pressing(w != given, moving, fixed)
+        if not (grown & (patch == 0)).any():
             break
-        patch = label_patches(free)
-        moving = np.where(np.isin(patch, np.unique(patch[pressing])), patch, 0)
+        patch = label_patches(grown | (patch > 0))
+        moving = np.where(np.isin(patch, np.unique(patch[grown])), patch, 0)
     return w
 
 

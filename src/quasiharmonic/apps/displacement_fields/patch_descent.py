@@ -12,9 +12,11 @@ them exactly to their positions under the given field. κ decreases in steps, un
 Patches share one block-diagonal matrix and Newton's direction. Step length and convergence are determined per patch.
 
 The start is a map without folds that agrees with the field outside patches around the folds. The pixels of folded cells
-and some pixels around them become free. Inside each patch, displacements become harmonic. If the result still folds,
-the patch grows and merges with patches that it meets. If a patch becomes the whole grid, the field is smoothed until it
-does not fold. This always ends, as smoothing converges to a translation.
+and some pixels around them become free, with harmonic displacements. Where the result still folds, the given map itself
+descends, with a penalty of ``½ (s − 2)²`` for s < 2 in place of B, whose weight increases. The patch grows if pixels at
+its border move. If folds
+remain, the displacements around them become harmonic, and the penalty acts once more. This repeats on larger distances.
+Finally the whole field is smoothed until it does not fold; this always ends, as smoothing converges to a translation.
 
 References
 ----------
@@ -24,6 +26,8 @@ References
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -45,14 +49,17 @@ if TYPE_CHECKING:
 _WIDTH = 0.05
 # The barrier's weights κ in turn.
 _WEIGHTS = 1e-3, 1e-5
+# The penalty's weights in turn.
+_PENALTIES = 1e-2, 1e-1, 1.0, 10.0, 100.0
 # A patch has converged if Newton's model predicts a decrease below this fraction of its value.
 _TOLERANCE = 1e-6
 # It has also converged below this decrease in squared pixels.
 _ZERO_DECREASE = 1e-14
 # It has also converged if a step lowers its value by less than this fraction.
 _IDLE = 1e-9
-# Maximum number of steps for one weight.
+# Maximum number of steps for one weight of the barrier, and of the penalty.
 _MAX_STEPS = 100
+_MAX_PENALTY_STEPS = 10
 # Maximum number of lengths of one step.
 _MAX_HALVINGS = 30
 # Fraction of the step to the first collapse, as in the other Newton descents.
@@ -61,46 +68,67 @@ _FRACTION = 0.9
 _SHIFTS = 0.0, 1e-12, 1e-8, 1e-4
 # Approximate number of free pixels in one matrix.
 _AT_ONCE = 20_000
-# Distance in pixels around folded cells that becomes free.
-_MARGIN = 2
-# Factor of that distance for patches that still fold.
-_GROWTH = 2
+# Distance in pixels around folded cells, and around patches whose border moves, that becomes free.
+_MARGIN = 4
+# Distance in pixels around folds in which displacements become harmonic; it grows by a half if folds remain.
+_NEAR = 2
 # Growth factor of the smoothing's standard deviation in pixels.
 _SMOOTHER = 1.2
 
 
 @dataclass(frozen=True)
-class ThinBarrier(Isotropic):
-    """A barrier at determinants of ``min_jacobian`` that vanishes from ``min_jacobian + width`` on."""
+class _OfDeterminant(Isotropic):
+    """A function of ``s = (det − min_jacobian) / width``."""
 
     min_jacobian: float
     width: float
+
+    @abstractmethod
+    def derivatives(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """First and second derivative by s."""
+
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """Derivatives by a and by b; they are opposite, as det = a − b."""
+        slope = self.derivatives(self.place(d))[0] / self.width
+        return slope, -slope
+
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Second derivatives by a and a, a and b, b and b."""
+        bend = self.derivatives(self.place(d))[1] / self.width**2
+        return bend, -bend, bend
+
+    def place(self, d: Deformation) -> FloatArray:
+        """Return s."""
+        return (d.det - self.min_jacobian) / self.width
+
+
+class ThinBarrier(_OfDeterminant):
+    """A barrier at determinants of ``min_jacobian`` that vanishes from ``min_jacobian + width`` on."""
 
     barrier = True
 
     def density(self, d: Deformation) -> FloatArray:
         """Return ``B(s)``."""
-        s = self._place(d)
+        s = np.minimum(self.place(d), 1)
         return np.where(s > 0, -((s - 1) ** 2) * np.log(np.where(s > 0, s, 1)), np.inf)
 
-    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
-        """Derivatives by a and by b; they are opposite, as φ is a function of det = a − b."""
-        s = self._inside(d)
-        slope = -(2 * (s - 1) * np.log(s) + (s - 1) ** 2 / s) / self.width
-        return slope, -slope
+    def derivatives(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """First and second derivative of B; zero where B is infinite."""
+        s = np.where(s > 0, np.minimum(s, 1), 1)
+        slope = -(2 * (s - 1) * np.log(s) + (s - 1) ** 2 / s)
+        return slope, -(2 * np.log(s) + 4 * (s - 1) / s - ((s - 1) / s) ** 2)
 
-    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Second derivatives by a and a, a and b, b and b."""
-        s = self._inside(d)
-        bend = -(2 * np.log(s) + 4 * (s - 1) / s - ((s - 1) / s) ** 2) / self.width**2
-        return bend, -bend, bend
 
-    def _place(self, d: Deformation) -> FloatArray:
-        return np.minimum((d.det - self.min_jacobian) / self.width, 1)
+class FoldPenalty(_OfDeterminant):
+    """A penalty for determinants below ``min_jacobian + 2 width``, finite at folds."""
 
-    def _inside(self, d: Deformation) -> FloatArray:
-        s = self._place(d)
-        return np.where(s > 0, s, 1)
+    def density(self, d: Deformation) -> FloatArray:
+        """Return ``½ (s − 2)²`` for s < 2."""
+        return 0.5 * np.minimum(self.place(d) - 2, 0) ** 2
+
+    def derivatives(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """First and second derivative."""
+        return np.minimum(s - 2, 0), np.where(s < 2, 1.0, 0.0)
 
 
 def descend_patches(
@@ -112,30 +140,34 @@ def descend_patches(
     ``min_jacobian`` at all corners of cells with free pixels. ``given`` (h, w) is the given map, and ``patch`` (h, w)
     the patch of each free pixel, from 1 on; 0 for fixed pixels.
     """
-    size = np.bincount(patch.ravel())
+    _descend_batches(_Patches(grid, w, given, patch, ThinBarrier(min_jacobian, _WIDTH)), _WEIGHTS, _MAX_STEPS)
+
+
+class _Patches(NamedTuple):
+    """The arguments of `descend_patches`, and the function of the determinants."""
+
+    grid: PixelGrid
+    w: ComplexArray
+    given: ComplexArray
+    patch: IntArray
+    energy: _OfDeterminant
+
+
+def _descend_batches(patches: _Patches, weights: Iterable[float], steps: int) -> None:
+    """Converge all patches for some weights in turn, with at most so many steps each."""
+    size = np.bincount(patches.patch.ravel())
     size[0] = 0
     batch = (np.cumsum(size) - size) // _AT_ONCE
     # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never taken.
     with np.errstate(all="ignore"):
         for number in range(int(batch[-1]) + 1):
             todo = np.flatnonzero((batch == number) & (size > 0))
-            for weight in _WEIGHTS:
-                _descend(_Patches(grid, w, given, patch, min_jacobian), todo, weight)
+            for weight in weights:
+                _descend(patches, todo, weight, steps)
 
 
-class _Patches(NamedTuple):
-    """The arguments of `descend_patches`."""
-
-    grid: PixelGrid
-    w: ComplexArray
-    given: ComplexArray
-    patch: IntArray
-    min_jacobian: float
-
-
-def _descend(patches: _Patches, todo: IntArray, weight: float) -> None:
-    """Converge the patches ``todo`` for one weight of the barrier; the matrix only has patches that still move."""
-    steps = _MAX_STEPS
+def _descend(patches: _Patches, todo: IntArray, weight: float, steps: int) -> None:
+    """Converge the patches ``todo`` for one weight of the energy; the matrix only has patches that still move."""
     while todo.size and steps:
         batch = _Batch(patches, todo, weight)
         moving = np.ones(todo.size, dtype=bool)
@@ -151,7 +183,7 @@ class _Batch:
     """Patches that share one matrix."""
 
     def __init__(self, patches: _Patches, todo: IntArray, weight: float) -> None:
-        grid, w, given, patch, min_jacobian = patches
+        grid, w, given, patch, energy = patches
         patch = np.where(np.isin(patch, todo), patch, 0)
         touched = find_cells(patch > 0)
         cells = grid.cells(*np.nonzero(touched))
@@ -167,9 +199,7 @@ class _Batch:
         of = np.full(len(pixels), -1, dtype=np.int64)
         of[self.free] = own
         self.of_triangle = np.repeat(of[local.reshape(-1, 4)].max(axis=1), 4)
-        self.energy = DeformationEnergy(
-            grid.points.reshape(-1, 2)[pixels] / grid.unit, F, ThinBarrier(min_jacobian, _WIDTH)
-        )
+        self.energy = DeformationEnergy(grid.points.reshape(-1, 2)[pixels] / grid.unit, F, energy)
         self.system = NewtonSystem(F, self.energy.g, len(pixels), np.flatnonzero(label == 0))
         self._count = len(F)
 
@@ -199,7 +229,7 @@ class _Batch:
         direction = found[0] if found is not None else self.system.solve_diagonal(-gradient)
         fall = -(gradient.real * direction.real + gradient.imag * direction.imag)
         expected_decrease = np.bincount(self.of_pixel, fall, minlength=self.patches).astype(np.float64, copy=False)
-        fallen = self._search(direction, expected_decrease, value, moving & (expected_decrease > 0))
+        fallen = self._search(direction, expected_decrease, value, moving & (expected_decrease > 0) & (value < np.inf))
         return (fallen > _IDLE * value) & (0.5 * expected_decrease > np.maximum(_TOLERANCE * value, _ZERO_DECREASE))
 
     def _search(
@@ -209,12 +239,14 @@ class _Batch:
         full = np.zeros_like(self.here)
         full[self.free] = direction
         reach = np.full(self.patches, np.inf)
-        np.minimum.at(reach, self.of_triangle, self.energy.steps_to_collapse(self.here, full))
+        if self.energy.energy.barrier:
+            np.minimum.at(reach, self.of_triangle, self.energy.steps_to_collapse(self.here, full))
         longest = np.where(moving, np.minimum(1, _FRACTION * reach), 0)
         start, trial = self.here[self.free], self.here.copy()
 
         def values(t: FloatArray) -> FloatArray:
-            trial[self.free] = start + t[self.of_pixel] * direction
+            step = t[self.of_pixel]
+            trial[self.free] = np.where(step > 0, start + step * direction, start)
             return self._values(trial)[0]
 
         t, value = backtrack_each(values, before, expected_decrease, longest, tries=_MAX_HALVINGS)
@@ -243,28 +275,53 @@ def fill_patches(
     Return the map and the patch (h, w) of each free pixel, from 1 on; 0 for all others. Raise FixedPixelsError if no
     such map was found, which can only happen with fixed pixels.
     """
-    w, steps = given.copy(), _MARGIN
-    free = grow(find_points(find_folds(grid, given, min_jacobian)), steps, fixed)
+    w, distance, penalties = given.copy(), _NEAR, list(_PENALTIES)
+    free = grow(find_points(find_folds(grid, given, min_jacobian)), distance, fixed)
+    if not free.all():
+        _fill(grid, w, free)
+    patch = label_patches(free)
+    folded = np.isin(patch, np.unique(patch[find_points(find_folds(grid, w, min_jacobian)) & free]))
+    w[folded & free] = given[folded & free]
+    wrong = find_folds(grid, w, min_jacobian)
+    if not wrong.any():
+        return w, patch
+    free |= grow(find_points(wrong), _MARGIN, fixed)
     while not free.all():
-        patch = label_patches(free)
-        _fill(grid, w, given, free)
+        for weight in penalties:
+            patch = label_patches(free)
+            folded = np.isin(patch, np.unique(patch[find_points(wrong)]))
+            patches = _Patches(grid, w, given, np.where(folded, patch, 0), FoldPenalty(min_jacobian, _WIDTH))
+            _descend_batches(patches, [weight], _MAX_PENALTY_STEPS)
+            free |= grow_pressing(w != given, patch, fixed)
+            wrong = find_folds(grid, w, min_jacobian)
+            if not wrong.any():
+                return w, label_patches(free)
+        around = grow(find_points(wrong), distance, fixed)
+        if around.all():
+            break
+        if distance > max(grid.shape):
+            raise FixedPixelsError(find_points(wrong))
+        _fill(grid, w, around)
+        free |= around
         wrong = find_folds(grid, w, min_jacobian)
         if not wrong.any():
-            return w, patch
-        steps *= _GROWTH
-        failed = np.unique(patch[find_points(wrong)])
-        larger = grow(np.isin(patch, failed[failed > 0]) | find_points(wrong), steps, fixed) | free
-        if np.array_equal(larger, free):
-            raise FixedPixelsError(find_points(wrong))
-        free = larger
-    return _smooth(grid, given, min_jacobian), label_patches(free)
+            return w, label_patches(free)
+        distance += distance // 2
+        penalties = penalties[-1:]
+    return _smooth(grid, given, min_jacobian), np.ones(grid.shape, dtype=np.int64)
 
 
-def _fill(grid: PixelGrid, w: ComplexArray, given: ComplexArray, free: BoolArray) -> None:
+def grow_pressing(moved: BoolArray, patch: IntArray, fixed: BoolArray) -> BoolArray:
+    """Return the patches (h, w) in which pixels moved at the border, and pixels around them."""
+    rim = moved & (patch > 0) & grow(patch == 0, 1, fixed)
+    return grow(np.isin(patch, np.unique(patch[rim])) & (patch > 0), _MARGIN, fixed)
+
+
+def _fill(grid: PixelGrid, w: ComplexArray, free: BoolArray) -> None:
     """Make the displacements of free pixels harmonic, given the others; natural conditions at the grid's border."""
     from scipy.sparse import csr_array, dia_array, kron, triu
 
-    inside, moved = np.flatnonzero(free), (given - grid.rest).ravel()
+    inside, moved = np.flatnonzero(free), (w - grid.rest).ravel()
     (rows, columns), aspect = grid.shape, grid.spacing[1] / grid.spacing[0]
     across, along = (dia_array((np.ones((1, count)), [0]), shape=(count, count)) for count in (rows, columns))
     laplacian = aspect * kron(across, _path(columns)) + kron(_path(rows), along) / aspect
@@ -275,7 +332,6 @@ def _fill(grid: PixelGrid, w: ComplexArray, given: ComplexArray, free: BoolArray
     with make_solver(matrix.indptr, matrix.indices) as solver:
         solver.factor(matrix.data)
         answer = solver.solve(np.stack([load.real, load.imag], axis=1))
-    w[:] = given
     w.ravel()[inside] = grid.rest.ravel()[inside] + answer[:, 0] + 1j * answer[:, 1]
 
 
