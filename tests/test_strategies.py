@@ -25,7 +25,7 @@ from quasiharmonic.solver.methods import (
 )
 from quasiharmonic.solver.methods.base import SearchStage
 from quasiharmonic.solver.methods.local_repair import Patch, untangle_fully
-from quasiharmonic.solver.methods.random_restarts import left_of, nearest
+from quasiharmonic.solver.methods.random_restarts import find_nearest, left_of
 from quasiharmonic.solver.methods.reweighting import reweight
 from quasiharmonic.solver.methods.untangling import GRADINGS, Regularised, untangle
 from quasiharmonic.solver.search.stages import STRATEGIES, TentativeStage, stages_of
@@ -160,9 +160,9 @@ class TestRandomRestarts:
 
     def test_nearest_point_of_an_outline(self):
         square = np.array([0, 1, 1 + 1j, 1j])
-        assert nearest(square, 0.4 - 2j) == 0.4
-        assert nearest(square, 3 + 3j) == 1 + 1j
-        assert nearest(square, 0.9 + 0.5j) == 1 + 0.5j
+        assert find_nearest(square, 0.4 - 2j) == 0.4
+        assert find_nearest(square, 3 + 3j) == 1 + 1j
+        assert find_nearest(square, 0.9 + 0.5j) == 1 + 0.5j
 
     @pytest.mark.long
     def test_moves_a_vertex_around_a_fold(self):

@@ -9,7 +9,7 @@ import pytest
 
 from quasiharmonic import MovingMesh, certify_tetrahedra, injective_tetrahedra, morph
 from quasiharmonic.apps.tetrahedra.contacts import edges_meeting_triangles
-from quasiharmonic.apps.tetrahedra.energy import BlockMatrix, ShapeEnergy, reduce_epsilon, regularised
+from quasiharmonic.apps.tetrahedra.energy import BlockMatrix, ShapeEnergy, reduce_epsilon, regularise
 from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus, tetrahedron_quality
 from quasiharmonic.io.fem.files import read_volume
 from quasiharmonic.ui.cli import main
@@ -97,11 +97,11 @@ def energy_of_determinants(energy, Y, step, h):
 
 def test_the_regularisation_parameter():
     D = np.array([-1e8, -1.0, 0.0, 1.0, 1e8])
-    np.testing.assert_allclose(regularised(D, 1.0), [2.5e-9, (np.sqrt(2) - 1) / 2, 0.5, (np.sqrt(2) + 1) / 2, 1e8])
+    np.testing.assert_allclose(regularise(D, 1.0), [2.5e-9, (np.sqrt(2) - 1) / 2, 0.5, (np.sqrt(2) + 1) / 2, 1e8])
     # The rule multiplies χ of the least determinant by the energy's ratio, at most by 0.9.
     for ratio, factor in ((0.5, 0.5), (0.99, 0.9)):
         now = reduce_epsilon(0.3, -0.2, ratio)
-        assert regularised(np.array(-0.2), now) == pytest.approx(factor * regularised(np.array(-0.2), 0.3))
+        assert regularise(np.array(-0.2), now) == pytest.approx(factor * regularise(np.array(-0.2), 0.3))
     assert reduce_epsilon(0.3, 0.5, 0.5) == 0.0
 
 

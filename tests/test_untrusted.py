@@ -18,7 +18,7 @@ from quasiharmonic.io.fields import check_header
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives.samples import read_samples
-from quasiharmonic.util.untrusted import beside, bounded, check_gifti, parse_json, read_npy, unpack_gzip
+from quasiharmonic.util.untrusted import check_gifti, parse_json, read_npy, resolve_beside, unpack_gzip, use_bound
 
 NESTED = b"[" * 100_000
 
@@ -34,7 +34,7 @@ def test_gzip_is_that_of_the_standard_library():
 
 def test_decompressed_sizes_have_a_bound():
     packed = gzip.compress(bytes(20_000_000))
-    with bounded(10_000_000), pytest.raises(ValueError, match="more than the bound of 10,000,000"):
+    with use_bound(10_000_000), pytest.raises(ValueError, match="more than the bound of 10,000,000"):
         unpack_gzip(packed)
     # The bound holds within the block only.
     assert len(unpack_gzip(packed)) == 20_000_000
@@ -46,7 +46,7 @@ def test_compressed_arrays_of_gifti_have_a_bound():
 
     data = b'<DataArray Encoding="GZipBase64Binary"><Data>%s</Data>' % base64.b64encode(zlib.compress(bytes(9_000_000)))
     check_gifti(data)
-    with bounded(8_000_000), pytest.raises(ValueError, match="decompress to at least"):
+    with use_bound(8_000_000), pytest.raises(ValueError, match="decompress to at least"):
         check_gifti(data)
 
 
@@ -84,7 +84,7 @@ def test_records_that_are_not_json_are_incomplete(tmp_path, data):
 @pytest.mark.parametrize("name", ["../x.png", "/x.png", "a/../../x.png", "C:\\x.png", "file:///x.png", "%2e%2e/x.png"])
 def test_names_that_lead_out_of_a_folder(name):
     with pytest.raises(ValueError, match="not in the folder"):
-        beside(Path("/here"), name)
+        resolve_beside(Path("/here"), name)
 
 
 def test_materials_show_images_of_the_folder_only(tmp_path):

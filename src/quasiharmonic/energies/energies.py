@@ -264,16 +264,16 @@ class MIPS(Isotropic):
 
     def density(self, d: Deformation) -> FloatArray:
         """``4 b / D``, ``inf`` where D ≤ 0."""
-        return _where_positive(d.det, 4 * d.b / _positive(d.det))
+        return _where_positive(d.det, 4 * d.b / _nan_unless_positive(d.det))
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``−4b/D², 4a/D²``."""
-        scale = 4 / _positive(d.det) ** 2
+        scale = 4 / _nan_unless_positive(d.det) ** 2
         return -scale * d.b, scale * d.a
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``8b/D³, −4(a + b)/D³, 8a/D³``."""
-        scale = 8 / _positive(d.det) ** 3
+        scale = 8 / _nan_unless_positive(d.det) ** 3
         return scale * d.b, -0.5 * scale * (d.a + d.b), scale * d.a
 
 
@@ -284,18 +284,18 @@ class SymmetricDirichlet(Isotropic):
 
     def density(self, d: Deformation) -> FloatArray:
         """``2 (D − 1)²/D + 4b (1 + D⁻²)``, ``inf`` where D ≤ 0."""
-        det = _positive(d.det)
+        det = _nan_unless_positive(d.det)
         return _where_positive(d.det, 2 * (det - 1) ** 2 / det + 4 * d.b * (1 + det**-2))
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``2 − 2/D² − 8b/D³`` and ``2 + 6/D² + 8b/D³``."""
-        det = _positive(d.det)
+        det = _nan_unless_positive(d.det)
         shear = 8 * d.b / det**3
         return 2 - 2 / det**2 - shear, 2 + 6 / det**2 + shear
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``4/D³ + 24b/D⁴, −12/D³ − 24b/D⁴, 20/D³ + 24b/D⁴``."""
-        det = _positive(d.det)
+        det = _nan_unless_positive(d.det)
         cubic = 4 / det**3
         shear = 24 * d.b / det**4
         return cubic + shear, -3 * cubic - shear, 5 * cubic + shear
@@ -373,17 +373,17 @@ class AreaBarrier(Isotropic):
 
     def density(self, d: Deformation) -> FloatArray:
         """``(D − 1)²/D``, ``inf`` where D ≤ 0."""
-        det = _positive(d.det)
+        det = _nan_unless_positive(d.det)
         return _where_positive(d.det, (det - 1) ** 2 / det)
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``1 − 1/D²`` and its negative."""
-        slope = 1 - _positive(d.det) ** -2.0
+        slope = 1 - _nan_unless_positive(d.det) ** -2.0
         return slope, -slope
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``2/D³, −2/D³, 2/D³``."""
-        second = 2 * _positive(d.det) ** -3.0
+        second = 2 * _nan_unless_positive(d.det) ** -3.0
         return second, -second, second
 
 
@@ -439,7 +439,7 @@ def conformal_area_blend(theta: float = 1 / 128) -> Combination:
     return Combination((1 - theta, MIPS()), (theta, AreaBarrier()))
 
 
-def _positive(det: FloatArray) -> FloatArray:
+def _nan_unless_positive(det: FloatArray) -> FloatArray:
     """Return the determinants, with NaN where they are not positive."""
     return np.where(det > 0, det, np.nan)
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 _MAX_LENGTH = 300
 
 
-def printable(path: str | bytes | os.PathLike[str]) -> str:
+def printable_path(path: str | bytes | os.PathLike[str]) -> str:
     """Return a file name for messages, with unprintable characters escaped."""
     text = os.fsdecode(path)
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in text)
@@ -52,11 +52,11 @@ class MeshFileError(ValueError):
         then = f"; {self.remedy}" if self.remedy else ""
         text = f"{self.what}{at}{then}"
         # Escape invalid Unicode, so that the message stays printable.
-        return f"{printable(self.path)}: {text.encode('utf-8', 'backslashreplace').decode()}"
+        return f"{printable_path(self.path)}: {text.encode('utf-8', 'backslashreplace').decode()}"
 
 
 @contextmanager
-def reading(
+def report_damage(
     path: str | os.PathLike[str],
     fault: str = "",
     damage: type[Exception] | tuple[type[Exception], ...] = ValueError,

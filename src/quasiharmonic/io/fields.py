@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
 from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.util.arrays import FloatArray
@@ -159,7 +159,7 @@ def read_field(path: str | os.PathLike[str]) -> DisplacementField:
 
 
 def _read_npy(path: str | os.PathLike[str]) -> DisplacementField:
-    with reading(path, "is not an array of numbers in NumPy's format .npy: "):
+    with report_damage(path, "is not an array of numbers in NumPy's format .npy: "):
         array = read_npy(path)
 
     def encode(components: FloatArray, suffix: str) -> bytes:
@@ -177,7 +177,7 @@ def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
         import nibabel
     read_bytes(path)  # Raises an error that names what is wrong with the path.
     # Damaged files cause errors of many types.
-    with reading(path, "is not valid NIfTI: ", Exception):
+    with report_damage(path, "is not valid NIfTI: ", Exception):
         image: Any = nibabel.load(path)
         check_size(8 * prod(image.shape), "its header announces")
         data = np.asarray(image.dataobj, dtype=np.float64)
@@ -210,7 +210,7 @@ def _read_itk(path: str | os.PathLike[str]) -> DisplacementField:
     with explain_missing("ITK's files need SimpleITK", "SimpleITK"):
         import SimpleITK
     try:
-        with reading(path):
+        with report_damage(path):
             check_header(read_bytes(path), field_suffix(path))
             image = SimpleITK.ReadImage(os.fspath(path))
     except RuntimeError as error:

@@ -21,10 +21,10 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_range,
     loop_arrays,
+    make_unchangeable,
     map_array,
     names_of,
     own_triangles,
-    unchangeable,
 )
 
 
@@ -74,7 +74,7 @@ def certify(
     check_bool("boundary", boundary)
     triangles, positions = _convert(F, uv)
     # Release the writable copy before the computation begins.
-    positions = unchangeable(positions)
+    positions = make_unchangeable(positions)
     given = None if loops is None else loop_arrays(loops, len(positions))
     if given == [] and len(triangles):
         raise ValueError("loops has no boundary loop: omit it to find the loops automatically")

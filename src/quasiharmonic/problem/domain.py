@@ -19,11 +19,11 @@ from quasiharmonic.util.arrays import (
     IntArray,
     ReadOnly,
     fixed_vertices,
+    make_unchangeable,
     mark,
     names_of,
     scale_to_unit,
     triangle_array,
-    unchangeable,
     vertex_array,
 )
 
@@ -64,7 +64,7 @@ class Domain(ReadOnly):
 
     def __init__(self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike | None) -> None:
         V = vertex_array(V)
-        F = unchangeable(triangle_array(F, len(V)))
+        F = make_unchangeable(triangle_array(F, len(V)))
         edges = surface_edges(F, len(V))
         fixed = fixed_vertices(np.unique(edges.boundary) if fixed is None else fixed, len(V))
         self._assemble(V, F, fixed, edges, trace_loops(edges.boundary))

@@ -101,12 +101,12 @@ class MeshReport:
         if self.welded.size:
             lines.append(
                 f"{count_of('vertex', 'vertices', self.welded.size)} welded to an earlier vertex, "
-                f"first {_first(self.welded)}"
+                f"first {_name_first(self.welded)}"
             )
         if self.coincident.size:
             lines.append(
                 f"{count_of('vertex', 'vertices', self.coincident.size)} at the position of an earlier vertex, "
-                f"first {_first(self.coincident)}"
+                f"first {_name_first(self.coincident)}"
             )
         if self.close.size:
             lines.append(describe_soup(self.close))
@@ -135,7 +135,7 @@ def tabulate_elements(title: str, classes: dict[str, IntArray]) -> list[str]:
     if not rows:
         return []
     width = max(len(title), *(len(name) for name, _ in rows))
-    table = [f"{name:<{width}} {len(found):>9,}  {_first(found)}" for name, found in rows]
+    table = [f"{name:<{width}} {len(found):>9,}  {_name_first(found)}" for name, found in rows]
     return [f"{title:<{width}} {'count':>9}  first", *table]
 
 
@@ -228,7 +228,7 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike, *, weld: bool | float = False) -> M
         genus=genus,
         inward=int(np.count_nonzero(inward)),
         defects=defects,
-        coincident=np.setdiff1d(_coincident(V), welded),
+        coincident=np.setdiff1d(_find_coincident(V), welded),
         close=np.flatnonzero(kept)[find_close_vertices(V[kept], np.bincount(part))],
         welded=welded,
     )
@@ -280,12 +280,12 @@ def _defects(V: FloatArray, F: IntArray, collapsed: BoolArray, split: IntArray, 
         "triangles without area": flat[~collapsed[flat]],
         "edges of three or more triangles": found.nonmanifold,
         "edges with mixed winding": found.inconsistent[found.inconsistent[:, 0] != found.inconsistent[:, 1]],
-        "vertices where surfaces touch": _touching(F[~collapsed], split, len(V), found),
+        "vertices where surfaces touch": _find_touching(F[~collapsed], split, len(V), found),
         "vertices without triangle": np.flatnonzero(kept & ~used),
     }
 
 
-def _touching(F: IntArray, split: IntArray, n: int, found: Edges) -> IntArray:
+def _find_touching(F: IntArray, split: IntArray, n: int, found: Edges) -> IntArray:
     """Return vertices with several fans of triangles that no defective edge explains, ascending."""
     vertex_of_fan = np.empty(int(split.max(initial=-1)) + 1, dtype=np.int64)
     vertex_of_fan[split] = F
@@ -306,14 +306,14 @@ def _volumes(V: FloatArray, F: IntArray, part: IntArray, count: int) -> FloatArr
     return volumes
 
 
-def _coincident(V: FloatArray) -> IntArray:
+def _find_coincident(V: FloatArray) -> IntArray:
     """Return vertices at exactly the position of an earlier vertex, ascending."""
     order = np.lexsort((np.arange(len(V)), *V.T))
     same = (V[order[1:]] == V[order[:-1]]).all(axis=1)
     return np.sort(order[1:][same])
 
 
-def _first(found: IntArray) -> str:
+def _name_first(found: IntArray) -> str:
     """Name the first elements."""
     listed = (str(tuple(one)) if isinstance(one, list) else str(one) for one in found[:_LISTED].tolist())
     return ", ".join(listed) + (", …" if len(found) > _LISTED else "")

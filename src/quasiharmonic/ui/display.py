@@ -75,13 +75,13 @@ def _result(result: MapResult, kind: str, measure: str) -> Figure:
         return plot.plot_distortion(result.V, result.F, result.uv, measure)
     if kind == "texture":
         return plot.plot_texture(result.V, result.F, result.uv)
-    return map_figure(result.V, result.F, result.uv, inverted=_bad(result.certificate))
+    return map_figure(result.V, result.F, result.uv, inverted=_find_bad(result.certificate))
 
 
 def _certificate(certificate: Certificate) -> Figure:
     figure = new_figure((4.5, 4.5))
     ax = figure.add_axes((0.01, 0.02, 0.98, 0.88))
-    uv, bad = certificate.uv, _bad(certificate)
+    uv, bad = certificate.uv, _find_bad(certificate)
     plot.plot_map(uv, certificate.F, uv, inverted=bad, ax=ax)
     for i, j, k, m in certificate.crossings.tolist():
         ax.plot(*uv[[i, j]].T, *uv[[k, m]].T, color=RED, linewidth=2.4, zorder=7)
@@ -104,7 +104,7 @@ def _diagnosis(diagnosis: Diagnosis) -> Figure:
     return plot.plot_problem(problem.V, problem.F, problem.fixed, problem.target, vertices=vertices, edges=edges)
 
 
-def _bad(certificate: Certificate) -> np.ndarray:
+def _find_bad(certificate: Certificate) -> np.ndarray:
     """Return the triangles that are not positive."""
     return np.concatenate([certificate.inverted, certificate.degenerate, certificate.nonfinite])
 

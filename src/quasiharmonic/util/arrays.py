@@ -104,7 +104,7 @@ class _Unchangeable(np.ndarray):
     """Owner of the memory of a result of `unchangeable`; only that result refers to it."""
 
 
-def unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
+def make_unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
     """Return the values of an array in memory that no other code can write to.
 
     An array that `unchangeable` made, or a view of one, is returned as it is; any other array is copied. A
@@ -208,7 +208,7 @@ def scale_to_unit(values: FloatArray) -> FloatArray:
 
 def own_triangles(F: ArrayLike) -> IntArray:
     """Triangles as from `triangle_rows`, contiguous and unchangeable, as kernels require."""
-    return unchangeable(triangle_rows(F, copy=False))
+    return make_unchangeable(triangle_rows(F, copy=False))
 
 
 def vertex_array(V: ArrayLike, name: str = "V", *, finite: bool = True) -> FloatArray:

@@ -27,7 +27,7 @@ _GIFTI_DATA = re.compile(rb"<Data>([^<]*)</Data>")
 
 
 @contextmanager
-def bounded(limit: int | None) -> Iterator[None]:
+def use_bound(limit: int | None) -> Iterator[None]:
     """Use another bound than `MAX_BYTES`, such as a limit of memory; None keeps the current bound."""
     token = _bound.set(_bound.get() if limit is None else limit)
     try:
@@ -113,7 +113,7 @@ def read_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
         return np.lib.format.read_array(file, allow_pickle=False)
 
 
-def beside(folder: Path, uri: str) -> Path:
+def resolve_beside(folder: Path, uri: str) -> Path:
     """Return the path of a file in a folder or below it, by its relative URI; ValueError for any other file."""
     name = unquote(uri)
     if ":" in name or "\\" in name or name.startswith("/") or ".." in Path(name).parts:

@@ -8,7 +8,7 @@ import numpy as np
 
 from quasiharmonic.apps.baking.images import Bytes, decode, sample
 from quasiharmonic.apps.baking.tangents import TangentFrames
-from quasiharmonic.io.errors import printable
+from quasiharmonic.io.errors import printable_path
 from quasiharmonic.io.models.appearance import Appearance, ImageUse, NamedImage, Role, SurfaceMaterial
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -32,14 +32,14 @@ class SurfaceLook:
             if use.image not in self._pixels:
                 self._pixels[use.image] = self._decode(use.image)
             if use.channel not in appearance.coordinates:
-                name = printable(use.image.name)
+                name = printable_path(use.image.name)
                 self.problems.append(f"texture {name} needs texture coordinates {use.channel}, which are missing")
 
     def _decode(self, image: NamedImage) -> Bytes | None:
         try:
             return decode(image.data)
         except ValueError as error:
-            self.problems.append(f"texture {printable(image.name)} {error}")
+            self.problems.append(f"texture {printable_path(image.name)} {error}")
             return None
 
     def has(self, *roles: Role) -> bool:

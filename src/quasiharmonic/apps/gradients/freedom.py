@@ -117,7 +117,7 @@ class SlidingFreedom(Freedom):
         ahead, curvature = self._track.frame(s, np.ones(s.size, dtype=bool))
         back, curvature_back = self._track.frame(s, ~kink)
         self._by_arc = self._barrier_gradient(s)
-        slope, slope_back = (_along(tangent, at) + self._by_arc for tangent in (ahead, back))
+        slope, slope_back = (_component_along(tangent, at) + self._by_arc for tangent in (ahead, back))
         turned = kink & (slope_back > np.maximum(-slope, 0))
         rests: BoolArray = kink & (slope >= 0) & (slope_back <= 0)
         self.resting = bool(rests.any())
@@ -125,7 +125,9 @@ class SlidingFreedom(Freedom):
         system.tangent = tangent
         # A vertex may leave a kink only on the side on which the objective decreases.
         self._side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
-        system.curve_stiffness = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * self._unit
+        system.curve_stiffness = (
+            _component_along(1j * tangent, at) * np.where(turned, curvature_back, curvature) * self._unit
+        )
         bends = self._barrier_hessian(s)
         self._add_at_ends(system.curve_stiffness, bends[:, (0, 1), (0, 1)])
         both = (tangent[self._deviation.pairs[self._both]] != 0).all(axis=1)
@@ -193,7 +195,7 @@ class SlidingFreedom(Freedom):
         return 0.5 * (out + out.swapaxes(1, 2))
 
 
-def _along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:
+def _component_along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:
     """Components of vectors along unit tangents."""
     return tangent.real * vector.real + tangent.imag * vector.imag
 

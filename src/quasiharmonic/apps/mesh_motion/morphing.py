@@ -179,7 +179,7 @@ def morph(
     _check_used("points", points, used)
     first = points if rest is None else _check_positions("rest", rest, points, used)
     begin = (None if rest is None else points) if start is None else _check_positions("start", start, points, used)
-    F = _counterclockwise(F, first)
+    F = _orient_counterclockwise(F, first)
     check_spread(F, len(points))
     fixed, goal = _find_fixed(points, F, moved_vertices, target)
     search = _NodeSearch(F, first, fixed, nets_of(F), checked)
@@ -295,7 +295,7 @@ def _check_used(name: str, points: FloatArray, used: IntArray) -> None:
     check_finite(name, "vertex", "vertices", used_points)
 
 
-def _counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
+def _orient_counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:
     """Return the elements with counterclockwise winding; raise ValueError if the distortion of one is undefined."""
     quadrilaterals = F.shape[1] == 4
     triangles, of = corner_triangles(F) if quadrilaterals else covering_triangles(F)

@@ -42,9 +42,9 @@ from quasiharmonic.util.arrays import (
     check_range,
     count_of,
     index_array,
+    make_unchangeable,
     names_of,
     real_array,
-    unchangeable,
 )
 from quasiharmonic.util.outcome import Verdict
 
@@ -91,7 +91,7 @@ class TetrahedraCertificate(ReadOnly, Verdict):
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
-                object.__setattr__(self, name, unchangeable(value))
+                object.__setattr__(self, name, make_unchangeable(value))
 
     def _read_only(self) -> Iterator[NDArray[Any]]:
         return (value for value in vars(self).values() if isinstance(value, np.ndarray))

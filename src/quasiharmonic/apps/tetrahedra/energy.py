@@ -45,7 +45,7 @@ class _Density(NamedTuple):
     by_d_d: FloatArray
 
 
-def regularised(D: FloatArray, epsilon: float) -> FloatArray:
+def regularise(D: FloatArray, epsilon: float) -> FloatArray:
     """Return χ(D, ε), without cancellation where D is negative."""
     root = np.hypot(D, epsilon)
     if epsilon == 0:
@@ -61,7 +61,7 @@ def reduce_epsilon(epsilon: float, min_determinant: float, ratio: float) -> floa
     finitely many steps.
     """
     share = max(1.0 - ratio, 0.1)
-    mu = (1.0 - share) * float(regularised(np.array(min_determinant), epsilon))
+    mu = (1.0 - share) * float(regularise(np.array(min_determinant), epsilon))
     if min_determinant < mu:
         return 2.0 * float(np.sqrt(mu) * np.sqrt(mu - min_determinant))
     return 0.0
@@ -108,7 +108,7 @@ class ShapeEnergy:
         D = dot(J[0], cross(J[1], J[2]))
         if epsilon == 0 and not D.min() > self.floor:
             return np.inf
-        chi = regularised(D - self.floor, epsilon)
+        chi = regularise(D - self.floor, epsilon)
         t = np.einsum("abt,abt->t", J, J)
         density = (1 - _VOLUME_SHARE) / 3 * t * np.cbrt(chi) ** -2 + _VOLUME_SHARE / 2 * (D * D + 1) / chi
         value = float(density.mean())
@@ -123,7 +123,7 @@ class ShapeEnergy:
 
     def _density(self, J: FloatArray, D: FloatArray, epsilon: float) -> _Density:
         t = np.einsum("abt,abt->t", J, J)
-        chi = regularised(D - self.floor, epsilon)
+        chi = regularise(D - self.floor, epsilon)
         root = np.hypot(D - self.floor, epsilon)
         first = chi / root
         second = 0.5 * (epsilon / root) ** 2 / root

@@ -34,7 +34,7 @@ def ahead(side: IntArray) -> IntArray:
     return side + 1 - 3 * (side % 3 == 2)
 
 
-def behind(side: IntArray) -> IntArray:
+def previous_sides(side: IntArray) -> IntArray:
     """Return the previous side of the same triangle."""
     return side - 1 + 3 * (side % 3 == 0)
 
@@ -116,8 +116,8 @@ def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
     a, b = normal[one // 3], normal[other // 3]
     sine = np.linalg.norm(np.cross(a, b), axis=1)
     angle = np.arctan2(sine, (a * b).sum(axis=1))
-    above = ((flat_P[behind(other)] - start) * a).sum(axis=1)
-    height = np.maximum(np.abs(above), np.abs(((flat_P[behind(one)] - start) * b).sum(axis=1)))
+    above = ((flat_P[previous_sides(other)] - start) * a).sum(axis=1)
+    height = np.maximum(np.abs(above), np.abs(((flat_P[previous_sides(one)] - start) * b).sum(axis=1)))
     flat = (height <= FLAT) & (angle <= _FLAT_ANGLE) & ~(tiny[one // 3] | tiny[other // 3])
     fraction, exponent = np.frexp(length * size)
     rounded = np.ldexp(np.rint(np.ldexp(fraction, _BITS)), exponent - _BITS)

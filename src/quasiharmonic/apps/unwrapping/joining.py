@@ -52,7 +52,7 @@ def join_small_charts(
         if not _is_small(chart, total_area):
             continue
         tail, head = _sides(chart)
-        wanted = _demanded(chart)
+        wanted = _find_demanded(chart)
         length = np.linalg.norm(chart.V[tail] - chart.V[head], axis=1)
         tries = 0
         for i in np.argsort(-length, kind="stable").tolist():
@@ -77,7 +77,7 @@ def _is_small(chart: WorkingChart, total_area: float) -> bool:
     return len(chart.F) <= _SMALL and chart.surface_area <= _SHARE * total_area
 
 
-def _demanded(chart: WorkingChart) -> set[tuple[int, int]]:
+def _find_demanded(chart: WorkingChart) -> set[tuple[int, int]]:
     """Return the sides of triangles that must be seams, by their ends."""
     demanded = chart.cost <= DEMANDED_COST
     return set(zip(chart.F[demanded].tolist(), chart.F[:, (1, 2, 0)][demanded].tolist(), strict=True))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.hinges import ahead, behind
+from quasiharmonic.apps.unwrapping.hinges import ahead, previous_sides
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, repeat_each
 
@@ -291,7 +291,7 @@ def _split(F: IntArray, links: Links, turned: BoolArray, contested: IntArray) ->
         # Only the first pair of sides, or the first side, stays at this edge. The others get a vertex of their own.
         away = side[repeat_each(wrong, count) & (leader != repeat_each(leader[first], count))]
         at_start = fan[away] < fan[ahead(away)]
-        cut = mark(F.size, np.where(at_start, behind(away), ahead(away)))
+        cut = mark(F.size, np.where(at_start, previous_sides(away), ahead(away)))
         apart = cut[links.one] | cut[links.other]
         contested = np.union1d(contested, [links.one[apart], links.other[apart]])
         links = links.select(~apart)

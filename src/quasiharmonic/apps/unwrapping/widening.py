@@ -102,7 +102,7 @@ def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
     across = -_towards_tips(points, ordinary, start, end)
     for one, other in ((end, apex), (apex, start)):
         across = np.where(np.isnan(across), _towards_tips(points, ordinary, one, other), across)
-    across = np.where(np.isnan(across), _across(along, dimension), across)
+    across = np.where(np.isnan(across), _direction_across(along, dimension), across)
     # Random shifts do not put several vertices on one line again. The seed is fixed, so that results are reproducible.
     points[apex] += across * (length * np.random.default_rng(0).uniform(0.5, 1, rows.size))[:, None]
     degenerate[near[flat_triangles(points, F[near])]] = True
@@ -148,7 +148,7 @@ def _towards_tips(points: FloatArray, F: IntArray, start: IntArray, end: IntArra
     return towards
 
 
-def _across(along: FloatArray, dimension: int) -> FloatArray:
+def _direction_across(along: FloatArray, dimension: int) -> FloatArray:
     """Return unit vectors perpendicular to others (k, 3), which are not zero, in random directions."""
     along = along / np.abs(along).max(axis=1, keepdims=True)
     along /= np.linalg.norm(along, axis=1, keepdims=True)

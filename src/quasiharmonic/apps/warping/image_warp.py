@@ -202,7 +202,10 @@ def warp_along(
     inverse = InverseMap(rest, F, positions)
     source = _find_sources(inverse, height, width)
     channels = pixels.reshape(*pixels.shape[:2], -1)
-    layers = [np.ascontiguousarray(channels[..., k], dtype=_drawable(pixels.dtype)) for k in range(channels.shape[2])]
+    layers = [
+        np.ascontiguousarray(channels[..., k], dtype=_find_drawable_type(pixels.dtype))
+        for k in range(channels.shape[2])
+    ]
     drawn = np.zeros((height * width, len(layers)), dtype=pixels.dtype)
     for start in range(0, height * width, _PIXELS):
         here = source[start : start + _PIXELS]
@@ -265,6 +268,6 @@ def _fill(inverse: InverseMap, source: FloatArray) -> None:
         place[inside] = origins[t, 0] + second[inside][:, None] * along + third[inside][:, None] * across
 
 
-def _drawable(kind: np.dtype[Any]) -> np.dtype[Any]:
+def _find_drawable_type(kind: np.dtype[Any]) -> np.dtype[Any]:
     """Return a dtype that SciPy can draw from without loss."""
     return kind if kind.kind in "iu" or kind in (np.float32, np.float64) else np.dtype(np.float64)

@@ -235,16 +235,19 @@ class SlidingModel(MapModel):
         kink = self._track.at_kink(s)
         ahead, curvature = self._track.frame(s, np.ones(at.size, dtype=bool))
         back, curvature_back = self._track.frame(s, ~kink)
-        slope, slope_back = _along(ahead, at) + barrier_gradient, _along(back, at) + barrier_gradient
+        slope, slope_back = (
+            _component_along(ahead, at) + barrier_gradient,
+            _component_along(back, at) + barrier_gradient,
+        )
         # If the energy decreases to both sides, take the steeper one.
         turned = kink & (slope_back > np.maximum(-slope, 0))
         stays = kink & (slope >= 0) & (slope_back <= 0)
         tangent = np.where(stays, 0, np.where(turned, back, ahead))
-        forces = _along(1j * tangent, at) * np.where(turned, curvature_back, curvature)
+        forces = _component_along(1j * tangent, at) * np.where(turned, curvature_back, curvature)
         # A vertex may leave a kink only to the chosen side.
         side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
         gradient = pull[system.free]
-        gradient[system.at] = np.where(tangent == 0, 0, _along(tangent, at) + barrier_gradient)
+        gradient[system.at] = np.where(tangent == 0, 0, _component_along(tangent, at) + barrier_gradient)
         return _TangentFrame(gradient, tangent, forces * 2.0**self.coordinates.exponent, side, barrier_hessian)
 
     def _barrier(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -337,6 +340,6 @@ class SlidingModel(MapModel):
         return value, NewtonState(w, derivatives, value, _Boundary(there, energy))
 
 
-def _along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:
+def _component_along(tangent: ComplexArray, vector: ComplexArray) -> FloatArray:
     """Components of vectors along unit tangents."""
     return tangent.real * vector.real + tangent.imag * vector.imag

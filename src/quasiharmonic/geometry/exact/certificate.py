@@ -48,8 +48,8 @@ from quasiharmonic.util.arrays import (
     IntArray,
     ReadOnly,
     count_of,
+    make_unchangeable,
     names_of,
-    unchangeable,
 )
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Verdict
@@ -115,8 +115,8 @@ class Certificate(ReadOnly, Displayable, Verdict):
         """Keep every array in memory that nobody can write to, whatever flags they set."""
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
-                object.__setattr__(self, name, unchangeable(value))
-        object.__setattr__(self, "loops", tuple(unchangeable(loop) for loop in self.loops))
+                object.__setattr__(self, name, make_unchangeable(value))
+        object.__setattr__(self, "loops", tuple(make_unchangeable(loop) for loop in self.loops))
 
     @property
     def triangles(self) -> int:
@@ -196,7 +196,7 @@ def certify(
     loops : sequence of (l,) int64, optional
         The boundary loops of ``F``, at least one if there are triangles; not checked.
     """
-    F, uv = unchangeable(F), unchangeable(uv)
+    F, uv = make_unchangeable(F), make_unchangeable(uv)
     sign, nonfinite = triangle_signs(F, uv)
     inverted = degenerate = _none()
     reasons: list[Reason] = []

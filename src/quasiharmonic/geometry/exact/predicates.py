@@ -281,18 +281,18 @@ def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray)
     )
     # On a common line, lexicographic order is the order along the line, so the overlap is that of two intervals.
     collinear = (r_side == 0) & (s_side == 0) & (p_side == 0) & (q_side == 0)
-    p_first, r_first = _before(p, q), _before(r, s)
+    p_first, r_first = _compare_lexically(p, q), _compare_lexically(r, s)
     p, q = np.where(p_first[:, None], p, q), np.where(p_first[:, None], q, p)
     r, s = np.where(r_first[:, None], r, s), np.where(r_first[:, None], s, r)
-    start = np.where(_before(p, r)[:, None], r, p)
-    end = np.where(_before(q, s)[:, None], q, s)
+    start = np.where(_compare_lexically(p, r)[:, None], r, p)
+    end = np.where(_compare_lexically(q, s)[:, None], q, s)
     relation[near[touching]] = SegmentRelation.TOUCHING
     relation[near[crossing]] = SegmentRelation.CROSSING
-    relation[near[collinear & _before(start, end)]] = SegmentRelation.OVERLAPPING
+    relation[near[collinear & _compare_lexically(start, end)]] = SegmentRelation.OVERLAPPING
     return relation
 
 
-def _before(a: FloatArray, b: FloatArray) -> BoolArray:
+def _compare_lexically(a: FloatArray, b: FloatArray) -> BoolArray:
     """Lexicographic order of points: by x, then by y."""
     less: BoolArray = (a[:, 0] < b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] < b[:, 1]))
     return less
@@ -312,7 +312,7 @@ def box_pairs(lo: FloatArray, hi: FloatArray) -> Iterator[tuple[IntArray, IntArr
     such boxes is about proportional to the number of boxes and of pairs found.
     """
     tree = _box_tree(lo, hi, max(len(lo) - 1, 0).bit_length())
-    for i, j in _meeting(tree, tree):
+    for i, j in _find_meeting_boxes(tree, tree):
         yield i[i < j], j[i < j]
 
 
@@ -329,7 +329,7 @@ def box_pairs_within(lo: FloatArray, hi: FloatArray, starts: IntArray) -> Iterat
     leaves = np.full((2, groups << depth, 2), np.array([np.inf, -np.inf])[:, None, None])
     leaves[0, leaf], leaves[1, leaf] = lo, hi
     tree = _box_tree(leaves[0], leaves[1], depth)
-    for i, j in _meeting(tree, tree):
+    for i, j in _find_meeting_boxes(tree, tree):
         yield number[i[i < j]], number[j[i < j]]
 
 
@@ -338,7 +338,7 @@ def box_pairs_between(
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield pairs of closed boxes that meet, the first of one set and the second of another; as `box_pairs`."""
     depth = max(len(lo) - 1, len(other_lo) - 1, 0).bit_length()
-    yield from _meeting(_box_tree(lo, hi, depth), _box_tree(other_lo, other_hi, depth))
+    yield from _find_meeting_boxes(_box_tree(lo, hi, depth), _box_tree(other_lo, other_hi, depth))
 
 
 _BoxTree = list[tuple[FloatArray, FloatArray]]
@@ -355,7 +355,7 @@ def _box_tree(lo: FloatArray, hi: FloatArray, depth: int) -> _BoxTree:
     return tree
 
 
-def _meeting(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArray]]:
+def _find_meeting_boxes(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArray, IntArray]]:
     """Pairs of leaves that meet, of two trees of the same depth; for a tree with itself, only ``i ≤ j``.
 
     With several roots, only leaves below the same root are compared.

@@ -20,10 +20,10 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_range,
     edge_names,
+    make_unchangeable,
     names_of,
     own_triangles,
     repeat_each,
-    unchangeable,
 )
 from quasiharmonic.util.kernels import compiled
 
@@ -248,7 +248,7 @@ def label_components(tail: IntArray, head: IntArray, n: int) -> IntArray:
     ``tail`` and ``head`` (e,) or (e, k) are the nodes at the ends of each link.
     """
     label = np.empty(n, dtype=np.int64)
-    tail, head = unchangeable(tail), unchangeable(head)
+    tail, head = make_unchangeable(tail), make_unchangeable(head)
     if not link_nodes(tail, head, label):
         for nodes in (tail, head):
             check_range("a link", nodes, n, "node", "nodes")

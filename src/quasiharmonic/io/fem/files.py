@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.fem.byte_tables import MeshParts
 from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
@@ -61,7 +61,7 @@ class FemMesh:
         which an array of integers is not zero; ``NAME=VALUE`` for those where it has this value. MFEM: a named set of
         attributes of the boundary or of elements, or the number of an attribute of the boundary.
         """
-        with reading(self.source, "the groups cannot be read: ", _DAMAGE):
+        with report_damage(self.source, "the groups cannot be read: ", _DAMAGE):
             sets = self.parts.find_sets()
         nodes = sets.get(name)
         if nodes is None or not nodes.size:
@@ -76,7 +76,10 @@ class FemMesh:
             there = ", ".join(map(repr, sorted(fields))) or "none"
             raise MeshFileError(self.source, f"there is no point data {name!r}", remedy=f"available: {there}")
         # Converting a signalling NaN to double raises a warning.
-        with reading(self.source, f"the point data {name!r} cannot be read: ", _DAMAGE), np.errstate(invalid="ignore"):
+        with (
+            report_damage(self.source, f"the point data {name!r} cannot be read: ", _DAMAGE),
+            np.errstate(invalid="ignore"),
+        ):
             values = fields[name]()[which]
         lost = which[~np.isfinite(values).all(axis=1)]
         if lost.size:
@@ -168,7 +171,7 @@ def write_fem(path: str | os.PathLike[str], mesh: FemMesh, points: ArrayLike) ->
 def _parse(source: str | os.PathLike[str], data: bytes, *, solid: bool) -> MeshParts:
     """Parse a file, with its tetrahedra and hexahedra if ``solid``."""
     parse = find_function(source, "read_elements")
-    with reading(source, "cannot be read: ", _DAMAGE, describe=_describe_damage), np.errstate(invalid="ignore"):
+    with report_damage(source, "cannot be read: ", _DAMAGE, describe=_describe_damage), np.errstate(invalid="ignore"):
         parts: MeshParts = parse(data, solid)
     return parts
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
@@ -50,7 +50,7 @@ def read_gifti(path: str | os.PathLike[str]) -> MeshData:
         If nibabel is not installed.
     """
     image = _read_gifti(path)
-    with reading(path, damage=(TypeError, ValueError)):
+    with report_damage(path, damage=(TypeError, ValueError)):
         return MeshData(*gifti_arrays(image), source=os.fspath(path))
 
 
@@ -75,10 +75,10 @@ def _read_gifti(path: str | os.PathLike[str]) -> Any:
     """Return the ``GiftiImage`` of a file; MeshFileError if it is not valid."""
     nibabel, data = _nibabel(), read_bytes(path)
     if os.fspath(path).lower().endswith(".gz"):
-        with reading(path, "is not a complete gzip file: "):
+        with report_damage(path, "is not a complete gzip file: "):
             data = unpack_gzip(data)
     # The parser raises errors of many types for damaged files.
-    with reading(path, "is not valid GIFTI: ", Exception), warnings.catch_warnings():
+    with report_damage(path, "is not valid GIFTI: ", Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_gifti(data)
         return nibabel.gifti.GiftiImage.from_bytes(data)
@@ -140,7 +140,7 @@ def read_freesurfer(path: str | os.PathLike[str]) -> MeshData:
     if data.startswith(b"#!ascii"):
         raise MeshFileError(path, "is a text file of FreeSurfer", remedy="convert it: mris_convert IN OUT.gii")
     # A damaged file also gives MemoryError, and errors of other types.
-    with reading(path, "is not a binary surface of FreeSurfer: ", Exception), warnings.catch_warnings():
+    with report_damage(path, "is not a binary surface of FreeSurfer: ", Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         V, F = nibabel.freesurfer.read_geometry(os.fspath(path))
         return MeshData(V, F, source=os.fspath(path))
@@ -285,7 +285,7 @@ def read_patch(path: str | os.PathLike[str], surface: str | os.PathLike[str] | N
     V, F = _patch_of(number, places, n, F)
     if not len(F):
         raise MeshFileError(path, "has no triangle whose corners all belong to the patch")
-    with reading(path):
+    with report_damage(path):
         return MeshData(V, F, source=os.fspath(path))
 
 
@@ -346,7 +346,7 @@ def _binary_patch(path: str | os.PathLike[str], data: bytes) -> tuple[IntArray, 
 
 def _text_patch(path: str | os.PathLike[str], data: bytes) -> tuple[IntArray, FloatArray, IntArray]:
     """Return numbers and positions of the vertices of a text patch, and its triangles."""
-    with reading(path, "is not a text patch of FreeSurfer: ", (ValueError, IndexError, OverflowError)):
+    with report_damage(path, "is not a text patch of FreeSurfer: ", (ValueError, IndexError, OverflowError)):
         _, text = data.split(b"\n", 1)
         # The number from zero follows as "vno=…".
         words = re.sub(rb"vno=\S*", b"", text).split()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.lowlevel.textual import integer, number, shown
+from quasiharmonic.io.lowlevel.textual import integer, number, quote_token
 from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
 from quasiharmonic.util.arrays import count_of
 
@@ -184,7 +184,9 @@ def _strip_comment(text: bytes) -> bytes:
 def _numbers(text: bytes, max_count: int) -> list[float]:
     tokens = _strip_comment(text).split(None, max_count + 1)[1:]
     if len(tokens) > max_count:
-        raise _FaultError(f"{shown(text.split(None, 1)[0])} with more than {max_count} numbers", "remove the rest")
+        raise _FaultError(
+            f"{quote_token(text.split(None, 1)[0])} with more than {max_count} numbers", "remove the rest"
+        )
     return [number(token) for token in tokens]
 
 
@@ -192,7 +194,7 @@ def _corner(text: bytes, counts: tuple[int, int, int]) -> list[int]:
     """Return the 0-based references of ``a``, ``a/b``, ``a//c`` or ``a/b/c``; -1 for an absent one."""
     parts = text.split(b"/", 3)
     if len(parts) > 3 or not parts[0]:
-        raise ValueError(f"{shown(text)} is not a corner of a face")
+        raise ValueError(f"{quote_token(text)} is not a corner of a face")
     references = [-1, -1, -1]
     for i, part in enumerate(parts):
         if not part:
@@ -201,7 +203,7 @@ def _corner(text: bytes, counts: tuple[int, int, int]) -> list[int]:
         if index > 0:
             references[i] = index - 1
         elif index == 0:
-            raise _FaultError(f"index 0 in {shown(text)}", "OBJ counts from 1")
+            raise _FaultError(f"index 0 in {quote_token(text)}", "OBJ counts from 1")
         elif index < -counts[i]:
             raise ValueError(f"index {index} reaches back beyond the {counts[i]} that come before it")
         else:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.lowlevel.textual import (
     content_lines,
@@ -17,8 +17,8 @@ from quasiharmonic.io.lowlevel.textual import (
     integer_table,
     number,
     number_table,
+    quote_token,
     read_text,
-    shown,
 )
 from quasiharmonic.io.models.meshdata import MeshData, in_plane, polygon_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -52,13 +52,13 @@ def read_off(path: str | os.PathLike[str]) -> MeshData:
     line, text = next(lines, (1, b""))
     header, *counts = text.split(None, 3) or [b""]
     if not _HEADER.fullmatch(header):
-        raise MeshFileError(path, f"{shown(text)} and not OFF", line, "only the plain text form is supported")
+        raise MeshFileError(path, f"{quote_token(text)} and not OFF", line, "only the plain text form is supported")
     if not counts:
         line, text = next(lines, (line, b""))
         counts = text.split(None, 2)
     if len(counts) < 2:
         raise MeshFileError(path, "no counts of vertices and faces", line)
-    with reading(path, "no counts of vertices and faces: ", line=line):
+    with report_damage(path, "no counts of vertices and faces: ", line=line):
         vertices, faces = integer(counts[0]), integer(counts[1])
     if vertices < 1 or faces < 1:
         what = f"has {vertices} vertices and {faces} faces"

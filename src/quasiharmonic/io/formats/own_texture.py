@@ -15,7 +15,7 @@ from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.materials import library_names
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.models.textures import Texture, read_texture, texture_of
-from quasiharmonic.util.untrusted import beside
+from quasiharmonic.util.untrusted import resolve_beside
 
 _GLTF = ".glb", ".gltf"
 # Keywords of images in material libraries that do not begin with "map_".
@@ -109,7 +109,7 @@ def _find_textures(materials: Any) -> Iterator[int]:
 def is_beside(folder: Path, name: str) -> bool:
     """Whether a name is that of a file in a folder or below it."""
     try:
-        beside(folder, quote(name))
+        resolve_beside(folder, quote(name))
     except ValueError:
         return False
     return True

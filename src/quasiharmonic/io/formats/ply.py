@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import reading
+from quasiharmonic.io.errors import report_damage
 from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables, parse_tables
 from quasiharmonic.io.formats.vertex_data import colours_of, normal_lines, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
@@ -68,7 +68,7 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
     """
     data = read_bytes(path)
     # Converting a signalling NaN is invalid; it is reported later as not finite.
-    with reading(path, remedy="" if data else "it is empty"), np.errstate(invalid="ignore"):
+    with report_damage(path, remedy="" if data else "it is empty"), np.errstate(invalid="ignore"):
         return _mesh(parse_tables(data), os.fspath(path))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.lowlevel.textual import shown
+from quasiharmonic.io.lowlevel.textual import quote_token
 from quasiharmonic.util.arrays import IntArray, repeat_each
 from quasiharmonic.util.untrusted import check_end
 
@@ -119,11 +119,11 @@ def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Propert
             case [b"property", *form, name] if declared and len(form) in (1, 3):
                 kinds = [_KINDS.get(word.decode("ascii", "replace")) for word in form[-2:]]
                 if None in kinds or (len(form) == 3 and (form[0] != b"list" or str(kinds[0])[0] == "f")):
-                    raise ValueError(f"its header has {shown(line)}")
+                    raise ValueError(f"its header has {quote_token(line)}")
                 count = kinds[0] if len(form) == 3 else None
                 declared[-1][2].append(_Property(name.decode("ascii", "replace"), str(kinds[-1]), count))
             case _:
-                raise ValueError(f"its header has {shown(line)}")
+                raise ValueError(f"its header has {quote_token(line)}")
     if order is None:
         raise ValueError("its header has no supported format")
     for element, many, of in declared:

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.formats.vertex_data import weld
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData
@@ -47,7 +47,7 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
     if not len(corners):
         raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
     V, F = weld(corners.reshape(-1, 3))
-    with reading(path):
+    with report_damage(path):
         return MeshData(V, F.reshape(-1, 3), source=os.fspath(path))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
-from quasiharmonic.io.errors import FileInUseError, OutputError, check_path, printable
+from quasiharmonic.io.errors import FileInUseError, OutputError, check_path, printable_path
 
 # Windows refuses to replace or delete a file that another program has open, for example a virus scanner, with one of
 # these errors (access denied, sharing violation, lock violation). Seconds to try again, and between attempts.
@@ -56,7 +56,7 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
     except OutputError:
         raise
     except (OSError, ValueError) as error:
-        raise OutputError(f"cannot write {printable(path)}: {_reason(error)}") from error
+        raise OutputError(f"cannot write {printable_path(path)}: {_reason(error)}") from error
     return target
 
 
@@ -180,7 +180,7 @@ def new_folder(path: str | os.PathLike[str], *, leftovers: frozenset[str] = froz
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         _remove_empty(missing)
-        raise OutputError(f"cannot create the folder {printable(path)}: {_reason(error)}") from error
+        raise OutputError(f"cannot create the folder {printable_path(path)}: {_reason(error)}") from error
     try:
         yield
     except BaseException:

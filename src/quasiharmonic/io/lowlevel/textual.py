@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
 from quasiharmonic.util.arrays import count_of
 
 # First bytes of common files that are not plain text.
@@ -34,7 +34,7 @@ _INTEGER = re.compile(rb"[+-]?[0-9]+")
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """Read the bytes of a file; MeshFileError if it does not exist or cannot be read."""
     check_path("path", path)
-    with reading(path, "is not a file name: "):
+    with report_damage(path, "is not a file name: "):
         try:
             mode = os.stat(path).st_mode
             if stat.S_ISDIR(mode):
@@ -75,7 +75,7 @@ def content_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
             yield line, text
 
 
-def shown(token: bytes) -> str:
+def quote_token(token: bytes) -> str:
     """Quote a piece of a file for a message, shortened and in ASCII."""
     text = ascii(token[:40].decode("utf-8", "replace"))
     return text if len(token) <= 40 else f"{text[:-1]}...'"
@@ -89,7 +89,7 @@ def number(token: bytes) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{shown(token)} is not a finite number")
+        raise ValueError(f"{quote_token(token)} is not a finite number")
     return value
 
 
@@ -107,10 +107,10 @@ def integer(token: bytes) -> int:
     if len(token) <= 18 and token.isdigit():
         return int(token)
     if not _INTEGER.fullmatch(token):
-        raise ValueError(f"{shown(token)} is not an integer")
+        raise ValueError(f"{quote_token(token)} is not an integer")
     digits = token.lstrip(b"+-").lstrip(b"0")
     if len(digits) > 18:
-        raise ValueError(f"{shown(token)} is far too large")
+        raise ValueError(f"{quote_token(token)} is far too large")
     value = int(digits or b"0")
     return -value if token.startswith(b"-") else value
 
@@ -183,7 +183,7 @@ def read_pairs(path: str | os.PathLike[str], what: str) -> Iterator[tuple[int, l
         if len(words) != 2 or not all(word.isdigit() for word in words):
             shown_line = line[:60].decode("utf-8", "replace")
             raise MeshFileError(path, f"is not {what}, two whole numbers from 0 on: {shown_line!r}", at)
-        with reading(path, line=at, remedy="indices count from 0"):
+        with report_damage(path, line=at, remedy="indices count from 0"):
             numbers = list(map(integer, words))
         yield at, numbers
 
@@ -205,7 +205,7 @@ def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, lis
         if at == 1 and not any(is_number(word) for word in words):
             continue
         if len(words) != columns:
-            raise MeshFileError(path, f"not {count_of('number', 'numbers', columns)}: {shown(text)}", at)
+            raise MeshFileError(path, f"not {count_of('number', 'numbers', columns)}: {quote_token(text)}", at)
         try:
             rows.append((at, [number(word) for word in words]))
         except ValueError as error:

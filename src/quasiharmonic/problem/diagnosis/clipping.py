@@ -212,13 +212,13 @@ class Walls:
         walls = walls[blocks][np.argsort(-hidden, kind="stable")]
         points = self._lattice.points
         for k, (i, j) in enumerate(walls.tolist()):
-            parts = _past(area, points[eye], points[i], points[j])
+            parts = _view_past(area, points[eye], points[i], points[j])
             if parts is not None:
                 return parts, walls[k + 1 :]
         return None, walls[:0]
 
 
-def _past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | None:
+def _view_past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | None:
     """Return the parts of an area outside the shadow of a wall, or None if the wall hides no part of it."""
     across = line(p, q)
     side = across[0] * eye[0] + across[1] * eye[1] + across[2]

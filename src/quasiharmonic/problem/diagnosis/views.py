@@ -183,7 +183,7 @@ class Views:
         with np.errstate(invalid="ignore"):  # Rounding may make a ray zero.
             ray /= np.hypot(*ray.T)[:, None]
         between = ray + np.roll(ray, -1, axis=0)
-        nearest = _nearest(first, last, tail, head - tail, between)
+        nearest = _find_nearest(first, last, tail, head - tail, between)
         if sides[0] >= 0:
             # The inside is counterclockwise from the next side to the side before.
             nearest[(np.arange(count) - rank[sides[0]]) % count >= (rank[sides[1]] - rank[sides[0]]) % count] = -1
@@ -237,7 +237,7 @@ class Views:
         return cmp_to_key(compare)
 
 
-def _nearest(first: IntArray, last: IntArray, tail: FloatArray, along: FloatArray, ray: FloatArray) -> IntArray:
+def _find_nearest(first: IntArray, last: IntArray, tail: FloatArray, along: FloatArray, ray: FloatArray) -> IntArray:
     """Return the nearest wall in each of a circle of directions ``ray`` (r, 2), -1 if there is none.
 
     A wall covers the directions from ``first`` up to, not including, ``last`` (m,). ``tail`` (m, 2) is its start

@@ -172,7 +172,7 @@ def construct_and_thin(
         uv = np.ldexp(uv, exponent)
         uv[problem.fixed] = problem.target
         certificate = certify(refined.F, uv, loops=problem.domain.loops)
-        return Construction(refined, uv, certificate, _nearest(problem, refined.F, uv, certificate))
+        return Construction(refined, uv, certificate, _find_nearest(problem, refined.F, uv, certificate))
 
     if not np.array_equal(np.ldexp(unit.target, exponent), problem.target) and not is_simple(unit):
         uncut = as_refined(problem.V, problem.F, problem.F, [])
@@ -201,7 +201,7 @@ def _embed_pieces(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArr
     return refined, fine.positions(embed_pieces(fine, fine.frame.inward(uv), fixed))
 
 
-def _nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certificate) -> IntArray:
+def _find_nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certificate) -> IntArray:
     """Return the fixed vertices nearest to triangles that are not positive, ascending."""
     from scipy.spatial import cKDTree
 

@@ -171,7 +171,7 @@ def _choose_position(rng: Generator, problem: Problem, patch: Patch, w: ComplexA
         if len(region) < 3:
             return None
     depth = 10 ** rng.uniform(*_DEPTHS)
-    corner = rng.choice(np.append(region, nearest(region, w[vertex])))
+    corner = rng.choice(np.append(region, find_nearest(region, w[vertex])))
     return vertex, complex((1 - depth) * corner + depth * region.mean())
 
 
@@ -187,7 +187,7 @@ def left_of(region: ComplexArray, tail: complex, head: complex) -> ComplexArray:
     return np.array(corners, dtype=np.complex128)
 
 
-def nearest(region: ComplexArray, point: complex) -> complex:
+def find_nearest(region: ComplexArray, point: complex) -> complex:
     """Return the point of a convex polygon's outline that is nearest to a given point."""
     ahead = np.roll(region, -1)
     share, distance = nearest_on_segments(to_points(np.array([point])), to_points(region), to_points(ahead))

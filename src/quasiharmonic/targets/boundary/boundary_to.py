@@ -23,7 +23,7 @@ from quasiharmonic.targets.boundary.chords import chords_of
 from quasiharmonic.targets.boundary.corner_pins import Corners, Pins, pins_by_angle
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, project_loop
 from quasiharmonic.targets.boundary.placement import CornerPlacement
-from quasiharmonic.targets.boundary.turning import boundary_turning, in_space, outermost
+from quasiharmonic.targets.boundary.turning import boundary_turning, find_outermost, in_space
 from quasiharmonic.targets.outlines.contours import NestedContour, arrange, filled, from_corner, in_unit
 from quasiharmonic.targets.specification import outline as specified
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, describe, to_complex
@@ -214,7 +214,7 @@ def boundary_to(
     if 0 not in to.values():
         # Of the loops without a given contour, the one that encloses the largest area goes to the outer contour.
         free = [i for i in range(len(loops)) if i not in to]
-        to[free[outermost([loops[i] for i in free], space)]] = 0
+        to[free[find_outermost([loops[i] for i in free], space)]] = 0
     outer = next(i for i, contour in to.items() if contour == 0)
     flat = project_loop(space[loops[outer]], contours[0])
 

@@ -55,8 +55,8 @@ def clear_chords(
     found: list[tuple[int, float]] = []
     for stretch in stretches(s, pins):
         here, wanted = stretch.within(t, sharp[bends[sharp] > 0])
-        spare = _between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
-        straight = _between(wanted, stretch.within(t, left)[1]) == 0
+        spare = _find_between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
+        straight = _find_between(wanted, stretch.within(t, left)[1]) == 0
         conditions = ChordConditions(reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
         chosen = choose(stretch.along, wanted, conditions)
         if chosen is None:
@@ -89,7 +89,7 @@ def reach(stretch: BoundaryStretch, chords: IntArray, n: int) -> IntArray:
     return np.minimum.accumulate(reach[::-1])[::-1]
 
 
-def _between(wanted: FloatArray, others: FloatArray) -> IntArray:
+def _find_between(wanted: FloatArray, others: FloatArray) -> IntArray:
     """Numbers of ``others`` before the first, strictly between successive, and after the last of ``wanted``."""
     ends = np.concatenate([[0.0], wanted, [1.0]])
     return np.searchsorted(others, ends[1:], side="left") - np.searchsorted(others, ends[:-1], side="right")

@@ -14,7 +14,7 @@ import numpy as np
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.curves.arcs import Arc
 from quasiharmonic.geometry.curves.curve import Curve
-from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.lowlevel.textual import read_pairs
 from quasiharmonic.targets.outlines.contours import Pieces
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths
@@ -65,7 +65,7 @@ def outline_curves(specification: str | PathLike[str], *, font: Font | None = No
         a, b = map(float, argument.lower().split("x"))
         return [Curve([Arc((0.0, 0.0), (a, 0.0), (0.0, b), 0.0, 2 * np.pi)])]
     if Path(text).suffix.lower() == ".svg":
-        with reading(text):
+        with report_damage(text):
             return _contours(svg_paths(text, arcs=True))
     return [Curve.polygon(contour) for contour in contours]
 

@@ -179,7 +179,7 @@ def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
     loops = boundary_turning(V, F)
     if not loops:
         raise ValueError("the surface is closed: it has no boundary with corners")
-    loop = loops[outermost([one.vertices for one in loops], in_space(vertex_array(V)))]
+    loop = loops[find_outermost([one.vertices for one in loops], in_space(vertex_array(V)))]
     return loop.vertices[loop.corners(count)[0]]
 
 
@@ -196,7 +196,7 @@ def mean_turns(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> F
     return np.asarray(np.roll(total - mean, 1) + turning[corners] + mean)
 
 
-def outermost(loops: Sequence[IntArray], space: FloatArray) -> int:
+def find_outermost(loops: Sequence[IntArray], space: FloatArray) -> int:
     """Index of the loop that encloses the largest area, given positions (n, 3) of about unit size."""
     return int(np.argmax([np.linalg.norm(_vector_area(space[loop])) for loop in loops]))
 

@@ -111,10 +111,10 @@ class EdgeGraph:
         for _ in range(rings):
             count = start[vertices + 1] - start[vertices]
             first = repeat_each(start[vertices] - np.cumsum(count) + count, count)
-            triangles = distinct(star[first + np.arange(first.size)])
-            vertices = distinct(self.F[triangles])
+            triangles = find_distinct(star[first + np.arange(first.size)])
+            vertices = find_distinct(self.F[triangles])
         side = self.side[:, triangles]
-        own = distinct(side)
+        own = find_distinct(side)
         number = np.searchsorted(own, side)
         ends = np.searchsorted(vertices, self.ends[own])
         F = np.searchsorted(vertices, self.F[triangles])
@@ -179,7 +179,7 @@ def triangles_near(F: IntArray, marked: BoolArray, rings: int) -> BoolArray:
     return has_marked_corner(F, marked)
 
 
-def distinct(values: IntArray) -> IntArray:
+def find_distinct(values: IntArray) -> IntArray:
     """Return the distinct values in ascending order; for few values faster than `numpy.unique`."""
     values = np.sort(values, axis=None)
     return values[np.flatnonzero(np.diff(values, prepend=-1))]

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from quasiharmonic.targets.cuts.graph import EdgeGraph, distinct
+from quasiharmonic.targets.cuts.graph import EdgeGraph, find_distinct
 from quasiharmonic.targets.cuts.ring import find_path_across
 from quasiharmonic.util.arrays import BoolArray, IntArray
 from quasiharmonic.util.progress import heartbeat
@@ -58,7 +58,7 @@ def shorten_cuts(
             heartbeat()
             if way.tobytes() in optimal or not _is_stretch(graph, cut, degree, way):
                 continue
-            instead = _cheapest(graph, cut, way) if rings is None else _cheapest_near(graph, cut, way, rings)
+            instead = _find_cheapest_path(graph, cut, way) if rings is None else _cheapest_near(graph, cut, way, rings)
             if instead is None:
                 if rings is not None:
                     optimal.add(way.tobytes())
@@ -81,7 +81,7 @@ def _exchange(graph: EdgeGraph, cut: BoolArray, way: IntArray, instead: IntArray
     cut[way] = False
     others = graph.mark_vertices(cut)
     cut[instead] = True
-    for node in distinct(graph.ends[way[[0, -1]]]).tolist():
+    for node in find_distinct(graph.ends[way[[0, -1]]]).tolist():
         while others[node] and not graph.rim_vertices[node]:
             chosen = np.flatnonzero(cut)
             at_node = chosen[(graph.ends[chosen] == node).any(axis=1)]
@@ -129,12 +129,12 @@ def _is_stretch(graph: EdgeGraph, cut: BoolArray, degree: IntArray, way: IntArra
 
 def _cheapest_near(graph: EdgeGraph, cut: BoolArray, way: IntArray, rings: int) -> IntArray | None:
     """Return edges close to a stretch that replace it at lower cost, or None."""
-    part, own = graph.part_near(distinct(graph.ends[way]), rings)
-    instead = _cheapest(part, cut[own], np.searchsorted(own, way))
+    part, own = graph.part_near(find_distinct(graph.ends[way]), rings)
+    instead = _find_cheapest_path(part, cut[own], np.searchsorted(own, way))
     return None if instead is None else own[instead]
 
 
-def _cheapest(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntArray | None:
+def _find_cheapest_path(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntArray | None:
     """Return edges that replace a stretch at lower cost, or None."""
     others = cut.copy()
     others[way] = False
@@ -143,7 +143,7 @@ def _cheapest(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntArray | Non
     loose = np.flatnonzero((degree == 1) & ~held)
     limit = (1 - _SAVES) * float(graph.cost[way].sum())
     if loose.size == 0:
-        return _across(graph, way, others, held, limit)
+        return _find_path_across(graph, way, others, held, limit)
     goals = np.flatnonzero(held) if loose.size == 1 else loose[1:]
     distance, before = graph.distances(goals, graph.cost, limit=limit)
     if np.isinf(distance[loose[0]]):
@@ -153,7 +153,9 @@ def _cheapest(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntArray | Non
     return None if loose.size == 2 and instead.size == 1 else instead
 
 
-def _across(graph: EdgeGraph, way: IntArray, others: BoolArray, held: BoolArray, limit: float) -> IntArray | None:
+def _find_path_across(
+    graph: EdgeGraph, way: IntArray, others: BoolArray, held: BoolArray, limit: float
+) -> IntArray | None:
     """Cheapest path across the ring that remains without a stretch; None if all cost more than ``limit``."""
     # The two ends of the stretch lie on different borders of the ring.
     first, last = graph.ends[way[0]], graph.ends[way[-1]]

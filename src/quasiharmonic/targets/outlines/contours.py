@@ -101,7 +101,7 @@ def flatten(pieces: Pieces, tolerance: float) -> FloatArray:
             f"the outline has more than {MAX_POINTS:,} points at a tolerance of {tolerance:.3g}: raise the tolerance"
         )
     points = [pieces[0][:1], *(_bezier(control, n) for control, n in zip(pieces, steps, strict=True))]
-    return distinct(np.concatenate(points), tolerance)
+    return drop_close_points(np.concatenate(points), tolerance)
 
 
 def _steps(control: FloatArray, tolerance: float) -> float:
@@ -129,7 +129,7 @@ def _bezier(control: FloatArray, steps: float) -> FloatArray:
     return np.asarray(points[0])
 
 
-def distinct(contour: FloatArray, min_distance: float) -> FloatArray:
+def drop_close_points(contour: FloatArray, min_distance: float) -> FloatArray:
     """Drop points within ``min_distance`` of the last kept point, cyclically; the first point is always kept."""
     kept = [0]
     # Python floats, because reading array elements one by one is several times slower.
@@ -207,11 +207,11 @@ def filled(contours: Sequence[ArrayLike]) -> list[FloatArray]:
 def arrange(contours: Sequence[ArrayLike]) -> list[NestedContour]:
     """Return contours by decreasing area with their nesting; raises as `nested`."""
     check_sequence("contours", contours, "contours (k, 2)")
-    found = [distinct(check_contour(c, f"contour {i}"), 0.0) for i, c in enumerate(contours)]
+    found = [drop_close_points(check_contour(c, f"contour {i}"), 0.0) for i, c in enumerate(contours)]
     if not found:
         return []
     for i, contour in enumerate(found):
-        if collinear(contour):
+        if is_collinear(contour):
             raise ValueError(f"contour {i} of the outline encloses no area")
     points = np.concatenate(found)
     curves = LoopEdges.of(np.split(np.arange(len(points)), np.cumsum([len(c) for c in found])[:-1]), points)
@@ -223,7 +223,7 @@ def arrange(contours: Sequence[ArrayLike]) -> list[NestedContour]:
     return [NestedContour(found[i], int(depth[i]), bool(sense[i] < 0)) for i in order]
 
 
-def collinear(contour: FloatArray) -> bool:
+def is_collinear(contour: FloatArray) -> bool:
     """Whether all points of a contour lie on one line."""
     one, other = contour[np.lexsort((contour[:, 1], contour[:, 0]))[[0, -1]]]
     return not orientation(np.tile(one, (len(contour), 1)), np.tile(other, (len(contour), 1)), contour).any()

@@ -7,9 +7,9 @@ import os
 import numpy as np
 
 from quasiharmonic.geometry.exact.loops import join_items
-from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.lowlevel.textual import is_number, number, read_text
-from quasiharmonic.targets.outlines.contours import MAX_POINTS, arrange, collinear, distinct
+from quasiharmonic.targets.outlines.contours import MAX_POINTS, arrange, drop_close_points, is_collinear
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_numbers, check_positive
 
 
@@ -219,8 +219,8 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     for loop, start in zip(loops, starts, strict=True):
         if not loop:
             continue
-        contour = distinct(np.array(loop), 0.0)
-        if len(contour) < 3 or collinear(contour):
+        contour = drop_close_points(np.array(loop), 0.0)
+        if len(contour) < 3 or is_collinear(contour):
             what = f"a contour of {len(contour)} different points that encloses no area begins"
             raise MeshFileError(path, what, start, "use blank lines only between contours")
         contours.append(contour)
@@ -228,5 +228,5 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     if not contours:
         raise MeshFileError(path, "has no points")
     plural = "contour begins at line" if len(begins) == 1 else "contours begin at lines"
-    with reading(path, describe=lambda error: f"{error} (the {plural} {join_items(begins)})"):
+    with report_damage(path, describe=lambda error: f"{error} (the {plural} {join_items(begins)})"):
         return [one.points for one in arrange(contours)]

@@ -16,7 +16,7 @@ from xml.parsers import expat
 import numpy as np
 
 from quasiharmonic.geometry.curves.arcs import Arc
-from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
 from quasiharmonic.io.lowlevel.textual import read_text
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces, arrange, flatten
 from quasiharmonic.targets.outlines.svgpath import commands, parse_path
@@ -89,14 +89,14 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
         raise MeshFileError(path, "has coordinates that are too large")
     size = float(np.ptp(every, axis=0).max())
     contours = []
-    with reading(path):
+    with report_damage(path):
         for pieces in subpaths if size > 1 / _LARGEST else []:
             contour = flatten(pieces, tolerance * size)
             if len(contour) > 2 and _breadth(contour) > (tolerance * size) ** 2:
                 contours.append(contour)
     if not contours:
         raise MeshFileError(path, "has no path or shape that encloses an area")
-    with reading(path, describe=lambda error: f"{error} (in units of the drawing, the y-axis upwards)"):
+    with report_damage(path, describe=lambda error: f"{error} (in units of the drawing, the y-axis upwards)"):
         return [one.points for one in arrange(contours)]
 
 
@@ -145,7 +145,7 @@ class _Drawing:
         drawn: list[tuple[list[Any], FloatArray]] = []
         count = 0
         for tag, line, d, transform in self.shapes:
-            with reading(self.path, f"<{tag}>: ", line=line):
+            with report_damage(self.path, f"<{tag}>: ", line=line):
                 for pieces in parse_path(d, arcs=self.arcs):
                     count += len(pieces)
                     if count > MAX_POINTS:
@@ -192,7 +192,7 @@ class _Drawing:
         self._check_style(tag, attributes.get("style", ""))
         if "transform" in attributes and "transform-origin" in attributes:
             raise self._error(f"<{tag}>: transform-origin is not supported", "apply the transform in a drawing program")
-        with reading(self.path, f"<{tag}>: ", line=self.parser.CurrentLineNumber):
+        with report_damage(self.path, f"<{tag}>: ", line=self.parser.CurrentLineNumber):
             transform = self.transforms[-1]
             if "transform" in attributes:
                 transform = transform @ _transform(attributes["transform"])

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from quasiharmonic.geometry.curves.curve import Curve
-from quasiharmonic.targets.outlines.contours import distinct, filled, nested, signed_area
+from quasiharmonic.targets.outlines.contours import drop_close_points, filled, nested, signed_area
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter
 from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive
 from quasiharmonic.util.optional import explain_missing, with_extra
@@ -61,7 +61,7 @@ def word(text: str, font: Font | None = None, *, overlap: float = OVERLAP, toler
     ModuleNotFoundError
         When Shapely, which unites the letters, is not installed.
     """
-    contours = [distinct(contour, tolerance) for contour in _unite(_set(text, font, overlap, tolerance)[0])]
+    contours = [drop_close_points(contour, tolerance) for contour in _unite(_set(text, font, overlap, tolerance)[0])]
     loose = len(filled(contours)) - 1
     if loose:
         raise ValueError(
@@ -84,7 +84,7 @@ def word_curves(text: str, font: Font | None, tolerance: float) -> list[Curve]:
         for path in glyph_paths(character, font)
         if any(np.ptp(piece, axis=0).any() for piece in path)
     ]
-    return [_trace(distinct(contour, _SAME_POINT), drawn, tolerance) for contour in _unite(letters)]
+    return [_trace(drop_close_points(contour, _SAME_POINT), drawn, tolerance) for contour in _unite(letters)]
 
 
 def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tuple[list[list[FloatArray]], list[float]]:
@@ -115,7 +115,7 @@ def _trace(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
     runs = np.split(np.arange(len(contour)), begins[1:] - begins[0])
     curves = [drawn[own[run[0]]] for run in runs]
     # Start of each run, on the previous curve and on its own.
-    meetings = [_meeting(curves[k - 1], curves[k], contour[run[0]]) for k, run in enumerate(runs)]
+    meetings = [_find_meeting(curves[k - 1], curves[k], contour[run[0]]) for k, run in enumerate(runs)]
     pieces = []
     for k, (one, run) in enumerate(zip(curves, runs, strict=True)):
         points = contour[np.append(run, run[-1] + 1) % len(contour)]
@@ -133,7 +133,7 @@ def _trace(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
     return found
 
 
-def _meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
+def _find_meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, float]:
     """Intersection of two curves near a point, as arc lengths along each, by Newton's method."""
     s, t = (curve.nearest(near[None])[0] for curve in (one, other))
     ahead = np.ones(1, dtype=bool)
@@ -156,11 +156,11 @@ def _gap(before: list[FloatArray], after: list[FloatArray]) -> float:
         [extreme([extreme(c[:, 1]) for c in shape]) for shape in (before, after)] for extreme in (np.min, np.max)
     )
     levels = np.linspace(max(low), min(high), 513)[1:-1:2]
-    right_side = -_leftmost([c * (-1, 1) for c in before], levels)
-    return float((_leftmost(after, levels) - right_side).min())
+    right_side = -_find_leftmost([c * (-1, 1) for c in before], levels)
+    return float((_find_leftmost(after, levels) - right_side).min())
 
 
-def _leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
+def _find_leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
     """Smallest x of a shape on each horizontal line, ``inf`` where the line misses the shape."""
     a = np.concatenate(shape)
     b = np.concatenate([np.roll(contour, -1, axis=0) for contour in shape])

@@ -39,7 +39,7 @@ def solve_on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: An
         from distributed import Client
         from distributed.comm import resolve_address
     if isinstance(scheduler, Client):
-        yield from _through(scheduler, todo, orders)
+        yield from _solve_on_cluster(scheduler, todo, orders)
         return
     try:
         if isinstance(scheduler, str):
@@ -52,10 +52,10 @@ def solve_on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: An
     except (OSError, TimeoutError) as error:
         raise ConnectionError(f"there is no Dask scheduler at {scheduler}: {error}") from error
     with client:
-        yield from _through(client, todo, orders)
+        yield from _solve_on_cluster(client, todo, orders)
 
 
-def _through(client: Any, todo: Iterator[ProblemFiles], orders: Orders) -> Generator[Finished | None]:
+def _solve_on_cluster(client: Any, todo: Iterator[ProblemFiles], orders: Orders) -> Generator[Finished | None]:
     from distributed.scheduler import KilledWorker
 
     pending: dict[str, tuple[ProblemFiles, Any]] = {}

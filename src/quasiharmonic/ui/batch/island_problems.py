@@ -57,7 +57,7 @@ def make_problems(
             fitted = (
                 fix_in_place(island, fixed, reference=reference)
                 if to is None
-                else _onto(island, k, corner_spec, settings)
+                else _fit_island(island, k, corner_spec, settings)
             )
             slide: bool | BoundaryCurves = settings["slide"]
             if slide:
@@ -67,7 +67,7 @@ def make_problems(
     return found
 
 
-def _onto(island: Island, k: int, corner_spec: CornerSpec | None, settings: dict[str, Any]) -> FittedProblem:
+def _fit_island(island: Island, k: int, corner_spec: CornerSpec | None, settings: dict[str, Any]) -> FittedProblem:
     """Map an island's boundary to the outline; island ``k`` gets a copy of the outline shifted to the right."""
     to = settings["to"]
     # A file that has changed is read again.

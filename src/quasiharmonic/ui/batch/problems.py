@@ -81,7 +81,7 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
     check_bool("plain", plain)
     path = Path(os.path.abspath(source))
     if path.is_dir():
-        yield from _below(path, "", plain, frozenset())
+        yield from _find_problems_below(path, "", plain, frozenset())
     elif not path.exists():
         raise ValueError(f"there is no folder, list or mesh {source}")
     elif path.suffix.lower() in suffixes("read"):
@@ -117,7 +117,9 @@ def group_small(problems: Iterable[ProblemFiles]) -> Iterator[list[ProblemFiles]
         yield group
 
 
-def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int]]) -> Iterator[ProblemFiles]:
+def _find_problems_below(
+    folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int]]
+) -> Iterator[ProblemFiles]:
     """Yield the problems in a folder and below; ``above`` are the enclosing folders, to detect cyclic links."""
     try:
         status = folder.stat()
@@ -138,7 +140,7 @@ def _below(folder: Path, name: str, plain: bool, above: frozenset[tuple[int, int
     for entry, is_folder in kinds:
         inner = f"{name}/{entry}" if name else entry
         if is_folder:
-            yield from _below(folder / entry, inner, plain, above | {here})
+            yield from _find_problems_below(folder / entry, inner, plain, above | {here})
         elif plain and os.path.splitext(entry)[1].lower() in suffixes("read"):
             yield ProblemFiles(inner, folder / entry, None)
 
@@ -175,7 +177,7 @@ def _read_list(path: Path, plain: bool) -> Iterator[ProblemFiles]:
             base = path.parent if place.is_relative_to(path.parent) else Path(place.anchor)
             name = place.relative_to(base).as_posix()
             if place.is_dir():
-                found = _below(place, "" if name == "." else name, plain, frozenset())
+                found = _find_problems_below(place, "" if name == "." else name, plain, frozenset())
             else:
                 found = iter([ProblemFiles(name, place, None)])
             none = True

@@ -14,7 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from quasiharmonic.io.errors import MeshFileError, check_path, reading
+from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
 from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole, writing
 from quasiharmonic.util.optional import explain_missing, with_extra
 from quasiharmonic.util.untrusted import parse_json
@@ -287,7 +287,7 @@ def write_parquet(file: BinaryIO, schema: Any, rows: Iterable[Record], together:
 
 def _csv_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
     damage = OSError, UnicodeDecodeError, csv.Error
-    with reading(path, _NO_TABLE, damage), open(path, encoding="utf-8-sig", newline="") as file:
+    with report_damage(path, _NO_TABLE, damage), open(path, encoding="utf-8-sig", newline="") as file:
         for row in csv.DictReader(file):
             row.pop(None, None)  # values after the last column
             yield row
@@ -297,7 +297,7 @@ def _parquet_rows(path: str | os.PathLike[str]) -> Iterator[Record]:
     parquet = load_pyarrow()
     import pyarrow
 
-    with reading(path, _NO_TABLE, (OSError, pyarrow.ArrowException)), parquet.ParquetFile(path) as file:
+    with report_damage(path, _NO_TABLE, (OSError, pyarrow.ArrowException)), parquet.ParquetFile(path) as file:
         for batch in file.iter_batches(_ROWS):
             yield from batch.to_pylist()
 

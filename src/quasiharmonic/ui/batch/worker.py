@@ -42,7 +42,7 @@ from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.options import PolishOptions
 from quasiharmonic.util.standard_input import detach_input
-from quasiharmonic.util.untrusted import bounded
+from quasiharmonic.util.untrusted import use_bound
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"
@@ -140,7 +140,7 @@ def solve_files(job: dict[str, Any], tell: Tell) -> Record:
 def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -> None:
     """Read, solve, write, certify and measure a problem; each result is recorded as soon as it is known."""
     settings = job["settings"]
-    with metadata.time_phase(record, "read"), bounded(job["record"].get("memory_limit")):
+    with metadata.time_phase(record, "read"), use_bound(job["record"].get("memory_limit")):
         mesh = io.read_mesh(job["mesh"])
     if settings["unwrap"] is not None:
         # SciPy's subpackages that this needs would double the time in which workers for maps start.

@@ -41,7 +41,7 @@ def check(options: argparse.Namespace) -> int:
         return _check_volume(options, volume)
     mesh = read_fem(options.input)
     triangles, _, inverted = _split(mesh)
-    with report.about(options.input):
+    with report.name_source(options.input):
         found = inspect_mesh(mesh.points, triangles)
     elements = count_of("element", "elements", len(mesh.F))
     verdict = f"inverted: {name_elements(mesh.F, inverted)}" if inverted.size else f"None of {elements} is inverted."

@@ -89,7 +89,7 @@ def _check_companions(options: argparse.Namespace, companions: tuple[Path, ...])
 @contextmanager
 def working(source: Path, words: Callable[[Any], str] = streams.describe_step) -> Iterator[Any]:
     """Show progress during the block, and name the source in its errors; yield a callback, or None."""
-    with report.about(source), streams.progress_line(words) as show:
+    with report.name_source(source), streams.progress_line(words) as show:
         yield show
 
 

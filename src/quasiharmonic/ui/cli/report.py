@@ -166,7 +166,7 @@ def _check_distinct(outputs: Mapping[str, Path | None], inputs: Sequence[Path | 
             continue
         _check_replaces_nothing(what, path, inputs)
         for other, name in taken.items():
-            if _same(path, other):
+            if _is_same_file(path, other):
                 raise ValueError(f"{what} {path} is also the file of {name}")
         taken[path] = what
 
@@ -192,17 +192,17 @@ def _check_replaces_nothing(option: str, path: Path, inputs: Sequence[Path | Non
     from quasiharmonic import io
 
     io.check_writable(path)
-    if any(_same(path, source) for source in inputs if source is not None):
+    if any(_is_same_file(path, source) for source in inputs if source is not None):
         raise ValueError(f"{option} {path} would replace an input file")
 
 
-def _same(path: Path, other: Path) -> bool:
+def _is_same_file(path: Path, other: Path) -> bool:
     """Whether two paths are the same file, also through symbolic or hard links."""
     return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
 
 
 @contextmanager
-def about(source: Path | str) -> Iterator[None]:
+def name_source(source: Path | str) -> Iterator[None]:
     """Prefix error messages about a mesh with its file, and state that indices count from 0 where it matters.
 
     A `MeshFileError` already names its file and is not changed.
@@ -227,12 +227,12 @@ def about(source: Path | str) -> Iterator[None]:
 
 def describe_error(error: Exception) -> str:
     """Return the message of an error; system errors without their number."""
-    from quasiharmonic.io.errors import printable
+    from quasiharmonic.io.errors import printable_path
 
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
     named = isinstance(error.filename, str | bytes)
-    return f"{printable(error.filename)}: {error.strerror}" if named else error.strerror
+    return f"{printable_path(error.filename)}: {error.strerror}" if named else error.strerror
 
 
 def tell_written(path: Path) -> int:

@@ -59,7 +59,7 @@ def surface(
     from quasiharmonic.ui.cli import report
     from quasiharmonic.util.arrays import count_of
 
-    with report.about(mesh.source):
+    with report.name_source(mesh.source):
         if options.seams == "file":
             if mesh.FT is not None and getattr(options, "to", "") is not None:
                 # A partial map is sufficient only if the map defines the target of the boundary.

@@ -92,7 +92,7 @@ def make_problem(
     else:
         posed = _onto_outline(options, island, beside)
     if options.to is not None and not options.refine:
-        with report.about(options.input):
+        with report.name_source(options.input):
             _check_room(posed.fitted.problem, options.to)
     if options.slide:
         _slide(options, posed)
@@ -111,7 +111,7 @@ def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> I
         text = str(error)
         raise ValueError(text if options.to in text else f"--to {options.to}: {text}") from error
     corners = None if options.corners is None else read_corners(options.corners).within(island.vertices)
-    with report.about(f"{options.input} --to {options.to}"):
+    with report.name_source(f"{options.input} --to {options.to}"):
         fitted = fit_boundary(
             island.V,
             island.F,

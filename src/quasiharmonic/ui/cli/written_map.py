@@ -151,14 +151,14 @@ def add_old_textures(facts: dict[str, Any], lines: list[str], before: MeshData, 
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.io.errors import printable
+    from quasiharmonic.io.errors import printable_path
 
     if after.texture is not None or after.lower_maps or not (named := io.texture_names(before)):
         return
     if np.array_equal(before.corner_uv, after.corner_uv, equal_nan=True):
         return
     facts["old_textures"] = named
-    names = ", ".join(map(printable, named))
+    names = ", ".join(map(printable_path, named))
     lines.append(f"the new coordinates do not fit the textures of the file: {names}")
 
 

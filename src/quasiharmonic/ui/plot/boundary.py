@@ -79,7 +79,7 @@ def save_boundary_figure(
     digits = np.array([len(str(vertex)) for vertex in border.tolist()])
     half = _FONT_SIZE / 2 * np.stack([_DIGIT_WIDTH * (digits + 1), np.full(len(digits), _NUMBER_HEIGHT)], axis=1)
     centres = scale * seen.points[border] + (half + _NUMBER_DISTANCE * _FONT_SIZE) * _outward(seen.points, F, border)
-    for k in _readable(centres, half):
+    for k in _find_readable(centres, half):
         color = RED if k < len(marked) else INK
         x, y = centres[k] / scale
         ax.text(x, y, str(border[k]), size=_FONT_SIZE, color=color, ha="center", va="center", zorder=7)
@@ -98,7 +98,7 @@ def _outward(points: FloatArray, F: IntArray, border: IntArray) -> FloatArray:
     return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1), np.finfo(float).tiny)[:, None])
 
 
-def _readable(centres: FloatArray, half: FloatArray) -> list[int]:
+def _find_readable(centres: FloatArray, half: FloatArray) -> list[int]:
     """Return the indices of a greedy choice of boxes that do not overlap.
 
     The boxes have ``centres`` (k, 2) and half sizes ``half`` (k, 2). Earlier boxes take precedence.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.ui.plot.shading import View, drawable, edge_style, min_heights
+from quasiharmonic.ui.plot.shading import View, edge_style, min_heights, scale_for_drawing
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, triangle_rows, vertex_array
 from quasiharmonic.util.optional import explain_missing
 
@@ -140,8 +140,8 @@ def paint_map(
     The view contains the whole map, or the points of ``window`` if given.
     """
     window = uv if window is None else window
-    uv = drawable(uv, window)
-    scale = fit(ax, drawable(window))
+    uv = scale_for_drawing(uv, window)
+    scale = fit(ax, scale_for_drawing(window))
     color = color.copy()
     color[inverted] = RED
     height = scale * min_heights(uv[F])
@@ -191,7 +191,7 @@ def png_bytes(figure: Figure, **options: Any) -> bytes:
 
 def not_positive(F: IntArray, uv: FloatArray) -> IntArray:
     """Return the indices of triangles whose signed area, in floating point, is not positive."""
-    uv = drawable(uv)
+    uv = scale_for_drawing(uv)
     a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
     return np.flatnonzero(~(a[:, 0] * b[:, 1] > a[:, 1] * b[:, 0]))
 

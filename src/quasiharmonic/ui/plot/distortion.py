@@ -160,7 +160,7 @@ def _scale(measure: str, values: FloatArray, share: FloatArray) -> _ColourScale:
     usable = np.isfinite(values) & ((values > 0) | (kind in ("asinh", "linear")))
     if not usable.any():
         raise ValueError(f"{measure} has no finite value on any triangle that is not inverted")
-    low, high = _between(values[usable], share[usable], 0.01, 0.99)
+    low, high = _share_between(values[usable], share[usable], 0.01, 0.99)
     if kind == "linear":
         return _ColourScale(label, Normalize(0.0, max(min(high, 1.0), 1e-3)), "viridis")
     if kind == "asinh":
@@ -174,7 +174,7 @@ def _scale(measure: str, values: FloatArray, share: FloatArray) -> _ColourScale:
     return _ColourScale(label, LogNorm(perfect, max(high, 1.01 * perfect)), "viridis")
 
 
-def _between(values: FloatArray, share: FloatArray, low: float, high: float) -> tuple[float, float]:
+def _share_between(values: FloatArray, share: FloatArray, low: float, high: float) -> tuple[float, float]:
     """Return two quantiles of the values, weighted by area."""
     order = np.argsort(values)
     below = np.cumsum(share[order])

@@ -21,7 +21,7 @@ from quasiharmonic.ui.plot.canvas import (
     paint_surface,
     panels,
 )
-from quasiharmonic.ui.plot.shading import drawable, view
+from quasiharmonic.ui.plot.shading import scale_for_drawing, view
 from quasiharmonic.util.arrays import check_range, fixed_vertices, index_array, target_positions
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def plot_problem(
     rest, F = as_mesh(V, F)
     held = fixed_vertices(fixed, len(rest))
     places = np.full((len(rest), 2), np.nan)
-    places[held] = drawable(target_positions(target, len(held)))
+    places[held] = scale_for_drawing(target_positions(target, len(held)))
     border, marked = boundary_edges(F, len(rest)), index_array("vertices", vertices)
     pairs = index_array("edges", edges).reshape(-1, 2)
     check_range("vertices", marked, len(rest))

@@ -34,7 +34,7 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
     """Project a surface: a planar one from above, an open one from the direction that shows most of it."""
     if not len(F):
         raise ValueError("the mesh has no triangles to draw")
-    V = pad_to_space(drawable(V))
+    V = pad_to_space(scale_for_drawing(V))
     normals = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
     sizes = np.linalg.norm(normals, axis=1)
     frame = _frame(normals.sum(axis=0), sizes.sum())
@@ -59,7 +59,7 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
     )
 
 
-def drawable(points: FloatArray, beside: FloatArray | None = None) -> FloatArray:
+def scale_for_drawing(points: FloatArray, beside: FloatArray | None = None) -> FloatArray:
     """Return points scaled by a power of two, so that squares of lengths neither overflow nor underflow.
 
     Points of moderate size are returned unchanged. If ``beside`` is given, its size determines the factor.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
-from quasiharmonic.io.errors import check_path, reading
+from quasiharmonic.io.errors import check_path, report_damage
 from quasiharmonic.io.models.textures import Texture, read_texture
 from quasiharmonic.ui.plot.canvas import (
     RED,
@@ -25,7 +25,7 @@ from quasiharmonic.ui.plot.canvas import (
     save_picture,
     verdict,
 )
-from quasiharmonic.ui.plot.shading import drawable, lit, view
+from quasiharmonic.ui.plot.shading import lit, scale_for_drawing, view
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, enumerate_each, map_array
 from quasiharmonic.util.optional import explain_missing
 
@@ -78,7 +78,7 @@ def plot_texture(
         If there are no triangles, a vertex is not finite, ``squares`` is less than 1, or ``texture`` is not an image.
     """
     rest, F = as_mesh(V, F)
-    uv = drawable(map_array("uv", uv, len(rest)))
+    uv = scale_for_drawing(map_array("uv", uv, len(rest)))
     if not F.size:
         raise ValueError("the mesh has no triangles")
     check_integer("squares", squares, minimum=1)
@@ -201,7 +201,7 @@ def _make_image_color(texture: str | PathLike[str] | Texture) -> Callable[[Float
         check_path("texture", texture)
     path, image_file = ("", texture) if isinstance(texture, Texture) else (texture, read_texture(texture))
     damage = OSError, ValueError, SyntaxError, Image.DecompressionBombError
-    with reading(path, "is a damaged image: ", damage), Image.open(BytesIO(image_file.data)) as image:
+    with report_damage(path, "is a damaged image: ", damage), Image.open(BytesIO(image_file.data)) as image:
         # Details finer than the panel's samples would alias.
         image.thumbnail((_SIDE * _SAMPLES, _SIDE * _SAMPLES))
         glass = image.convert("RGBA")

@@ -18,7 +18,7 @@ from quasiharmonic.ui.batch.records import OUTCOMES, SOLVED, Record
 from quasiharmonic.ui.batch.settings import Settings
 from quasiharmonic.ui.report import charts, statistics
 from quasiharmonic.ui.report.charts import thumbnail
-from quasiharmonic.ui.report.statistics import PHASES, BatchRun, quantile, worst
+from quasiharmonic.ui.report.statistics import PHASES, BatchRun, find_worst, quantile
 from quasiharmonic.util.untrusted import parse_json
 
 STYLE = """
@@ -105,7 +105,7 @@ def write_report(
 
 
 def _page(run: BatchRun, other: BatchRun | None) -> str:
-    title = f"Report: {shown(run.name)}"
+    title = f"Report: {escape_text(run.name)}"
     drawn: dict[str, str] = {}
 
     def draw(row: Record) -> str:
@@ -120,16 +120,16 @@ def _page(run: BatchRun, other: BatchRun | None) -> str:
         _tiles(run),
         _outcomes(run),
         _groups(run),
-        _unwrapped(run),
+        _describe_unwraps(run),
         '<div class="pair">',
         _distortion(run, other),
         _times(run) if other is None else _comparison(run, other),
         *([] if other is None else [_times(run)]),
         _phases(run),
         "</div>",
-        _gallery("Highest stretch, max(σ₁, 1/σ₂), of certified maps", draw, _worst(run, "isometric")),
-        _gallery("Highest MIPS distortion of certified maps", draw, _worst(run, "mips")),
-        _gallery("Slowest certified maps", draw, _worst(run, "seconds")),
+        _gallery("Highest stretch, max(σ₁, 1/σ₂), of certified maps", draw, _find_worst(run, "isometric")),
+        _gallery("Highest MIPS distortion of certified maps", draw, _find_worst(run, "mips")),
+        _gallery("Slowest certified maps", draw, _find_worst(run, "seconds")),
         _failures(run, draw),
     ]
     return (
@@ -144,7 +144,7 @@ def _page(run: BatchRun, other: BatchRun | None) -> str:
     )
 
 
-def shown(text: object) -> str:
+def escape_text(text: object) -> str:
     """Return untrusted text as HTML; characters that do not print or change the reading direction are escaped."""
     plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
     return escape(plain)
@@ -170,14 +170,14 @@ def percent(part: int, total: int) -> str:
 def _origin(run: BatchRun) -> str:
     words = []
     if run.about.get("source"):
-        words.append(f"Problems of <code>{shown(run.about['source'])}</code>.")
+        words.append(f"Problems of <code>{escape_text(run.about['source'])}</code>.")
     usual = Settings().to_dict()
     settings = {k: v for k, v in run.about.get("settings", {}).items() if v and v != usual.get(k)}
     if settings:
-        words.append("Settings: " + ", ".join(f"{shown(k)} {shown(v)}" for k, v in settings.items()) + ".")
+        words.append("Settings: " + ", ".join(f"{escape_text(k)} {escape_text(v)}" for k, v in settings.items()) + ".")
     for versions in sorted({str(row["versions"]) for row in run.rows if row.get("versions")}):
         try:
-            words.append(", ".join(f"{shown(k)} {shown(v)}" for k, v in parse_json(versions).items()) + ".")
+            words.append(", ".join(f"{escape_text(k)} {escape_text(v)}" for k, v in parse_json(versions).items()) + ".")
         except (ValueError, AttributeError):
             continue
     return f'<p class="quiet">{" ".join(words)}</p>' if words else ""
@@ -190,8 +190,8 @@ def _tiles(run: BatchRun) -> str:
     usual_time, late = (number(quantile(seconds, share), "s") for share in (0.5, 0.95))
     tiles = [
         (percent(certified, problems), f"{certified:,} of {problems:,} certified {run.wanted}"),
-        (number(worst(stretch)), f"worst stretch, max(σ₁, 1/σ₂), of a triangle; median {usual_stretch}"),
-        (number(worst(mips)), f"worst MIPS distortion of a map; median {usual_mips}"),
+        (number(find_worst(stretch)), f"worst stretch, max(σ₁, 1/σ₂), of a triangle; median {usual_stretch}"),
+        (number(find_worst(mips)), f"worst MIPS distortion of a map; median {usual_mips}"),
         (usual_time, f"median time of the certified; 95 % within {late}"),
         (number(float(np.nansum(run.column("triangles")))), "triangles in total"),
         (number(quantile(run.column("peak_memory"), 1.0) / 2**20, "MiB"), "maximum memory of a problem"),
@@ -204,7 +204,7 @@ def _outcomes(run: BatchRun) -> str:
     counted = statistics.outcomes(run)
     css = {**dict.fromkeys(SOLVED, "good"), "not injective": "bad", "not bijective": "bad"}
     bar = "".join(f'<i class="{css.get(name, "broken")}" style="flex:{count}"></i>' for name, count in counted)
-    words = ", ".join(f"{count:,} {shown(OUTCOMES.get(name, name))}" for name, count in counted)
+    words = ", ".join(f"{count:,} {escape_text(OUTCOMES.get(name, name))}" for name, count in counted)
     impossible = sum(row.get("status") == "impossible" for row in run.rows)
     words += f"; {impossible:,} proven to have no such map" if impossible else ""
     return f'<div class="bar">{bar}</div><p class="quiet">{words}</p>'
@@ -220,22 +220,22 @@ def _groups(run: BatchRun) -> str:
         certified, problems = int(group.certified.sum()), len(group.rows)
         stretch, mips, seconds = (group.certified_column(name) for name in ("isometric", "mips", "seconds"))
         success = f"{problems:,}", f"{certified:,}", percent(certified, problems)
-        distortion = (number(value) for value in (worst(stretch), worst(mips), quantile(mips, 0.5)))
+        distortion = (number(value) for value in (find_worst(stretch), find_worst(mips), quantile(mips, 0.5)))
         times = (number(quantile(seconds, share), "s") for share in (0.5, 0.95, 1.0))
-        rows.append((shown(group.name or "(top)"), *success, *distortion, *times))
+        rows.append((escape_text(group.name or "(top)"), *success, *distortion, *times))
     return _table(("folder", *head), rows, last_is_sum=True)
 
 
-def _unwrapped(run: BatchRun) -> str:
+def _describe_unwraps(run: BatchRun) -> str:
     """Return a table of the charts of unwrapped models, those with most charts first; empty for maps."""
-    rows = _worst(run, "charts", _MAX_LISTED)
+    rows = _find_worst(run, "charts", _MAX_LISTED)
     if not rows:
         return ""
     lines = [
         (
-            shown(row["problem"]),
+            escape_text(row["problem"]),
             *(number(float(row.get(name) or np.nan)) for name in ("charts", "seam_length", "stretch", "utilisation")),
-            shown(row.get("cleaned") or "–"),
+            escape_text(row.get("cleaned") or "–"),
         )
         for row in rows
     ]
@@ -286,7 +286,7 @@ def _times(run: BatchRun) -> str:
 
 def _comparison(run: BatchRun, other: BatchRun) -> str:
     ours, theirs = statistics.match_column(run, other, "seconds")
-    name = shown(other.name)
+    name = escape_text(other.name)
     if not ours.size:
         words = f"No problem of {name} has a time and the name of a problem of this run."
         return f'<section class="card"><h2>Time against {name}</h2><p>{words}</p></section>'
@@ -312,7 +312,7 @@ def _phases(run: BatchRun) -> str:
     return f'<section class="card"><h2>Time by phase</h2>{table}</section>'
 
 
-def _worst(run: BatchRun, column: str, most: int = _PICTURES) -> list[Record]:
+def _find_worst(run: BatchRun, column: str, most: int = _PICTURES) -> list[Record]:
     """Return the certified records with the highest values in a column, in decreasing order."""
     values = np.where(run.certified, run.column(column), np.nan)
     order = np.argsort(-values, kind="stable")
@@ -339,8 +339,8 @@ def _card(row: Record, address: str) -> str:
             facts.append(form.format(number(value)))
     if row.get("flips_after"):
         facts.append(f"{row['flips_after']} inverted, {row.get('flips_before')} initially")
-    words = f'<p class="why">{shown(_reason(row))}</p>' if row.get("certified") is not True else ""
-    title, line = shown(row["problem"]), shown(" · ".join(facts))
+    words = f'<p class="why">{escape_text(_reason(row))}</p>' if row.get("certified") is not True else ""
+    title, line = escape_text(row["problem"]), escape_text(" · ".join(facts))
     return f'<div class="card item">{picture}<h3>{title}</h3><p>{line}</p>{words}</div>'
 
 
@@ -368,12 +368,12 @@ def _failures(run: BatchRun, draw: Draw) -> str:
 def _line(row: Record) -> tuple[str, ...]:
     sizes = (row.get(column) for column in ("triangles", "seconds"))
     triangles, seconds = (float("nan") if value is None else float(value) for value in sizes)
-    return shown(row["problem"]), number(triangles), number(seconds, "s"), shown(_reason(row))
+    return escape_text(row["problem"]), number(triangles), number(seconds, "s"), escape_text(_reason(row))
 
 
 def _figure(title: str, drawing: str, legend: Iterable[tuple[str, str]], caption: str) -> str:
     """Return a card with a figure; title and caption are HTML."""
-    keys = "".join(f'<span><i class="{css}"></i>{shown(name)}</span>' for css, name in legend)
+    keys = "".join(f'<span><i class="{css}"></i>{escape_text(name)}</span>' for css, name in legend)
     keys = f'<div class="legend">{keys}</div>' if keys else ""
     return f'<section class="card"><h2>{title}</h2>{keys}{drawing}<p class="quiet">{caption}</p></section>'
 

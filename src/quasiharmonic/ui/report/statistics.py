@@ -108,7 +108,7 @@ def quantile(values: FloatArray, share: float) -> float:
     return float(np.quantile(finite, share)) if finite.size else float("nan")
 
 
-def worst(values: FloatArray) -> float:
+def find_worst(values: FloatArray) -> float:
     """Return the largest value, including infinity; NaN if there are no values."""
     known = values[~np.isnan(values)]
     return float(known.max()) if known.size else float("nan")

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.errors import MeshFileError, printable, reading
+from quasiharmonic.io.errors import MeshFileError, printable_path, report_damage
 from quasiharmonic.io.lowlevel.textual import read_bytes
-from quasiharmonic.util.untrusted import beside, check_end
+from quasiharmonic.util.untrusted import check_end, resolve_beside
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}
@@ -163,7 +163,7 @@ def load(path: str | os.PathLike[str]) -> Document:
     MeshFileError if the file is not glTF, is damaged or compressed, or refers to bytes outside its own folder.
     """
     data = read_bytes(path)
-    with reading(path, "is not a glTF file: ", DAMAGE, describe=fault):
+    with report_damage(path, "is not a glTF file: ", DAMAGE, describe=fault):
         text, chunk = _chunks(data) if data[:4] == b"glTF" else (data, None)
         tree = json.loads(text, parse_constant=_no_number)
         version = str(tree["asset"]["version"])
@@ -173,7 +173,7 @@ def load(path: str | os.PathLike[str]) -> Document:
     compressed = [name for name in _COMPRESSIONS if f'"{name}"' in json.dumps(tree.get("extensionsUsed", []))]
     if compressed:
         raise MeshFileError(path, f"is compressed by {compressed[0]}", remedy="save it without compression")
-    with reading(path, "is damaged: ", DAMAGE, describe=fault):
+    with report_damage(path, "is damaged: ", DAMAGE, describe=fault):
         buffers = [_buffer(path, buffer, chunk) for buffer in tree.get("buffers", [])]
         views = [_view(view, buffers) for view in tree.get("bufferViews", [])]
     return Document(tree, views)
@@ -185,7 +185,7 @@ def fault(error: Exception) -> str:
         case ValueError():
             return str(error)
         case KeyError():
-            return f"an entry lacks {printable(str(error.args[0]))[:80]}"
+            return f"an entry lacks {printable_path(str(error.args[0]))[:80]}"
         case IndexError():
             return "an entry refers to another entry that does not exist"
         case RecursionError():
@@ -219,7 +219,7 @@ def embed_pictures(document: Document, folder: Path) -> list[str]:
 def read_uri(folder: Path, uri: str) -> bytes:
     """Return the bytes in a data URI, or those of a file in the folder of the document; ValueError if it is damaged."""
     if not uri.startswith("data:"):
-        return read_bytes(beside(folder, uri))
+        return read_bytes(resolve_beside(folder, uri))
     head, _, text = uri.partition(",")
     if not head.endswith(";base64"):
         raise ValueError("a buffer is not base64")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.io.errors import printable
+from quasiharmonic.io.errors import printable_path
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, read_uri, whole
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf, read_corners
 from quasiharmonic.io.models.appearance import Appearance, ImageUse, NamedImage, Role, SurfaceMaterial, Wrap
@@ -78,10 +78,10 @@ class _MaterialReader:
                     try:
                         textures[role] = self._use(within[key])
                     except DAMAGE as error:
-                        self.problems.append(f"{key} of material {printable(name)} is damaged: {fault(error)}")
+                        self.problems.append(f"{key} of material {printable_path(name)} is damaged: {fault(error)}")
         others = sorted(set(extensions) - {_STRENGTH})
         if others and any("Texture" in key for extension in others for key in extensions[extension]):
-            self.problems.append(f"textures of {', '.join(map(printable, others))} are not baked")
+            self.problems.append(f"textures of {', '.join(map(printable_path, others))} are not baked")
         return SurfaceMaterial(
             name,
             _numbers(pbr.get("baseColorFactor"), (1.0, 1.0, 1.0, 1.0)),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError, reading
+from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
 from quasiharmonic.io.formats.vertex_data import normal_lines, weld
 from quasiharmonic.io.models.meshdata import Carried, MeshData
@@ -122,7 +122,7 @@ def read_gltf(path: str | os.PathLike[str], *, instances: str = "share") -> Mesh
     check_choice("instances", instances, INSTANCES)
     document = load(path)
     # Overflow is reported later, by the checks for finite numbers.
-    with reading(path, "is damaged: ", DAMAGE, describe=fault), np.errstate(over="ignore", invalid="ignore"):
+    with report_damage(path, "is damaged: ", DAMAGE, describe=fault), np.errstate(over="ignore", invalid="ignore"):
         if instances == "own":
             _separate_instances(document.tree)
         mesh = _mesh(document, os.fspath(path))

@@ -224,10 +224,10 @@ def _convert_places(uv: FloatArray) -> NDArray[np.float32]:
     v = 1 - uv[..., 1]
     # Round v so that 1 - v is exact in double precision, and readers lose nothing.
     v = np.where(np.abs(v) < 2.0**-29, np.rint(v / _EXACT) * _EXACT, v)
-    return _single("a place", np.stack([uv[..., 0], v], axis=-1))
+    return _to_single("a place", np.stack([uv[..., 0], v], axis=-1))
 
 
-def _single(what: str, numbers: FloatArray) -> NDArray[np.float32]:
+def _to_single(what: str, numbers: FloatArray) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):
         single = numbers.astype(np.float32)
     if np.isinf(single).any():
@@ -258,12 +258,12 @@ def _new(mesh: MeshData) -> Document:
     line = np.zeros_like(mesh.F) if normals is None or mesh.FN is None else mesh.FN
     keys = np.concatenate([_bits(places), line[:, :, None]], axis=2)
     rows, origin, corner = _split(mesh.F, keys, len(mesh.V))
-    points = _single("a position", mesh.V[origin])
+    points = _to_single("a position", mesh.V[origin])
     attributes = {"POSITION": document.add(points)}
     bounds = points.min(axis=0).astype(float).tolist(), points.max(axis=0).astype(float).tolist()
     tree["accessors"][0]["min"], tree["accessors"][0]["max"] = bounds
     if normals is not None:
-        attributes["NORMAL"] = document.add(_single("a normal", normals[line.ravel()[corner]]))
+        attributes["NORMAL"] = document.add(_to_single("a normal", normals[line.ravel()[corner]]))
     if colours is not None:
         attributes["COLOR_0"] = document.add(colours[origin].astype(np.float32))
     placed = {}

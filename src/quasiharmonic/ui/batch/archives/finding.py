@@ -49,7 +49,7 @@ def find_archives(source: str | os.PathLike[str], *, plain: bool) -> list[Archiv
         if places.is_url(location) and not found:
             raise ValueError(f"there are no archives below {source}: problems by URL must be in .tar or .parquet files")
     else:
-        found = _listed(Path(location)) if os.path.isfile(location) else []
+        found = _read_list(Path(location)) if os.path.isfile(location) else []
     _check(found)
     return found
 
@@ -77,7 +77,7 @@ def _archives_of(names: list[str]) -> list[str]:
     return [name for name in names if is_archive(name) and not is_output(name)]
 
 
-def _listed(path: Path) -> list[Archive]:
+def _read_list(path: Path) -> list[Archive]:
     """Return the archives in a list; none if its first line is not an archive."""
     found: list[Archive] = []
     for number, text in list_lines(path):

@@ -87,14 +87,17 @@ def _check(sample: Sample, seen: set[str]) -> None:
     """Set the error of a sample that cannot be used."""
     meshes = [extension for extension in sample.files if _is_mesh(extension)]
     if sample.key in seen:
-        sample.key, sample.error = _unused(sample.key, seen), f"the name {sample.key} is used twice in the archive"
+        sample.key, sample.error = (
+            _find_unused_key(sample.key, seen),
+            f"the name {sample.key} is used twice in the archive",
+        )
     elif not meshes:
         sample.error = "it has no mesh"
     elif len(meshes) > 1:
         sample.error = f"it has several meshes: {', '.join(meshes)} (the name of a problem ends at the first dot)"
 
 
-def _unused(key: str, seen: set[str]) -> str:
+def _find_unused_key(key: str, seen: set[str]) -> str:
     """Return the name with the first number that makes it new."""
     return next(name for number in count(2) if (name := f"{key} ({number})") not in seen)
 
@@ -108,14 +111,14 @@ _MESHES = frozenset(suffixes("read"))
 
 def _split(name: str) -> tuple[str, str]:
     """Return key and extension of a member's name."""
-    folder, base = posixpath.split(_within(name))
+    folder, base = posixpath.split(_drop_parent_parts(name))
     if base in _FOLDER_FILES and folder:
         return folder, _FOLDER_FILES[base]
     stem, _, extension = base.partition(".")
     return posixpath.join(folder, stem), extension
 
 
-def _within(name: str) -> str:
+def _drop_parent_parts(name: str) -> str:
     """Return a name without the parts that lead out of a folder, because results repeat it."""
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
     return "/".join(parts)
@@ -179,7 +182,7 @@ def _parquet_samples(path: Path) -> Iterator[Sample]:
 def _row_sample(row: Mapping[str, Any], key: str | None, number: int) -> Sample:
     """Return the problem of a row; lists of fixed vertices may be text or lists of integers."""
     named = None if key is None else row[key]
-    sample = Sample(f"{number:09d}" if named is None else _within(str(named)) or f"{number:09d}")
+    sample = Sample(f"{number:09d}" if named is None else _drop_parent_parts(str(named)) or f"{number:09d}")
     for name, value in row.items():
         if name == key or value is None:
             continue

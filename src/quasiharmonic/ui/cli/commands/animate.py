@@ -93,10 +93,10 @@ def run(options: argparse.Namespace) -> int:
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
     if fixed is None:
-        with report.about(options.input):
+        with report.name_source(options.input):
             fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))
     positions = _targets(targets, mesh, fixed)
-    with report.about(options.input):
+    with report.name_source(options.input):
         problem = Problem(mesh.V, mesh.F, fixed, positions[0])
     given = pick(options, "polish", "max_motion_ratio", "fill_gaps", "max_iterations", "linear_solver")
     with pipeline.working(options.input, _words) as show:
@@ -172,7 +172,7 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
         frame = io.read_mesh(path)
         if len(frame.V) != len(mesh.V):
             raise ValueError(f"{path}: {len(frame.V)} vertices, but the surface has {len(mesh.V)}")
-        with report.about(path):
+        with report.name_source(path):
             mapped = io.mapped(frame)
         opened = mapped.opened()
         if opened.uv is None or not mapped.seamless:
@@ -183,13 +183,13 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
 
 def _array(path: Path, n: int, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
     from quasiharmonic import io
-    from quasiharmonic.io.errors import reading
+    from quasiharmonic.io.errors import report_damage
     from quasiharmonic.util.arrays import real_array
     from quasiharmonic.util.untrusted import read_npy
 
     if not path.is_file():
         raise io.MeshFileError(path, "there is no such file")
-    with reading(path, "not an array of numbers in NumPy's format: "):
+    with report_damage(path, "not an array of numbers in NumPy's format: "):
         array = read_npy(path)
     shaped = array.ndim == 3 and len(array) > 0 and array.shape[1] in (n, fixed.size) and array.shape[2] == 2
     if not shaped or array.dtype.kind not in "iuf":

@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
         return finite_elements.check(options)
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
-    with report.about(options.input):
+    with report.name_source(options.input):
         found = inspect_mesh(mesh.V, mesh.F, weld=options.weld)
     facts: dict[str, Any] = {"input": str(options.input), "mesh": found.to_dict()}
     lines = [f"{options.input}: {found.summary()}"]
@@ -192,7 +192,7 @@ def _list_boundary(options: argparse.Namespace) -> int:
     if options.plot is not None:
         report.check_picture("--plot", options.plot, (options.input,))
     mesh = io.read_mesh(options.input)
-    with report.about(options.input):
+    with report.name_source(options.input):
         opened = io.seamed(mesh).opened()
         # A seam vertex has several copies; each boundary copy is listed with the vertex's number.
         origin = np.arange(len(opened.V))

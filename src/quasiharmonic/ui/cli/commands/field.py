@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     for path in outputs:
         given.check_output(path)
     field, spacing = given.field, _spacing(options, given)
-    with report.about(options.input):
+    with report.name_source(options.input):
         held = _border(field) if options.fix_border else None
         try:
             repaired = nearest_invertible(field, spacing=spacing, min_jacobian=options.min_jacobian, fixed=held)

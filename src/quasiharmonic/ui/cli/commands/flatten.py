@@ -106,7 +106,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
             raise ValueError("--start and --fixed need the input's map, which new seams discard: omit them")
         # Raises an error that names the missing part of the map.
         io.mapped(mesh)
-    with report.about(options.input):
+    with report.name_source(options.input):
         F, joint = weld_triangles(mesh.V, mesh.F, options.weld)
     if options.fixed is not None:
         given["fixed"] = np.unique(joint[io.read_handles(options.fixed, len(mesh.V))])

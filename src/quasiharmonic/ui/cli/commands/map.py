@@ -141,7 +141,7 @@ def _map(
                 result = smooth(fine, result, linear_solver=options.linear_solver, callback=show, slide=one.slide)
         return result
 
-    with report.about(source):
+    with report.name_source(source):
         mapped = each_island(found.mesh, solve_island, reflect=options.to is None, only=options.islands)
     refined = [one.result.refined for one in mapped.islands]
     refined += [None] * (len(islands) - len(refined))

@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
     if mirrored.size:
         reflected = reflect_mirrored(opened).uv
         uv = uv if reflected is None else reflected
-    with report.about(options.input):
+    with report.name_source(options.input):
         found = distortion(V, F, uv, rings=options.rings if options.distances else None)
     if options.export is not None:
         # Viewers colour by the first value; the isometric distortion bounds the error of a texture.

@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"--texture is not supported by --kind {options.kind}: use --kind texture, or omit it")
     mesh = io.read_mesh(options.input)
     V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
-    with report.about(options.input):
+    with report.name_source(options.input):
         if options.kind == "distortion":
             save_distortion_figure(options.output, V, F, uv, options.measure)
         elif options.kind == "texture" or options.texture is not None:

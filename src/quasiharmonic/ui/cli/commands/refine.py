@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     report.check_new(outputs, options.json, inputs=(mesh_path, fixed_path))
     mesh = io.read_mesh(mesh_path)
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
-    with report.about(mesh_path):
+    with report.name_source(mesh_path):
         problem = Problem(*io.problem_arrays(mesh, fixed), reference="equilateral")
         result = refine_problem(problem)
     with io.no_remains(output, handles, origin):

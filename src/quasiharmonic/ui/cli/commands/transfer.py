@@ -185,7 +185,7 @@ def _read(path: Path) -> _MappedFile:
     V, F, uv = io.cut_at_seams(mesh)
     origin = np.full(len(V), -1, dtype=np.int64)
     origin[F] = mesh.F
-    with report.about(path):
+    with report.name_source(path):
         inverse = InverseMap(V, F, np.where(origin[:, None] < 0, 0.0, uv))
     return _MappedFile(mesh, inverse, origin)
 
@@ -237,7 +237,7 @@ def _read_table(path: Path) -> NDArray[np.float64]:
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.io.errors import reading
+    from quasiharmonic.io.errors import report_damage
     from quasiharmonic.util.arrays import real_array
     from quasiharmonic.util.untrusted import read_npy
 
@@ -246,7 +246,7 @@ def _read_table(path: Path) -> NDArray[np.float64]:
         return io.read_gifti_values(path)
     if path.suffix.lower() not in _TABLES:
         raise ValueError(f"--values {path}: supported: {', '.join(_TABLES)}, .gii")
-    with reading(path, "not a table of numbers: ", (ValueError, EOFError)):
+    with report_damage(path, "not a table of numbers: ", (ValueError, EOFError)):
         if path.suffix.lower() == ".npy":
             return real_array(str(path), read_npy(path))
         lines = [line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]

@@ -141,9 +141,9 @@ def run(options: argparse.Namespace) -> int:
 def _read(options: argparse.Namespace, source: Path) -> MeshData:
     """Read the model within the limit of memory."""
     from quasiharmonic.io.formats.gltf.reader import read_gltf
-    from quasiharmonic.util.untrusted import bounded
+    from quasiharmonic.util.untrusted import use_bound
 
-    with bounded(options.memory):
+    with use_bound(options.memory):
         if options.instances == "share":
             return pipeline.read_mesh(options, source)
         if source.suffix.lower() not in (".glb", ".gltf"):
@@ -167,7 +167,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         statement_labels,
     )
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
-    from quasiharmonic.io.errors import printable
+    from quasiharmonic.io.errors import printable_path
     from quasiharmonic.util.arrays import count_of
 
     below = io.place_map(mesh, mesh, options.channel).lower_maps
@@ -213,7 +213,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         lines = [f"wrote {options.output}: {result.message}", result.summary(), *_cleaning(result)]
         if densities := material_densities(mesh, result):
             facts["material_texels_per_unit"] = densities
-            shown = ", ".join(f"{printable(name)} {density:.4g}" for name, density in densities.items())
+            shown = ", ".join(f"{printable_path(name)} {density:.4g}" for name, density in densities.items())
             lines.append(f"texels per unit by material: {shown}")
         if baked is not None:
             facts["bake"] = baked.to_dict()

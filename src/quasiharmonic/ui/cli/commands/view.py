@@ -40,6 +40,6 @@ def run(options: argparse.Namespace) -> int:
     if options.screenshot is not None:
         report.check_picture("--screenshot", options.screenshot, inputs=(options.input,), endings=(".png",))
     V, F, uv = io.without_idle(*io.cut_at_seams(io.read_mesh(options.input)))
-    with report.about(options.input):
+    with report.name_source(options.input):
         show(V, F, uv, screenshot=options.screenshot)
     return 0
