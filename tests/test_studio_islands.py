@@ -207,20 +207,17 @@ def test_selected_islands_are_unwrapped_and_the_others_stay(tmp_path):
 
 @pytest.mark.parametrize("what", ["unwrap", "flatten"])
 def test_stop_keeps_the_best_certified_result(what):
-    stopped = []
-    one = Visitor(*starfish(3, 12))
-    before = one.session.state
-    one.session._stops = lambda: bool(stopped)
-    one.session._waiting = lambda: bool(stopped)
+    made = list[Visitor]()
 
-    def hear(header, arrays):
-        Visitor._hear(one, header, arrays)
-        if header["kind"] == "progress" and (header.get("phase") == "improve" or "energy" in header):
-            stopped.append(True)
+    def stops():
+        shown = [frame.header for one in made for frame in one.frames[opened:] if frame.header["kind"] == "progress"]
+        return any(header.get("phase") == "improve" or "energy" in header for header in shown)
 
-    one.session._tell = hear
+    one = Visitor(*starfish(3, 12), waiting=stops, stops=stops)
+    before, opened = one.session.state, len(one.frames)
+    made.append(one)
     one.does(what)
-    assert stopped
+    assert stops()
     assert one.session.state is not before
     assert one.last("map").header["injective"]
     assert one.last("map").header["command"] == "qhm check start.obj"

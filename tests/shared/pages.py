@@ -21,9 +21,18 @@ class Visitor:
     Its model is a file, or an array of positions and one of triangles.
     """
 
-    def __init__(self, V=None, F=None, name="surface.obj", waiting=lambda: False, storage=None, restore=False):
+    def __init__(
+        self,
+        V=None,
+        F=None,
+        name="surface.obj",
+        waiting=lambda: False,
+        storage=None,
+        restore=False,
+        stops=lambda: False,
+    ):
         self.frames: list[MessageFrame] = []
-        self.session = Session(self._hear, waiting, storage)
+        self.session = Session(self._hear, waiting, storage, stops)
         if restore:
             assert self.session.restore()
             return
