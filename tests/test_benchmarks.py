@@ -13,7 +13,7 @@ import problems
 import small_problems
 import speed
 import stages
-import tetrahedra
+import tetrahedral_problems
 from quasiharmonic import Problem, boundary_loops, certify, certify_tetrahedra, injective_tetrahedra, solve
 from quasiharmonic.solver.search.stages import stages_of
 
@@ -48,9 +48,9 @@ def test_the_name_determines_a_problem(family):
     assert not np.array_equal(first.target, problems.make(family, 6, 0.7, triangles=100).target)
 
 
-@pytest.mark.parametrize("family", tetrahedra.FAMILIES)
+@pytest.mark.parametrize("family", tetrahedral_problems.FAMILIES)
 def test_a_problem_of_tetrahedra_has_its_known_solution(family):
-    case = tetrahedra.make(family, 1, 300)
+    case = tetrahedral_problems.make(family, 1, 300)
     for points in (case.X, case.hidden):
         certificate = certify_tetrahedra(case.T, points)
         assert certificate.injective

@@ -34,8 +34,8 @@ from quasiharmonic.util.options import (
     PolishOptions,
     RepairOptions,
     TetrahedraOptions,
-    check_positive_integer,
     option,
+    positive,
     takes,
 )
 
@@ -152,7 +152,7 @@ def test_a_new_option_needs_a_field_and_a_type():
 
     @dataclass(frozen=True, kw_only=True)
     class Dive(Depth):
-        depth: int = option(3, check=check_positive_integer)
+        depth: int = option(3, check=positive)
 
     @takes(Dive, Keywords)
     def dive(place: str, **given: Unpack[Keywords]) -> int:
@@ -168,7 +168,7 @@ def test_a_new_option_needs_a_field_and_a_type():
 def test_numbers_of_the_command_line_have_the_type_of_their_field():
     @dataclass(frozen=True, kw_only=True)
     class Dive(Options):
-        depth: int = option(3, "how deep", check=check_positive_integer)
+        depth: int = option(3, "how deep", check=positive)
         stops: int = option(0, "how many", check=options.count)
         divers: int | None = option(None, "how many", check=lambda name, value: None)
         speed: float | None = option(None, "how fast", check=options.seconds)

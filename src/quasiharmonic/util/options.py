@@ -56,7 +56,7 @@ def option(
     return field(default=default, metadata={"help": help, "check": check, "choices": choices})
 
 
-def check_positive_integer(name: str, value: Any) -> None:
+def positive(name: str, value: Any) -> None:
     """Check a positive integer."""
     from quasiharmonic.util.arrays import check_integer
 
@@ -120,7 +120,7 @@ def motion_ratio(name: str, value: Any) -> None:
 def positive_or_none(name: str, value: Any) -> None:
     """Check a positive integer or None."""
     if value is not None:
-        check_positive_integer(name, value)
+        positive(name, value)
 
 
 def stretch_bound(name: str, value: Any) -> None:
@@ -272,7 +272,7 @@ class MapOptions(SolverOptions):
     )
     polish: Any = option(None)
     start: Any = option(None)
-    max_iterations: int = option(MAX_ITERATIONS, "(default: 2000)", check=check_positive_integer)
+    max_iterations: int = option(MAX_ITERATIONS, "(default: 2000)", check=positive)
     record_every: int = option(0, check=count)
     time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     slide: Any = option(False)
@@ -335,7 +335,7 @@ class HarmoniseOptions(SolverOptions):
     conformal: float = option(1e-3, check=tolerance)
     weights: Any = option(None)
     scaled: bool = option(True, check=switch)
-    max_iterations: int = option(40, "linear solves per round (default: 40)", check=check_positive_integer)
+    max_iterations: int = option(40, "linear solves per round (default: 40)", check=positive)
     tol: float = option(1e-3, check=tolerance)
     reference: str = option("rest", check=reference_name)
 
@@ -344,7 +344,7 @@ class HarmoniseOptions(SolverOptions):
 class DistanceOptions(SolverOptions):
     """Options of `quasiharmonic.keep_distances`."""
 
-    rings: int = option(20, check=check_positive_integer)
+    rings: int = option(20, check=positive)
     max_iterations: int = option(100, check=count)
     tol: float = option(1e-3, check=tolerance)
     record_every: int = option(0, check=count)
@@ -414,7 +414,7 @@ class RepairOptions(SolverOptions):
     fixed: Any = option(None)
     whole: bool = option(False, check=switch)
     unmirror: bool = option(False, check=switch)
-    max_iterations: int = option(MAX_ITERATIONS, check=check_positive_integer)
+    max_iterations: int = option(MAX_ITERATIONS, check=positive)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -425,7 +425,7 @@ class AnimationOptions(SolverOptions):
     max_motion_ratio: float | None = option(None, check=motion_ratio)
     fill_gaps: bool = option(False, check=switch)
     start: Any = option(None)
-    max_iterations: int = option(MAX_ITERATIONS, check=check_positive_integer)
+    max_iterations: int = option(MAX_ITERATIONS, check=positive)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -433,9 +433,7 @@ class BakeOptions(Options):
     """Options of `quasiharmonic.bake`."""
 
     size: Any = option(2048, check=texture_size)
-    samples: int = option(
-        1, "samples along each side of a texel, whose mean it gets (default: 1)", check=check_positive_integer
-    )
+    samples: int = option(1, "samples along each side of a texel, whose mean it gets (default: 1)", check=positive)
     padding: int = option(16, "texels beside charts that get the values of the nearest ones (default: 16)", check=count)
     max_distance: float = option(
         0.05,
@@ -482,7 +480,7 @@ class UnwrapOptions(Options):
     resolution: Any = option(2048)
     padding: float = option(4.0, "minimum texels between two charts (default: 4)")
     texels_per_unit: float | None = option(None, "texels per unit of length of the model (default: as many as fit)")
-    tiles: int = option(1, "UDIM tiles (default: 1)", check=check_positive_integer)
+    tiles: int = option(1, "UDIM tiles (default: 1)", check=positive)
     tile_by: Any = option(None)
     lightmap: bool = option(
         False,

@@ -26,9 +26,9 @@ from quasiharmonic.util.options import (
     DescentOptions,
     Options,
     UnwrapOptions,
-    check_positive_integer,
     one_of,
     option,
+    positive,
     seconds,
     switch,
 )
@@ -135,7 +135,7 @@ class Settings(DescentOptions):
     slide: bool = option(False, check=switch)
     pieces: str | None = option(None, check=_text)
     reference: str | None = option(None, check=one_of(None, *REFERENCES))
-    max_iterations: int = option(MAX_ITERATIONS, check=check_positive_integer)
+    max_iterations: int = option(MAX_ITERATIONS, check=positive)
     linear_solver: str = option("auto", check=lambda name, value: check_choice(name, value, ("auto", *available())))
 
     unwrap: dict[str, Any] | None = option(None, check=_unwrap_options)
@@ -271,7 +271,7 @@ class Orders(Options):
 
     output: Path  # Absolute path of the run's folder, the same on all machines
     settings: Settings
-    threads: int = option(1, check=check_positive_integer)  # Threads of the linear solver
+    threads: int = option(1, check=positive)  # Threads of the linear solver
     time_limit: float | None = option(None, check=seconds)  # Seconds of wall time per problem
     memory_limit: int | None = option(None, check=seconds)  # Bytes of resident memory of the process for a problem
     retry: bool = option(False, check=switch)  # Whether to retry failures that the input did not cause

@@ -89,9 +89,7 @@ def _declare(one: Field[Any]) -> Option:
         return flag(words)
     if choices:
         return choice(choices, words, default=one.default)
-    integer = {options.check_positive_integer: count, options.positive_or_none: count, options.count: steps}.get(
-        check, int
-    )
+    integer = {options.positive: count, options.positive_or_none: count, options.count: steps}.get(check, int)
     if one.type in ("int", "int | None"):
         return number(integer, words, default=one.default)
     return number(float, words, metavar="SECONDS" if check is options.seconds else "X", default=one.default)

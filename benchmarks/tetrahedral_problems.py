@@ -1,7 +1,7 @@
 """Tetrahedra: maps onto a given boundary with a hidden injective map, and the certificate against an oracle.
 
-    python benchmarks/tetrahedra.py problems -n 300
-    python benchmarks/tetrahedra.py certificate -n 20000   tiny meshes against an oracle in rational numbers
+    python benchmarks/tetrahedral_problems.py problems -n 300
+    python benchmarks/tetrahedral_problems.py certificate -n 20000   tiny meshes against an oracle in rational numbers
 
 A problem has a mesh and the boundary of a hidden map. Both are made from one mesh: the hidden map by a
 diffeomorphism, the rest mesh by the same with a negative strength. Each strength is raised until a tetrahedron is
