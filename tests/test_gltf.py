@@ -10,6 +10,7 @@ import pytest
 
 from quasiharmonic import certify, io
 from quasiharmonic.io import MeshData, MeshFileError
+from quasiharmonic.io.models.materials import label_materials
 from quasiharmonic.surfaces import cat
 from shared.gltf_files import HALVES, SQUARE, Gltf, numbers, opened, square
 
@@ -199,8 +200,8 @@ def test_several_meshes_in_a_scene(tmp_path):
     assert len(mesh.V) == 8
     np.testing.assert_allclose(mesh.V[:4], 2 * SQUARE[:, [1, 0, 2]] * [-1, 1, 1] + [0, 0, 5], atol=1e-15)
     np.testing.assert_array_equal(mesh.V[4:], SQUARE + np.array([0, 0, 5]))
-    assert mesh.statements == b"usemtl wood\no second f 1 2 3\n"
-    np.testing.assert_array_equal(mesh.statement_faces, [0, 2])
+    assert mesh.statements == b"usemtl wood\nusemtl -\no second f 1 2 3\n"
+    np.testing.assert_array_equal(mesh.statement_faces, [0, 1, 2])
     np.testing.assert_allclose([float(x) for x in mesh.normals.split()[1:4]], [0, 1, 0], atol=1e-15)
 
 
@@ -222,6 +223,17 @@ def test_meshes_with_the_same_attributes_have_vertices_of_their_own(tmp_path):
     )
     written = io.read_mesh(tmp_path / "out.glb")
     np.testing.assert_array_equal(written.V[written.F], mesh.V[mesh.F])
+
+
+def test_a_primitive_without_material_has_none_of_another(tmp_path):
+    made = Gltf()
+    shared = {"POSITION": made.accessor(SQUARE)}
+    made.mesh(*({"attributes": shared, "indices": made.accessor(half)} for half in HALVES))
+    made.tree["materials"] = [{"name": "wood"}]
+    made.tree["meshes"][0]["primitives"][0]["material"] = 0
+    mesh = read(made, tmp_path)
+    label, names = label_materials(mesh)
+    assert [names[k] for k in label] == ["wood", "-"]
 
 
 def test_a_new_file_has_materials_normals_and_colours(tmp_path):

@@ -166,7 +166,7 @@ def _mesh(document: Document, source: str) -> MeshData | None:
 def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntArray, list[tuple[bytes, int]]]:
     """Return pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
     tree, pools, parts, known = document.tree, list[VertexPool](), list[Primitive](), dict[str, int]()
-    triangles, statements, vertices, faces = [np.empty((0, 3), dtype=np.int64)], [], 0, 0
+    triangles, statements, vertices, faces, named = [np.empty((0, 3), dtype=np.int64)], [], 0, 0, False
     for m, mesh in enumerate(tree.get("meshes", [])):
         for p, primitive in enumerate(mesh["primitives"]):
             attributes, targets = primitive["attributes"], primitive.get("targets", [])
@@ -198,6 +198,11 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
                 # A single material without a name needs no statement.
                 if "name" in tree["materials"][index] or len(tree["materials"]) > 1:
                     statements.append((material_statement(tree, index), faces))
+                    named = True
+            elif named:
+                # A statement is valid until the next one.
+                statements.append((_statement("usemtl", ""), faces))
+                named = False
             triangles.append(pool.first + own)
             faces += len(own)
     return pools, parts, np.concatenate(triangles), statements
