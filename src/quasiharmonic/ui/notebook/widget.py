@@ -212,7 +212,8 @@ def _sheet(surface: Any, F: ArrayLike | None) -> PageSurface:
         # Only the positions of fixed vertices are used.
         uv = np.zeros((surface.n, 2))
         uv[surface.fixed] = surface.target
-        return make_sheet(MeshData(surface.V, surface.F, source="").with_map(uv), "problem", surface.fixed)
+        sheet = make_sheet(MeshData(surface.V, surface.F, source="").with_map(uv), "problem", surface.fixed)
+        return replace(sheet, posed=True)
     if isinstance(surface, MapResult):
         if surface.V is None:
             raise ValueError("the result has no surface: pass its Problem, or V and F")

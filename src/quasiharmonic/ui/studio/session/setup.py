@@ -17,6 +17,7 @@ from quasiharmonic.ui.studio.session.operations import (
     fix_where_it_is,
     flatten_islands,
     is_flattenable,
+    map_in_place,
     map_to_outline,
     saved_start,
 )
@@ -48,7 +49,7 @@ def make_first_state(sheet: PageSurface, callback: Callable[[Any], object] | Non
     """
     bare = open_without_map(sheet)
     if has_complete_map(sheet.mesh) or (sheet.fixed is not None and sheet.is_file and sheet.mesh.FT is not None):
-        return _take_map(sheet)
+        return _take_map(sheet, callback)
     if len(bare.islands) == 1 and sheet.is_file:
         if len(bare.islands[0].loops) == 1 and is_flattenable(bare.islands[0].island):
             # Some disks have no map to a square: a boundary of three vertices, triangles with all corners on one side.
@@ -64,13 +65,19 @@ def make_first_state(sheet: PageSurface, callback: Callable[[Any], object] | Non
     return bare if len(sheet.surface.F) > MAX_AUTOMATIC else unwrap_model(bare, callback)
 
 
-def _take_map(sheet: PageSurface) -> SessionState:
-    """Return the state with the map of the file."""
+def _take_map(sheet: PageSurface, callback: Callable[[Any], object] | None) -> SessionState:
+    """Return the state with the map of the file; of a problem, with a map that has its fixed vertices in place."""
     mesh = sheet.initial_map()
     pins = [] if sheet.fixed is None else sheet.fixed.tolist()
     islands = tuple(_with_file_pins(IslandState(island), pins) for island in mesh.islands)
     state = SessionState(sheet, mesh, islands, Recipe(), tuple(range(len(islands))))
-    return as_it_is(state, mesh, Recipe(), keep=("pins",))
+    found = as_it_is(state, mesh, Recipe(), keep=("pins",))
+    if not sheet.posed:
+        return found
+    try:
+        return map_in_place(state, mesh, None, callback)
+    except ValueError:
+        return found
 
 
 def _with_file_pins(one: IslandState, pins: Sequence[int]) -> IslandState:

@@ -42,6 +42,7 @@ class PageSurface:
     turned: bool = False  # Whether the triangles of the surface are reversed
     fixed: IntArray | None = None  # (k,): fixed vertices, if the file comes with a list
     texture: io.Texture | None = None  # The model's own texture
+    posed: bool = False  # Whether of the map only the positions of the fixed vertices count
     # A name that stays the same in other processes; another model has another one
     key: str = field(init=False, default_factory=lambda: secrets.token_hex(8))
 
