@@ -36,7 +36,6 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io, targets
     from quasiharmonic.apps.atlas.mapped_atlas import each_island
     from quasiharmonic.geometry import surfaces
-    from quasiharmonic.geometry.mesh.topology import boundary_loops
     from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem import Problem
     from quasiharmonic.solver.mapping import solve
@@ -47,8 +46,7 @@ def run(options: argparse.Namespace) -> int:
     output = folder / "demo.obj"
     with io.new_folder(folder):
         V, F = surfaces.cat()
-        (loop,) = boundary_loops(F, len(V))
-        problem = Problem(V, F, loop, targets.arc_length(V[loop], targets.letter(LETTER)[0]))
+        problem = Problem(V, F, *targets.boundary_to(V, F, f"letter:{LETTER}"))
         with streams.progress_line() as show:
             mapped = each_island(SeamedMesh(V, F), lambda _: solve(problem, callback=show))
         io.write_mapped(output, io.MeshData(V, F).with_places(mapped.mesh))
