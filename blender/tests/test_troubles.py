@@ -202,9 +202,10 @@ def test_an_unwrap_stops_soon(extension):
     bpy.ops.object.modifier_apply(modifier="finer")
     before = scenes.places(thing)
     parts = unwrapping.read_parts([thing], edited=False)
-    one = job.Job(lambda callback: unwrapping.unwrap_parts(parts, keep_seams=False, callback=callback))
+    options = {"keep_seams": False, "hard_edges": False, "around": False}
+    one = job.Job(lambda callback: unwrapping.unwrap_parts(parts, **options, callback=callback))
     one.start()
-    while one.step is None or one.step.phase == "clean":
+    while one._thread.is_alive() and (one.step is None or one.step.phase == "clean"):
         one._thread.join(0.01)
     one.stop()
     began = time.perf_counter()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import ceil, sqrt
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from quasiharmonic.apps.atlas.packing.layout import MAX_SIZE
 from quasiharmonic.apps.atlas.packing.pack import Packing, Placement
@@ -128,7 +129,8 @@ def _place(texels: IntArray, size: tuple[int, int], gap: int, rotate: bool) -> t
             width, height = cells[k, turn], cells[k, 1 - turn]
             if width > columns:
                 continue
-            below = np.lib.stride_tricks.sliding_window_view(top, width).max(axis=1)
+            # The filter's windows are centred.
+            below = maximum_filter1d(top, width, mode="constant")[width // 2 : columns - (width - 1) // 2]
             at = int(np.argmin(below))
             if best is None or below[at] + height < best[0]:
                 best = int(below[at] + height), at, int(width), int(height), turn
