@@ -206,3 +206,29 @@ def test_a_thousand_small_meshes():
     assert result.certificate.bijective
     assert len(result.parts) == 1000
     assert result.seconds < 60
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "message"),
+    [
+        (list, {}, "the list has no meshes"),
+        (lambda: [BOX], {"weights": 3}, "weights must be a sequence with a number per mesh, not 3"),
+        (make_scene, {"weights": [1, 2]}, "weights must be a mapping from names of meshes to numbers"),
+    ],
+)
+def test_wrong_kinds_of_lists_and_weights(given, options, message):
+    with pytest.raises(ValueError, match=message):
+        unwrap(given(), **options)
+
+
+@pytest.mark.slow
+def test_a_padding_beyond_the_texture_is_refused():
+    with pytest.raises(ValueError, match="do not fit into a lightmap"):
+        unwrap(*BOX, lightmap=True, padding=1e6)
+
+
+def test_other_formats_name_the_occurrences_that_they_lose(tmp_path):
+    mesh = io.read_mesh(write_scene(tmp_path / "in.glb"))
+    assert "1 further occurrence of meshes in the scene" in io.not_held(tmp_path / "out.obj", mesh)
+    assert "1 further occurrence of meshes in the scene" in io.not_held(tmp_path / "out.ply", mesh)
+    assert not io.not_held(tmp_path / "out.glb", mesh)

@@ -38,6 +38,8 @@ REFERENCES = "equilateral", "rest", "corrected"
 SYMMETRIES = "auto", "x", "y", "z"
 UPS = "x", "y", "z", "-x", "-y", "-z"
 INSTANCES = "share", "own"
+#: Largest number of samples along a side of a texel.
+MAX_SAMPLES = 16
 LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"
 
 
@@ -115,6 +117,13 @@ def motion_ratio(name: str, value: Any) -> None:
     """Check a maximum displacement of vertices relative to that of the boundary, or None."""
     if value is not None and (not isinstance(value, Real) or not float(value) >= 1):
         raise ValueError(f"{name} must be a number of at least 1, not {value!r}: the boundary itself has ratio 1")
+
+
+def sample_count(name: str, value: Any) -> None:
+    """Check the number of samples along a side of a texel."""
+    positive(name, value)
+    if value > MAX_SAMPLES:
+        raise ValueError(f"{name} must be at most {MAX_SAMPLES}, not {value}: more would take too much memory")
 
 
 def positive_or_none(name: str, value: Any) -> None:
@@ -433,7 +442,9 @@ class BakeOptions(Options):
     """Options of `quasiharmonic.bake`."""
 
     size: Any = option(2048, check=texture_size)
-    samples: int = option(1, "samples along each side of a texel, whose mean it gets (default: 1)", check=positive)
+    samples: int = option(
+        1, "samples along each side of a texel, whose mean it gets, 1 to 16 (default: 1)", check=sample_count
+    )
     padding: int = option(16, "texels beside charts that get the values of the nearest ones (default: 16)", check=count)
     max_distance: float = option(
         0.05,

@@ -16,8 +16,8 @@ from quasiharmonic.util.options import UnwrapOptions
 
 # Angle of the edges that are seams of a lightmap by default, in degrees.
 _HARD = 60.0
-# Texels of half the resolution are two texels wide.
-_LEAST_PADDING = 2
+# A filter at half the resolution mixes texels that are closer.
+_LEAST_PADDING = 4
 # Coordinates of later tiles are rounded more coarsely, by this share of the texture's side.
 _ROUNDING = 2.0**-18
 # If charts do not fit at the density of another tile, the density is lowered by this factor, at most so often.

@@ -25,6 +25,7 @@ from quasiharmonic.util.arrays import (
     check_choice,
     check_positive,
     count_of,
+    describe,
     pad_to_space,
     repeat_each,
     triangle_array,
@@ -220,7 +221,7 @@ def _is_scene(value: object) -> bool:
 
 def _is_list_of_meshes(value: object) -> bool:
     """Whether a value is a list of meshes, or of pairs (V, F), and not a list of positions."""
-    if not isinstance(value, list) or not value:
+    if not isinstance(value, list):
         return False
     return all(stands_for_mesh(one) or (isinstance(one, tuple) and np.ndim(one[:1]) > 2) for one in value)
 
@@ -235,6 +236,11 @@ def _unwrap_scene(
 ) -> SceneResult:
     """Unwrap several meshes into one texture."""
     check_choice("instances", instances, INSTANCES)
+    if not _is_scene(scene) and not scene:
+        raise ValueError("the list has no meshes: pass at least one")
+    if weights is not None and not isinstance(weights, Mapping if _is_scene(scene) else Sequence | np.ndarray):
+        kind = "a mapping from names of meshes to numbers" if _is_scene(scene) else "a sequence with a number per mesh"
+        raise ValueError(f"weights must be {kind}, not {describe(weights)}")
     instances = "own" if options.get("lightmap") else instances
     placed, of_part = (
         _place_scene(scene, instances, weights) if _is_scene(scene) else _place_list(scene, instances, weights)

@@ -16,7 +16,7 @@ from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
 from quasiharmonic.io.formats.vertex_data import normal_lines, weld
 from quasiharmonic.io.models.meshdata import Carried, MeshData
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_choice, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_choice, count_of, repeat_each
 from quasiharmonic.util.options import INSTANCES
 
 PLACES = "TEXCOORD_0"
@@ -89,6 +89,9 @@ class CarriedGltf(Carried):
         found = [name for name in ("materials", "animations", "skins", "cameras") if tree.get(name)]
         if any(pool.targets for pool in self.pools):
             found.append("morph targets")
+        used = [node["mesh"] for node in tree.get("nodes", []) if "mesh" in node]
+        if more := len(used) - len(set(used)):
+            found.append(f"{count_of('further occurrence', 'further occurrences', more)} of meshes in the scene")
         names = sorted({name for pool in self.pools for name in pool.attributes if name not in _READ})
         return found + [f"{name} of vertices" for name in names]
 
@@ -232,8 +235,10 @@ def _triangles(corners: IntArray, mode: int) -> IntArray:
 
 
 def material_statement(tree: dict[str, Any], index: int) -> bytes:
-    """Return the statement that names a material, by its name or else its index."""
-    return _statement("usemtl", str(tree["materials"][index].get("name", index)))
+    """Return the statement that names a material, by its name or else its index; equal names get their index, too."""
+    names = [one.get("name") for one in tree["materials"]]
+    name = index if names[index] is None else names[index]
+    return _statement("usemtl", str(name) if names.count(name) < 2 else f"{name}.{index}")
 
 
 def _statement(keyword: str, name: str) -> bytes:
