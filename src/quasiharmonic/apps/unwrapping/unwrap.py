@@ -131,9 +131,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         of trimesh in a list or a scene.
     lightmap : bool
         Whether the texture is a lightmap: boxes of charts begin at even texels, sides of rectangular charts lie between
-        texels, which changes their length by at most half a texel, and no chart is narrower than two texels. Edges of
+        texels, which changes their length by at most half a texel, and no chart is shorter than two texels. Edges of
         more than 60° are seams, unless ``hard_edges`` is given. Instances have places of their own. The padding is at
-        least two texels; then no bilinear filter mixes charts, at the resolution or at half of it.
+        least four texels; then no bilinear filter mixes charts, at the resolution or at half of it.
         `UnwrapResult.stretch` includes the change of the lengths.
     rotate : bool
         Whether charts may be rotated to fit better.
