@@ -91,3 +91,16 @@ def test_options_that_exclude_baking(coloured, tmp_path, capfd, options, words):
     assert run("unwrap", coloured, "-o", tmp_path / "out.glb", "--bake", *options) == 2
     assert words in capfd.readouterr().err
     assert not (tmp_path / "out.glb").exists()
+
+
+def test_unwrap_says_that_a_texture_is_missing(tmp_path, capfd):
+    V, F = starfish(2, 12)
+    lines = [*(f"v {x} {y} {z}" for x, y, z in V), *(f"vt {x} {y}" for x, y, _ in 0.4 + 0.2 * V), "usemtl painted"]
+    lines += ["f " + " ".join(f"{k}/{k}" for k in corners) for corners in F + 1]
+    (tmp_path / "in.obj").write_text("\n".join(["mtllib in.mtl", *lines, ""]))
+    (tmp_path / "in.mtl").write_text("newmtl painted\nmap_Kd gone.png\n")
+    out, report = tmp_path / "out.glb", tmp_path / "report.json"
+    assert run("unwrap", tmp_path / "in.obj", "-o", out, "--resolution", 64, "--bake", "--json", report) == 1
+    assert "gone.png" in capfd.readouterr().out
+    assert json.loads(report.read_text())["success"] is False
+    assert io.read_mesh(out).FT is not None

@@ -4,8 +4,8 @@ Compute texture coordinates for any model: cut it into few charts with little st
 The vertices, faces, materials and other data of the file stay the same. Degenerate and repeated faces, mixed winding
 and edges of three or more faces are accepted and reported.
 
-Exit status: 0 every chart is certified bijective, and no two charts overlap; 1 this is not so; 2 wrong input or call,
-nothing written; 3 written, but the report failed. Ctrl-C writes nothing.
+Exit status: 0 every chart is certified bijective, and no two charts overlap; 1 this is not so, or --bake could not bake
+the whole look; 2 wrong input or call, nothing written; 3 written, but the report failed. Ctrl-C writes nothing.
 
     qhm unwrap model.obj -o out.glb
     qhm unwrap scan.ply --max-stretch 1.2 --resolution 4096 --padding 8 -o out.ply
@@ -202,9 +202,10 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
 
     def describe(written: MeshData) -> pipeline.Account:
         same = is_written(written, result)
+        done = result.success and same and (baked is None or baked.success)
         facts = {
             **result.to_dict(),
-            "success": result.success and same,
+            "success": done,
             "vertices": len(mesh.V),
             "triangles": len(mesh.F),
             "divided_polygons": divided,
@@ -220,7 +221,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             lines.append(baked.summary())
         if divided:
             lines.append(f"{count_of('polygon', 'polygons', divided)} written as triangles, because seams cross them")
-        account = pipeline.Account(facts, lines, result.success and same)
+        account = pipeline.Account(facts, lines, done)
         written_map.add_bent(account.facts, account.closing, unwrapped)
         if not same:
             account.closing.append(f"{options.output} has other coordinates than were certified")
