@@ -12,7 +12,7 @@ import trimesh
 from quasiharmonic import io
 from quasiharmonic.surfaces import starfish
 from shared.commands import run
-from shared.gltf_files import SQUARE, opened, square
+from shared.gltf_files import SQUARE, Gltf, opened, square
 
 
 @pytest.fixture
@@ -117,3 +117,26 @@ def test_channels_that_cannot_be_written(model, tmp_path):
         io.place_map(bare, bare, 1)
     with pytest.raises(io.MeshFileError, match="has no texture coordinates 1"):
         io.select_channel(bare, 1)
+
+
+def test_meshes_without_coordinates_get_the_new_ones_below(tmp_path):
+    made = Gltf()
+    V, F = starfish(2, 12)
+    corners = made.accessor(F.ravel().astype("u2"))
+    first = (0.4 + 0.2 * V[:, :2]).astype("f4")
+    made.mesh(
+        {
+            "attributes": {"POSITION": made.accessor(V.astype("f4")), "TEXCOORD_0": made.accessor(first)},
+            "indices": corners,
+        }
+    )
+    made.mesh({"attributes": {"POSITION": made.accessor((V + 3).astype("f4"))}, "indices": corners})
+    source, out = tmp_path / "in.glb", tmp_path / "out.glb"
+    source.write_bytes(made.glb())
+    assert run("unwrap", source, "--channel", 1, "--resolution", 256, "-o", out) == 0
+    before, after = io.read_mesh(source), io.read_mesh(out)
+    second = io.select_channel(after, 1).corner_uv
+    assert np.isfinite(second).all()
+    half = len(F)
+    np.testing.assert_array_equal(after.corner_uv[:half], before.corner_uv[:half])
+    np.testing.assert_array_equal(after.corner_uv[half:], second[half:])

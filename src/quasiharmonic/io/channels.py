@@ -31,11 +31,14 @@ def select_channel(mesh: MeshData, channel: int) -> MeshData:
 def place_map(mapped: MeshData, mesh: MeshData, channel: int) -> MeshData:
     """Return a mesh with a map that is to be written into a channel, and the channels below from a mesh of a file.
 
-    ``mapped`` has the triangles of ``mesh``. MeshFileError if a channel below does not cover all triangles.
+    ``mapped`` has the triangles of ``mesh``. Triangles without coordinates in a channel below get those of the map.
+    MeshFileError if the map does not cover them either, or the file does not have a channel below.
     """
-    below = tuple(_find_channel(mesh, k).corner_uv for k in range(channel))
+    below = tuple(_find_channel(mesh, k).corner_uv.copy() for k in range(channel))
     for k, corners in enumerate(below):
         bare = np.flatnonzero(np.isnan(corners).any(axis=(1, 2)))
+        corners[bare] = mapped.corner_uv[bare]
+        bare = bare[np.isnan(corners[bare]).any(axis=(1, 2))]
         if bare.size:
             raise MeshFileError(
                 mesh.source,

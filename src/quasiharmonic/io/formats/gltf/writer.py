@@ -86,7 +86,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     """Return the document that was read, with the texture coordinates of a mesh."""
     document = carried.document.copy()
     users, all_places = _users(carried), _convert_places(mesh.corner_uv)
-    name = _channel_name(mesh)
+    name = _channel_name(len(mesh.lower_maps))
     for number, pool in enumerate(carried.pools):
         parts, faces = carried.parts_of(number), carried.faces_of(number)
         primitives = [document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in parts]
@@ -106,15 +106,18 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
             for primitive, own in zip(primitives, np.split(rows, bounds), strict=True):
                 primitive["mode"] = 4
                 primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
-        _set_numbers(document, [primitive["attributes"] for primitive in primitives], name, table, users)
+        # Channels below that the pool lacks have the same coordinates.
+        lacking = [low for low in map(_channel_name, range(len(mesh.lower_maps))) if low not in pool.attributes]
+        for one in (*lacking, name):
+            _set_numbers(document, [primitive["attributes"] for primitive in primitives], one, table, users)
         if name == PLACES and _has_moved(carried, number, all_places):
             _drop_tangents(primitives)
     return document
 
 
-def _channel_name(mesh: MeshData) -> str:
-    """Return the name of the attribute of the map."""
-    return f"TEXCOORD_{len(mesh.lower_maps)}"
+def _channel_name(channel: int) -> str:
+    """Return the name of the attribute of a channel."""
+    return f"TEXCOORD_{channel}"
 
 
 def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
@@ -126,7 +129,7 @@ def _drop_tangents(primitives: list[dict[str, Any]]) -> None:
 
 def _has_old_tangents(carried: CarriedGltf, mesh: MeshData) -> bool:
     """Whether the file has tangents, and the mesh has other texture coordinates."""
-    if _channel_name(mesh) != PLACES:
+    if _channel_name(len(mesh.lower_maps)) != PLACES:
         return False
     places = _convert_places(mesh.corner_uv)
     tangents = [number for number, pool in enumerate(carried.pools) if "TANGENT" in pool.attributes]

@@ -155,8 +155,6 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
     """Unwrap a mesh."""
-    from dataclasses import replace
-
     from quasiharmonic import io
     from quasiharmonic.apps.unwrapping.hard_edges import find_hard_edges
     from quasiharmonic.apps.unwrapping.model_files import (
@@ -170,7 +168,8 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
     from quasiharmonic.io.errors import printable_path
     from quasiharmonic.util.arrays import count_of
 
-    below = io.place_map(mesh, mesh, options.channel).lower_maps
+    for k in range(options.channel):
+        io.select_channel(mesh, k)  # raises an error before the work if the file does not have this one
     given = pick(options, "resolution", "stack", "weld", *declared(UnwrapOptions))
     if options.symmetry == "none":
         given["symmetry"] = None
@@ -196,7 +195,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             **given,
         )
     unwrapped, divided = add_map(mesh, result)
-    unwrapped = replace(unwrapped, lower_maps=below)
+    unwrapped = io.place_map(unwrapped, mesh, options.channel)
     baked = _bake(options, mesh, unwrapped)
     unwrapped = unwrapped if baked is None else baked.mesh
 
