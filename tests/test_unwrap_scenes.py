@@ -212,6 +212,11 @@ def test_a_thousand_small_meshes():
     ("given", "options", "message"),
     [
         (list, {}, "the list has no meshes"),
+        (
+            lambda: [BOX],
+            {"tile_by": "materials"},
+            "not 'materials'; did you mean material",
+        ),
         (lambda: [BOX], {"weights": 3}, "weights must be a sequence with a number per mesh, not 3"),
         (make_scene, {"weights": [1, 2]}, "weights must be a mapping from names of meshes to numbers"),
     ],
@@ -232,3 +237,16 @@ def test_other_formats_name_the_occurrences_that_they_lose(tmp_path):
     assert "1 further occurrence of meshes in the scene" in io.not_held(tmp_path / "out.obj", mesh)
     assert "1 further occurrence of meshes in the scene" in io.not_held(tmp_path / "out.ply", mesh)
     assert not io.not_held(tmp_path / "out.glb", mesh)
+
+
+def test_each_part_has_its_inverse():
+    V, F = BOX
+    broken = V, np.vstack([F, F[:1]])
+    result = unwrap([TUBE, broken], resolution=256)
+    for (points, triangles), part in zip([TUBE, broken], result.parts, strict=True):
+        middle = part.uvs[part.indices].mean(axis=1)[: len(triangles) - (part.excluded.size or 0)]
+        inverse = part.inverse()
+        np.testing.assert_allclose(
+            inverse.surface(inverse.locate(middle)), points[triangles[: len(middle)]].mean(axis=1), atol=1e-6
+        )
+    assert result.parts[1].excluded.tolist() == [len(F)]

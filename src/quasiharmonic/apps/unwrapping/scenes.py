@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.inverse.chart_inverse import ChartInverse
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.model_files import label_statements
 from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStatus
@@ -68,6 +69,8 @@ class ScenePart:
         mean over its directions.
     source : object
         The mesh that was given.
+    excluded : (k,) int64
+        Triangles without area, and repeated ones; they have the texture coordinates of others.
     """
 
     name: str
@@ -79,9 +82,14 @@ class ScenePart:
     charts: IntArray
     texels_per_unit: float
     source: Any
+    excluded: IntArray
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.vmapping, self.indices, self.uvs))
+
+    def inverse(self) -> ChartInverse:
+        """Return the inverse map, from the texture to the mesh; see `UnwrapResult.inverse`."""
+        return ChartInverse(self.V, self.vmapping[self.indices], self.uvs, self.indices, leave_out=self.excluded)
 
     def to_trimesh(self) -> Trimesh:
         """Return the mesh as a trimesh.Trimesh with texture coordinates; vertices are split at seams.
@@ -199,6 +207,8 @@ def accepts_scene(function: AcceptsMesh[P, UnwrapResult]) -> AcceptsScene[P]:
 
     @wraps(called)
     def call(*args: Any, **options: Any) -> Any:
+        if isinstance(options.get("tile_by"), str):
+            check_choice("tile_by", options["tile_by"], ("material",))
         given = args[0] if len(args) == 1 else options.pop("V", None) if not args and "F" not in options else None
         if given is None or "F" in options:
             return called(*args, **options)
@@ -248,7 +258,7 @@ def _unwrap_scene(
     meshes = [_read(one) for one in placed]
     points = [_move(one, V) for one, (V, _) in zip(placed, meshes, strict=True)]
     vertices, triangles = [len(V) for V, _ in meshes], [len(F) for _, F in meshes]
-    if isinstance(options.get("tile_by"), str) and options["tile_by"] == "material":
+    if isinstance(options.get("tile_by"), str):
         options["tile_by"] = _number_materials([one.source for one in placed], triangles)
     first, begin = np.cumsum([0, *vertices]), np.cumsum([0, *triangles])
     atlas = unwrap(
@@ -261,6 +271,7 @@ def _unwrap_scene(
     for k, (one, (V, F)) in enumerate(zip(placed, meshes, strict=True)):
         faces = slice(begin[k], begin[k] + len(F))
         rows, indices = np.unique(atlas.indices[faces], return_inverse=True)
+        excluded = atlas.cleaned.excluded
         parts.append(
             ScenePart(
                 name=one.name,
@@ -272,6 +283,7 @@ def _unwrap_scene(
                 charts=atlas.charts[faces],
                 texels_per_unit=atlas.texels_per_unit * one.scale,
                 source=one.source,
+                excluded=excluded[(excluded >= begin[k]) & (excluded < begin[k + 1])] - begin[k],
             )
         )
     named = [replace(parts[k], name=name) for name, k in of_part]
