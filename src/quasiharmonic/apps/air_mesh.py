@@ -37,7 +37,7 @@ from quasiharmonic.util.arrays import (
     real_array,
     triangle_array,
 )
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
 #: ARAP, and a barrier that keeps triangles from collapsing.
 _ELASTIC = Combination((1.0, ARAP()), (0.1, AreaBarrier()))
@@ -339,6 +339,6 @@ def thicken(corners: FloatArray, gap: float) -> FloatArray:
 
 
 def _shapely() -> Any:
-    with explain_missing("the air is triangulated by Shapely", with_extra("shapes")):
+    with explain_missing("the air is triangulated by Shapely", extra="shapes"):
         import shapely
     return shapely

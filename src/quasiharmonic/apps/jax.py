@@ -19,9 +19,9 @@ from functools import partial
 from threading import Lock
 from typing import Any
 
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
-with explain_missing("quasiharmonic.jax needs JAX", with_extra("jax")):
+with explain_missing("quasiharmonic.jax needs JAX", extra="jax"):
     import jax
     import jax.numpy as jnp
 

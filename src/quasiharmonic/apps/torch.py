@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
-with explain_missing("quasiharmonic.torch needs PyTorch", with_extra("torch")):
+with explain_missing("quasiharmonic.torch needs PyTorch", extra="torch"):
     import torch
     from torch.autograd.function import once_differentiable
 

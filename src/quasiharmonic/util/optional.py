@@ -14,15 +14,17 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def explain_missing(need: str, package: str) -> Iterator[None]:
+def explain_missing(need: str, package: str = "", *, extra: str = "", hint: str = "") -> Iterator[None]:
     """Say in an ImportError of the block what needs the package, and what to install.
 
-    ``need`` is a clause such as "NIfTI files need nibabel", and ``package`` is what follows ``pip install``.
+    ``need`` is a clause such as "NIfTI files need nibabel". ``package`` is what follows ``pip install``, unless an
+    ``extra`` of this package is named. ``hint`` is added to the command.
     """
     try:
         yield
     except ImportError as error:
-        raise type(error)(f"{need}: pip install {package} ({error})") from error
+        wanted = with_extra(extra) if extra else package
+        raise type(error)(f"{need}: pip install {wanted}{hint} ({error})") from error
 
 
 def with_extra(name: str) -> str:
@@ -47,7 +49,7 @@ def with_extra(name: str) -> str:
 
 def make_dataframe(columns: Mapping[str, Any], index: str) -> DataFrame:
     """Return a DataFrame of columns of equal length, with an index of the given name that counts from 0."""
-    with explain_missing("a DataFrame needs pandas", with_extra("pandas")):
+    with explain_missing("a DataFrame needs pandas", extra="pandas"):
         import pandas
     frame = pandas.DataFrame(dict(columns))
     frame.index.name = index

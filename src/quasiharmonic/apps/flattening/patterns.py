@@ -20,7 +20,7 @@ from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.problem.certification import certify
 from quasiharmonic.util.arrays import FloatArray, check_choice, check_non_negative, map_array
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
 #: Millimetres per unit of the map.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
@@ -207,13 +207,13 @@ def _dxf(lines: Pattern) -> bytes:
 
 
 def _ezdxf() -> Any:
-    with explain_missing("DXF output needs ezdxf", with_extra("patterns")):
+    with explain_missing("DXF output needs ezdxf", extra="patterns"):
         import ezdxf
         import ezdxf.units
     return ezdxf
 
 
 def _shapely() -> Any:
-    with explain_missing("an allowance needs Shapely", with_extra("shapes")):
+    with explain_missing("an allowance needs Shapely", extra="shapes"):
         import shapely
     return shapely

@@ -26,7 +26,7 @@ from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import check_gifti, unpack_gzip
 
 # The intents that the standard has for points and triangles.
@@ -373,7 +373,7 @@ def _check_patch(path: str | os.PathLike[str], number: IntArray, places: FloatAr
 
 
 def _nibabel() -> Any:
-    with explain_missing("GIFTI and FreeSurfer surfaces need nibabel", with_extra("neuro")):
+    with explain_missing("GIFTI and FreeSurfer surfaces need nibabel", extra="neuro"):
         import nibabel
         import nibabel.freesurfer
         import nibabel.gifti

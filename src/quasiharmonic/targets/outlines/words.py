@@ -10,7 +10,7 @@ from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.targets.outlines.contours import drop_close_points, filled, nested, signed_area
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter
 from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
 #: Overlap of each letter with the one before, in units of the font size, by default.
 OVERLAP = 0.03
@@ -172,7 +172,7 @@ def _find_leftmost(shape: list[FloatArray], levels: FloatArray) -> FloatArray:
 
 def _unite(shapes: list[list[FloatArray]]) -> list[FloatArray]:
     """Outline of the union of shapes, each of them an outline oriented as in `nested`."""
-    with explain_missing("joining the letters of a word needs Shapely", with_extra("shapes")):
+    with explain_missing("joining the letters of a word needs Shapely", extra="shapes"):
         import shapely
 
     covered = [

@@ -11,7 +11,7 @@ from typing import Any
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.supervisor import Finished, Supervisor, record_crash
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
 # Problems submitted per thread of the cluster: enough to keep threads busy, few to lose if the driver dies.
 _PER_THREAD = 3
@@ -35,7 +35,7 @@ def solve_on_cluster(todo: Iterator[ProblemFiles], orders: Orders, scheduler: An
     ImportError if ``distributed`` is not installed, ValueError if the address is malformed, ConnectionError if the
     connection fails, and errors of a `Supervisor` on a worker.
     """
-    with explain_missing("a Dask cluster needs distributed", with_extra("dask")):
+    with explain_missing("a Dask cluster needs distributed", extra="dask"):
         from distributed import Client
         from distributed.comm import resolve_address
     if isinstance(scheduler, Client):

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
 from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole, writing
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import parse_json
 
 Record = dict[str, Any]
@@ -244,7 +244,7 @@ def _suffix(path: str | os.PathLike[str]) -> str:
 
 def load_pyarrow() -> Any:
     """Return the module `pyarrow.parquet`; ImportError with the install command if it is missing."""
-    with explain_missing("Parquet needs pyarrow", f"{with_extra('batch')}, or choose .csv"):
+    with explain_missing("Parquet needs pyarrow", extra="batch", hint=", or choose .csv"):
         import pyarrow.parquet
     return pyarrow.parquet
 

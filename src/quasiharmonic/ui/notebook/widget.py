@@ -23,9 +23,9 @@ from quasiharmonic.ui.studio.session.exports import mapped_model, write_model
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.surface import PageSurface, make_sheet, read_sheet
 from quasiharmonic.util.arrays import IntArray, describe
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
-with explain_missing("the widget needs anywidget", with_extra("notebook")):
+with explain_missing("the widget needs anywidget", extra="notebook"):
     import anywidget
     import traitlets
 

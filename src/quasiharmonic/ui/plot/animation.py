@@ -19,7 +19,7 @@ from quasiharmonic.io.errors import check_path
 from quasiharmonic.ui.plot.canvas import AS_DRAWN, as_mesh, new_figure, not_positive, paint_map, verdict
 from quasiharmonic.ui.plot.shading import view
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_sequence, map_array
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -187,7 +187,7 @@ def _ffmpeg() -> str:
     """Return the path of the program ffmpeg, from PATH or from the extra ``video``."""
     if (found := shutil.which("ffmpeg")) is not None:
         return found
-    with explain_missing("an .mp4 needs the program ffmpeg", f"{with_extra('video')} brings it, or write a .gif"):
+    with explain_missing("an .mp4 needs the program ffmpeg", extra="video", hint=" brings it, or write a .gif"):
         from imageio_ffmpeg import get_ffmpeg_exe
     return str(get_ffmpeg_exe())
 

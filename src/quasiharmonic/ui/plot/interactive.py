@@ -12,7 +12,7 @@ from quasiharmonic.energies.measures import distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.ui.plot.canvas import RED, as_mesh
 from quasiharmonic.util.arrays import FloatArray, map_array, pad_to_space
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
 #: Measures of distortion that the window offers as colours.
 SHOWN = ("isometric", "conformal", "area_ratio", "mips")
@@ -116,6 +116,6 @@ def view_of(points: FloatArray, aspect: float, angle: float) -> tuple[FloatArray
 
 
 def _polyscope() -> Any:
-    with explain_missing("a window needs polyscope", with_extra("view")):
+    with explain_missing("a window needs polyscope", extra="view"):
         import polyscope
     return polyscope

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from quasiharmonic.io.lowlevel.atomic import writing
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.optional import explain_missing
 
 T = TypeVar("T")
 # Number of attempts, and seconds before the second one; each further pause is twice as long.
@@ -81,9 +81,9 @@ def read_start(location: str, size: int) -> bytes | None:
 
 def _open(location: str) -> tuple[Any, str]:
     """Return the file system of a URL and the path in it; ImportError if a package is missing."""
-    with explain_missing("URLs need fsspec", with_extra("remote")):
+    with explain_missing("URLs need fsspec", extra="remote"):
         from fsspec.core import url_to_fs
-    with explain_missing(location, f"{with_extra('remote')} for S3"):
+    with explain_missing(location, extra="remote", hint=" for S3"):
         return url_to_fs(location)
 
 
