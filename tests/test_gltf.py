@@ -11,7 +11,7 @@ import pytest
 from quasiharmonic import certify, io
 from quasiharmonic.io import MeshData, MeshFileError
 from quasiharmonic.io.models.materials import label_materials
-from quasiharmonic.surfaces import cat
+from quasiharmonic.surfaces import cat, starfish
 from shared.gltf_files import HALVES, SQUARE, Gltf, numbers, opened, square
 
 
@@ -234,6 +234,22 @@ def test_a_primitive_without_material_has_none_of_another(tmp_path):
     mesh = read(made, tmp_path)
     label, names = label_materials(mesh)
     assert [names[k] for k in label] == ["wood", "-"]
+
+
+def test_materials_of_equal_names_are_told_apart(tmp_path):
+    made = Gltf()
+    V, F = starfish(2, 12)
+    table = {"POSITION": made.accessor(V.astype("f4"))}
+    halves = F[: len(F) // 2], F[len(F) // 2 :]
+    made.mesh(
+        *(
+            {"attributes": table, "indices": made.accessor(f.ravel().astype("u2")), "material": k}
+            for k, f in enumerate(halves)
+        )
+    )
+    made.tree["materials"] = [{"name": "same"}, {"name": "same"}]
+    label, names = label_materials(read(made, tmp_path))
+    assert [names[k] for k in (label[0], label[-1])] == ["same.0", "same.1"]
 
 
 def test_a_new_file_has_materials_normals_and_colours(tmp_path):

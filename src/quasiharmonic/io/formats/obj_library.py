@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from quasiharmonic.io.formats.gltf.looks import gltf_appearance
-from quasiharmonic.io.formats.gltf.reader import CarriedGltf, material_statement
+from quasiharmonic.io.formats.gltf.reader import CarriedGltf, material_statements
 from quasiharmonic.io.models.appearance import Role, SurfaceMaterial
 from quasiharmonic.io.models.materials import companions
 from quasiharmonic.io.models.meshdata import MeshData
@@ -77,7 +77,8 @@ def _read_materials(carried: CarriedGltf) -> tuple[list[bytes], tuple[SurfaceMat
     """Return the names of the materials that triangles use, empty for the default one, and these materials."""
     tree = carried.document.tree
     used = dict.fromkeys(tree["meshes"][one.mesh]["primitives"][one.primitive].get("material") for one in carried.parts)
-    names = [b"" if k is None else material_statement(tree, k).split(None, 1)[1].strip() for k in used]
+    statements = material_statements(tree)
+    names = [b"" if k is None else statements[k].split(None, 1)[1].strip() for k in used]
     return names, gltf_appearance(carried).materials
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import os
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -170,6 +171,7 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
     """Return pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
     tree, pools, parts, known = document.tree, list[VertexPool](), list[Primitive](), dict[str, int]()
     triangles, statements, vertices, faces, named = [np.empty((0, 3), dtype=np.int64)], [], 0, 0, False
+    materials = list[bytes]()
     for m, mesh in enumerate(tree.get("meshes", [])):
         for p, primitive in enumerate(mesh["primitives"]):
             attributes, targets = primitive["attributes"], primitive.get("targets", [])
@@ -200,7 +202,8 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
                 index = whole(primitive["material"])
                 # A single material without a name needs no statement.
                 if "name" in tree["materials"][index] or len(tree["materials"]) > 1:
-                    statements.append((material_statement(tree, index), faces))
+                    materials = materials or material_statements(tree)
+                    statements.append((materials[index], faces))
                     named = True
             elif named:
                 # A statement is valid until the next one.
@@ -234,11 +237,14 @@ def _triangles(corners: IntArray, mode: int) -> IntArray:
     return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
 
 
-def material_statement(tree: dict[str, Any], index: int) -> bytes:
-    """Return the statement that names a material, by its name or else its index; equal names get their index, too."""
-    names = [one.get("name") for one in tree["materials"]]
-    name = index if names[index] is None else names[index]
-    return _statement("usemtl", str(name) if names.count(name) < 2 else f"{name}.{index}")
+def material_statements(tree: dict[str, Any]) -> list[bytes]:
+    """Return for each material the statement that names it, by its name or else its index.
+
+    Materials of equal names have their index, too.
+    """
+    names = [str(one.get("name", k)) for k, one in enumerate(tree.get("materials", []))]
+    times = Counter(names)
+    return [_statement("usemtl", name if times[name] < 2 else f"{name}.{k}") for k, name in enumerate(names)]
 
 
 def _statement(keyword: str, name: str) -> bytes:
