@@ -2,13 +2,14 @@ from __future__ import annotations
 
 import json
 import re
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import campaign
+import phases
 import problems
 import small_problems
 import speed
@@ -274,14 +275,16 @@ def test_invalid_calls_of_the_speed_benchmark_are_rejected(arguments, message, t
     assert [path.name for path in tmp_path.iterdir()] == ["other.csv"]
 
 
-def test_speed_is_measured_merged_and_limited(tmp_path, capsys):
+def test_speed_is_measured_merged_and_limited(tmp_path, capsys, monkeypatch):
     """A tool that exceeds the limit gets no larger problem, including this project's own."""
+    # A clock that counts its calls: on a busy machine any part of a call may wait.
+    monkeypatch.setattr(phases, "clock", map(float, count()).__next__)
     once = ["--peers", "-r", "1", "--letters", "C", "-o", str(tmp_path)]
     speed.main([*once, "--triangles", "100", "300", "--limit", "1e-9"])
     assert "cat on C, 294 triangles: every tool has exceeded the limit" in capsys.readouterr().out
     (first,) = speed.read_csv(tmp_path / "speed.csv")
     assert first.injective
-    assert 0.5 * first.median < sum(first.phases[0].values()) <= first.median
+    assert 0.4 * first.median < sum(first.phases[0].values()) < first.median
     assert "| 96 | " in (tmp_path / "speed.md").read_text()
     other = speed.Record("cat on C", 294, speed.YARDSTICK, [0.5], injective=False)
     speed.write_csv([first, other], tmp_path / "both.csv")

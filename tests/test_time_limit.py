@@ -25,9 +25,9 @@ def dome():
 
 def test_a_search_ends_with_its_best_map():
     V, F, loop, target = folded()
-    began = time.perf_counter()
+    began = time.process_time()
     result = injective_map(V, F, loop, target, time_limit=0.02, strategy="paper")
-    assert time.perf_counter() - began < 2
+    assert time.process_time() - began < 2
     assert result.status is Status.TIME_LIMIT
     assert not result.injective
     assert not result
