@@ -10,11 +10,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.multilevel.coarse_flattening import descend_around, flatten_coarse, grow_rings
 from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
@@ -24,7 +25,7 @@ from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 from quasiharmonic.util.options import FlattenOptions
 
 #: No triangle may be stretched more than this, except triangles with a smaller angle than `THIN_ANGLE`.
@@ -181,12 +182,16 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
             chart.stretch = np.full(len(chart.F), np.inf)
             return
         chart.use(uv)
+        if chart.start is not None and chart.too_long.any() and chart.share_over(bound) <= FREE_SHARE:
+            _relax_long(chart, bound)
         if flat is None and not (chart.start is not None and keeps_bound(chart, bound)):
             _descend(chart, SymmetricDirichlet(), check_wanted)
         if keeps_bound(chart, bound):
             return
     else:
         chart.use(chart.uv)
+        if chart.bijective and keeps_bound(chart, bound):
+            return
     before, good = chart.uv, chart.bijective and keeps_bound(chart, bound)
     try:
         _descend(chart, EvenStretch(bound), check_wanted)
@@ -235,6 +240,15 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
     finally:
         # After a time limit, the chart has the map so far.
         chart.use(descent.uv)
+
+
+def _relax_long(chart: WorkingChart, bound: float) -> None:
+    """Lower the stretch around triangles that are stretched too much, with the rest of the map fixed."""
+    assert chart.uv is not None
+    loose = grow_rings(chart.F, mark(len(chart.V), chart.F[chart.too_long]))
+    density = EvenStretch(bound)
+    energy = partial(DeformationEnergy, energy=density)
+    chart.use(descend_around(energy, density, chart.piece.V, chart.F, chart.uv, loose))
 
 
 def _fit_scale(piece: Piece, uv: FloatArray) -> FloatArray:

@@ -49,9 +49,10 @@ _ENOUGH = 0.6
 _MAX_FAILURES = 1
 # Charts are improved until this fraction of the free share remains, if all improvements succeed.
 _LEFT = 0.8
-# The search first aims at a bound with this fraction of the permitted stretch; charts of a coarse mesh, whose seams are
-# carried to the surface, only need to keep the second one there.
-_AIM, _AIM_OF_CARRIED = 0.6, 0.7
+# The search first aims at a bound with this fraction of the permitted stretch.
+_AIM = 0.6
+#: Charts of a coarse mesh, whose seams are carried to the surface, only need to keep this fraction there.
+AIM_OF_CARRIED = 0.7
 # Overlaps of at most this share of a chart are separated without dividing the chart.
 _SMALL_OVERLAP = 0.005
 # It divides charts to reach its aim only up to this number of charts, plus a multiple of the root of the number of
@@ -148,7 +149,7 @@ def search_charts(
         All have bijective maps.
     """
     carried = any(chart.start is not None for chart in charts)
-    aim = 1 + (1.0 if not joinable else _AIM_OF_CARRIED if carried else _AIM) * (bound - 1)
+    aim = 1 + (1.0 if not joinable else AIM_OF_CARRIED if carried else _AIM) * (bound - 1)
     root = sum(len(chart.F) for chart in charts) ** 0.5
     few, many = (len(charts) + round(base + share * root) for base, share in (_FEW_CHARTS, _MANY_CHARTS))
     keep([*charts])

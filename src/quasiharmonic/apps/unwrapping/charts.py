@@ -116,7 +116,7 @@ def find_charts(
         working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
     min_gain = _MIN_GAIN if uv_cuts is None else np.inf
     coarse = uv_cuts is None and max_charts is None and not given.size
-    search_first = partial(CoarseSearch, max_stretch, workers, len(V)) if coarse else None
+    search_first = partial(CoarseSearch, max_stretch, workers, V) if coarse else None
     cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain, search_first=search_first)
     draft.charts = [*charts]
     total = surface_area(V, F)

@@ -1,9 +1,11 @@
 """Charts of a large surface from those of a coarse mesh: their seams, and initial maps close to the final ones.
 
 The seams of all charts of the coarse mesh are carried to the surface and shortened there. A vertex in the interior of a
-coarse chart keeps its position in that chart's map. The other vertices of a chart of the surface get the harmonic
-extension. Then every triangle is rotated as this map rotates it, and the map is fitted to the rotated triangles [1]_,
-which is repeated. All systems have one unknown per vertex and the same matrix.
+coarse chart keeps its position in that chart's map, and so do vertices that are inserted between such vertices. They
+give the rotations of their triangles. The triangles near seams get theirs by unfolding from their neighbours. The map
+is fitted to the rotated triangles [1]_, then to the nearest ones that are stretched little, which is repeated. All
+systems have one unknown per vertex and the same matrix. The surroundings of the few triangles that stay inverted are
+mapped by `injective_map`. A map whose boundary meets itself is not used.
 
 References
 ----------
@@ -15,30 +17,40 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
-from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
+from quasiharmonic.apps.flattening.multilevel.coarse_flattening import grow_rings
+from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
+from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
 from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.geometry.coarsening.levels import Removal, has_marked_corner
 from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.fans import split_parts
 from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.solver.mapping import injective_map
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, sum_at, to_complex, to_points
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
 
-# Numbers of fits after which a map without inverted triangles is used, and after which the search for one ends.
-_FITS, _MOST_FITS = 4, 16
+# Number of fits to rotated triangles, and least and largest number of all fits.
+_FITS, _LEAST_FITS, _MOST_FITS = 4, 6, 16
+# A fit permits this share of the stretch that the bound permits.
+_PERMITTED = 0.5
+# Maps with a larger share of inverted triangles are not repaired.
+_FEW = 0.01
+_NO_CUT = np.empty((0, 2), dtype=np.int64)
 
 
 class CoarseSearch:
     """A search for charts on the coarse mesh of a surface with ``n`` vertices; ``names`` (m,) are those of its part."""
 
-    def __init__(self, bound: float, workers: Workers, n: int, names: IntArray) -> None:
-        self._bound, self._workers, self._names = bound, workers, names
-        self._chart, self._place = np.full(n, -1), np.zeros(n, dtype=np.complex128)
+    def __init__(self, bound: float, workers: Workers, V: FloatArray, names: IntArray) -> None:
+        self._bound, self._workers, self._V, self._names = bound, workers, V, names
+        self._chart, self._place = np.full(len(V), -1), np.zeros(len(V), dtype=np.complex128)
         self._count = 0
 
-    def __call__(self, graph: EdgeGraph, cut: BoolArray, vertices: IntArray) -> BoolArray:
+    def __call__(self, graph: EdgeGraph, cut: BoolArray, vertices: IntArray, rounds: list[list[Removal]]) -> BoolArray:
         """Return the seams (e,) of the charts of a coarse mesh, given cuts that make disks."""
         F, names = graph.F, self._names[vertices]
         cost = (graph.cost / edge_graph(graph.V, F).cost)[graph.side].T
@@ -61,11 +73,26 @@ class CoarseSearch:
             for loop in chart.piece.loops:
                 seams[graph.numbers(*chart.vertices[np.stack([loop, np.roll(loop, -1)])])] = True
         self._chart[names[graph.mark_vertices(seams)]] = -1
+        self._prolong(rounds)
         return seams & ~graph.rim
 
     def start(self, charts: list[WorkingChart]) -> None:
         """Give initial maps to charts of the surface, where the coarse ones give an injective map."""
         self._workers.map("start", self._start, charts)
+
+    def _prolong(self, rounds: list[list[Removal]]) -> None:
+        """Place vertices that the coarse mesh lacks, round after round, if their ring is in a chart."""
+        for removals in reversed(rounds):
+            for vertices, rings in removals:
+                vertices, rings = self._names[vertices], self._names[rings]
+                of = self._chart[rings]
+                inside = (of[:, 0] >= 0) & (of == of[:, :1]).all(axis=1)
+                vertices, rings = vertices[inside], rings[inside]
+                distance = np.linalg.norm(self._V[rings] - self._V[vertices][:, None], axis=2)
+                weight = 1 / np.maximum(distance, np.finfo(np.float64).tiny)
+                weight /= weight.sum(axis=1, keepdims=True)
+                self._place[vertices] = (weight * self._place[rings]).sum(axis=1)
+                self._chart[vertices] = of[inside, 0]
 
     def _start(self, chart: WorkingChart) -> None:
         of = self._chart[chart.vertices]
@@ -77,29 +104,106 @@ class CoarseSearch:
             return
         g = chart.piece.energy(SymmetricDirichlet(), None).g
         try:
-            chart.start = _fit(chart.F, g, self._place[chart.vertices], known, self._workers)
+            chart.start = _fit(
+                chart, g, self._place[chart.vertices], known, 1 + AIM_OF_CARRIED * (self._bound - 1), self._workers
+            )
         except NotPositiveDefinite:
             return
 
 
-def _fit(F: IntArray, g: ComplexArray, w: ComplexArray, known: BoolArray, workers: Workers) -> FloatArray | None:
+def _fit(
+    chart: WorkingChart, g: ComplexArray, w: ComplexArray, known: BoolArray, bound: float, workers: Workers
+) -> FloatArray | None:
     """Return an injective map (n, 2) close to the positions w (n,) of some vertices; None if none was found.
 
     ``g`` (3, f) is as in `NewtonSystem`.
     """
+    F, n = chart.F, len(w)
     corners = np.ascontiguousarray(F.T)
+    turned = _carry_rotations(F, g, w, known)
+    if turned is None:
+        return None
     area = 1 / np.abs((g[1].conj() * g[2]).imag)
-    stiffness = 2 * area * (g * g[(1, 2, 0), :].conj()).real
-    w = Laplacian(F, len(w), np.flatnonzero(known)).factor(stiffness).extend(w)
-    fitted = Laplacian(F, len(w), np.array([0])).factor(stiffness)
-    for k in range(_MOST_FITS):
+    fitted = Laplacian(F, n, np.array([0])).factor(2 * area * (g * g[(1, 2, 0), :].conj()).real)
+    w = fitted.respond(sum_at(corners.ravel(), (area * turned * g).ravel(), n))
+    most = 1 + _PERMITTED * (bound - 1)
+    for k in range(_MOST_FITS + 1):
         workers.check_wanted()
         at = w[corners]
         p, q = (g.conj() * at).sum(axis=0), (g * at).sum(axis=0)
-        if k >= _FITS and (np.abs(p) > np.abs(q)).all():
+        larger, smaller = np.abs(p) + np.abs(q), np.abs(p) - np.abs(q)
+        with np.errstate(all="ignore"):
+            scale = np.sqrt(area.sum() / (area * larger * smaller).sum())
+        good = (larger * scale < bound) & (smaller * scale * bound > 1)
+        if k == _MOST_FITS or (k >= _LEAST_FITS and area[~good].sum() <= FREE_SHARE * area.sum()):
             break
-        turned = p / np.maximum(np.abs(p), np.finfo(np.float64).tiny)
-        load = area * ((turned - p) * g - q * g.conj())
-        w = w + fitted.respond(sum_at(corners.ravel(), load.ravel(), w.size))
-    uv = to_points(w)
-    return uv if is_injective(F, uv) else None
+        # At first the targets are rotations, then the nearest matrices with little stretch.
+        less = 1.0 if k < _FITS else most
+        larger, smaller = np.clip(larger, 1 / less, less), np.clip(smaller, 1 / less, less)
+        target = 0.5 * (larger + smaller) * _direction(p) - p, 0.5 * (larger - smaller) * _direction(q) - q
+        load = area * (target[0] * g + target[1] * g.conj())
+        w = w + fitted.respond(sum_at(corners.ravel(), load.ravel(), n))
+    if not np.isfinite(w).all() or len(check_loops(chart.piece.loops, to_points(w))[0]):
+        return None
+    return _repair(chart, to_points(w), smaller <= 0)
+
+
+def _direction(p: ComplexArray) -> ComplexArray:
+    """Return ``p / |p|``, or 0."""
+    return p / np.maximum(np.abs(p), np.finfo(np.float64).tiny)
+
+
+def _repair(chart: WorkingChart, uv: FloatArray, inverted: BoolArray) -> FloatArray | None:
+    """Map the surroundings of inverted triangles (f,) anew, with all other vertices fixed; None if that fails."""
+    if is_injective(chart.F, uv):
+        return uv
+    if np.count_nonzero(inverted) > _FEW * len(chart.F):
+        return None
+    n = len(uv)
+    loose = grow_rings(chart.F, mark(n, chart.F[inverted])) & ~mark(n, *chart.piece.loops)
+    rows = np.flatnonzero(has_marked_corner(chart.F, loose))
+    if not rows.size:
+        return None
+    for _, T, vertices in split_parts(chart.F[rows], rows, _NO_CUT, n):
+        fixed = np.flatnonzero(~loose[vertices])
+        try:
+            uv[vertices] = injective_map(chart.V[vertices], T, fixed, uv[vertices[fixed]]).uv
+        except ValueError:
+            # The surroundings are no disks.
+            return None
+    return uv if is_injective(chart.F, uv) else None
+
+
+def _carry_rotations(F: IntArray, g: ComplexArray, w: ComplexArray, known: BoolArray) -> ComplexArray | None:
+    """Return the rotation (f,) of each triangle: by a map w (n,), or as its neighbours unfold if a corner is unknown.
+
+    None if no triangle has known corners.
+    """
+    at = w[np.ascontiguousarray(F.T)]
+    p, q = (g.conj() * at).sum(axis=0), (g * at).sum(axis=0)
+    done = known[F].all(axis=1) & (np.abs(p) > np.abs(q))
+    if not done.any():
+        return None
+    turned = _direction(p)
+    sides = edge_keys(F, F[:, (1, 2, 0)], len(w)).ravel()
+    order = np.argsort(sides, kind="stable")
+    pairs = np.flatnonzero(np.diff(sides[order]) == 0)
+    one, other = order[pairs], order[pairs + 1]
+    # Side k of a triangle is orthogonal to the gradient at its opposite corner.
+    side = np.ascontiguousarray(g[(2, 0, 1), :].T).ravel()
+    turn = -side[one] / side[other]
+    turn /= np.abs(turn)
+    source, there = np.concatenate([one, other]) // 3, np.concatenate([other, one]) // 3
+    turn = np.concatenate([turn, turn.conj()])
+    left = ~done[there]
+    source, there, turn = source[left], there[left], turn[left]
+    while True:
+        reached = done[source]
+        if not reached.any():
+            return turned
+        new = there[reached]
+        total = sum_at(new, turned[source[reached]] * turn[reached], len(F))
+        turned[new] = _direction(total[new])
+        done[new] = True
+        left = ~done[there]
+        source, there, turn = source[left], there[left], turn[left]

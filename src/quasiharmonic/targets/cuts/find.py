@@ -8,6 +8,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.geometry.coarsening.levels import Removal
 from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
@@ -119,12 +120,12 @@ def find_cuts_by(
     given: IntArray,
     costs: FloatArray | None,
     min_gain: float,
-    extend: Callable[[EdgeGraph, BoolArray, IntArray], BoolArray] | None = None,
+    extend: Callable[[EdgeGraph, BoolArray, IntArray, list[list[Removal]]], BoolArray] | None = None,
 ) -> IntArray:
     """Find cuts as `find_cuts` does, from checked arrays.
 
     On the coarse mesh of a large surface, ``extend`` replaces the cuts (e,) bool of an `EdgeGraph` by others, which are
-    carried to the surface. It also gets the indices (m,) of the graph's vertices.
+    carried to the surface. It also gets the indices (m,) of the graph's vertices, and the removed ones by rounds.
     """
     inner = manifold_edges(F, len(V)).interior
     # Open along the given edges. Surfaces that touch at a vertex are also separated.
@@ -135,9 +136,14 @@ def find_cuts_by(
         names, own = origin[vertices], None if costs is None else costs[triangles]
         if vertices.size > _LARGE:
 
-            def find(graph: EdgeGraph, some: IntArray, names: IntArray = names) -> BoolArray:
+            def find(
+                graph: EdgeGraph, some: IntArray, rounds: list[list[Removal]], names: IntArray = names
+            ) -> BoolArray:
                 cut = _cut_part(graph, min_gain)
-                return cut if extend is None else extend(graph, cut, names[some])
+                if extend is None:
+                    return cut
+                own = [[Removal(names[gone], names[rings]) for gone, rings in removals] for removals in rounds]
+                return extend(graph, cut, names[some], own)
 
             cut = cut_by_levels(V[names], T, own, find, rings)
         else:

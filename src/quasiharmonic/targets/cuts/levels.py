@@ -27,7 +27,11 @@ _RINGS = 5
 
 
 def cut_by_levels(
-    V: FloatArray, F: IntArray, costs: FloatArray | None, find: Callable[[EdgeGraph, IntArray], BoolArray], rings: int
+    V: FloatArray,
+    F: IntArray,
+    costs: FloatArray | None,
+    find: Callable[[EdgeGraph, IntArray, list[list[Removal]]], BoolArray],
+    rings: int,
 ) -> IntArray:
     """Cut a large connected surface.
 
@@ -58,7 +62,7 @@ def cut_by_levels(
     factors = [None] * (len(coarsening.rounds) + 1) if costs is None else _vertex_costs(F, costs, coarsening.rounds, n)
     means = _mean_positions(V, fixed, coarsening.rounds)
     vertices, graph = _part(means, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
-    cut = vertices[graph.ends[find(graph, vertices)]]
+    cut = vertices[graph.ends[find(graph, vertices, coarsening.rounds)]]
     if not cut.size:
         return cut
     for k in reversed(range(len(coarsening.rounds))):

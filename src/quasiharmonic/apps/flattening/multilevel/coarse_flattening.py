@@ -10,7 +10,7 @@ around them are cheap.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 
 import numpy as np
@@ -22,14 +22,14 @@ from quasiharmonic.apps.flattening.disk_start import map_to_disk
 from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
-from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.coarsening.prolongation import are_positive
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, to_points
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, to_points
 
 # Fraction of the way to the weighted mean of its neighbours that a vertex moves.
 _STEP = 0.8
@@ -131,24 +131,45 @@ def _descend_on_patches(
     with np.errstate(all="ignore"):
         density = energy.energy.density(energy.deform(in_units(uv, 0)))
     for bad in _BAD * np.quantile(density, 0.75), np.quantile(density, _WORST):
-        loose = mark(len(V), F[density > bad])
-        for _ in range(_RINGS):
-            loose[F[has_marked_corner(F, loose)]] = True
-        patches = F[has_marked_corner(F, loose)]
-        if len(patches) < _MAX_SHARE * len(F):
+        loose = grow_rings(F, mark(len(V), F[density > bad]))
+        count = np.count_nonzero(has_marked_corner(F, loose))
+        if count < _MAX_SHARE * len(F):
             break
-    if not 0 < len(patches) < _MAX_SHARE * len(F):
+    if not 0 < count < _MAX_SHARE * len(F):
         return uv
+    return descend_around(thick_energy, SymmetricDirichlet(), V, F, uv, loose, linear_solver)
+
+
+def descend_around(
+    energy: Callable[[FloatArray, IntArray], DeformationEnergy],
+    density: Energy,
+    V: FloatArray,
+    F: IntArray,
+    uv: FloatArray,
+    loose: BoolArray,
+    linear_solver: str = "auto",
+) -> FloatArray:
+    """Descend on the triangles at some vertices (n,), with all others fixed; the boundary may overlap itself.
+
+    ``energy`` makes the energy of a mesh, and ``density`` is as for `descend`. Return the map (n, 2).
+    """
+    patches = F[has_marked_corner(F, loose)]
     vertices, flat = np.unique(patches, return_inverse=True)
-    patches = flat.reshape(-1, 3)
-    descent = SurfaceDescent(
-        thick_energy(V[vertices], patches), uv[vertices], linear_solver, np.flatnonzero(~loose[vertices])
-    )
-    for _ in islice(descend(descent, SymmetricDirichlet(), _MOVE_TOLERANCE), _MAX_STEPS):
+    T = flat.reshape(-1, 3)
+    descent = SurfaceDescent(energy(V[vertices], T), uv[vertices], linear_solver, np.flatnonzero(~loose[vertices]))
+    for _ in islice(descend(descent, density, _MOVE_TOLERANCE), _MAX_STEPS):
         pass
     opened = uv.copy()
     opened[vertices] = descent.uv
     return opened
+
+
+def grow_rings(F: IntArray, marked: BoolArray, rings: int = _RINGS) -> BoolArray:
+    """Return a mask (n,) of some vertices and those up to some rings of triangles around them."""
+    loose = marked.copy()
+    for _ in range(rings):
+        loose[F[has_marked_corner(F, loose)]] = True
+    return loose
 
 
 def flatten_coarse(
