@@ -60,8 +60,11 @@ def unwrap_model(
     """Unwrap the model with options of `unwrap`, along the seams that the user drew at least.
 
     With ``keep_seams`` the seams of the map are kept. With ``selected`` only the selected islands are unwrapped.
+    Triangles that have texture coordinates in the file keep them if there is no map yet.
     """
     sheet = state.sheet
+    if not state.mapped and len(sheet.unmapped):
+        return _unwrap_rest(state, callback, given)
     script, model = Script(), Code("model")
     options = {"max_stretch": 1.5, "resolution": 2048, "padding": 4.0, **given}
     if options.get("symmetry", "") is None:
@@ -103,4 +106,20 @@ def unwrap_model(
         # The call was stopped, so it cannot be repeated.
         recipe = saved_start(mapped)
     after = as_it_is(state, mapped, recipe)
+    return replace(after, from_file=False, selected=tuple(range(len(after.islands))))
+
+
+def _unwrap_rest(
+    state: SessionState, callback: Callable[[UnwrapStep], object] | None, options: dict[str, Any]
+) -> SessionState:
+    """Unwrap the triangles without texture coordinates, into the tile of the texture right of the others."""
+    sheet, surface = state.sheet, state.sheet.surface
+    assert sheet.mesh.vt is not None
+    assert sheet.mesh.FT is not None
+    FT, uv = sheet.from_file(sheet.mesh.FT).copy(), sheet.mesh.vt
+    result = unwrap(surface.V, surface.F[sheet.unmapped], callback=callback, **options)
+    right = np.ceil(uv[np.delete(FT, sheet.unmapped, axis=0), 0].max())
+    FT[sheet.unmapped] = result.indices + len(uv)
+    mapped = SeamedMesh(surface.V, surface.F, FT, np.concatenate([uv, result.uvs + np.array([right, 0.0])]))
+    after = as_it_is(state, mapped, saved_start(mapped))
     return replace(after, from_file=False, selected=tuple(range(len(after.islands))))
