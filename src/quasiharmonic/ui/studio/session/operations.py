@@ -108,8 +108,8 @@ def map_to_outline(
     word = corners if corners == "auto" else ",".join(f"{v}:{k}" for v, k in named) or None
     chosen: dict[int, int] | str = corners if isinstance(corners, str) else dict(named)
     options = {
-        "to": Given(outline, recipes.literal(outline.to), {"to": outline.to}, outline.texts),
-        "corners": Given(chosen, recipes.literal(chosen), {"corners": word}) if chosen else None,
+        "to": Given(outline, outline.to, {"to": outline.to}, outline.texts),
+        "corners": Given(chosen, chosen, {"corners": word}) if chosen else None,
     }
     recipe = _record_map(source, mapped, options, {}, only)
     after = rebuild(state, mapped, replace(recipe, outline=outline.to))

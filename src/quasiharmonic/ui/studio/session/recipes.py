@@ -108,17 +108,12 @@ def public(thing: Callable[..., Any]) -> Code:
     return Code(name, frozenset({(thing.__module__, name)}))
 
 
-def literal(value: Any) -> Code:
-    """Return a constant."""
-    return Code(repr(value))
-
-
 def _expression(value: Any) -> Code:
+    if isinstance(value, Given):
+        value = value.code
     if isinstance(value, Code):
         return value
-    if isinstance(value, Given):
-        return value.code
-    return public(value) if callable(value) else literal(value)
+    return public(value) if callable(value) else Code(repr(value))
 
 
 class Script:
@@ -149,7 +144,7 @@ class Given:
     """Value of an argument, and how command and script spell it."""
 
     value: Any
-    code: Code
+    code: Any  # An expression or a constant
     words: Mapping[str, object] = field(default_factory=dict)  # Options of the command
     texts: Mapping[str, bytes] = field(default_factory=dict)  # Files that command and script read
 

@@ -17,17 +17,7 @@ from quasiharmonic.ui.studio.offered import NAMES
 from quasiharmonic.ui.studio.protocol import MessageFrame
 from quasiharmonic.ui.studio.session import recipes
 from quasiharmonic.ui.studio.session.operations import as_it_is, make_start, saved_start
-from quasiharmonic.ui.studio.session.recipes import (
-    FACES,
-    FORBIDDEN,
-    SEAMS,
-    Code,
-    Given,
-    Script,
-    Source,
-    literal,
-    public,
-)
+from quasiharmonic.ui.studio.session.recipes import FACES, FORBIDDEN, SEAMS, Code, Given, Script, Source, public
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.options import UnwrapOptions
@@ -68,7 +58,7 @@ def unwrap_model(
     script, model = Script(), Code("model")
     options = {"max_stretch": 1.5, "resolution": 2048, "padding": 4.0, **given}
     if options.get("symmetry", "") is None:
-        options["symmetry"] = Given(None, literal(None), {"symmetry": "none"})
+        options["symmetry"] = Given(None, None, {"symmetry": "none"})
     some = selected and state.mapped and len(state.selected) < len(state.islands)
     if some or (keep_seams and state.drawn is None and state.mapped):
         mesh = state.mesh
