@@ -222,8 +222,9 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
     for end, line in zip(at[head:].tolist(), [*statements[head:-1], b""], strict=True):
         for first in range(begin, end, _CHUNK):
             bounds = starts[first : min(first + _CHUNK, end) + 1]
-            forms = ["f" + " %s" * size + "\n" for size in np.diff(bounds).tolist()]
-            yield ("".join(forms) % tuple(corners[bounds[0] : bounds[-1]])).encode()
+            sizes = np.diff(bounds).tolist()
+            forms = {size: "f" + " %s" * size + "\n" for size in set(sizes)}
+            yield ("".join(map(forms.__getitem__, sizes)) % tuple(corners[bounds[0] : bounds[-1]])).encode()
         begin = end
         yield line + b"\n" if line else b""
 
