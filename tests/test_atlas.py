@@ -402,3 +402,20 @@ def write_cube(path, k):
     _, first, same = np.unique(V.round(6), axis=0, return_index=True, return_inverse=True)
     text = "".join(f"v {a:g} {b:g} {c:g}\n" for a, b, c in V[first])
     path.write_text(text + "".join("f {} {} {} {}\n".format(*row) for row in same.ravel()[quads] + 1))
+
+
+class TestOutlines:
+    def test_each_chosen_island_goes_to_a_copy_of_an_outline(self, tmp_path):
+        mesh = seamed(tmp_path / "in.obj")
+        vertex = int(mesh.islands[2].vertices[0])
+        found = atlas.injective_map(mesh, to="rect:2x1", corners={vertex: 1}, islands=[0, 2])
+        assert found.verdict().bijective
+        assert np.array_equal(found.mesh.islands[1].uv, mesh.islands[1].uv)
+        boxes = [(found.mesh.islands[k].uv.min(axis=0), np.ptp(found.mesh.islands[k].uv, axis=0)) for k in (0, 2)]
+        np.testing.assert_allclose([size for _, size in boxes], [[2, 1], [2, 1]])
+        np.testing.assert_allclose(boxes[1][0] - boxes[0][0], [2.1, 0], atol=1e-12)
+        corner = boxes[1][0] + [boxes[1][1][0], 0]
+        np.testing.assert_allclose(found.mesh.islands[2].uv[0], corner, atol=1e-12)
+        for options, words in (({"fixed": [0], "to": "disk"}, "omit fixed or to"), ({"corners": "auto"}, "by to")):
+            with pytest.raises(ValueError, match=words):
+                atlas.injective_map(mesh, **options)

@@ -18,7 +18,7 @@ import pytest
 from quasiharmonic import batch, io
 from quasiharmonic.ui.batch.archives import places
 from quasiharmonic.ui.batch.archives.finding import find_archives
-from quasiharmonic.ui.batch.archives.results import Journal, read_about, read_results
+from quasiharmonic.ui.batch.archives.results import Journal, Result, read_about, read_results
 from quasiharmonic.ui.batch.archives.samples import read_samples
 from quasiharmonic.ui.batch.archives.tar_stream import Damage, read_members
 from quasiharmonic.ui.cli import main
@@ -129,8 +129,8 @@ class TestSamples:
 
 
 class TestJournal:
-    def record(self, name):
-        return {"problem": name, "outcome": "injective", "key": "0", "seconds": 0.1}
+    def result(self, name, data, form="obj"):
+        return Result(name, {"problem": name, "outcome": "injective", "key": "0", "seconds": 0.1}, data, form)
 
     @pytest.mark.slow
     def test_cut_anywhere_it_continues(self, tmp_path):
@@ -138,7 +138,7 @@ class TestJournal:
         journal = Journal(tmp_path / "r.tar")
         ends = [0]
         for name in names:
-            journal.add(name, self.record(name), name.encode() * 30)
+            journal.add(self.result(name, name.encode() * 30))
             ends.append(journal.part.stat().st_size)
         data = journal.part.read_bytes()
         for end in range(0, len(data) + 1, 128):
@@ -148,8 +148,8 @@ class TestJournal:
             assert list(again.entries) == names[:whole]
             assert again.part.stat().st_size == ends[whole]
             for name in names[whole:]:
-                again.add(name, self.record(name), name.encode() * 30)
-            again.finish(names[::-1], "stamp", "settings")
+                again.add(self.result(name, name.encode() * 30))
+            again.finish(names[::-1], "stamp", "settings", "obj")
             with tarfile.open(tmp_path / "s.tar") as tar:
                 assert tar.getnames() == [name + suffix for name in names[::-1] for suffix in (".obj", ".json")]
                 assert tar.extractfile(names[0] + ".obj").read() == names[0].encode() * 30
@@ -157,15 +157,15 @@ class TestJournal:
             (tmp_path / "s.tar").unlink()
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("name", ["r.tar", "r.parquet"])
-    def test_a_finished_archive_is_opened_again(self, tmp_path, name):
+    @pytest.mark.parametrize(("name", "form"), [("r.tar", "ply"), ("r.parquet", "obj"), ("r.parquet", "ply")])
+    def test_a_finished_archive_is_opened_again(self, tmp_path, name, form):
         pytest.importorskip("pyarrow")
         for step in range(3):
             journal = Journal(tmp_path / name)
             assert len(journal.entries) == step
-            journal.add(str(step), self.record(str(step)), None if step == 1 else b"v 0 0 0\n")
-            journal.finish([str(k) for k in range(step + 1)], "stamp", "settings")
-        found = [(key, record["problem"], data) for key, record, data in read_results(tmp_path / name)]
+            journal.add(self.result(str(step), None if step == 1 else b"v 0 0 0\n", form))
+            journal.finish([str(k) for k in range(step + 1)], "stamp", "settings", form)
+        found = [(key, record["problem"], data) for key, record, data, _ in read_results(tmp_path / name)]
         assert found == [("0", "0", b"v 0 0 0\n"), ("1", "1", None), ("2", "2", b"v 0 0 0\n")]
         assert os.listdir(tmp_path) == [name]
 
@@ -210,8 +210,12 @@ def strip(record):
 @pytest.mark.usefixtures("quick_workers")
 @pytest.mark.long
 class TestRun:
-    def test_as_from_folders(self, tmp_path, stars):
+    @pytest.mark.parametrize("form", ["obj", "ply"])
+    def test_as_from_folders(self, tmp_path, stars, form):
         source, expected = stars
+        if form == "ply":
+            expected = tmp_path / "folders"
+            batch.run(source, expected, batch.Settings(map_format="ply"), jobs=1)
         parquet = pytest.importorskip("pyarrow.parquet")
         import pyarrow
 
@@ -221,7 +225,7 @@ class TestRun:
                 for name in "ef" for mesh in [(source / name / "input.obj").read_bytes()]]  # fmt: skip
         parquet.write_table(pyarrow.Table.from_pylist(rows), tmp_path / "set/2.parquet")
         out = tmp_path / "out"
-        assert main(["batch", str(tmp_path / "set"), "-o", str(out), "-j", "2", "--report"]) == 0
+        assert main(["batch", str(tmp_path / "set"), "-o", str(out), "-j", "2", "--report", "--map-format", form]) == 0
         assert (out / "report.html").read_text().count("data:image/png") > 6
         rows = list(batch.read_table(out / "records.csv"))
         order = ["1.tar/d", "2.parquet/e", "2.parquet/f", "x/0.tar.gz/c", "x/0.tar.gz/a", "x/0.tar.gz/b"]
@@ -229,11 +233,12 @@ class TestRun:
         files = {path.relative_to(out / "results").as_posix() for path in (out / "results").rglob("*.*")}
         assert files == {"1.tar", "2.parquet", "x/0.tar"}
         for name in ("1.tar", "2.parquet", "x/0.tar"):
-            for key, record, data in read_results(out / "results" / name):
-                assert data == (expected / "results" / key / "map.obj").read_bytes()
+            for key, record, data, found in read_results(out / "results" / name):
+                assert found == form
+                assert data == (expected / "results" / key / f"map.{form}").read_bytes()
                 assert strip(record) == strip(record_of(expected, key))
         stamps = {path: path.stat().st_mtime_ns for path in out.rglob("results/**/*")}
-        assert batch.run(tmp_path / "set", out, jobs=1).resumed == 6
+        assert batch.run(tmp_path / "set", out, batch.Settings(map_format=form), jobs=1).resumed == 6
         assert stamps == {path: path.stat().st_mtime_ns for path in out.rglob("results/**/*")}
 
     def test_damage_change_and_move(self, tmp_path, stars):

@@ -269,3 +269,43 @@ class TestSettings:
         with pytest.raises(ValueError, match="blob"):
             batch.run(stars, "other", batch.Settings(to="blob:3"))
         assert not Path("other").exists()
+
+
+class TestMapFormat:
+    def test_binary_maps_are_the_same_and_replace_others(self, stars, tmp_path):
+        """Bit for bit; resumed, checked, merged and reported like OBJ files, from problems in either format."""
+        ply = batch.Settings(map_format="ply")
+        source = tmp_path / "binary" / "p"
+        source.mkdir(parents=True)
+        io.write_ply(source / "input.ply", io.read_mesh(stars / "a" / "input.obj"))
+        (source / "handles.txt").write_bytes((stars / "a" / "handles.txt").read_bytes())
+        out = tmp_path / "out"
+        assert batch.run(stars, out, jobs=1).solved == 4
+        maps = {path.parent: io.read_mesh(path) for path in (out / "results").rglob("map.obj")}
+        assert len(maps) == 4
+        for shard in ("1/2", "2/2"):
+            assert main(["batch", str(stars), "-o", str(out), "--map-format", "ply", "-j1", "--shard", shard]) == 0
+        assert main(["batch", "-o", str(out), "--merge", "--report"]) == 0
+        assert (out / "report.html").read_text().count("data:image/png") > 3
+        assert batch.run(stars, out, ply, jobs=1).resumed == 4
+        for folder, mesh in maps.items():
+            assert sorted(path.name for path in folder.iterdir()) == ["map.ply", "record.json"]
+            found = io.read_mesh(folder / "map.ply")
+            np.testing.assert_array_equal(found.V, mesh.V)
+            np.testing.assert_array_equal(io.map_of(found), io.map_of(mesh))
+        assert main(["check", str(folder / "map.ply")]) == 0
+        assert batch.run(tmp_path / "binary", tmp_path / "b", ply, jobs=1).solved == 1
+        once, again = (path / "results" / name / "map.ply" for path, name in ((out, "a"), (tmp_path / "b", "p")))
+        np.testing.assert_array_equal(io.map_of(io.read_mesh(once)), io.map_of(io.read_mesh(again)))
+        (out / "results/a/map.ply").write_bytes(once.read_bytes()[:-1])
+        assert batch.run(stars, out, ply, jobs=1).resumed == 3
+
+    def test_models(self, tmp_path):
+        (tmp_path / "set").mkdir()
+        io.write_obj(
+            tmp_path / "set" / "octahedron.obj",
+            io.MeshData(np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, -1, 0], [-1, 0, 0], [0, 0, -1]]), OCTAHEDRON),
+        )
+        settings = batch.Settings(unwrap={}, map_format="ply")
+        assert batch.run(tmp_path / "set", tmp_path / "out", settings, jobs=1).outcomes == {"bijective": 1}
+        assert main(["check", str(tmp_path / "out/results/octahedron.obj/map.ply")]) == 0

@@ -9,6 +9,7 @@ import pytest
 
 from quasiharmonic import io
 from quasiharmonic.surfaces import annulus, cat, grid, starfish
+from quasiharmonic.ui.studio.session import setup
 from quasiharmonic.ui.studio.session.setup import make_first_state
 from quasiharmonic.ui.studio.session.surface import MAX_TRIANGLES, make_sheet
 from shared.pages import Visitor
@@ -200,3 +201,30 @@ def test_an_image_is_shown_and_saved_with_the_map(tmp_path):
         assert io.own_texture(io.read_mesh(tmp_path / name)).data == picture
     # The model's own image is shown when it is opened.
     assert Visitor(tmp_path / "map.glb").last("image").arrays["content"].tobytes() == picture
+
+
+@pytest.mark.parametrize("spoilt", [False, True])
+@pytest.mark.parametrize("large", [False, True])
+def test_triangles_without_texture_coordinates_are_added_to_those_with(tmp_path, monkeypatch, large, spoilt):
+    """The others keep theirs, bit for bit; a large model waits for *Unwrap*. One model has a repeated triangle."""
+    (V, F), (W, G) = cat(6), grid(5, 5)
+    W = np.pad(W, [(0, 0), (0, 1)]) + 3.0
+    uv = W[:, :2] * np.array([0.4, 0.3])
+    FT = np.concatenate([np.full_like(F, -1), G, G[: int(spoilt)]])
+    mesh = io.MeshData(np.concatenate([V, W]), np.concatenate([F, G + len(V), G[: int(spoilt)] + len(V)]), vt=uv, FT=FT)
+    io.write_obj(tmp_path / "model.obj", mesh)
+    if large:
+        monkeypatch.setattr(setup, "MAX_AUTOMATIC", len(F) - 1)
+    one = Visitor(tmp_path / "model.obj")
+    note = one.last("note").header["text"]
+    assert f"{len(F)} of {len(F) + len(G)} triangles of model.obj lack texture coordinates" in note
+    assert one.session.state.mapped is not large
+    if large:
+        assert "press Unwrap" in note
+        one.does("unwrap", resolution=256)
+    state = one.session.state
+    assert state.injective
+    assert not len(state.overlapping)
+    saved = state.sheet.mapped_file(state.mesh)
+    assert np.array_equal(saved.corner_uv[len(F) : len(F) + len(G)], mesh.corner_uv[len(F) : len(F) + len(G)])
+    assert saved.corner_uv[: len(F), :, 0].min() >= 2

@@ -2,7 +2,7 @@
 
 The format is that of the Locally Injective Mappings Benchmark (Du et al. 2020): a folder with ``input.obj`` and
 ``handles.txt``. The texture coordinates of ``input.obj`` are the target positions, and ``handles.txt`` lists the fixed
-vertices.
+vertices. A PLY file, ``input.ply``, is read faster.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from quasiharmonic.io.lowlevel.textual import content_lines, integer, read_text
 from quasiharmonic.io.mesh_files import read_mesh
 from quasiharmonic.io.models.meshdata import MeshData, vertex_places
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, names_of
+
+#: Names of the mesh in the folder of a problem, the first that exists counts.
+INPUTS = "input.obj", "input.ply"
 
 
 class ProblemArrays(NamedTuple):
@@ -48,7 +51,7 @@ def read_problem(source: str | os.PathLike[str], fixed: str | os.PathLike[str] |
     Parameters
     ----------
     source : str or path-like
-        A folder with ``input.obj`` and, optionally, ``handles.txt``; or a mesh file alone.
+        A folder with ``input.obj`` or ``input.ply`` and, optionally, ``handles.txt``; or a mesh file alone.
     fixed : str or path-like, optional
         A list of fixed vertices that replaces the folder's list. Without any list, the boundary is fixed.
 
@@ -75,7 +78,7 @@ def problem_files(
     Parameters
     ----------
     source : path
-        A mesh file, or a folder with ``input.obj`` and optionally ``handles.txt``.
+        A mesh file, or a folder with ``input.obj`` or ``input.ply``, and optionally ``handles.txt``.
     fixed : path, optional
         A list of fixed vertices that replaces the folder's list.
 
@@ -90,7 +93,9 @@ def problem_files(
         check_path("fixed", fixed)
     mesh_path = Path(source)
     if mesh_path.is_dir():
-        folder, mesh_path = mesh_path, mesh_path / "input.obj"
+        folder, mesh_path = mesh_path, mesh_path / INPUTS[0]
+        if not os.path.lexists(mesh_path) and os.path.lexists(folder / INPUTS[1]):
+            mesh_path = folder / INPUTS[1]
         # lexists: a broken link counts as a list, so that reading it raises an error.
         if fixed is None and os.path.lexists(folder / "handles.txt"):
             fixed = folder / "handles.txt"

@@ -38,6 +38,8 @@ REFERENCES = "equilateral", "rest", "corrected"
 SYMMETRIES = "auto", "x", "y", "z"
 UPS = "x", "y", "z", "-x", "-y", "-z"
 INSTANCES = "share", "own"
+#: Formats of the maps of a data set, by the suffix of their files.
+MAP_FORMATS = "obj", "ply"
 #: Largest number of samples along a side of a texel.
 MAX_SAMPLES = 16
 LINEAR_SOLVERS = "auto", "mkl", "cholmod", "rslab", "qdldl", "superlu"

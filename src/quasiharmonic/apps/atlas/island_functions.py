@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import os
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from itertools import count
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +35,9 @@ from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.search.harmonising import harmonise_map
+from quasiharmonic.targets import outline
+from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+from quasiharmonic.targets.boundary.fitting import fit_boundary
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -132,6 +137,8 @@ def injective_map(
     mesh: SeamedMesh | MeshLike,
     *,
     fixed: ArrayLike | None = None,
+    to: str | os.PathLike[str] | None = None,
+    corners: Mapping[int, int] | Literal["auto"] | None = None,
     reference: Any = None,
     islands: Collection[int] | None = None,
     **rest: Any,
@@ -144,6 +151,11 @@ def injective_map(
     fixed : (k,) array of int, optional
     islands : collection of int, optional
         As for `polish`.
+    to : str or path, optional
+        Outline to which the boundaries are mapped, such as ``"letter:R"``: each island gets a copy beside the one
+        before. Holes of the outline are filled for an island without holes.
+    corners : mapping of int to int or "auto", optional
+        For ``to``: the number of the outline's corner for each of some vertices of the mesh, or corners by angle.
     reference, **rest
         Options of `quasiharmonic.injective_map`.
 
@@ -154,12 +166,23 @@ def injective_map(
     """
     mesh = as_seamed_mesh(mesh)
     checked = _check_fixed(mesh, fixed)
+    if to is None and corners is not None:
+        raise ValueError("corners are those of an outline: give it by to")
+    if to is not None and checked is not None:
+        raise ValueError("an outline fixes the boundary: omit fixed or to")
+    contours, copies = [] if to is None else outline(to), count()
+    spec = None if corners is None else CornerSpec("auto" if corners == "auto" else tuple(corners.items()))
 
-    def find(island: Island) -> MapResult:
-        own = _select_fixed(island, checked)
-        return solve(Problem(island.V, island.F, own, island.uv[own], reference=reference), **rest)
+    def pose(island: Island) -> Problem:
+        if to is None:
+            own = _select_fixed(island, checked)
+            return Problem(island.V, island.F, own, island.uv[own], reference=reference)
+        chosen = None if spec is None else spec.within(island.vertices)
+        return fit_boundary(
+            island.V, island.F, contours, corners=chosen, reference=reference, beside=next(copies)
+        ).problem
 
-    return each_island(mesh, find, only=islands)
+    return each_island(mesh, lambda island: solve(pose(island), **rest), reflect=to is None, only=islands)
 
 
 def flatten(

@@ -1,4 +1,4 @@
-"""Repair of existing maps, and fitting an island to an outline.
+"""Repair of existing maps.
 
 The package builds on `solver`, `targets` and `apps.atlas`. Start reading in `uv_repair`.
 """

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from quasiharmonic.io.formats.obj_library import list_lost_looks, make_library
 from quasiharmonic.io.formats.objlines import REFUSED, read_obj_lines
 from quasiharmonic.io.lowlevel.atomic import no_remains, write_whole
-from quasiharmonic.io.lowlevel.textual import integer_table, number_table, read_text
+from quasiharmonic.io.lowlevel.textual import as_text, integer_table, number_table, read_bytes
 from quasiharmonic.io.models.materials import companions, materials_lost, with_libraries, write_material
 from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
 
@@ -56,10 +56,10 @@ def read_obj(path: str | os.PathLike[str]) -> MeshData:
         text that is not a finite number, free-form geometry, and ``l`` or ``p`` elements whose indices are not plain
         (they cannot be kept). Also for a file that has no vertices or no faces, is missing, or is not text.
     """
-    data = read_text(path)
-    mesh = read_regular(path, data) or read_obj_lines(path, data)
-    with open(path, "rb") as file:
-        return replace(mesh, newline=b"\r\n" if b"\r\n" in file.read(_DETECTED_BYTES) else b"\n")
+    data = read_bytes(path)
+    text = as_text(path, data)
+    mesh = read_regular(path, text) or read_obj_lines(path, text)
+    return replace(mesh, newline=b"\r\n") if b"\r\n" in data[:_DETECTED_BYTES] else mesh
 
 
 def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
@@ -113,7 +113,7 @@ def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
     """Read a file whose lines of one kind all have the same form; return None for other files."""
     lines = data.count(b"\n")
     # Lines shorter than any vertex or face would need too much memory for the size of the file.
-    if not lines or 4 * lines > len(data) or b"\\\n" in data:
+    if not lines or 4 * lines > len(data) or (b"\\" in data and b"\\\n" in data):
         return None
     ends, kinds = _classify(data)
     counts = np.bincount(kinds, minlength=6)
@@ -222,8 +222,9 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
     for end, line in zip(at[head:].tolist(), [*statements[head:-1], b""], strict=True):
         for first in range(begin, end, _CHUNK):
             bounds = starts[first : min(first + _CHUNK, end) + 1]
-            forms = ["f" + " %s" * size + "\n" for size in np.diff(bounds).tolist()]
-            yield ("".join(forms) % tuple(corners[bounds[0] : bounds[-1]])).encode()
+            sizes = np.diff(bounds).tolist()
+            forms = {size: "f" + " %s" * size + "\n" for size in set(sizes)}
+            yield ("".join(map(forms.__getitem__, sizes)) % tuple(corners[bounds[0] : bounds[-1]])).encode()
         begin = end
         yield line + b"\n" if line else b""
 

@@ -72,14 +72,14 @@ def read_ply(path: str | os.PathLike[str]) -> MeshData:
         return _mesh(parse_tables(data), os.fspath(path))
 
 
-def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
+def write_ply(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = True) -> None:
     """Write a mesh as a binary PLY file, atomically.
 
     Positions and texture coordinates are doubles. Texture coordinates are the vertices' ``s`` and ``t``, or the faces'
     ``texcoord`` if there are seams or corners without texture coordinates. Those of a second channel are the faces'
     ``texcoord1``. A mesh that was read from a PLY file keeps
     all other data of that file, and its positions unchanged. Other meshes keep normals and colours that are unique per
-    vertex.
+    vertex. ``durable`` is as in `write_obj`.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def write_ply(path: str | os.PathLike[str], mesh: MeshData) -> None:
         tables = _with_second_places(_with_places(tables, with_corner_map(mesh, mesh.lower_maps[0])), mesh)
     else:
         raise ValueError("PLY files have two texture coordinates at most: write .glb")
-    write_whole(path, encode_tables(tables))
+    write_whole(path, encode_tables(tables), durable=durable)
 
 
 def not_in_ply(mesh: MeshData) -> list[str]:

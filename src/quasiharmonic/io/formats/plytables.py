@@ -283,6 +283,30 @@ def _count_kind(sizes: IntArray) -> str:
 
 def _rows(element: Element) -> bytes:
     """Return the bytes of a table."""
+    return _even_rows(element) or _uneven_rows(element)
+
+
+def _even_rows(element: Element) -> bytes | None:
+    """Return the bytes of a table if the lists of each column are equally long, else None."""
+    fields: list[Any] = []
+    for i, column in enumerate(element.columns):
+        size = 1
+        if column.sizes is not None:
+            size = int(column.sizes[0]) if element.rows else 0
+            if (column.sizes != size).any():
+                return None
+            fields.append((f"n{i}", "<" + _count_kind(column.sizes)))
+        fields.append((f"v{i}", column.values.dtype.newbyteorder("<"), (size,)))
+    table = np.empty(element.rows, np.dtype(fields))
+    for i, column in enumerate(element.columns):
+        if column.sizes is not None:
+            table[f"n{i}"] = column.sizes
+        table[f"v{i}"] = column.values.reshape(table[f"v{i}"].shape)
+    return table.tobytes()
+
+
+def _uneven_rows(element: Element) -> bytes:
+    """Return the bytes of a table."""
     width = np.zeros(element.rows, dtype=np.int64)
     fields: list[tuple[IntArray, NDArray[Any], IntArray | None]] = []
     for column in element.columns:

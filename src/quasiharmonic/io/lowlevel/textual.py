@@ -54,7 +54,11 @@ def read_text(path: str | os.PathLike[str]) -> bytes:
     Each line ends with a single newline, and there is no byte order mark. The contents need not be valid UTF-8: only
     names and comments contain non-ASCII characters, and these are passed through.
     """
-    data = read_bytes(path)
+    return as_text(path, read_bytes(path))
+
+
+def as_text(path: str | os.PathLike[str], data: bytes) -> bytes:
+    """Return the contents of a file as `read_text` does; ``path`` is for messages."""
     for start, (what, remedy) in _FOREIGN.items():
         if data.startswith(start):
             raise MeshFileError(path, what, remedy=remedy)
@@ -121,21 +125,19 @@ def number_table(block: bytes, keyword: bytes, rows: int) -> NDArray[np.float64]
     Each line of the block starts with ``keyword``, which may be empty, and ends with a newline. None if the lines
     differ in form or contain anything but finite numbers.
     """
-    block = _collapse_blanks(block)
     separators = block[: block.index(b"\n")].count(b" ")
     columns = separators if keyword else separators + 1
-    if not 1 <= columns <= 8:
-        return None
     # Without its numbers every line must be the same. Two separators enclose at most one number, so the right total
     # means that no number is missing.
-    if block.translate(None, _NUMERIC) != (keyword + b" " * separators + b"\n") * rows:
-        return None
-    numbers = block.translate(None, keyword).split()
-    if len(numbers) != rows * columns:
-        return None
+    frame = keyword + b" " * separators + b"\n"
+    is_even = 1 <= columns <= 8 and block.translate(None, _NUMERIC) == frame * rows
+    numbers = block.translate(None, keyword).split() if is_even else []
+    if not is_even or len(numbers) != rows * columns:
+        even = _collapse_blanks(block)
+        return None if even == block else number_table(even, keyword, rows)
     try:
         # float() rounds correctly and is as fast as any array function.
-        values = np.array(list(map(float, numbers)))
+        values = np.fromiter(map(float, numbers), np.float64, len(numbers))
     except ValueError:
         return None
     return values.reshape(rows, columns) if np.isfinite(values).all() else None
@@ -147,10 +149,10 @@ def integer_table(block: bytes, form: bytes, rows: int) -> NDArray[np.int64] | N
     ``form`` is a line with ``1`` for every number: ``b"f 1/1 1/1 1/1\n"``. Numbers that are too large become 2⁶³ - 1.
     None if a line has another form.
     """
-    block = _collapse_blanks(block)
     frame = form.replace(b"1", b"")
     if block.translate(None, b"0123456789") != frame * rows:
-        return None
+        even = _collapse_blanks(block)
+        return None if even == block else integer_table(even, form, rows)
     # As in `number_table`. In addition, reject digits where the form has none.
     for joint in {form[i : i + 2] for i in range(len(form) - 1)}:
         if b"1" not in joint and block.count(joint) != form.count(joint) * rows:

@@ -240,6 +240,9 @@ def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
     """
     uv = np.full((len(mesh.V), 2), np.nan)
     seam = np.zeros(len(mesh.V), dtype=np.bool_)
+    if mesh.vt is not None and mesh.FT is not None and np.array_equal(mesh.FT, mesh.F):
+        uv[mesh.F] = mesh.vt[mesh.F]
+        return uv, seam
     places = mesh.corner_uv
     given = ~np.isnan(places[:, :, 0])
     vertex, place = mesh.F[given], places[given]

@@ -115,10 +115,10 @@ def run(
     """Solve every problem of a data set in separate processes; a failure does not affect other problems.
 
     If the problems are in archives, their results are in archives of the same names in ``output/results``. Otherwise
-    every problem gets a folder in ``output/results`` with its map, ``map.obj``, and its record, ``record.json``. Both
-    are written completely when the problem is finished. The same call resumes an interrupted run: a problem is skipped
-    if its record has the same input and settings. At the end all records are collected in ``output/records.csv`` or
-    ``.parquet``.
+    every problem gets a folder in ``output/results`` with its map, ``map.obj`` or ``map.ply``, and its record,
+    ``record.json``. Both are written completely when the problem is finished. The same call resumes an interrupted run:
+    a problem is skipped if its record has the same input and settings. At the end all records are collected in
+    ``output/records.csv`` or ``.parquet``.
 
     Parameters
     ----------

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quasiharmonic import io
-from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.linsolve import available
@@ -52,14 +51,6 @@ class _SingleIsland(NamedTuple):
     mapped: Callable[[FloatArray], io.MeshData]
 
 
-class _GroupMap(NamedTuple):
-    """Written map, as read back from its file."""
-
-    V: FloatArray
-    F: IntArray
-    uv: FloatArray
-
-
 def solver_for(problem: Problem, linear_solver: str) -> str:
     """Return the linear solver for a problem: QDLDL for a small problem if the user did not choose one.
 
@@ -86,38 +77,27 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
             if len(one.mesh.F) <= SMALL:
                 read[k] = one
     posed = _find_single_islands(read, settings)
-    written: dict[int, _GroupMap] = {}
     for k, result in _solve_first_stage({k: one.problem for k, one in posed.items()}, settings):
-        record = read[k].record
+        record, certificate = read[k].record, result.certificate
+        path = records.map_path(folders[k], settings["map_format"])
         record |= metadata.sizes([posed[k].problem]) | metadata.describe_search([result], result.status)
         record |= {"flips_before": result.history[0].inverted, "seconds_map": result.seconds}
         try:
             records.clear(folders[k])
             with metadata.time_phase(record, "write"):
-                path = records.map_path(folders[k])
-                io.write_obj(path, posed[k].mapped(result.uv), durable=False)
-                found = _read_map(io.read_mesh(path))
-        except FileInUseError:
-            continue  # tried again when the problem is solved individually
-        if np.array_equal(found.F, posed[k].problem.F) and len(found.V) == posed[k].problem.n:
-            written[k] = found
-    with _time_shared([read[k].record for k in written], "write"):
-        loops = [posed[k].problem.domain.loops for k in written]
-        certificates = certify_each([one.F for one in written.values()], [one.uv for one in written.values()], loops)
-    for (k, found), certificate in zip(written.items(), certificates, strict=True):
-        if not certificate.injective:
-            continue
-        record = read[k].record
-        path = records.map_path(folders[k])
-        record |= metadata.describe_map(path, "injective", True, bool(certificate.bijective), 0)
-        with metadata.time_phase(record, "measure"):
-            record |= metadata.measure(*found)
-        record["peak_memory"] = metadata.peak()
-        record["seconds"] = sum(value for name, value in record.items() if name.startswith("seconds_"))
-        try:
+                records.write_map(path, posed[k].mapped(certificate.uv))
+                V, F, uv = _read_map(io.read_mesh(path))
+            # The same map has the same certificate.
+            if not np.array_equal(F, certificate.F) or not np.array_equal(uv, certificate.uv):
+                continue
+            record |= metadata.describe_map(path, "injective", True, bool(certificate.bijective), 0)
+            with metadata.time_phase(record, "measure"):
+                record |= metadata.measure(V, F, uv)
+            record["peak_memory"] = metadata.peak()
+            record["seconds"] = sum(value for name, value in record.items() if name.startswith("seconds_"))
             records.write_record(folders[k], record)
         except FileInUseError:
-            continue
+            continue  # tried again when the problem is solved individually
         tell({"done": k, "outcome": "injective", "seconds": record["seconds"]})
 
 
@@ -178,11 +158,11 @@ def _solve_first_stage(problems: dict[int, Problem], settings: dict[str, Any]) -
                 yield k, result
 
 
-def _read_map(mesh: io.MeshData) -> _GroupMap:
-    """Return the mesh and the map of a file."""
+def _read_map(mesh: io.MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Return vertices, triangles and map of a file."""
     if mesh.vt is not None and len(mesh.vt) == len(mesh.V) and mesh.FT is not None and np.array_equal(mesh.FT, mesh.F):
-        return _GroupMap(mesh.V, mesh.F, mesh.vt)
-    return _GroupMap(*io.cut_at_seams(mesh))
+        return mesh.V, mesh.F, mesh.vt
+    return io.cut_at_seams(mesh)
 
 
 @contextmanager

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from quasiharmonic import io
 from quasiharmonic.apps.atlas.mapped_atlas import name_island, orient_islands
 from quasiharmonic.apps.atlas.seam_cuts import cut_apart
-from quasiharmonic.apps.repair.fitting import FittedProblem, fit_boundary, fix_in_place
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.targets.boundary.corner_spec import CornerSpec, read_corners
+from quasiharmonic.targets.boundary.fitting import FittedProblem, fit_boundary, fix_in_place
 from quasiharmonic.targets.boundary.sliding_curves import find_sliding_curves
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from quasiharmonic.io import problem_files, suffixes
 from quasiharmonic.io.errors import check_path
+from quasiharmonic.io.handles import INPUTS
 from quasiharmonic.util.arrays import check_bool
 
 #: A file that marks a folder as the output of a run; problems are not searched there.
@@ -62,8 +63,8 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
         with one folder or mesh per line, relative to the list's folder; blank lines and comments are skipped. A comment
         begins with ``#`` at the start of a line or after a space.
     plain : bool
-        Take every mesh as a problem. Otherwise a problem is a folder with ``input.obj`` and, usually,
-        ``handles.txt``, or an OBJ file that is named itself.
+        Take every mesh as a problem. Otherwise a problem is a folder with ``input.obj`` or ``input.ply`` and, usually,
+        ``handles.txt``, or a mesh file that is named itself.
 
     Yields
     ------
@@ -134,7 +135,7 @@ def _find_problems_below(
     files = {entry for entry, is_folder in kinds if not is_folder}
     if MARKER in files:
         return
-    if not plain and "input.obj" in files:
+    if not plain and not files.isdisjoint(INPUTS):
         name = name or folder.name
         yield ProblemFiles(name, *problem_files(folder))
     for entry, is_folder in kinds:

@@ -15,8 +15,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
+from quasiharmonic.io.formats.obj import write_obj
+from quasiharmonic.io.formats.ply import write_ply
 from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole, writing
+from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.options import MAP_FORMATS
 from quasiharmonic.util.untrusted import parse_json
 
 Record = dict[str, Any]
@@ -105,14 +109,21 @@ COLUMNS: dict[str, type] = {
 TABLES = "records.csv", "records.parquet"
 #: File name of the record in the folder of a problem's results.
 FILE = "record.json"
-_MAP = "map.obj"
 _ROWS = 1000
 _NO_TABLE = "cannot be read as a table: "
 
 
-def map_path(folder: Path) -> Path:
-    """Return the path of a problem's map in the folder of its results."""
-    return folder / _MAP
+def map_path(folder: Path, form: str) -> Path:
+    """Return the path of a problem's map, in one of `MAP_FORMATS`, in the folder of its results."""
+    return folder / f"map.{form}"
+
+
+def write_map(path: Path, mesh: MeshData) -> None:
+    """Write a map without waiting for the disk, which would take longer than most problems.
+
+    `is_complete` detects truncated files. OutputError if it cannot be written.
+    """
+    (write_ply if path.suffix == ".ply" else write_obj)(path, mesh, durable=False)
 
 
 def write_record(folder: Path, record: Record) -> None:
@@ -153,22 +164,25 @@ def clear(folder: Path) -> None:
     OutputError if the folder cannot be created or emptied, FileInUseError if another program has one of its files open.
     """
     with writing(f"results to {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_results(folder)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            remove_results(folder)
 
 
 def remove_results(folder: Path) -> None:
     """Delete the results in a folder, the record first; OSError if that fails."""
-    for path in (folder / FILE, folder / _MAP, *folder.glob(".qhm-*.tmp")):
+    maps = [map_path(folder, form) for form in MAP_FORMATS]
+    for path in (folder / FILE, *maps, *folder.glob(".qhm-*.tmp")):
         remove_file(path)
 
 
-def is_complete(folder: Path, record: Record) -> bool:
-    """Whether the map of a record exists and has the recorded length."""
+def is_complete(path: Path, record: Record) -> bool:
+    """Whether the map of a record exists at a path and has the recorded length."""
     if record.get("map_bytes") is None:
         return True
     try:
-        return (folder / _MAP).stat().st_size == record["map_bytes"]
+        return path.stat().st_size == record["map_bytes"]
     except OSError:
         return False
 

@@ -16,10 +16,12 @@ from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
 from quasiharmonic.linsolve import available
 from quasiharmonic.solver.search.stages import Stages, select_strategy
 from quasiharmonic.ui.batch.problems import ProblemFiles
+from quasiharmonic.ui.batch.records import map_path
 from quasiharmonic.util.arrays import check_choice, describe
 from quasiharmonic.util.options import (
     ENERGIES,
     FLATTENED,
+    MAP_FORMATS,
     MAX_ITERATIONS,
     REFERENCES,
     STRATEGIES,
@@ -112,7 +114,9 @@ class Settings(DescentOptions):
 
     unwrap : dict or None
         If given, problems are models of any kind, and `quasiharmonic.unwrap` computes their texture coordinates with
-        these options, such as ``{"max_stretch": 1.2}``. No other setting applies.
+        these options, such as ``{"max_stretch": 1.2}``. Of the other settings only ``map_format`` applies.
+    map_format : {"obj", "ply"}
+        Format of the maps. Binary PLY files are read and written faster.
 
     Raises
     ------
@@ -139,6 +143,7 @@ class Settings(DescentOptions):
     linear_solver: str = option("auto", check=lambda name, value: check_choice(name, value, ("auto", *available())))
 
     unwrap: dict[str, Any] | None = option(None, check=_unwrap_options)
+    map_format: str = option(MAP_FORMATS[0], check=one_of(*MAP_FORMATS))
 
     def __post_init__(self) -> None:
         """Check the values, without reading files."""
@@ -147,7 +152,7 @@ class Settings(DescentOptions):
 
     def _check_combination(self) -> None:
         """Raise ValueError if a setting has no effect with the others."""
-        changed = {one.name for one in fields(self) if getattr(self, one.name) != one.default}
+        changed = {one.name for one in fields(self) if getattr(self, one.name) != one.default} - {"map_format"}
         if self.unwrap is not None:
             others = [one.name for one in fields(self) if one.name in changed and one.name != "unwrap"]
             if others:
@@ -279,3 +284,7 @@ class Orders(Options):
     def folder(self, files: ProblemFiles) -> Path:
         """Return the folder of a problem's map and record."""
         return files.results or self.output / "results" / files.name
+
+    def map_path(self, folder: Path) -> Path:
+        """Return the path of a problem's map in the folder of its results."""
+        return map_path(folder, self.settings.map_format)

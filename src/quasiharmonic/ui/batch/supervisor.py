@@ -110,7 +110,7 @@ class Supervisor:
             return _conclude(folder, known | {"outcome": "invalid", "error": str(error)}, 0.0)
         before = None if again else records.read_record(folder)
         finished = None if before is None else find_resumed(files.name, before, known["key"], orders)
-        if before is not None and finished is not None and records.is_complete(folder, before):
+        if before is not None and finished is not None and records.is_complete(orders.map_path(folder), before):
             return finished
         return {
             "mesh": str(files.mesh),

@@ -11,7 +11,7 @@ from quasiharmonic import io
 from quasiharmonic.apps.unwrapping.model_files import add_map, is_written, polygon_costs
 from quasiharmonic.apps.unwrapping.unwrap import unwrap
 from quasiharmonic.ui.batch import metadata
-from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.ui.batch.records import Record, write_map
 
 
 def unwrap_model(
@@ -34,7 +34,6 @@ def unwrap_model(
         "status": result.status.name.lower(),
     }
     with metadata.time_phase(record, "write"):
-        # As for maps, the file is not awaited on the disk.
-        io.write_obj(path, add_map(mesh, result)[0], durable=False)
+        write_map(path, add_map(mesh, result)[0])
         certified = result.success and is_written(io.read_mesh(path), result)
     record |= metadata.describe_map(path, "bijective", certified, certified, None)

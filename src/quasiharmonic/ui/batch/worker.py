@@ -28,7 +28,6 @@ from quasiharmonic.apps.atlas import island_functions as atlas
 from quasiharmonic.apps.atlas.atlas_verdict import certify
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, each_island, merge_refined, orient_islands
 from quasiharmonic.apps.flattening.free_boundary import check_flattenable
-from quasiharmonic.apps.repair.fitting import FittedProblem
 from quasiharmonic.energies.polishing import polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.refinement import Refined
@@ -37,6 +36,7 @@ from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refine.attempts import on_refinement
+from quasiharmonic.targets.boundary.fitting import FittedProblem
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
@@ -140,13 +140,14 @@ def solve_files(job: dict[str, Any], tell: Tell) -> Record:
 def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -> None:
     """Read, solve, write, certify and measure a problem; each result is recorded as soon as it is known."""
     settings = job["settings"]
+    path = records.map_path(folder, settings["map_format"])
     with metadata.time_phase(record, "read"), use_bound(job["record"].get("memory_limit")):
         mesh = io.read_mesh(job["mesh"])
     if settings["unwrap"] is not None:
         # SciPy's subpackages that this needs would double the time in which workers for maps start.
         from quasiharmonic.ui.batch import unwrapped_models
 
-        unwrapped_models.unwrap_model(mesh, settings["unwrap"], records.map_path(folder), record, tell)
+        unwrapped_models.unwrap_model(mesh, settings["unwrap"], path, record, tell)
         return
     with metadata.time_phase(record, "read"):
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
@@ -168,7 +169,7 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
     if settings["pack"]:
         mapped = mapped.with_places(atlas.pack(io.mapped(mapped)))
     with metadata.time_phase(record, "write"):
-        record |= _write_map(records.map_path(folder), mapped, "bijective" if settings["flatten"] else "injective")
+        record |= _write_map(path, mapped, "bijective" if settings["flatten"] else "injective")
     with metadata.time_phase(record, "measure"):
         record |= metadata.measure(*io.without_idle(*io.cut_at_seams(mapped)))
 
@@ -253,8 +254,7 @@ def _flatten_islands(surface: SeamedMesh, settings: dict[str, Any], record: Reco
 
 def _write_map(path: Path, mesh: io.MeshData, required: str) -> Record:
     """Write a map, read it back, and certify that it is injective or bijective, as required."""
-    # Waiting for the disk would take longer than most problems. `is_complete` detects truncated files.
-    io.write_obj(path, mesh, durable=False)
+    records.write_map(path, mesh)
     V, F, uv = io.cut_at_seams(io.read_mesh(path))
     verdict = certify(SeamedMesh(V, F, F, uv))
     bijective = verdict.bijective and not len(verdict.overlapping)

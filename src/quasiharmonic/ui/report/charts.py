@@ -17,6 +17,7 @@ from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.archives.results import find_map
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.util.arrays import FloatArray, scale_to_unit
+from quasiharmonic.util.options import MAP_FORMATS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -177,13 +178,15 @@ def thumbnail(record: Record, results: Path | None) -> str:
 
 def _read(record: Record, results: Path | None) -> tuple[MeshData | None, bool]:
     """Return the mesh to draw, and whether it has a map."""
-    data = None if results is None else find_map(results, record["problem"])
-    if data is not None:
-        with TemporaryDirectory() as folder:
-            path = Path(folder, "map.obj")
+    found = None if results is None else find_map(results, record["problem"])
+    if found is not None:
+        data, form = found
+        with TemporaryDirectory() as place:
+            path = records.map_path(Path(place), form)
             path.write_bytes(data)
             return io.read_mesh(path), True
-    candidates = [] if results is None else [(records.map_path(results / record["problem"]), True)]
+    folder = None if results is None else results / record["problem"]
+    candidates = [] if folder is None else [(records.map_path(folder, form), True) for form in MAP_FORMATS]
     if record.get("source"):
         candidates.append((Path(record["source"]), False))
     for path, mapped in candidates:

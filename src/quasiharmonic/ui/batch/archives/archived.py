@@ -81,7 +81,7 @@ class ArchivedProblems:
         self._present = frozenset(results.results_name(archive.name) for archive in archives)
         self._archives = [archive for archive in archives if shard.contains(archive.name)]
         self._outputs, self._scratch = outputs, scratch
-        self._settings_key = orders.settings.key_of(b"", b"")
+        self._settings_key, self._form = orders.settings.key_of(b"", b""), orders.settings.map_format
         self._lock = threading.RLock()  # `problems` runs in other threads than the other methods
         self._numbers = count()
         self._extracted: dict[str, _Extracted] = {}
@@ -137,8 +137,8 @@ class ArchivedProblems:
                 yield {"problem": archive.name, "source": archive.location, **failure}
                 continue
             with self._outputs.reading(results.results_name(archive.name)) as path:
-                for key, record, _ in () if path is None else results.read_results(path, maps=False):
-                    yield record | _names(archive, key)
+                for one in () if path is None else results.read_results(path, maps=False):
+                    yield one.record | _names(archive, one.key)
 
     def _problems_of(self, archive: Archive) -> Iterator[ProblemFiles]:
         name = results.results_name(archive.name)
@@ -189,7 +189,7 @@ class ArchivedProblems:
             mesh, fixed = sample.mesh, None if self.orders.settings.plain else sample.fixed
             if sample.error is not None or mesh is None:
                 record = names | {"outcome": "invalid", "certified": False, "error": sample.error}
-                opened.journal.add(sample.key, record, None)
+                opened.journal.add(results.Result(sample.key, record, None, self._form))
                 self._ready.append(Finished(names["problem"], "invalid", 0.0))
                 return None
             key = self.orders.settings.key_of(sample.files[mesh], b"" if fixed is None else sample.files[fixed])
@@ -218,9 +218,9 @@ class ArchivedProblems:
         else:
             if record.get("error"):
                 record["error"] = record["error"].replace(str(folder), record["source"])
-            path = records.map_path(folder)
+            path = records.map_path(folder, self._form)
             data = path.read_bytes() if record.get("map_bytes") is not None and path.exists() else None
-            opened.journal.add(key, record, data)
+            opened.journal.add(results.Result(key, record, data, self._form))
         opened.waiting -= 1
         with suppress(OSError):  # in use by another program: the folder is not used again
             records.remove_results(folder)
@@ -237,7 +237,7 @@ class ArchivedProblems:
         if opened.copy is not None:
             shutil.rmtree(opened.copy, ignore_errors=True)
         if not opened.lost:
-            opened.journal.finish(opened.order, opened.stamp, self._settings_key)
+            opened.journal.finish(opened.order, opened.stamp, self._settings_key, self._form)
             self._outputs.publish(opened.journal.path.relative_to(self._outputs.path("")).as_posix())
 
 

@@ -1,7 +1,7 @@
 """Archives of results: one for each archive of problems, with the same names in the same order.
 
-A tar file has ``NAME.obj``, the map, and ``NAME.json``, the record, for each problem. A Parquet file has the columns of
-the records and ``obj``. The metadata of both identify the input and the settings.
+A tar file has ``NAME.obj`` or ``NAME.ply``, the map, and ``NAME.json``, the record, for each problem. A Parquet file
+has the columns of the records and ``obj`` or ``ply``. The metadata of both identify the input and the settings.
 
 A journal keeps the results of an archive that is not finished, in the order in which they were found.
 """
@@ -30,12 +30,13 @@ from quasiharmonic.ui.batch.archives.tar_stream import (
     read_members,
 )
 from quasiharmonic.ui.batch.records import Record, load_pyarrow
+from quasiharmonic.util.options import MAP_FORMATS
 from quasiharmonic.util.untrusted import parse_json
 
 #: Suffix of the name of unfinished results.
 PART = ".part"
-#: Extensions of map and record.
-MAP, RECORD = ".obj", ".json"
+# Extension of a record.
+_RECORD = ".json"
 #: Bytes at the start of a tar file with its metadata.
 MAX_ABOUT = 1 << 16
 _MARK = b"quasiharmonic"
@@ -50,6 +51,7 @@ class Result(NamedTuple):
     key: str  # Name of the problem in the archive
     record: Record
     data: bytes | None  # The map, if there is one and it was asked for
+    form: str  # Format of the map, one of `MAP_FORMATS`
 
 
 def results_name(name: str) -> str:
@@ -104,37 +106,39 @@ def outcomes(about: dict[str, Any]) -> Iterator[tuple[Record, int]]:
         yield {"outcome": outcome, "time_limit": time_limit, "memory_limit": memory_limit}, count
 
 
-def write_results(path: Path, about: dict[str, Any], found: Iterable[Result]) -> None:
-    """Write an archive of results; it appears when it is complete and on the disk."""
-    write = _write_parquet if is_parquet(path) else _write_tar
-    write_whole(path, lambda file: write(file, json.dumps(about), found))
+def write_results(path: Path, about: dict[str, Any], found: Iterable[Result], form: str) -> None:
+    """Write an archive of results with maps of one format; it appears when it is complete and on the disk."""
+    if is_parquet(path):
+        write_whole(path, lambda file: _write_parquet(file, json.dumps(about), found, form))
+    else:
+        write_whole(path, lambda file: _write_tar(file, json.dumps(about), found))
 
 
 def _write_tar(file: BinaryIO, about: str, found: Iterable[Result]) -> None:
     file.write(pack_comment(about))
     for result in found:
-        file.write(pack_result(*result))
+        file.write(_pack_result(*result))
     file.write(END_MARK)
 
 
-def pack_result(key: str, record: Record, data: bytes | None) -> bytes:
+def _pack_result(key: str, record: Record, data: bytes | None, form: str) -> bytes:
     """Return the members of a result in a tar file: the map, if there is one, and the record after it."""
-    packed = b"" if data is None else pack_member(key + MAP, data)
-    return packed + pack_member(key + RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
+    packed = b"" if data is None else pack_member(f"{key}.{form}", data)
+    return packed + pack_member(key + _RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
 
 
-def _write_parquet(file: BinaryIO, about: str, found: Iterable[Result]) -> None:
+def _write_parquet(file: BinaryIO, about: str, found: Iterable[Result], form: str) -> None:
     load_pyarrow()
     import pyarrow
 
     schema = records.table_schema()
-    schema = schema.insert(0, pyarrow.field(KEYS[0], pyarrow.string())).append(pyarrow.field("obj", pyarrow.binary()))
-    rows = ({KEYS[0]: key, **records.table_row(record), "obj": data} for key, record, data in found)
+    schema = schema.insert(0, pyarrow.field(KEYS[0], pyarrow.string())).append(pyarrow.field(form, pyarrow.binary()))
+    rows = ({KEYS[0]: key, **records.table_row(record), form: data} for key, record, data, _ in found)
     records.write_parquet(file, schema.with_metadata({_MARK: about}), rows, _ROWS)
 
 
-def find_map(folder: Path, problem: str) -> bytes | None:
-    """Return the map of a problem from the archives of results in a folder; None if there is none."""
+def find_map(folder: Path, problem: str) -> tuple[bytes, str] | None:
+    """Return the map of a problem and its format from the archives of results in a folder; None if there is none."""
     parts = problem.split("/")
     for k in range(1, len(parts)):
         path, key = folder / results_name("/".join(parts[:k])), "/".join(parts[k:])
@@ -143,25 +147,34 @@ def find_map(folder: Path, problem: str) -> bytes | None:
     return None
 
 
-def _tar_map(path: Path, key: str) -> bytes | None:
+def _tar_map(path: Path, key: str) -> tuple[bytes, str] | None:
+    names = {f"{key}.{form}": form for form in MAP_FORMATS}
     with open_tar(os.fspath(path)) as file:
-        for member in read_members(file, lambda name: name == key + MAP):
+        for member in read_members(file, names.__contains__):
             if isinstance(member, Member) and member.data is not None:
-                return member.data
+                return member.data, names[member.name]
     return None
 
 
-def _parquet_map(path: Path, key: str) -> bytes | None:
-    table = load_pyarrow().read_table(path, columns=["obj"], filters=[(KEYS[0], "=", key)])
-    return table["obj"][0].as_py() if len(table) else None
+def _parquet_map(path: Path, key: str) -> tuple[bytes, str] | None:
+    with load_pyarrow().ParquetFile(path) as file:
+        form = _form_of(file)
+    table = load_pyarrow().read_table(path, columns=[form], filters=[(KEYS[0], "=", key)])
+    data = table[form][0].as_py() if len(table) else None
+    return None if data is None else (data, form)
+
+
+def _form_of(file: Any) -> str:
+    """Return the format of the maps in a Parquet file of results."""
+    return next(form for form in MAP_FORMATS if form in file.schema_arrow.names)
 
 
 def find_records(folder: Path) -> Iterator[Record]:
     """Yield the records in the archives of results in a folder, finished or not."""
     for path in sorted(folder.rglob("*")):
         if is_archive(path.name.removesuffix(PART)):
-            for _, record, _ in read_results(path, maps=False):
-                yield record
+            for result in read_results(path, maps=False):
+                yield result.record
 
 
 def read_results(path: Path, *, maps: bool = True) -> Iterator[Result]:
@@ -187,28 +200,30 @@ class TarResult(NamedTuple):
 def read_tar_results(file: BinaryIO, *, maps: bool = True) -> Iterator[TarResult]:
     """Read the results of a tar file, which have the record after the map."""
     mapped: Member | None = None
-    for member in read_members(file, lambda name: maps or name.endswith(RECORD)):
+    for member in read_members(file, lambda name: maps or name.endswith(_RECORD)):
         if isinstance(member, Damage):
             yield TarResult(None, member.start, member.start)
             continue
         key, extension = os.path.splitext(member.name)
-        if extension == MAP:
+        if extension[1:] in MAP_FORMATS:
             mapped = member
-        elif extension == RECORD:
-            own = mapped if mapped is not None and mapped.name == key + MAP else None
+        elif extension == _RECORD:
+            name, form = ("", "") if mapped is None else os.path.splitext(mapped.name)
+            own = mapped if name == key else None
             record = records.parse_record(member.data or b"")
             data, start = (None, member.start) if own is None else (own.data, own.start)
-            yield TarResult(None if record is None else Result(key, record, data), start, member.end)
+            yield TarResult(None if record is None else Result(key, record, data, form[1:]), start, member.end)
             mapped = None
 
 
 def _parquet_results(path: Path, maps: bool) -> Iterator[Result]:
     with load_pyarrow().ParquetFile(path) as file:
-        columns = [name for name in file.schema_arrow.names if maps or name != "obj"]
+        form = _form_of(file)
+        columns = [name for name in file.schema_arrow.names if maps or name != form]
         for rows in file.iter_batches(_ROWS, columns=columns):
             for row in rows.to_pylist():
-                key, data = row.pop(KEYS[0]), row.pop("obj", None)
-                yield Result(key, {name: value for name, value in row.items() if value is not None}, data)
+                key, data = row.pop(KEYS[0]), row.pop(form, None)
+                yield Result(key, {name: value for name, value in row.items() if value is not None}, data, form)
 
 
 class _Entry(NamedTuple):
@@ -245,7 +260,7 @@ class Journal:
                     os.replace(path, self.part)
                 else:
                     for result in read_results(path):
-                        self.add(*result)
+                        self.add(result)
             self._repair()
 
     def record(self, key: str) -> Record | None:
@@ -253,22 +268,22 @@ class Journal:
         entry = self.entries.get(key)
         return None if entry is None else entry.record
 
-    def add(self, key: str, record: Record, data: bytes | None) -> None:
+    def add(self, result: Result) -> None:
         """Append a result; OutputError if it cannot be written."""
-        packed = pack_result(key, record, data)
+        packed = _pack_result(*result)
         with writing(self.part), open(self.part, "ab") as file:
             start = file.tell()
             file.write(packed)
-        self._note(key, start, start + len(packed), record)
+        self._note(result.key, start, start + len(packed), result.record)
 
-    def finish(self, order: Sequence[str], stamp: str, settings: str) -> None:
-        """Write the finished archive, in the given order of names, and delete the journal."""
+    def finish(self, order: Sequence[str], stamp: str, settings: str, form: str) -> None:
+        """Write the finished archive with maps of a format, in the given order of names, and delete the journal."""
         entries = [self.entries[key] for key in order]
         about = describe((entry.record for entry in entries), stamp, settings)
         with writing(self.path):
             # An archive without problems has no journal.
             with open(self.part, "a+b") as file:
-                write_results(self.path, about, _read_entries(file, entries))
+                write_results(self.path, about, _read_entries(file, entries), form)
             self.part.unlink()
 
     def _note(self, key: str, start: int, end: int, record: Record) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from quasiharmonic.io import suffixes
+from quasiharmonic.io.handles import INPUTS
 from quasiharmonic.ui.batch.archives.tar_stream import Damage, open_tar, read_members
 from quasiharmonic.ui.batch.records import load_pyarrow
 from quasiharmonic.util.untrusted import MAX_BYTES
@@ -23,7 +24,7 @@ KEYS = "__key__", "problem", "name"
 # Extensions of the list of fixed vertices.
 _FIXED = "handles.txt", "txt"
 # Problem folders in a tar file have these files, so that the folder is the name.
-_FOLDER_FILES = {"input.obj": "obj", "handles.txt": "txt"}
+_FOLDER_FILES = {name: name.partition(".")[2] for name in (*INPUTS, "handles.txt")}
 _ROWS = 64
 
 
@@ -65,8 +66,8 @@ def read_samples(path: Path, limit: int | None = None) -> Iterator[Sample]:
     """Read the problems of an archive, in order; constant memory. Members of a tar file have at most ``limit`` bytes.
 
     Consecutive members of a tar file with the same name up to the first dot are one problem, as in WebDataset. So are
-    the members ``input.obj`` and ``handles.txt`` of a folder. In a Parquet file each row is a problem: the columns are
-    named by the extensions, and the column ``__key__``, ``problem`` or ``name`` has the name.
+    the members ``input.obj`` or ``input.ply`` and ``handles.txt`` of a folder. In a Parquet file each row is a problem:
+    the columns are named by the extensions, and the column ``__key__``, ``problem`` or ``name`` has the name.
 
     Yields
     ------

@@ -41,7 +41,7 @@ from quasiharmonic.ui.cli.arguments import (
     texture_size,
 )
 from quasiharmonic.ui.cli.streams import tell
-from quasiharmonic.util.options import ENERGIES, FLATTENED, DescentOptions, UnwrapOptions
+from quasiharmonic.util.options import ENERGIES, FLATTENED, MAP_FORMATS, DescentOptions, UnwrapOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
@@ -85,6 +85,9 @@ def add_parser(commands: Commands) -> None:
             metavar="OTHER",
         ),
         table=choice(("csv", "parquet"), "format of the table of records (default: csv)", default="csv"),
+        map_format=choice(
+            MAP_FORMATS, "format of the maps (default: obj); binary ply is written and read faster", default="obj"
+        ),
         retry=flag("retry problems that failed by an error, a crash or a limit"),
         shard=text(
             "I/N",

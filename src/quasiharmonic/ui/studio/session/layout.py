@@ -11,6 +11,7 @@ from quasiharmonic.apps.atlas.atlas_verdict import MIRROR
 from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.ui.studio.session import recipes
 from quasiharmonic.ui.studio.session.operations import as_it_is, find_source, require_map, saved_start
+from quasiharmonic.ui.studio.session.recipes import public
 from quasiharmonic.ui.studio.session.seams import find_chain, pair_sides
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
@@ -24,11 +25,10 @@ def pack_all(state: SessionState, resolution: int, padding: float) -> SessionSta
     mesh = atlas.pack(laid.mesh, resolution=resolution, padding=padding)
     size = {"resolution": resolution, "padding": padding}
     words = ["--start", "--max-iterations", "0", "--pack"]
-    lines = [
-        f"flat = atlas.flatten({source.name!r}, start=True, max_iterations=0).mesh",
-        f"mesh = atlas.pack(flat{recipes.arguments(**size)})",
-    ]
-    recipe = recipes.record_call("flatten", source, "packed.obj", size, words=words, lines=lines)
+    script = recipes.Script()
+    flat = script.let("flat", public(atlas.flatten)(source.name, start=True, max_iterations=0).mesh)
+    script.let("mesh", public(atlas.pack)(flat, **size))
+    recipe = recipes.record_call("flatten", source, "packed.obj", size, script, words=words)
     return as_it_is(state, mesh, recipe, keep=("pins",))
 
 

@@ -16,29 +16,33 @@ from quasiharmonic.apps.atlas import island_functions as atlas
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, mirrored_islands
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland, each_island
 from quasiharmonic.apps.atlas.seam_cuts import cut_along, cut_apart
-from quasiharmonic.apps.repair.fitting import find_corner_vertices, fit_boundary, fix_in_place
 from quasiharmonic.apps.repair.uv_repair import repair
 from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edges, trace_loops
-from quasiharmonic.io import MeshData
+from quasiharmonic.io import MeshData, read_mesh
+from quasiharmonic.io.adapters.objects import as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
-from quasiharmonic.targets import filled
+from quasiharmonic.targets import filled, outline_curves
 from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+from quasiharmonic.targets.boundary.fitting import find_corner_vertices, fit_boundary, fix_in_place
+from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.ui.studio.session import recipes
 from quasiharmonic.ui.studio.session.islands import IslandState
 from quasiharmonic.ui.studio.session.outlines import Outline
-from quasiharmonic.ui.studio.session.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Source
+from quasiharmonic.ui.studio.session.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public
 from quasiharmonic.ui.studio.session.state import SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import IntArray
 
 Callback = Callable[[Step], object] | None
+# Options of the smoothing after a search.
+_SMOOTHING = {"energy": "blend", "max_iterations": SMOOTHING_STEPS}
 
 
 class Interrupted(KeyboardInterrupt):
@@ -64,8 +68,9 @@ def make_start(mesh: SeamedMesh) -> Source:
 def saved_start(mesh: SeamedMesh) -> Recipe:
     """Return the recipe of a map that no step makes: the file with it."""
     source = make_start(mesh)
-    python = recipes.write_script([f"mesh = atlas.as_seamed_mesh({source.name!r})"])
-    return Recipe(f"qhm check {source.name}", python, source.start)
+    script = Script()
+    script.let("mesh", public(as_seamed_mesh)(source.name))
+    return Recipe(f"qhm check {source.name}", str(script), source.start)
 
 
 def choose(state: SessionState) -> list[int] | None:
@@ -89,25 +94,24 @@ def map_to_outline(
     own = state.active.island.vertices
     named = () if isinstance(corners, str) else tuple((int(own[v]), k) for v, k in corners)
     spec = CornerSpec("auto" if isinstance(corners, str) else named) if corners else None
-    width, fills = np.ptp(np.concatenate(outline.contours)[:, 0]), False
+    width = np.ptp(np.concatenate(outline.contours)[:, 0])
 
     def lower(island: Island) -> MapResult:
-        nonlocal fills
         asked = None if spec is None else spec.within(island.vertices)
         copy = [contour + np.array([len(posed) * 1.05 * width, 0.0]) for contour in outline.contours]
         fitted = fit_boundary(island.V, island.F, copy, corners=asked)
-        problem, fills = fitted.problem, fills or bool(fitted.filled_holes)
-        onto = filled(copy) if fitted.filled_holes else copy
+        problem, onto = fitted.problem, filled(copy) if fitted.filled_holes else copy
         posed.append((problem, find_corner_vertices(problem.fixed, problem.target, onto)))
         return solve_smoothly(problem, callback)
 
     mapped = each_island(state.mesh, lower, reflect=False, only=only)
     word = corners if corners == "auto" else ",".join(f"{v}:{k}" for v, k in named) or None
-    options = {"to": Given(outline, Code(), {"to": outline.to, "corners": word}, outline.texts)}
-    small = all(len(state.islands[k].island.F) <= LARGEST_SMOOTHED for k in state.selected)
-    chosen = corners if isinstance(corners, str) else dict(corners)
-    lines = recipes.outline_lines(source, outline.to, fills, chosen, state.selected, small)
-    recipe = recipes.record_call("map", source, "again.obj", options, only, lines=lines)
+    chosen: dict[int, int] | str = corners if isinstance(corners, str) else dict(named)
+    options = {
+        "to": Given(outline, outline.to, {"to": outline.to}, outline.texts),
+        "corners": Given(chosen, chosen, {"corners": word}) if chosen else None,
+    }
+    recipe = _record_map(source, mapped, options, {}, only)
     after = rebuild(state, mapped, replace(recipe, outline=outline.to))
     for i, (k, (problem, found)) in enumerate(zip(state.selected, posed, strict=True)):
         by_angle, given = corners == "auto", () if isinstance(corners, str) or i else tuple(corners)
@@ -134,17 +138,29 @@ def map_in_place(
     done = mapped.islands if only is None else [mapped.islands[k] for k in only]
     anew = all(one.result.injective for one in done)
     if anew or not follows:
-        chosen = list(range(len(mapped.islands))) if only is None else only
-        small = max(len(one.triangles) for one in done) <= LARGEST_SMOOTHED
-        smoothed = [k for k in chosen if small and mapped.islands[k].result.injective]
-        lines = recipes.map_lines(source, only, only if smoothed == chosen else smoothed, fixed)
-        recipe = recipes.record_call("map", source, "again.obj", {"fixed": fixed}, only, lines=lines)
+        recipe = _record_map(source, mapped, {"fixed": fixed}, {"fixed": fixed}, only)
     else:
-        options = {"energy": "blend", "max_iterations": SMOOTHING_STEPS, "fixed": fixed}
-        mapped = atlas.polish(start, islands=only, callback=callback, **recipes.values(options))
-        recipe = recipes.record_call("polish", source, "again.obj", options, only)
+        options = {**_SMOOTHING, "fixed": fixed}
+        mapped, recipe = recipes.perform(atlas.polish, start, source, "again.obj", options, only, callback)
     recipe = replace(recipe, anew=anew, dragged=start is not state.mesh)
     return rebuild(state, mapped, recipe, keep=("pins", "corners"))
+
+
+def _record_map(
+    source: Source, mapped: MappedAtlas, options: dict[str, Any], held: dict[str, Any], only: list[int] | None
+) -> Recipe:
+    """Return the recipe of a search for maps with ``options``; small injective maps are smoothed then.
+
+    ``held`` are the options of the smoothing that fix vertices.
+    """
+    script, chosen = Script(), list(range(len(mapped.islands))) if only is None else only
+    mesh = script.let("mesh", public(atlas.injective_map)(source.name, **options, islands=only).mesh)
+    found = [mapped.islands[k] for k in chosen]
+    small = [one.result.injective and len(one.triangles) <= LARGEST_SMOOTHED for one in found]
+    if any(small):
+        some = only if all(small) else [k for k, smoothed in zip(chosen, small, strict=True) if smoothed]
+        script.let("mesh", public(atlas.polish)(mesh, **held, **_SMOOTHING, islands=some).mesh)
+    return recipes.record_call("map", source, "again.obj", options, script, only)
 
 
 def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
@@ -153,15 +169,14 @@ def polish_islands(state: SessionState, energy: str, slide: bool, callback: Call
     outline = state.active.outline if slide and len(state.islands) == 1 else None
     curves = slide if outline is None else _sliding_curves(outline)
     options = {"energy": energy, "slide": curves, "fixed": _list_fixed(state, only, slide=slide)}
-    mapped = atlas.polish(state.mesh, islands=only, callback=callback, **recipes.values(options))
-    recipe = recipes.record_call("polish", source, "again.obj", options, only)
+    mapped, recipe = recipes.perform(atlas.polish, state.mesh, source, "again.obj", options, only, callback)
     recipe = replace(recipe, outline=None if outline is None else outline.to)
     return rebuild(state, mapped, recipe, keep=("pins", "corners", "outline", "chosen", "by_angle"))
 
 
 def _sliding_curves(outline: Outline) -> Given:
     """Return the curves of an outline, for a boundary that slides."""
-    code = Code(f"BoundaryCurves(outline_curves({outline.to!r}))")
+    code = public(BoundaryCurves)(public(outline_curves)(outline.to))
     return Given(BoundaryCurves(outline.curves()), code, {"slide": True, "to": outline.to}, outline.texts)
 
 
@@ -173,17 +188,15 @@ def flatten_islands(state: SessionState, callback: Callback = None) -> SessionSt
     pins = _list_pins(state, state.selected)
     source = find_source(state, with_map=only is not None or pins is not None)
     cut = only is None and not all(is_flattenable(one.island) for one in state.islands)
-    if cut:
-        mesh = cut_apart(mesh, polygons=_polygons(state, source), disks_too=True)
-    options = {"fixed": None if cut else pins}
-    mapped = atlas.flatten(mesh, islands=only, callback=callback, **recipes.values(options))
-    words, lines = ["--cut"] if cut else [], list[str]()
-    if cut:
-        lines = [f"mesh = atlas.as_seamed_mesh({source.name!r})", *_cut_lines(state, source)]
-        lines += recipes.call_lines("flatten", "mesh", {}, None)
-    recipe = recipes.record_call("flatten", source, "flat.obj", options, only, words=words, lines=lines)
-    after = rebuild(state, mapped, recipe, keep=() if cut else ("pins",))
-    return replace(after, from_file=state.from_file and not cut)
+    if not cut:
+        mapped, recipe = recipes.perform(atlas.flatten, mesh, source, "flat.obj", {"fixed": pins}, only, callback)
+        return rebuild(state, mapped, recipe, keep=("pins",))
+    script = Script()
+    cuts = _record_cut(state, source, script, script.let("mesh", public(as_seamed_mesh)(source.name)))
+    script.let("mesh", public(atlas.flatten)(cuts).mesh)
+    mapped = atlas.flatten(cut_apart(mesh, polygons=_polygons(state, source), disks_too=True), callback=callback)
+    recipe = recipes.record_call("flatten", source, "flat.obj", {}, script, words=["--cut"])
+    return replace(rebuild(state, mapped, recipe), from_file=False)
 
 
 def _list_pins(state: SessionState, islands: Sequence[int]) -> Given | None:
@@ -198,8 +211,9 @@ def repair_islands(state: SessionState, callback: Callback = None) -> SessionSta
     options = {"fixed": _list_pins(state, range(len(state.islands)))}
     assert mesh.uv is not None
     result = repair(mesh.V, mesh.F, mesh.uv, FT=mesh.FT, callback=callback, **recipes.values(options))
-    lines = [f"mesh = repair({source.name!r}{recipes.arguments(**options)}).mesh"]
-    recipe = recipes.record_call("repair", source, "repaired.obj", options, lines=lines)
+    script = Script()
+    script.let("mesh", public(repair)(source.name, **options).mesh)
+    recipe = recipes.record_call("repair", source, "repaired.obj", options, script)
     after = as_it_is(state, result.mesh, recipe, keep=("pins",))
     for k, (one, done) in enumerate(zip(after.islands, result.islands, strict=False)):
         if one.result is not None and done.diagnosis is not None:
@@ -293,14 +307,13 @@ def _polygons(state: SessionState, source: Source) -> Any:
     return state.sheet.mesh.polygons if source.start is None else None
 
 
-def _cut_lines(state: SessionState, source: Source) -> list[str]:
-    """Return the lines that cut a mesh as ``--cut`` does."""
-    if _polygons(state, source) is None:
-        return ["mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams))"]
-    return [
-        f"inside = io.read_mesh({source.name!r}).polygons.diagonals(mesh.F)",
-        "mesh = mesh.cut(find_cuts(mesh.V, mesh.F, edges=mesh.seams, forbidden_edges=inside))",
-    ]
+def _record_cut(state: SessionState, source: Source, script: Script, mesh: Code) -> Code:
+    """Append to a script that a mesh is cut as ``--cut`` does, and return the variable of the mesh."""
+    inside = None
+    if _polygons(state, source) is not None:
+        inside = script.let("inside", public(read_mesh)(source.name).polygons.diagonals(mesh.F))
+    cuts = public(find_cuts)(mesh.V, mesh.F, edges=mesh.seams, forbidden_edges=inside)
+    return script.let("mesh", mesh.cut(cuts))
 
 
 def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> SessionState:
@@ -316,16 +329,17 @@ def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> 
         mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
     mapped = atlas.flatten(mesh, callback=callback)
     saved = recipes.saved_rows(SEAMS, "seams", drawn)
-    lines = [
-        f"mesh = atlas.as_seamed_mesh({source.name!r})",
-        "mesh = atlas.SeamedMesh(mesh.V, mesh.F)",
-        *([f"mesh = mesh.cut({saved.code})"] if len(drawn) else []),
-        *(_cut_lines(state, source) if cut else []),
-        *recipes.call_lines("flatten", "mesh", {}, None),
-    ]
+    script = Script()
+    code = script.let("mesh", public(as_seamed_mesh)(source.name))
+    code = script.let("mesh", public(SeamedMesh)(code.V, code.F))
+    if len(drawn):
+        code = script.let("mesh", code.cut(saved.code))
+    if cut:
+        code = _record_cut(state, source, script, code)
+    script.let("mesh", public(atlas.flatten)(code).mesh)
     words = {"seams": SEAMS if len(drawn) else "none", "cut": cut}
     options = {"seams": replace(saved, words=words, texts=saved.texts if len(drawn) else {})}
-    recipe = recipes.record_call("flatten", source, "flat.obj", options, lines=lines)
+    recipe = recipes.record_call("flatten", source, "flat.obj", options, script)
     after = rebuild(state, mapped, recipe)
     return replace(after, from_file=False, selected=tuple(range(len(mapped.islands))))
 

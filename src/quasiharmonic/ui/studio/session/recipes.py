@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
-from quasiharmonic.energies.polishing import SMOOTHING_STEPS
+import numpy as np
+
+from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
 from quasiharmonic.io import MeshData
+from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import IntArray
 
 #: Names of the files that the page saves: the map, the map from which the last step started, the fixed vertices, the
@@ -17,12 +21,6 @@ from quasiharmonic.util.arrays import IntArray
 MAP, START, FIXED, SEAMS, FORBIDDEN, FACES = (
     *("map.obj", "start.obj", "fixed.txt", "seams.txt", "no_seams.txt", "faces.txt"),
 )
-# Names that scripts use, by the modules that they import them from.
-_IMPORTS = {
-    "quasiharmonic": ("BoundaryCurves", "atlas", "find_cuts", "injective_map", "io", "polish", "repair", "unwrap"),
-    "quasiharmonic.targets": ("boundary_to", "filled", "outline", "outline_curves"),
-    "quasiharmonic.apps.unwrapping.model_files": ("polygon_costs", "statement_labels"),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +69,74 @@ def option_words(**options: object) -> list[str]:
     return words
 
 
-class Code(str):
-    """Python code, as opposed to a text."""
+@dataclass(frozen=True, eq=False)
+class Code:
+    """An expression of a script. Its attributes, indices and calls are expressions, too."""
 
-    __slots__ = ()
+    _text: str
+    _imports: frozenset[tuple[str, str]] = frozenset()  # Modules, and the name that is imported from each
+
+    def __getattr__(self, name: str) -> Code:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return Code(f"{self._text}.{name}", self._imports)
+
+    def __getitem__(self, key: Any) -> Code:
+        index = _expression(key)
+        return Code(f"{self._text}[{index._text}]", self._imports | index._imports)
+
+    def __call__(self, *arguments: Any, **options: Any) -> Code:
+        """Return a call; options that are None or False are left out."""
+        chosen = {name: value for name, value in options.items() if value is not None and value is not False}
+        parts = [("", _expression(value)) for value in arguments]
+        parts += [(f"{name}=", _expression(value)) for name, value in chosen.items()]
+        text = ", ".join(name + one._text for name, one in parts)
+        return Code(f"{self._text}({text})", self._imports.union(*(one._imports for _, one in parts)))
+
+
+def public(thing: Callable[..., Any]) -> Code:
+    """Return a function or a class of the library or of NumPy by its public name."""
+    name = thing.__name__
+    for module in ("quasiharmonic", "quasiharmonic.targets"):
+        if getattr(import_module(module), name, None) is thing:
+            return Code(name, frozenset({(module, name)}))
+    for group in ("atlas", "io"):
+        if getattr(import_module(f"quasiharmonic.{group}"), name, None) is thing:
+            return Code(f"{group}.{name}", frozenset({("quasiharmonic", group)}))
+    if thing.__module__ == "numpy":
+        return Code(f"np.{name}", frozenset({("numpy", "np")}))
+    return Code(name, frozenset({(thing.__module__, name)}))
+
+
+def _expression(value: Any) -> Code:
+    if isinstance(value, Given):
+        value = value.code
+    if isinstance(value, Code):
+        return value
+    return public(value) if callable(value) else Code(repr(value))
+
+
+class Script:
+    """Lines that each assign the result of a call to a variable; ``str`` of it has the imports, too."""
+
+    def __init__(self) -> None:
+        self._lines: list[str] = []
+        self._imports: set[tuple[str, str]] = set()
+
+    def let(self, name: str, value: Code) -> Code:
+        """Append an assignment and return the variable."""
+        self._lines.append(f"{name} = {value._text}")
+        self._imports |= value._imports
+        return Code(name)
+
+    def __str__(self) -> str:
+        """Return the text of the script."""
+        modules = sorted({module for module, _ in self._imports} - {"numpy"}, key=lambda one: (one.count("."), one))
+        head = ["import numpy as np", ""] if ("numpy", "np") in self._imports else []
+        for module in modules:
+            names = sorted(name for whose, name in self._imports if whose == module)
+            head.append(f"from {module} import {', '.join(names)}")
+        return "\n".join([*head, "", *self._lines, ""])
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,19 +144,9 @@ class Given:
     """Value of an argument, and how command and script spell it."""
 
     value: Any
-    code: Code
+    code: Any  # An expression or a constant
     words: Mapping[str, object] = field(default_factory=dict)  # Options of the command
     texts: Mapping[str, bytes] = field(default_factory=dict)  # Files that command and script read
-
-
-def arguments(**options: object) -> str:
-    """Return further arguments of a Python call; None and False are left out."""
-    codes = {name: value.code if isinstance(value, Given) else value for name, value in options.items()}
-    return "".join(
-        f", {name}={value if isinstance(value, Code) else repr(value)}"
-        for name, value in codes.items()
-        if value is not None and value is not False
-    )
 
 
 def values(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -107,14 +159,13 @@ def record_call(
     source: Source,
     output: str,
     options: Mapping[str, Any],
+    script: Script,
     only: Sequence[int] | None = None,
-    *,
     words: Sequence[str] = (),
-    lines: Sequence[str] = (),
 ) -> Recipe:
-    """Return the recipe of a call for some islands: its command ``verb``, and a script with the function of `atlas`.
+    """Return the recipe of a call for some islands: a script, and the command ``verb`` with the same options.
 
-    ``words`` are further words of the command, and ``lines`` those of another script.
+    ``words`` are further words of the command.
     """
     given = [value for value in options.values() if isinstance(value, Given)]
     plain = {name: value for name, value in options.items() if not isinstance(value, Given)}
@@ -123,64 +174,29 @@ def record_call(
     command = ["qhm", verb, source.command, *words, *option_words(**plain, **chosen)]
     # The file that a step starts from is not overwritten.
     command += ["-o", output if source.name != output else f"new_{output}"]
-    script = write_script(lines or call_lines(verb, repr(source.name), options, only))
     texts = {name: content for one in given for name, content in one.texts.items()}
-    return Recipe(shlex.join(command), script, source.start, texts)
+    return Recipe(shlex.join(command), str(script), source.start, texts)
 
 
-def call_lines(verb: str, mesh: str, options: Mapping[str, Any], only: Sequence[int] | None) -> list[str]:
-    """Return the lines that call a function of `atlas` for some islands of ``mesh``, which is Python code."""
-    return [f"result = atlas.{verb}({mesh}{arguments(**options, islands=only)})", "mesh = result.mesh"]
+def perform(
+    function: Callable[..., MappedAtlas],
+    mesh: SeamedMesh,
+    source: Source,
+    output: str,
+    options: Mapping[str, Any],
+    only: Sequence[int] | None,
+    callback: Callable[[Step], object] | None,
+) -> tuple[MappedAtlas, Recipe]:
+    """Call a function of `atlas` for some islands; return its result, and the recipe of the call on ``source``."""
+    script = Script()
+    script.let("mesh", public(function)(source.name, **options, islands=only).mesh)
+    recipe = record_call(function.__name__, source, output, options, script, only)
+    return function(mesh, islands=only, callback=callback, **values(options)), recipe
 
 
 def saved_rows(name: str, option: str, rows: IntArray) -> Given:
     """Return whole numbers, (k,) or (k, 2), as the argument ``option``, from a file that the page saves."""
     table = rows if rows.ndim == 2 else rows[:, None]
     content = "".join(" ".join(map(str, row)) + "\n" for row in table.tolist()).encode()
-    shape = ".reshape(-1, 2)" if rows.ndim == 2 else ""
-    return Given(rows, Code(f"np.loadtxt({name!r}, dtype=np.int64){shape}"), {option: name}, {name: content})
-
-
-def write_script(lines: Sequence[str]) -> str:
-    """Return a script with its imports."""
-    text = "\n".join(lines)
-    head = ["import numpy as np", ""] if "np." in text else []
-    for module, names in _IMPORTS.items():
-        used = [name for name in names if re.search(rf"(?<![\w.]){name}[.(]", text)]
-        head += [f"from {module} import {', '.join(used)}"] if used else []
-    return "\n".join([*head, "", text, ""])
-
-
-def map_lines(
-    source: Source, only: Sequence[int] | None, smoothed: Sequence[int] | None, fixed: Given | None
-) -> list[str]:
-    """Return a script that maps the islands ``only`` again and keeps their fixed vertices; None means all islands.
-
-    The script then smooths the islands ``smoothed``; None means all.
-    """
-    lines = call_lines("injective_map", repr(source.name), {"fixed": fixed}, only)
-    smoothing = {"fixed": fixed, "energy": "blend", "max_iterations": SMOOTHING_STEPS}
-    return lines if smoothed == [] else [*lines, *call_lines("polish", "mesh", smoothing, smoothed)]
-
-
-def outline_lines(
-    source: Source, to: str, filled: bool, corners: object, islands: Sequence[int], smoothed: bool
-) -> list[str]:
-    """Return a script that maps islands to copies of an outline, side by side; it smooths them if ``smoothed``."""
-    contours = f"outline({to!r})"
-    more = arguments(fixed=Code("fixed"), energy="blend", max_iterations=SMOOTHING_STEPS)
-    smoothing = ["    if result.injective:", f"        result = polish(island.V, island.F, result.uv{more})"]
-    return [
-        f"mesh = atlas.as_seamed_mesh({source.name!r})",
-        f"contours = {f'filled({contours})' if filled else contours}",
-        "width = np.ptp(np.concatenate(contours)[:, 0])",
-        "places = [island.uv for island in mesh.islands]",
-        f"for i, k in enumerate({list(islands)}):",
-        "    island = mesh.islands[k]",
-        "    copy = [contour + np.array([i * 1.05 * width, 0.0]) for contour in contours]",
-        f"    fixed, target = boundary_to(island.V, island.F, copy{arguments(corners=corners or None)})",
-        "    result = injective_map(island.V, island.F, fixed, target)",
-        *(smoothing if smoothed else []),
-        "    places[k] = result.uv",
-        "mesh = mesh.with_places(places)",
-    ]
+    code = public(np.loadtxt)(name, dtype=np.int64)
+    return Given(rows, code.reshape(-1, 2) if rows.ndim == 2 else code, {option: name}, {name: content})

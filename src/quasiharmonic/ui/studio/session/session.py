@@ -62,6 +62,10 @@ class Session(PageUpdates):
         self._history.clear(sheet.texture)
         self._keep(first, fit=True)
         self._send_image()
+        if len(sheet.unmapped):
+            what = "the new charts are right of them" if first.mapped else "press Unwrap to map only these triangles"
+            text = f"{len(sheet.unmapped)} of {len(sheet.surface.F)} triangles of {sheet.name} lack texture coordinates"
+            self._tell({"kind": "note", "level": "info", "text": f"{text}; the others keep theirs: {what}"}, {})
 
     def restore(self) -> bool:
         """Continue the stored session; return whether there is one."""

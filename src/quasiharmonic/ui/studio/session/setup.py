@@ -45,11 +45,14 @@ def make_first_state(sheet: PageSurface, callback: Callable[[Any], object] | Non
     """Return the initial state of a model: with the map of the file; otherwise a square, a flat map, or charts.
 
     A disk is mapped to a square if possible. Another connected surface is flattened, and cut before if necessary. Any
-    other model is unwrapped. Large models that must be cut have no map.
+    other model is unwrapped. Large models that must be cut have no map. If only some triangles of the file have texture
+    coordinates, these stay, and the others are unwrapped.
     """
     bare = open_without_map(sheet)
     if has_complete_map(sheet.mesh) or (sheet.fixed is not None and sheet.is_file and sheet.mesh.FT is not None):
         return _take_map(sheet, callback)
+    if len(sheet.unmapped):
+        return bare if len(sheet.unmapped) > MAX_AUTOMATIC else unwrap_model(bare, callback)
     if len(bare.islands) == 1 and sheet.is_file:
         if len(bare.islands[0].loops) == 1 and is_flattenable(bare.islands[0].island):
             # Some disks have no map to a square: a boundary of three vertices, triangles with all corners on one side.

@@ -59,6 +59,14 @@ class PageSurface:
             return int(np.count_nonzero(self.cleaned.facing > 0)) if self.turned else found
         return inspect_mesh(self.surface.V, self.surface.F).inward if self.turned else self.report.inward
 
+    @cached_property
+    def unmapped(self) -> IntArray:
+        """Triangles of the surface without texture coordinates in a file in which others have some."""
+        if self.mesh.FT is None:
+            return np.empty(0, dtype=np.int64)
+        bare = (self.from_file(self.mesh.FT) < 0).any(axis=1)
+        return np.flatnonzero(bare & (not bare.all()))
+
     def initial_map(self) -> SeamedMesh:
         """Return the surface with the seams and the map of the file, without map if the file has none."""
         if self.mesh.FT is None or self.mesh.vt is None or (not self.is_file and (self.mesh.FT < 0).any()):
