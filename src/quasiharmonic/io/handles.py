@@ -17,7 +17,8 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.errors import MeshFileError, check_path
 from quasiharmonic.io.lowlevel.textual import content_lines, integer, read_text
 from quasiharmonic.io.mesh_files import read_mesh
-from quasiharmonic.io.models.meshdata import MeshData, vertex_places
+from quasiharmonic.io.models.mesh_maps import vertex_places
+from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, names_of
 
 

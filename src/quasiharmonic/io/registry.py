@@ -117,7 +117,7 @@ FORMATS: tuple[Format, ...] = (
         seams=True,
         image=True,
         **import_later("formats.obj", read="read_obj", write_map="write_obj", list_losses="not_in_obj"),
-        **import_later("models.materials", companions="companions"),
+        **import_later("models.appearance", companions="companions"),
     ),
     Format(
         name="OFF",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.mesh.refinement import Refined
-from quasiharmonic.io.adapters.trimesh import make_trimesh
+from quasiharmonic.io.adapters.objects import make_trimesh
 from quasiharmonic.util.arrays import ReadOnly
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Outcome

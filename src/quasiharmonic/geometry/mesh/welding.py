@@ -91,3 +91,10 @@ def _find_close(points: FloatArray, distance: float) -> IntArray:
             near = near[(((points[near] - points[i]) / distance) ** 2).sum(axis=1) <= 1]
             first[near], waiting[near] = i, False
     return first
+
+
+def weld_points(points: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the distinct points of (k, d), in the order of their first occurrence, and the row of each point (k,)."""
+    first = _find_equal(points)
+    distinct = np.flatnonzero(first == np.arange(len(points)))
+    return points[distinct], np.searchsorted(distinct, first)

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
-from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
+from quasiharmonic.io.models.mesh_maps import check_mapped, in_plane, vertex_places
+from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.optional import explain_missing
 from quasiharmonic.util.untrusted import check_gifti, unpack_gzip

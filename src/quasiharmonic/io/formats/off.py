@@ -20,7 +20,8 @@ from quasiharmonic.io.lowlevel.textual import (
     quote_token,
     read_text,
 )
-from quasiharmonic.io.models.meshdata import MeshData, in_plane, polygon_mesh
+from quasiharmonic.io.models.mesh_maps import in_plane
+from quasiharmonic.io.models.meshdata import MeshData, polygon_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Texture coordinates, colours and normals follow the coordinates, so the reader can skip them.

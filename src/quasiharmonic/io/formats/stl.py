@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.welding import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
-from quasiharmonic.io.formats.vertex_data import weld
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray
@@ -46,7 +46,7 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
         raise MeshFileError(path, "is not a text or binary STL file, or is cut off")
     if not len(corners):
         raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
-    V, F = weld(corners.reshape(-1, 3))
+    V, F = weld_points(corners.reshape(-1, 3))
     with report_damage(path):
         return MeshData(V, F.reshape(-1, 3), source=os.fspath(path))
 

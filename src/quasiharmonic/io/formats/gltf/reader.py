@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.welding import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
-from quasiharmonic.io.formats.vertex_data import normal_lines, weld
-from quasiharmonic.io.models.meshdata import Carried, MeshData
+from quasiharmonic.io.models.meshdata import Carried, MeshData, normal_lines
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_choice, count_of, repeat_each
 from quasiharmonic.util.options import INSTANCES
 
@@ -142,7 +142,7 @@ def _mesh(document: Document, source: str) -> MeshData | None:
         return None
     points, kind = _positions(document, pools)
     # Merge equal positions within each mesh.
-    V, which = weld(np.column_stack([kind, points]))
+    V, which = weld_points(np.column_stack([kind, points]))
     F = which[rows]
     vt, known = _attribute(document, pools, PLACES, 2)
     vt[:, 1] = 1 - vt[:, 1]

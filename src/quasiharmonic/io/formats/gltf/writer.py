@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
-from quasiharmonic.io.formats.gltf.painting import paint
+from quasiharmonic.io.formats.gltf.looks import paint
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
-from quasiharmonic.io.formats.vertex_data import colours_of, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
-from quasiharmonic.io.models.materials import label_materials, materials_lost
-from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.appearance import label_materials, materials_lost
+from quasiharmonic.io.models.meshdata import MeshData, colours_of, normals_of
 from quasiharmonic.io.models.textures import MaterialTextures
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of
 
