@@ -19,10 +19,9 @@ from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain
-from quasiharmonic.targets.boundary.chords import chords_of
 from quasiharmonic.targets.boundary.corner_pins import Corners, Pins, pins_by_angle
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, project_loop
-from quasiharmonic.targets.boundary.placement import CornerPlacement
+from quasiharmonic.targets.boundary.placement import CornerPlacement, chords_of
 from quasiharmonic.targets.boundary.turning import boundary_turning, find_outermost, in_space
 from quasiharmonic.targets.outlines.contours import NestedContour, arrange, filled, from_corner, in_unit
 from quasiharmonic.targets.specification import outline as specified

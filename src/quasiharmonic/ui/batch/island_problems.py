@@ -18,8 +18,8 @@ from quasiharmonic.apps.repair.fitting import FittedProblem, fit_boundary, fix_i
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
-from quasiharmonic.targets.boundary.corner_spec import CornerSpec, read_corners
-from quasiharmonic.targets.boundary.sliding_curves import find_sliding_curves
+from quasiharmonic.targets.boundary.corner_pins import CornerSpec, read_corners
+from quasiharmonic.targets.specification import find_sliding_curves
 
 
 class BatchIsland(NamedTuple):

@@ -29,7 +29,7 @@ from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.targets import filled
-from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+from quasiharmonic.targets.boundary.corner_pins import CornerSpec
 from quasiharmonic.ui.studio.session import recipes
 from quasiharmonic.ui.studio.session.islands import IslandState
 from quasiharmonic.ui.studio.session.outlines import Outline
