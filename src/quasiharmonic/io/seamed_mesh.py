@@ -15,9 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.fans import fans, number_fans, renumber
+from quasiharmonic.geometry.mesh.fans import fans, find_representatives, number_fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
-from quasiharmonic.geometry.mesh.welding import find_representatives
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,

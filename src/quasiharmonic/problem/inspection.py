@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.fans import fans, find_representatives
 from quasiharmonic.geometry.mesh.reference import flat_triangles
 from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, boundary_edges, edges, find_twins, trace_loops
-from quasiharmonic.geometry.mesh.welding import find_representatives
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_triangles
 from quasiharmonic.util.arrays import (

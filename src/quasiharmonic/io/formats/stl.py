@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.welding import weld_points
+from quasiharmonic.geometry.mesh.fans import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData

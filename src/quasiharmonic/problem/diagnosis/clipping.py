@@ -3,6 +3,8 @@
 All lines pass through two points of the target, and all points are intersections of two of these lines. Both have
 homogeneous integer coordinates, so every sign is exact. The size of the numbers is bounded: after any number of cuts, a
 corner is the intersection of two of the original lines.
+
+All such work has a common budget of time, `Effort`.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from quasiharmonic.problem.diagnosis.effort import Effort
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat
 
 Point = tuple[int, int]
 Line = tuple[int, int, int]
@@ -239,3 +241,22 @@ def cross(u: FloatArray, v: FloatArray) -> FloatArray:
     """Return cross products along the last axis; the other axes are broadcast."""
     product: FloatArray = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
     return product
+
+
+class EffortSpentError(Exception):
+    """The budget is exhausted."""
+
+
+@dataclass
+class Effort:
+    """A budget of time, and the amount spent so far, in units of about a microsecond."""
+
+    limit: int
+    spent: int = 0
+
+    def spend(self, amount: int) -> None:
+        """Spend an amount before the work; raise `EffortSpentError`, now and later, if the budget is exhausted."""
+        heartbeat()
+        self.spent += amount
+        if self.spent > self.limit:
+            raise EffortSpentError

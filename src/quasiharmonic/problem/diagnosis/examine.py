@@ -12,19 +12,19 @@ from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.objects import MeshLike
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis.curves import Corners, TargetCurves
-from quasiharmonic.problem.diagnosis.defects import (
+from quasiharmonic.problem.diagnosis.clipping import Effort, EffortSpentError
+from quasiharmonic.problem.diagnosis.conditions import (
+    Sight,
+    bad_chords,
     collapsed_edges,
     half_planes,
     inverted_fixed_triangles,
     inverted_patches,
     misplaced_pins,
 )
-from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
-from quasiharmonic.problem.diagnosis.fixture import Fixture, stars
+from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture, TargetCurves, stars
 from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, vertex_names
 from quasiharmonic.problem.diagnosis.shortcuts import Shortcuts
-from quasiharmonic.problem.diagnosis.sight import Sight, bad_chords
 from quasiharmonic.problem.diagnosis.witness import find_unplaced
 from quasiharmonic.util.arrays import IntArray, edge_names, names_of
 

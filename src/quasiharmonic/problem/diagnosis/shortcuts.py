@@ -29,11 +29,10 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import csr_array
 
-from quasiharmonic.geometry.exact.sweep import triangulate
+from quasiharmonic.geometry.mesh.polygons import triangulate
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import MARGIN, Rounding, join
-from quasiharmonic.problem.diagnosis.curves import Corners
-from quasiharmonic.problem.diagnosis.fixture import Fixture
+from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture
 from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, vertex_names
 from quasiharmonic.problem.diagnosis.witness import clear
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices

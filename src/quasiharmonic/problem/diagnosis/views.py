@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.problem.diagnosis.clipping import MARGIN, Convex, Lattice, cross, line
-from quasiharmonic.problem.diagnosis.effort import Effort
+from quasiharmonic.problem.diagnosis.clipping import MARGIN, Convex, Effort, Lattice, cross, line
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, scale_to_unit
 
 # Number of consecutive wedges that form a row for a first comparison.
