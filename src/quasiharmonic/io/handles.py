@@ -128,11 +128,7 @@ def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArra
     if fixed is None:
         fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))
         if not fixed.size:
-            raise MeshFileError(
-                mesh.source,
-                "has no boundary to fix",
-                remedy="cut it open, or give fixed vertices",
-            )
+            raise MeshFileError(mesh.source, "has no boundary to fix", remedy="cut it open, or give fixed vertices")
     else:
         fixed = index_array("fixed", fixed).ravel()
         check_range("fixed", fixed, len(mesh.V))

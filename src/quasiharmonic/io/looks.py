@@ -6,6 +6,7 @@ The texture of a file is the image of its first material that has one.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
@@ -14,7 +15,7 @@ from urllib.parse import quote
 
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.formats.gltf import document as gltf
-from quasiharmonic.io.formats.gltf.looks import gltf_appearance
+from quasiharmonic.io.formats.gltf.looks import find_objects, gltf_appearance
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.appearance import (
@@ -33,10 +34,9 @@ from quasiharmonic.util.untrusted import resolve_beside
 
 # Entries of material libraries about images that `read_appearance` reads.
 _IMAGES: dict[bytes, Role] = {b"map_Kd": "colour", b"map_Ke": "emission"}
-
 _GLTF = ".glb", ".gltf"
-# Keywords of images in material libraries that do not begin with "map_".
-_FURTHER_MAPS = b"bump", b"decal", b"disp", b"norm"
+# Keywords of images in material libraries.
+_IMAGE_KEYWORD = re.compile(rb"bump|decal|disp|norm|map_(?!aat$).*", re.IGNORECASE | re.DOTALL)
 
 
 def read_appearance(mesh: MeshData) -> Appearance:
@@ -129,13 +129,9 @@ def texture_names(mesh: MeshData) -> list[str]:
         except gltf.DAMAGE:
             # A damaged description of a material does not prevent other work.
             return []
-    textures = (os.fsdecode(words[-1]) for words, _ in library_entries(mesh) if _shows_image(words[0].lower()))
+    textures = (os.fsdecode(words[-1]) for words, _ in library_entries(mesh) if _IMAGE_KEYWORD.fullmatch(words[0]))
     # Names in libraries can have the separators of any system.
     return list(dict.fromkeys(PureWindowsPath(name).name for name in textures))
-
-
-def _shows_image(keyword: bytes) -> bool:
-    return keyword in _FURTHER_MAPS or (keyword.startswith(b"map_") and keyword != b"map_aat")
 
 
 def library_entries(mesh: MeshData) -> Iterator[tuple[list[bytes], Path]]:
@@ -157,28 +153,17 @@ def library_entries(mesh: MeshData) -> Iterator[tuple[list[bytes], Path]]:
 
 def _names_in_gltf(tree: dict[str, Any]) -> Iterator[str]:
     """Yield the names of the images that the materials of a glTF document show by the first texture coordinates."""
-    for number in _find_textures(tree.get("materials", [])):
-        texture = tree["textures"][number]
+    for info in find_objects(tree.get("materials", []), lambda node: "index" in node):
+        moved = info.get("extensions", {}).get("KHR_texture_transform", {})
+        if moved.get("texCoord", info.get("texCoord", 0)) != 0:
+            continue
+        texture = tree["textures"][info["index"]]
         # Extensions name images of other formats.
         for variant in (texture, *texture.get("extensions", {}).values()):
             if "source" in variant:
                 image = tree["images"][variant["source"]]
                 name = image.get("name") or image.get("uri", "data:")
                 yield f"image {variant['source']}" if name.startswith("data:") else name
-
-
-def _find_textures(materials: Any) -> Iterator[int]:
-    """Yield the numbers of the textures that materials show by the first texture coordinates, at any depth."""
-    if isinstance(materials, list):
-        for part in materials:
-            yield from _find_textures(part)
-    elif isinstance(materials, dict):
-        if "index" in materials:
-            moved = materials.get("extensions", {}).get("KHR_texture_transform", {})
-            if moved.get("texCoord", materials.get("texCoord", 0)) == 0:
-                yield materials["index"]
-        else:
-            yield from _find_textures([part for key, part in materials.items() if key != "extras"])
 
 
 def is_beside(folder: Path, name: str) -> bool:

@@ -94,13 +94,7 @@ class Problem(ReadOnly, Displayable):
 
     @overload
     def __init__(
-        self,
-        V: ArrayLike,
-        F: ArrayLike,
-        fixed: ArrayLike,
-        target: ArrayLike,
-        *,
-        reference: Reference | None = None,
+        self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, reference: Reference | None = None
     ) -> None: ...
     @overload
     def __init__(
@@ -108,13 +102,7 @@ class Problem(ReadOnly, Displayable):
     ) -> None: ...
     @init_accepts_mesh
     def __init__(
-        self,
-        V: ArrayLike,
-        F: ArrayLike,
-        fixed: ArrayLike,
-        target: ArrayLike,
-        *,
-        reference: Reference | None = None,
+        self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, reference: Reference | None = None
     ) -> None:
         if fixed is None:
             raise ValueError("fixed must list the vertices with target positions, not None")

@@ -20,6 +20,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+SignArray = NDArray[np.int8]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 # Number of elements that a message lists.
@@ -159,6 +160,16 @@ def list_others(n: int, chosen: IntArray) -> IntArray:
     return np.flatnonzero(~mark(n, chosen))
 
 
+def first_equal(rows: NDArray[Any]) -> IntArray:
+    """Index (k,) int64 of the first row that is equal to each row of (k, d)."""
+    order = np.lexsort(rows.T)
+    starts = np.ones(len(rows), dtype=bool)
+    starts[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    first = np.empty(len(rows), dtype=np.int64)
+    first[order] = order[starts][np.cumsum(starts) - 1]
+    return first
+
+
 def cyclic_pairs(loop: IntArray) -> IntArray:
     """Pairs (k, 2) of each element of a closed loop (k,) and the next, such as the edges of a boundary loop."""
     return np.stack([loop, np.roll(loop, -1)], axis=1)
@@ -243,6 +254,14 @@ def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArr
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"{name} must have shape (f, 3), triangles only, not {array.shape}")
     return array
+
+
+def edge_array(name: str, edges: ArrayLike) -> IntArray:
+    """Convert edges, pairs of vertices, to (k, 2) int64 without a check of the index range; returns a copy."""
+    array = index_array(name, edges)
+    if array.size and (array.ndim != 2 or array.shape[1] != 2):
+        raise ValueError(f"{name} must have shape (k, 2), not {array.shape}")
+    return array.reshape(-1, 2)
 
 
 def corner_rows(name: str, values: ArrayLike, F: IntArray, rows: int | None = None, *, copy: bool = False) -> IntArray:

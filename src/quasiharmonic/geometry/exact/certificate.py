@@ -43,14 +43,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.loops import Obstacle, Reason, check_loops, join_items, simple_loops
 from quasiharmonic.geometry.exact.triangles import find_multiply_wound, triangle_signs
 from quasiharmonic.geometry.mesh.topology import are_collapsed, edges, trace_loops
-from quasiharmonic.util.arrays import (
-    FloatArray,
-    IntArray,
-    ReadOnly,
-    count_of,
-    make_unchangeable,
-    names_of,
-)
+from quasiharmonic.util.arrays import FloatArray, IntArray, ReadOnly, count_of, make_unchangeable, names_of
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Verdict
 

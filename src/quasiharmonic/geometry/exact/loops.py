@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import (
     SegmentRelation,
@@ -20,10 +19,8 @@ from quasiharmonic.geometry.exact.predicates import (
     segment_relation,
     sure_orientation,
 )
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, repeat_each
 from quasiharmonic.util.kernels import compiled
-
-SignArray = NDArray[np.int8]
 
 # Maximum number of pairs of boundary edges to list. A collapsed boundary has billions.
 _MAX_CROSSINGS = 1000

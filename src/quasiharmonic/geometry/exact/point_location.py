@@ -160,12 +160,7 @@ def _pairs(begin: IntArray, end: IntArray) -> Iterator[tuple[IntArray, IntArray]
 
 @compiled
 def sure_hits(
-    points: FloatArray,
-    begin: IntArray,
-    end: IntArray,
-    listed: NDArray[np.int32],
-    rows: FloatArray,
-    hits: IntArray,
+    points: FloatArray, begin: IntArray, end: IntArray, listed: NDArray[np.int32], rows: FloatArray, hits: IntArray
 ) -> None:
     """Fill in the first candidate of each point that is not surely outside, if it surely contains the point.
 

@@ -29,11 +29,17 @@ from collections.abc import Iterator
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, repeat_each, to_integers
-
-SignArray = NDArray[np.int8]
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    SignArray,
+    invert_indices,
+    repeat_each,
+    to_integers,
+)
 
 # |computed − exact| ≤ (3u + O(u²)) (|l| + |r|) for the determinant l − r,
 # u = 2⁻⁵³ [1]_, and 4u covers the second order and the rounding of the bound itself.

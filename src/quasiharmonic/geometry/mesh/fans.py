@@ -21,6 +21,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_range,
     edge_names,
+    first_equal,
     mark,
     names_of,
     scale_to_unit,
@@ -178,7 +179,7 @@ def find_representatives(V: FloatArray, F: IntArray, weld: bool | float, meshes:
         return joint
     used = np.flatnonzero(mark(len(V), F))
     of = np.zeros(len(used)) if meshes is None else meshes[used].astype(np.float64)
-    first = _find_equal(np.column_stack([V[used], of]))
+    first = first_equal(np.column_stack([V[used], of]))
     distinct = np.flatnonzero(first == np.arange(len(first)))
     if not isinstance(weld, bool | np.bool_) and len(distinct):
         # In this unit, the diagonal neither overflows nor underflows.
@@ -205,16 +206,6 @@ def weld_triangles(V: FloatArray, F: IntArray, weld: bool | float) -> tuple[IntA
     return joint[F], joint
 
 
-def _find_equal(V: FloatArray) -> IntArray:
-    """Return for each vertex the first one at the same position."""
-    order = np.lexsort(V.T)
-    starts = np.ones(len(V), dtype=bool)
-    starts[1:] = (V[order[1:]] != V[order[:-1]]).any(axis=1)
-    first = np.empty(len(V), dtype=np.int64)
-    first[order] = order[starts][np.cumsum(starts) - 1]
-    return first
-
-
 def _find_close(points: FloatArray, distance: float) -> IntArray:
     """Return for each of several distinct points the first representative within a distance."""
     from scipy.spatial import cKDTree
@@ -237,6 +228,6 @@ def _find_close(points: FloatArray, distance: float) -> IntArray:
 
 def weld_points(points: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return the distinct points of (k, d), in the order of their first occurrence, and the row of each point (k,)."""
-    first = _find_equal(points)
+    first = first_equal(points)
     distinct = np.flatnonzero(first == np.arange(len(points)))
     return points[distinct], np.searchsorted(distinct, first)

@@ -20,6 +20,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_range,
     edge_names,
+    first_equal,
     make_unchangeable,
     names_of,
     own_triangles,
@@ -157,11 +158,7 @@ def find_twins(F: IntArray) -> IntArray:
     ordered = np.sort(sums)
     several = np.flatnonzero(np.isin(sums, ordered[1:][ordered[1:] == ordered[:-1]]))
     if several.size:
-        corners = np.sort(F[several], axis=1)
-        order = np.lexsort(corners.T)
-        starts = np.ones(order.size, dtype=bool)
-        starts[1:] = (corners[order[1:]] != corners[order[:-1]]).any(axis=1)
-        twin[several[order]] = several[order[starts]][np.cumsum(starts) - 1]
+        twin[several] = several[first_equal(np.sort(F[several], axis=1))]
     return twin
 
 

@@ -340,9 +340,8 @@ def _find_carried(mesh: MeshData) -> CarriedGltf | None:
 
 def _read_materials(carried: CarriedGltf) -> tuple[list[bytes], tuple[SurfaceMaterial, ...]]:
     """Return the names of the materials that triangles use, empty for the default one, and these materials."""
-    tree = carried.document.tree
-    used = dict.fromkeys(tree["meshes"][one.mesh]["primitives"][one.primitive].get("material") for one in carried.parts)
-    statements = material_statements(tree)
+    used = dict.fromkeys(part.entry(carried.document).get("material") for part in carried.parts)
+    statements = material_statements(carried.document.tree)
     names = [b"" if k is None else statements[k].split(None, 1)[1].strip() for k in used]
     return names, gltf_appearance(carried).materials
 

@@ -14,11 +14,10 @@ from functools import cached_property, cmp_to_key, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.problem.diagnosis.clipping import MARGIN, Convex, Effort, Lattice, cross, line
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, scale_to_unit
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, as_offsets, scale_to_unit
 
 # Number of consecutive wedges that form a row for a first comparison.
 _ROW = 16
@@ -129,9 +128,6 @@ class Wedges:
         reach &= (cross(right, from_eye) > -MARGIN).any(axis=2) | wide
         reach &= (cross(left, from_eye) < MARGIN).any(axis=2) | wide
         return reach
-
-
-SignArray = NDArray[np.int8]
 
 
 class Views:

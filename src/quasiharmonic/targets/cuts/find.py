@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from quasiharmonic.geometry.mesh.fans import open_along
-from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges
+from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges, pair_keys
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.targets.cuts.levels import cut_by_levels
@@ -27,7 +27,7 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_range,
-    index_array,
+    edge_array,
     names_of,
     real_array,
     triangle_array,
@@ -111,7 +111,10 @@ def find_cuts(
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    given, spared = _edge_array("edges", edges), _edge_array("forbidden_edges", forbidden_edges)
+    given, spared = (
+        edge_array(name, [] if pairs is None else pairs)
+        for name, pairs in (("edges", edges), ("forbidden_edges", forbidden_edges))
+    )
     check_range("forbidden_edges", spared, len(V))
     if not isinstance(min_gain, Real) or not float(min_gain) > 0:
         raise ValueError(f"min_gain must be a positive number, not {min_gain!r}")
@@ -135,7 +138,7 @@ def find_cuts_by(
     inner = manifold_edges(F, len(V)).interior
     # Open along the given edges. Surfaces that touch at a vertex are also separated.
     FT, origin = open_along(F, given, len(V))
-    found = [inner[np.isin(_keys(inner, len(V)), _open_keys(F, FT, given, len(V)))]] if given.size else [given]
+    found = [inner[np.isin(pair_keys(inner, len(V)), _open_keys(F, FT, given, len(V)))]] if given.size else [given]
     rings = _RINGS if np.isfinite(min_gain) else _RINGS_OF_SHORTEST
     for vertices, triangles, T in _parts(FT, len(origin)):
         names, own = origin[vertices], None if costs is None else costs[triangles]
@@ -213,7 +216,7 @@ def _costs_of_sides(F: IntArray, n: int, spared: IntArray, edge_costs: ArrayLike
         marked[spared] = True
         side = marked[F] & marked[F[:, (1, 2, 0)]]
         keys = edge_keys(F[side], F[:, (1, 2, 0)][side], n)
-        costs[side] *= np.where(np.isin(keys, _keys(spared, n)), _DEAR, 1.0)
+        costs[side] *= np.where(np.isin(keys, pair_keys(spared, n)), _DEAR, 1.0)
     elif edge_costs is None:
         return None
     return costs
@@ -227,24 +230,11 @@ def _cut_part(graph: EdgeGraph, min_gain: float) -> BoolArray:
     return cut
 
 
-def _edge_array(name: str, edges: ArrayLike | None) -> IntArray:
-    array = index_array(name, [] if edges is None else edges)
-    if array.size == 0:
-        return np.zeros((0, 2), dtype=np.int64)
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"{name} must have shape (k, 2), two vertices each, not {array.shape}")
-    return array
-
-
-def _keys(pairs: IntArray, n: int) -> IntArray:
-    return edge_keys(pairs[:, 0], pairs[:, 1], n)
-
-
 def _open_keys(F: IntArray, FT: IntArray, given: IntArray, n: int) -> IntArray:
     """Keys of the given edges that are open, so that their two sides are separate edges."""
     tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
     key = edge_keys(tail, head, n)
-    there = np.isin(key, edge_keys(given[:, 0], given[:, 1], n))
+    there = np.isin(key, pair_keys(given, n))
     side = edge_keys(FT.ravel(), np.roll(FT, -1, axis=1).ravel(), int(FT.max()) + 1)[there]
     _, which, count = np.unique(side, return_inverse=True, return_counts=True)
     return key[there][count[which] == 1]

@@ -31,8 +31,7 @@ _WITHOUT_IMAGES = {"KHR_lights_punctual", "KHR_materials_variants"}
 def gltf_appearance(carried: CarriedGltf) -> Appearance:
     """Return the appearance of the triangles of a glTF document; damaged materials are listed as problems."""
     reader = _MaterialReader(carried.document, carried.folder)
-    primitives = [carried.document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in carried.parts]
-    index = [primitive.get("material") for primitive in primitives]
+    index = [part.entry(carried.document).get("material") for part in carried.parts]
     used = list(dict.fromkeys(index))
     of_triangle: IntArray = np.concatenate(
         [np.full(part.end - part.begin, used.index(k)) for part, k in zip(carried.parts, index, strict=True)]
@@ -242,16 +241,16 @@ def _drop_unused_images(document: Document) -> None:
     if set(tree.get("extensions", {})) - _WITHOUT_IMAGES:
         return
     # References of damaged materials stay as they are.
-    infos = list(_find(tree["materials"], lambda node: _is_in(node.get("index"), tree["textures"])))
+    infos = list(find_objects(tree["materials"], lambda node: _is_in(node.get("index"), tree["textures"])))
     textures = _keep(tree, "textures", {info["index"] for info in infos})
     for info in infos:
         info["index"] = textures[info["index"]]
-    sources = list(_find(tree["textures"], lambda node: _is_in(node.get("source"), tree["images"])))
+    sources = list(find_objects(tree["textures"], lambda node: _is_in(node.get("source"), tree["images"])))
     before = {image["bufferView"] for image in tree["images"] if "bufferView" in image}
     images = _keep(tree, "images", {node["source"] for node in sources})
     for node in sources:
         node["source"] = images[node["source"]]
-    holders = list(_find(tree, lambda node: "bufferView" in node))
+    holders = list(find_objects(tree, lambda node: "bufferView" in node))
     dropped = before - {node["bufferView"] for node in holders}
     kept = [k for k in range(len(document.views)) if k not in dropped]
     number = {k: i for i, k in enumerate(kept)}
@@ -272,14 +271,14 @@ def _keep(tree: dict[str, Any], name: str, used: set[int]) -> dict[int, int]:
     return {k: i for i, k in enumerate(kept)}
 
 
-def _find(node: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> Iterator[dict[str, Any]]:
+def find_objects(node: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> Iterator[dict[str, Any]]:
     """Yield the wanted objects in a part of a document, at any depth, except in extras."""
     if isinstance(node, list):
         for part in node:
-            yield from _find(part, is_wanted)
+            yield from find_objects(part, is_wanted)
     elif isinstance(node, dict):
         if is_wanted(node):
             yield node
         for key, part in node.items():
             if key != "extras":
-                yield from _find(part, is_wanted)
+                yield from find_objects(part, is_wanted)

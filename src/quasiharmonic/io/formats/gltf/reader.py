@@ -22,9 +22,7 @@ from quasiharmonic.util.options import INSTANCES
 
 PLACES = "TEXCOORD_0"
 # Modes of a glTF primitive.
-_TRIANGLES = 4
-_STRIP = 5
-_FAN = 6
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _READ = "POSITION", "NORMAL", "COLOR_0", PLACES
 
 
@@ -56,6 +54,11 @@ class Primitive:
     pool: int
     begin: int
     end: int
+
+    def entry(self, document: Document) -> dict[str, Any]:
+        """Return the primitive's entry in a document."""
+        found: dict[str, Any] = document.tree["meshes"][self.mesh]["primitives"][self.primitive]
+        return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,7 +88,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     name = _channel_name(len(mesh.lower_maps))
     for number, pool in enumerate(carried.pools):
         parts, faces = carried.parts_of(number), carried.faces_of(number)
-        primitives = [document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in parts]
+        primitives = [part.entry(document) for part in parts]
         places = all_places[faces]
         if np.isnan(places).all():
             continue
