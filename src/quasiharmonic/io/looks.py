@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -29,7 +30,7 @@ from quasiharmonic.io.models.appearance import (
     plain_appearance,
 )
 from quasiharmonic.io.models.meshdata import MeshData, colours_of
-from quasiharmonic.io.models.textures import Texture, read_texture, texture_of
+from quasiharmonic.io.models.textures import Texture, texture_of
 from quasiharmonic.util.untrusted import resolve_beside
 
 # Entries of material libraries about images that `read_appearance` reads.
@@ -88,13 +89,11 @@ def _read_libraries(mesh: MeshData) -> tuple[dict[str, SurfaceMaterial], tuple[s
 
 def _read_image(mesh: MeshData, name: Path) -> NamedImage:
     """Return an image that a library in the folder of the mesh's file names."""
-    folder = Path(mesh.source).parent
-    if not is_beside(folder, str(name)):
-        return NamedImage(str(name), None)
-    try:
-        return NamedImage(str(name), read_bytes(folder / name))
-    except MeshFileError:
-        return NamedImage(str(name), None)
+    folder, data = Path(mesh.source).parent, None
+    if is_beside(folder, str(name)):
+        with suppress(MeshFileError):
+            data = read_bytes(folder / name)
+    return NamedImage(str(name), data)
 
 
 def own_texture(mesh: MeshData) -> Texture | None:
@@ -105,15 +104,11 @@ def own_texture(mesh: MeshData) -> Texture | None:
     """
     if Path(mesh.source).suffix.lower() in _GLTF:
         return _of_gltf(Path(mesh.source))
-    folder = Path(mesh.source).parent
     for words, within in library_entries(mesh):
-        name = within / os.fsdecode(words[-1])
-        if words[0] != b"map_Kd" or not is_beside(folder, str(name)):
-            continue
-        try:
-            return read_texture(folder / name)
-        except MeshFileError:
-            continue
+        if words[0] == b"map_Kd":
+            data = _read_image(mesh, within / os.fsdecode(words[-1])).data
+            if data is not None and (texture := texture_of(data)) is not None:
+                return texture
     return None
 
 

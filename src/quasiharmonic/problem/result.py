@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.mesh.refinement import Refined
 from quasiharmonic.io.adapters.objects import make_trimesh
-from quasiharmonic.util.arrays import ReadOnly
+from quasiharmonic.util.arrays import ReadOnly, count_of
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Outcome
 
@@ -373,7 +373,7 @@ class MapResult(ReadOnly, Displayable, Outcome):
         )
 
     def short_repr(self) -> str:
-        steps = f"{self.n_iterations} iteration{'' if self.n_iterations == 1 else 's'}"
+        steps = count_of("iteration", "iterations", self.n_iterations)
         return f"{self.certificate.short_repr()}, {steps}, {self.seconds:.3g} s"
 
     def summary(self) -> str:

@@ -109,11 +109,13 @@ class BoundaryCurves:
 
     def holding(self, vertices: IntArray) -> BoundaryCurves:
         """Return a copy with more fixed vertices, except those in ``on``."""
-        return self._with(self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on)))))
+        return self._copy_with(
+            self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on))))
+        )
 
     def keeping(self, vertices: IntArray) -> BoundaryCurves:
         """Return a copy with more fixed vertices, also such that are in ``on``."""
-        return self._with(self.on, np.union1d(self.fixed, vertices))
+        return self._copy_with(self.on, np.union1d(self.fixed, vertices))
 
     def among(self, used: IntArray) -> BoundaryCurves:
         """Return a copy for a submesh with the given vertices, ascending."""
@@ -124,9 +126,9 @@ class BoundaryCurves:
                 f"the boundary curves refer to {names_of('vertex', 'vertices', absent)}, but no triangle uses them"
             )
         on = {int(np.searchsorted(used, v)): k for v, k in self.on.items()}
-        return self._with(on, np.searchsorted(used, self.fixed))
+        return self._copy_with(on, np.searchsorted(used, self.fixed))
 
-    def _with(self, on: Mapping[int, int], fixed: IntArray) -> BoundaryCurves:
+    def _copy_with(self, on: Mapping[int, int], fixed: IntArray) -> BoundaryCurves:
         return BoundaryCurves(self.curves, on=on, fixed=fixed, corner_angle=self.corner_angle, tolerance=self.tolerance)
 
     def lay(self, loops: Sequence[IntArray], uv: FloatArray) -> Track:

@@ -243,7 +243,7 @@ def inverted_triangles(F: IntArray, uv: FloatArray) -> IntArray:
 def _count_by_kind(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
     """Count and list the non-positive triangles by kind."""
     return ", ".join(
-        f"{bad.size} {'is' if bad.size == 1 else 'are'} {what} ({join_items(bad.tolist())})"
+        f"{count_of('is', 'are', bad.size)} {what} ({join_items(bad.tolist())})"
         for bad, what in ((inverted, "inverted"), (degenerate, "degenerate"), (nonfinite, "not finite"))
         if bad.size
     )

@@ -360,7 +360,7 @@ def divide_cells(
         across = wide[row]
         down = step // across
         x, y = first[row, 0] + step - down * across, first[row, 1] + down
-        meets = _meet(nx[t], ny[t], offset[t], row, x, y, shift)
+        meets = _triangles_meet_cells(nx[t], ny[t], offset[t], row, x, y, shift)
         row, x, y = row[meets], x[meets], y[meets]
         owner = p[row]
         cells.append((owner * lines + y - corner[owner, 1]) * columns + x - corner[owner, 0])
@@ -385,7 +385,7 @@ def _lines(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return nx, ny, nx * tail[..., 0] + ny * tail[..., 1]
 
 
-def _meet(
+def _triangles_meet_cells(
     nx: FloatArray, ny: FloatArray, offset: FloatArray, row: IntArray, x: IntArray, y: IntArray, shift: int
 ) -> BoolArray:
     """Whether triangles, given by row, meet cells that their boxes meet; True if in doubt."""

@@ -118,8 +118,8 @@ class _VtuFile:
         # Appended data need not be XML, so parse only the part before.
         head = data if tag is None else data[: tag.end()] + b"</AppendedData></VTKFile>"
         self._parser = ParserCreate()
-        self._parser.StartElementHandler = self._begins
-        self._parser.EndElementHandler = self._ends
+        self._parser.StartElementHandler = self._open_element
+        self._parser.EndElementHandler = self._close_element
         try:
             self._parser.Parse(head, True)
         except ExpatError as error:
@@ -189,7 +189,7 @@ class _VtuFile:
                 whole = whole[: other.tag] + tag + whole[other.begin :]
         return whole
 
-    def _begins(self, name: str, attributes: dict[str, str]) -> None:
+    def _open_element(self, name: str, attributes: dict[str, str]) -> None:
         if name == "VTKFile":
             self._file = attributes
         elif name == "Piece":
@@ -198,7 +198,7 @@ class _VtuFile:
             self._open = attributes, self._parser.CurrentByteIndex
         self._path.append(name)
 
-    def _ends(self, name: str) -> None:
+    def _close_element(self, name: str) -> None:
         self._path.pop()
         if name in ("DataArray", "Array") and self._open is not None:
             attributes, tag = self._open
@@ -214,7 +214,7 @@ class _VtuFile:
 
         Compressed data of more than ``max_bytes`` bytes raise a `ValueError`.
         """
-        begin, raw = self._where(array)
+        begin, raw = self._find_bytes(array)
         take = _take_raw if raw else _take_base64
         size = self._word.itemsize
         if self._coder is None:
@@ -249,7 +249,7 @@ class _VtuFile:
 
     def _encode(self, block: bytes, array: _Array) -> bytes:
         """Encode bytes in the same way as an array of the same length in the file."""
-        begin, raw = self._where(array)
+        begin, raw = self._find_bytes(array)
         code: Callable[[bytes], bytes] = bytes if raw else base64.b64encode
         if self._coder is None:
             return code(np.array([len(block)], dtype=self._word).tobytes() + block)
@@ -261,7 +261,7 @@ class _VtuFile:
         header = np.concatenate([head, np.array([len(part) for part in packed], dtype=self._word)])
         return code(header.astype(self._word).tobytes()) + code(b"".join(packed))
 
-    def _where(self, array: _Array) -> tuple[int, bool]:
+    def _find_bytes(self, array: _Array) -> tuple[int, bool]:
         """Return the start of an array's bytes, and whether they are raw."""
         if array.attributes.get("format") != "appended":
             inline = self._data[array.begin : array.end]

@@ -39,9 +39,9 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
     """
     data = read_bytes(path)
     # The header of a binary file may start with "solid" too, so its length decides.
-    corners = _binary(data)
+    corners = _read_binary(data)
     if corners is None:
-        corners = _text(data)
+        corners = _read_text(data)
     if corners is None:
         raise MeshFileError(path, "is not a text or binary STL file, or is cut off")
     if not len(corners):
@@ -51,7 +51,7 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
         return MeshData(V, F.reshape(-1, 3), source=os.fspath(path))
 
 
-def _binary(data: bytes) -> FloatArray | None:
+def _read_binary(data: bytes) -> FloatArray | None:
     """Return the corners (f, 3, 3) of a binary file; None if its length does not match its header."""
     count = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
     if len(data) < _HEADER or len(data) != _HEADER + count * _FACET.itemsize:
@@ -61,7 +61,7 @@ def _binary(data: bytes) -> FloatArray | None:
         return np.frombuffer(data, _FACET, offset=_HEADER)["corners"].astype(np.float64)
 
 
-def _text(data: bytes) -> FloatArray | None:
+def _read_text(data: bytes) -> FloatArray | None:
     """Return the corners (f, 3, 3) of a text file; None if it is not STL text or a facet is malformed."""
     if data[:512].lstrip()[:5].lower() != b"solid" or b"endsolid" not in data.lower():
         return None

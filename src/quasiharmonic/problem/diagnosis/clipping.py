@@ -172,7 +172,7 @@ class Walls:
             blocking = list(blocking)
             for k, eye in enumerate(eyes):
                 if k == len(blocking):
-                    blocking.append(self._facing(eye, walls))
+                    blocking.append(self._walls_facing(eye, walls))
                 if len(blocking[k]):
                     parts, blocking[k] = self._split(area, approximate, eye, blocking[k])
                 if parts is not None:
@@ -188,7 +188,7 @@ class Walls:
         inside = (self._low[0] <= x1) & (self._high[0] >= x0) & (self._low[1] <= y1) & (self._high[1] >= y0)
         return self._ends[inside]
 
-    def _facing(self, eye: int, walls: IntArray) -> IntArray:
+    def _walls_facing(self, eye: int, walls: IntArray) -> IntArray:
         """Return walls ordered from right to left as seen from an eye, without those that end at it; (m, 2) int64."""
         ends = walls[(walls[:, 0] != eye) & (walls[:, 1] != eye)]
         p, q = self._lattice.approximate[ends.T] - self._lattice.approximate[eye]

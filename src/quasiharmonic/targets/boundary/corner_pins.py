@@ -28,6 +28,7 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_range,
+    count_of,
     describe,
     index_array,
     names_of,
@@ -96,7 +97,7 @@ class Pins:
             if isinstance(goal, int | np.integer):
                 self.wanted.setdefault(loop, {})[position] = int(goal)
                 continue
-            contour, along = self._nearest(np.asarray(goal, dtype=np.float64), int(vertex))
+            contour, along = self._find_on_outline(np.asarray(goal, dtype=np.float64), int(vertex))
             self.wanted.setdefault(loop, {})[position] = along
             if self.contour_of.setdefault(loop, contour) != contour:
                 raise ValueError(
@@ -128,9 +129,9 @@ class Pins:
         marks, t = self.sharp[contour], arc_parameters(self.contours[contour])
         if self.all_corners and wanted and len(wanted) != len(marks):
             raise ValueError(
-                f"{len(wanted)} corner {'vertex' if len(wanted) == 1 else 'vertices'} for a contour with {len(marks)} "
-                f"{'corner' if len(marks) == 1 else 'corners'} ({self._listed(contour)}): name one for each, or say "
-                "which corner each goes to"
+                f"{count_of('corner vertex', 'corner vertices', len(wanted))} for a contour with "
+                f"{count_of('corner', 'corners', len(marks))} ({self._list_corners(contour)}): name one for each, or "
+                "say which corner each goes to"
             )
         names = self.loops[loop]
         found = []
@@ -140,7 +141,7 @@ class Pins:
                     last = len(marks) - 1
                     raise ValueError(
                         f"vertex {names[position]} goes to corner {goal}, but the contour has corners 0 to {last}: "
-                        f"{self._listed(contour)}"
+                        f"{self._list_corners(contour)}"
                     )
                 goal = float(t[marks[goal]])
             found.append((goal, position))
@@ -162,13 +163,13 @@ class Pins:
             )
         return list(zip(positions.tolist(), places, strict=True))
 
-    def _listed(self, contour: int) -> str:
+    def _list_corners(self, contour: int) -> str:
         """List the corners of a contour with their numbers, for messages."""
         points = np.ldexp(self.contours[contour][self.sharp[contour]], self.exponent).tolist()
         named = [f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)]
         return ", ".join(named[:_MAX_LISTED]) + (", …" if len(named) > _MAX_LISTED else "")
 
-    def _nearest(self, point: FloatArray, vertex: int) -> tuple[int, float]:
+    def _find_on_outline(self, point: FloatArray, vertex: int) -> tuple[int, float]:
         """Return the contour on which a point lies and the parameter along it."""
         if point.shape != (2,) or not np.isfinite(point).all():
             raise ValueError(f"vertex {vertex} goes to a corner's number or a point (x, y), not to {point.tolist()}")
@@ -217,14 +218,14 @@ def pins_by_angle(
     lengths = np.cumsum(loop.lengths / loop.lengths.max())
     runs = lengths[positions - 1] / lengths[-1]
     alike = _likeness(turning + 0j, mean_turns(sides, turns(contour), sharp) + 0j)
-    alike += _likeness(_gaps(runs) + 0j, _gaps(ends) + 0j)
+    alike += _likeness(_measure_gaps(runs) + 0j, _measure_gaps(ends) + 0j)
     seen, goal = to_complex(flat[positions]), to_complex(contour[sharp])
     upright = _likeness(seen - seen.mean(), goal - goal.mean())
     first = int(np.argmax(np.where(alike >= alike.max() - _SIMILAR, upright, -np.inf)))
     return list(zip(np.roll(positions, -first).tolist(), ends.tolist(), strict=True))
 
 
-def _gaps(along: FloatArray) -> FloatArray:
+def _measure_gaps(along: FloatArray) -> FloatArray:
     """Distances from each of some parameters on a closed curve of length 1 to the next."""
     return np.asarray((np.roll(along, -1) - along) % 1.0)
 
@@ -308,9 +309,9 @@ def read_corners(text: str) -> CornerSpec:
     if os.path.isfile(text):
         lines = Path(text).read_text(encoding="utf-8", errors="replace").splitlines()
         words = [re.sub(r"\s*,\s*", ",", line.split("#")[0]).replace(":", " ").split() for line in lines]
-        entries = [_entry(":".join(line)) for line in words if line]
+        entries = [_parse_entry(":".join(line)) for line in words if line]
     else:
-        entries = [_entry(part) for part in _split(text)]
+        entries = [_parse_entry(part) for part in _split_entries(text)]
     if not entries:
         raise ValueError(f"the file names no corners: each line needs one of {FORMS}")
     lone = [who for who, goal in entries if goal is None]
@@ -353,7 +354,7 @@ def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArr
     return np.array([border[np.argmin(((here - place) ** 2).sum(axis=1))] for place in there], dtype=np.int64)
 
 
-def _split(text: str) -> list[str]:
+def _split_entries(text: str) -> list[str]:
     """Split a list of entries at commas; a position contains two commas of its own."""
     parts, entries = [part.strip() for part in text.split(",")], []
     while parts:
@@ -363,11 +364,11 @@ def _split(text: str) -> list[str]:
     return entries
 
 
-def _entry(text: str) -> tuple[int | Place, Goal | None]:
+def _parse_entry(text: str) -> tuple[int | Place, Goal | None]:
     """Parse a vertex or a position, with its target if given."""
     vertex, *goal = text.removeprefix(_NEAR).split(":")
     try:
-        who = _place(vertex) if text.startswith(_NEAR) else integer(vertex.strip().encode())
+        who = _parse_place(vertex) if text.startswith(_NEAR) else integer(vertex.strip().encode())
         if not goal:
             return who, None
         if len(goal) == 1:
@@ -378,7 +379,7 @@ def _entry(text: str) -> tuple[int | Place, Goal | None]:
         raise ValueError(f"{text[:40]!r} is not one of {FORMS}") from None
 
 
-def _place(text: str) -> Place:
+def _parse_place(text: str) -> Place:
     x, y, z = map(float, text.split(","))
     if not np.isfinite((x, y, z)).all():
         raise ValueError("no place")

@@ -57,7 +57,7 @@ def cut_by_levels(
     rim_keys = pair_keys(rim, n)
     factors = [None] * (len(coarsening.rounds) + 1) if costs is None else _vertex_costs(F, costs, coarsening.rounds, n)
     means = _mean_positions(V, fixed, coarsening.rounds)
-    vertices, graph = _part(means, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
+    vertices, graph = _make_subset(means, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
     cut = vertices[graph.ends[find(graph, vertices)]]
     if not cut.size:
         return cut
@@ -70,7 +70,7 @@ def cut_by_levels(
             T = coarsening.levels[k]
             near = triangles_near(T, marked, rings)
             some = costs[near] if k == 0 and costs is not None else _side_costs(factors[k], T[near])
-            cut = _shorten(*_part(V, T[near], some, rim_keys), cut)
+            cut = _shorten(*_make_subset(V, T[near], some, rim_keys), cut)
     return cut
 
 
@@ -131,7 +131,9 @@ def _shorten(vertices: IntArray, graph: EdgeGraph, cut: IntArray) -> IntArray:
     return vertices[graph.ends[shorten_cuts(graph, on_cut, rings=_RINGS)]]
 
 
-def _part(V: FloatArray, F: IntArray, costs: FloatArray | None, rim_keys: IntArray) -> tuple[IntArray, EdgeGraph]:
+def _make_subset(
+    V: FloatArray, F: IntArray, costs: FloatArray | None, rim_keys: IntArray
+) -> tuple[IntArray, EdgeGraph]:
     """Return the vertices of some triangles, and their graph, as `EdgeGraph.part_near` does."""
     vertices = np.flatnonzero(np.bincount(F.ravel(), minlength=len(V)))
     graph = edge_graph(V[vertices], np.searchsorted(vertices, F), costs)

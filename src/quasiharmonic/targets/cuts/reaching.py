@@ -90,11 +90,11 @@ class _Balance:
         """Return the scale w under given cuts, and store their price."""
         heartbeat()
         w = self.shrinking.of(self._rim | self.graph.mark_vertices(cut))
-        length = float(self.graph.length[cut].sum()) + _END * int(self._loose(cut).sum())
+        length = float(self.graph.length[cut].sum()) + _END * int(self._mark_loose_ends(cut).sum())
         self._prices[np.packbits(cut).tobytes()] = self.shrinking.energy(w) + self.min_gain * length
         return w
 
-    def _loose(self, cut: BoolArray) -> BoolArray:
+    def _mark_loose_ends(self, cut: BoolArray) -> BoolArray:
         """Mask (n,) of the vertices that are loose ends of cuts."""
         return (np.bincount(self.graph.ends[cut].ravel(), minlength=self.graph.n) == 1) & ~self._rim
 
@@ -136,7 +136,7 @@ class _Balance:
 
     def _twigs(self, cut: BoolArray) -> list[IntArray]:
         """Return the stretches with a loose end."""
-        loose = self._loose(cut)
+        loose = self._mark_loose_ends(cut)
         ways = stretches(self.graph, cut)
         return [way for way in ways if loose[self.graph.ends[way[[0, -1]]]].any()]
 

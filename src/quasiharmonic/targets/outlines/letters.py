@@ -17,7 +17,7 @@ import numpy as np
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.targets.outlines.contours import Pieces, drop_close_points, filled, flatten, nested, signed_area
-from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive, describe
+from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive, count_of, describe
 from quasiharmonic.util.optional import explain_missing
 
 Font = str | PathLike[str]
@@ -208,11 +208,13 @@ def word(text: str, font: Font | None = None, *, overlap: float = OVERLAP, toler
     ModuleNotFoundError
         When Shapely, which unites the letters, is not installed.
     """
-    contours = [drop_close_points(contour, tolerance) for contour in _unite(_set(text, font, overlap, tolerance)[0])]
+    contours = [
+        drop_close_points(contour, tolerance) for contour in _unite(_place_letters(text, font, overlap, tolerance)[0])
+    ]
     loose = len(filled(contours)) - 1
     if loose:
         raise ValueError(
-            f"{loose} {'part' if loose == 1 else 'parts'} of {text!r} (a dot, an accent) "
+            f"{count_of('part', 'parts', loose)} of {text!r} (a dot, an accent) "
             f"{'touches' if loose == 1 else 'touch'} no other part: choose other letters, such as capitals"
         )
     return contours
@@ -224,7 +226,7 @@ def word_curves(text: str, font: Font | None, tolerance: float) -> list[Curve]:
     There is one closed curve for each contour. Errors as `word`; ValueError also when letters touch at so small an
     angle that the intersection of their curves cannot be found.
     """
-    letters, shifts = _set(text, font, OVERLAP, tolerance)
+    letters, shifts = _place_letters(text, font, OVERLAP, tolerance)
     drawn = [
         Curve.contour([piece - (shift, 0.0) for piece in path])
         for character, shift in zip(text, shifts, strict=True)
@@ -234,7 +236,9 @@ def word_curves(text: str, font: Font | None, tolerance: float) -> list[Curve]:
     return [_trace(drop_close_points(contour, _SAME_POINT), drawn, tolerance) for contour in _unite(letters)]
 
 
-def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tuple[list[list[FloatArray]], list[float]]:
+def _place_letters(
+    text: str, font: Font | None, overlap: float, tolerance: float
+) -> tuple[list[list[FloatArray]], list[float]]:
     """Return the contours of each letter in its position, and each letter's shift to the left."""
     check_instance("text", text, str)
     check_positive(overlap=overlap)
@@ -243,7 +247,7 @@ def _set(text: str, font: Font | None, overlap: float, tolerance: float) -> tupl
     letters = [letter(character, font, tolerance=tolerance) for character in text]
     shifts = [0.0]
     for before, after in itertools.pairwise(letters):
-        shifts.append(_gap(before, after) + overlap)
+        shifts.append(_letter_spacing(before, after) + overlap)
         for contour in after:
             contour[:, 0] -= shifts[-1]
     return letters, shifts
@@ -297,7 +301,7 @@ def _find_meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, fl
     raise ValueError(_TANGENT_LETTERS)
 
 
-def _gap(before: list[FloatArray], after: list[FloatArray]) -> float:
+def _letter_spacing(before: list[FloatArray], after: list[FloatArray]) -> float:
     """Distance by which one letter can move to the left until it touches another."""
     low, high = (
         [extreme([extreme(c[:, 1]) for c in shape]) for shape in (before, after)] for extreme in (np.min, np.max)

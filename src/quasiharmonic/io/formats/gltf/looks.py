@@ -242,12 +242,12 @@ def _drop_unused_images(document: Document) -> None:
         return
     # References of damaged materials stay as they are.
     infos = list(find_objects(tree["materials"], lambda node: _is_in(node.get("index"), tree["textures"])))
-    textures = _keep(tree, "textures", {info["index"] for info in infos})
+    textures = _keep_used(tree, "textures", {info["index"] for info in infos})
     for info in infos:
         info["index"] = textures[info["index"]]
     sources = list(find_objects(tree["textures"], lambda node: _is_in(node.get("source"), tree["images"])))
     before = {image["bufferView"] for image in tree["images"] if "bufferView" in image}
-    images = _keep(tree, "images", {node["source"] for node in sources})
+    images = _keep_used(tree, "images", {node["source"] for node in sources})
     for node in sources:
         node["source"] = images[node["source"]]
     holders = list(find_objects(tree, lambda node: "bufferView" in node))
@@ -264,7 +264,7 @@ def _is_in(index: Any, entries: list[Any]) -> bool:
     return isinstance(index, int) and 0 <= index < len(entries)
 
 
-def _keep(tree: dict[str, Any], name: str, used: set[int]) -> dict[int, int]:
+def _keep_used(tree: dict[str, Any], name: str, used: set[int]) -> dict[int, int]:
     """Remove the entries of a list that are not used; return the new index of each of the others."""
     kept = sorted(used)
     tree[name] = [tree[name][k] for k in kept]

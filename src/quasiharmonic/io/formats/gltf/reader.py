@@ -346,7 +346,7 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
             continue
         seen.add(index)
         node = nodes[index]
-        here = above @ _local(node, index)
+        here = above @ _local_matrix(node, index)
         if "mesh" in node:
             # The transformation of a node with a skin is ignored, as glTF specifies.
             placed.setdefault(whole(node["mesh"]), np.eye(4) if "skin" in node else here)
@@ -354,7 +354,7 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
     return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
 
 
-def _local(node: dict[str, Any], index: int) -> FloatArray:
+def _local_matrix(node: dict[str, Any], index: int) -> FloatArray:
     """Return the matrix of a node."""
     if "matrix" in node:
         return _numbers(node, "matrix", [0] * 16, index).reshape(4, 4).T

@@ -44,7 +44,7 @@ def write_gltf(path: str | os.PathLike[str], mesh: MeshData) -> None:
         document = _replace_map(carried, mesh)
         embed_pictures(document, carried.folder)
     else:
-        document = _new(mesh)
+        document = _make_document(mesh)
     if mesh.texture is not None:
         paint(document, mesh.texture)
     check_path("path", path)
@@ -242,7 +242,7 @@ def _indices(rows: IntArray, count: int) -> NDArray[Any]:
     return rows.reshape(-1, 1).astype(np.uint16 if count < 1 << 16 else np.uint32)
 
 
-def _new(mesh: MeshData) -> Document:
+def _make_document(mesh: MeshData) -> Document:
     """Return a document of one mesh."""
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "quasiharmonic"},
