@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from quasiharmonic.io.errors import MeshFileError, check_path
 
 if TYPE_CHECKING:
-    from quasiharmonic.io.fem.byte_tables import MeshParts
+    from quasiharmonic.io.fem.mesh_parts import MeshParts
     from quasiharmonic.io.models.meshdata import MeshData
     from quasiharmonic.io.models.textures import Texture
     from quasiharmonic.util.arrays import FloatArray, IntArray

@@ -302,8 +302,7 @@ def _volumes(V: FloatArray, F: IntArray, part: IntArray, count: int) -> FloatArr
     points = V - V.mean(axis=0)
     points = points / max(float(np.abs(points).max()), np.finfo(float).tiny)
     a, b, c = (points[F[:, k]] for k in range(3))
-    volumes: FloatArray = np.bincount(part, (a * np.cross(b, c)).sum(axis=1), minlength=count).astype(np.float64)
-    return volumes
+    return np.bincount(part, (a * np.cross(b, c)).sum(axis=1), minlength=count).astype(np.float64)
 
 
 def _name_first(found: IntArray) -> str:

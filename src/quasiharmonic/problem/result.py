@@ -405,8 +405,7 @@ class MapResult(ReadOnly, Displayable, Outcome):
         ValueError
             If ``kind`` or ``measure`` is unknown, or ``V`` is None.
         """
-        figure: Figure = self._draw(kind, measure=measure)
-        return figure
+        return self._draw(kind, measure=measure)
 
     def to_trimesh(self) -> Trimesh:
         """Return the mesh as a trimesh.Trimesh with ``uv`` as texture coordinates; needs trimesh.

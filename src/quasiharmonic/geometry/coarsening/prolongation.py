@@ -185,5 +185,4 @@ def are_positive(w: ComplexArray, T: IntArray) -> BoolArray:
     x, y = corners.real, corners.imag
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])
     area -= (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    are_positive: BoolArray = area > 0
-    return are_positive
+    return area > 0

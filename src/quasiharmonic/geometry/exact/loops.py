@@ -246,18 +246,12 @@ def _cross_rays(
 class LoopEdges:
     """Closed curves as one array of edges, loop by loop."""
 
-    start: IntArray
-    """(l + 1,) Where each loop's edges start."""
-    owner: IntArray
-    """(k,) The loop of each edge."""
-    ends: IntArray
-    """(k, 2) Vertices of each edge."""
-    p: FloatArray
-    """(k, 2) Places of the first vertices."""
-    q: FloatArray
-    """(k, 2) Places of the second vertices."""
-    following: IntArray
-    """(k,) The next edge of the same loop."""
+    start: IntArray  # (l + 1,): where each loop's edges start
+    owner: IntArray  # (k,): the loop of each edge
+    ends: IntArray  # (k, 2): vertices of each edge
+    p: FloatArray  # (k, 2): positions of the first vertices
+    q: FloatArray  # (k, 2): positions of the second vertices
+    following: IntArray  # (k,): the next edge of the same loop
 
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> LoopEdges:

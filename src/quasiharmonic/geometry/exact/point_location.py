@@ -196,14 +196,10 @@ def _accurate_areas(points: FloatArray, corners: FloatArray) -> FloatArray:
 class _GridLevel:
     """The cells made by one division, and their concatenated lists."""
 
-    coordinates: IntArray
-    """(k, 2) Coordinates of the cells."""
-    length: IntArray
-    """(k,) Length of each list."""
-    triangle: IntArray
-    """(sum of lengths,) The lists, each ascending."""
-    crowded: BoolArray
-    """(k,) Whether a cell has all of the few triangles that the one had that it is a part of."""
+    coordinates: IntArray  # (k, 2): coordinates of the cells
+    length: IntArray  # (k,): length of each list
+    triangle: IntArray  # (sum of lengths,): the lists, each ascending
+    crowded: BoolArray  # (k,): whether a cell has all of the few triangles that the one had that it is a part of
 
     def without(self, cells: IntArray) -> _GridLevel:
         """Return the level with empty lists for the given cells."""

@@ -256,14 +256,10 @@ def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 class SegmentRelation(IntEnum):
     """Kinds of intersections of two closed segments."""
 
-    DISJOINT = 0
-    """No point."""
-    CROSSING = 1
-    """One point, interior to both."""
-    TOUCHING = 2
-    """One point, an end of at least one of them."""
-    OVERLAPPING = 3
-    """A segment of positive length."""
+    DISJOINT = 0  # No point
+    CROSSING = 1  # One point, interior to both
+    TOUCHING = 2  # One point, an end of at least one of them
+    OVERLAPPING = 3  # A segment of positive length
 
 
 def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> SignArray:
@@ -300,8 +296,7 @@ def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray)
 
 def _compare_lexically(a: FloatArray, b: FloatArray) -> BoolArray:
     """Lexicographic order of points: by x, then by y."""
-    less: BoolArray = (a[:, 0] < b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] < b[:, 1]))
-    return less
+    return (a[:, 0] < b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] < b[:, 1]))
 
 
 def _in_box(x: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:

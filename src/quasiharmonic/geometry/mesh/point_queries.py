@@ -58,8 +58,7 @@ class NearestPoint:
         second = along // 2 + np.where(upright, 1 / 3, 2 / 3)
         total = row + np.where(upright, 2 / 3, 1 / 3)
         weights = np.stack([sides - total, total - second, second], axis=1) / sides[:, None]
-        placed: FloatArray = np.einsum("kc,kcd->kd", weights, self._corners[self._triangle])
-        return placed
+        return np.einsum("kc,kcd->kd", weights, self._corners[self._triangle])
 
     def find(self, points: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return triangle (k,), barycentric coordinates (k, 3) and distance (k,) of the nearest points to (k, 3)."""

@@ -257,12 +257,10 @@ class _Interval:
     __slots__ = ("bottom", "last", "side", "top")
 
     def __init__(self, side: tuple[int, int], bottom: _Link, last: _Link, top: _Link) -> None:
+        # The side of the polygon below, from left to right.
         self.side = side
-        """The side of the polygon below, from left to right."""
-        self.bottom = bottom
-        self.last = last
-        """The rightmost corner of the chain: the one that came last."""
-        self.top = top
+        # The ends of the chain, and its rightmost corner, the one that came last.
+        self.bottom, self.last, self.top = bottom, last, top
 
 
 class _Sweep:

@@ -159,8 +159,7 @@ def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, 
 
 def _length(V: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
     """A quarter of the distances between vertices; the scale prevents overflow."""
-    lengths: FloatArray = np.hypot.reduce(V[i] / 4 - V[j] / 4, axis=1)
-    return lengths
+    return np.hypot.reduce(V[i] / 4 - V[j] / 4, axis=1)
 
 
 def _check_known(wanted: IntArray, known: IntArray, n: int, reason: str) -> None:

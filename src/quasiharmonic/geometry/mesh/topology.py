@@ -141,8 +141,7 @@ def pair_keys(pairs: IntArray, n: int) -> IntArray:
 
 def are_collapsed(F: IntArray) -> BoolArray:
     """Whether each triangle (f, 3) uses a vertex twice; (f,) bool."""
-    collapsed: BoolArray = (F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0])
-    return collapsed
+    return (F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0])
 
 
 def find_twins(F: IntArray) -> IntArray:

@@ -10,8 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
-from quasiharmonic.io.fem.byte_tables import MeshParts, Table, TableReader, replace_numbers, stack_tables
-from quasiharmonic.io.fem.vtk_cells import SUPPORTED
+from quasiharmonic.io.fem.mesh_parts import SUPPORTED, MeshParts, Table, TableReader, replace_numbers, stack_tables
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.untrusted import check_end
 

@@ -7,8 +7,15 @@ from functools import partial
 
 import numpy as np
 
-from quasiharmonic.io.fem.byte_tables import MeshParts, Table, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import elements, find_counts, find_sets
+from quasiharmonic.io.fem.mesh_parts import (
+    MeshParts,
+    Table,
+    TableReader,
+    find_counts,
+    find_sets,
+    replace_numbers,
+    select_elements,
+)
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 _KINDS = {
@@ -78,7 +85,7 @@ class _LegacyReader:
         kinds = self._kinds if self._kinds is not None else np.concatenate([np.empty(0, dtype=np.int64), *lists])
         place = self._points
         corners, begins = np.concatenate(connectivity), np.concatenate(starts)
-        F = elements(corners, begins, kinds, len(place.values), solid)
+        F = select_elements(corners, begins, kinds, len(place.values), solid)
         points = place.values.astype(np.float64)
         change = partial(replace_numbers, self._data, place)
         precision, fields = np.dtype(place.values.dtype.newbyteorder("=")), self._fields

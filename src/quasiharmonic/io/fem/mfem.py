@@ -7,8 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from quasiharmonic.io.fem.byte_tables import MeshParts, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import elements
+from quasiharmonic.io.fem.mesh_parts import MeshParts, TableReader, replace_numbers, select_elements
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.untrusted import check_end
 
@@ -54,7 +53,7 @@ def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
     points = np.zeros((count, 3))
     points[:, :axes] = table.values
     begin, end = span(b"elements")
-    F = elements(*_cells([int(word) for word in plain[begin:end].split()]), count, solid)
+    F = select_elements(*_cells([int(word) for word in plain[begin:end].split()]), count, solid)
     cells = {name: plain[slice(*span(name))] for name in (b"boundary", b"elements") if name in sections}
     named = {name: plain[slice(*span(name + b"_sets"))] for name in _SETS if name + b"_sets" in sections}
 

@@ -26,8 +26,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.fem.byte_tables import MeshParts, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import elements, find_sets
+from quasiharmonic.io.fem.mesh_parts import MeshParts, TableReader, find_sets, replace_numbers, select_elements
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.untrusted import check_end
@@ -81,7 +80,7 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
     ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
     connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
     starts = np.concatenate([[0], ends])
-    F = elements(connectivity, starts, kinds, len(place), solid)
+    F = select_elements(connectivity, starts, kinds, len(place), solid)
     fields, of_cells = (
         {name: partial(_rows, file, array, count) for name, array in file.last_arrays(parent).items()}
         for parent, count in (("PointData", file.points), ("CellData", file.cells))

@@ -222,8 +222,7 @@ def read_second_places(mesh: MeshData, carried: CarriedPly) -> FloatArray | None
     keys = repeat_each(np.arange(len(sizes)), sizes) * len(mesh.V) + mesh.F.ravel()[mesh.rings.corners]
     order = np.argsort(keys)
     wanted = mesh.rings.of_triangle[:, None] * len(mesh.V) + mesh.F
-    found: FloatArray = pairs[order[np.searchsorted(keys[order], wanted)]]
-    return found
+    return pairs[order[np.searchsorted(keys[order], wanted)]]
 
 
 def _corner_places(mesh: MeshData, name: str = _CORNER_PLACES) -> Column:

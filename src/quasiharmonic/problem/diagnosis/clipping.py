@@ -239,8 +239,7 @@ def _view_past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | N
 
 def cross(u: FloatArray, v: FloatArray) -> FloatArray:
     """Return cross products along the last axis; the other axes are broadcast."""
-    product: FloatArray = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-    return product
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 class EffortSpentError(Exception):

@@ -344,8 +344,7 @@ class Corners:
 
     def reflex(self, vertices: IntArray, where: FloatArray) -> BoolArray:
         """Return whether the interior angle is larger than π; (k,) bool."""
-        turns: BoolArray = orientation(where[self.before[vertices]], where[vertices], where[self.after[vertices]]) < 0
-        return turns
+        return orientation(where[self.before[vertices]], where[vertices], where[self.after[vertices]]) < 0
 
     def opens_to(self, vertices: IntArray, points: FloatArray, where: FloatArray) -> BoolArray:
         """Return whether the segment to a point starts strictly inside the interior angle; (k,) bool, False at pins."""

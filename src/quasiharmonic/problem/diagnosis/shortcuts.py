@@ -367,5 +367,4 @@ class Shortcuts:
 
 def _row_columns(matrix: csr_array, k: int) -> IntArray:
     """Return column indices of the entries in a row."""
-    columns: IntArray = matrix.indices[matrix.indptr[k] : matrix.indptr[k + 1]].astype(np.int64)
-    return columns
+    return matrix.indices[matrix.indptr[k] : matrix.indptr[k + 1]].astype(np.int64)

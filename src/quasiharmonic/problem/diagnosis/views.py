@@ -95,15 +95,13 @@ class Wedges:
     @cached_property
     def _triangles(self) -> FloatArray:
         """Triangles of the eye and a wall, which contain the wedges; (c, 3, 2), rounded."""
-        corners: FloatArray = self.lattice.approximate[np.column_stack([np.full(len(self), self.eye), self.wall])]
-        return corners
+        return self.lattice.approximate[np.column_stack([np.full(len(self), self.eye), self.wall])]
 
     @cached_property
     def _rays(self) -> FloatArray:
         """Points on the right and the left ray, relative to the eye; (2, c, 2), rounded."""
         points = self.lattice.approximate
-        rays: FloatArray = points[np.stack([self.right, self.left])] - points[self.eye]
-        return rays
+        return points[np.stack([self.right, self.left])] - points[self.eye]
 
     @cached_property
     def _boxes(self) -> FloatArray:
