@@ -26,7 +26,15 @@ from quasiharmonic.io.lowlevel.textual import content_lines, integer, read_text
 from quasiharmonic.io.models.mesh_maps import vertex_places, with_corner_map
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.registry import find_format, find_function
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, check_range, index_array, names_of
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_integer,
+    check_range,
+    index_array,
+    triangle_names,
+    vertex_names,
+)
 from quasiharmonic.util.optional import with_extra
 
 
@@ -143,7 +151,7 @@ def place_map(mapped: MeshData, mesh: MeshData, channel: int) -> MeshData:
         if bare.size:
             raise MeshFileError(
                 mesh.source,
-                f"has no texture coordinates {k} in {names_of('triangle', 'triangles', bare)} (0-based), but channel "
+                f"has no texture coordinates {k} in {triangle_names(bare)} (0-based), but channel "
                 f"{channel} requires those below it",
                 remedy=f"write channel {k} first",
             )
@@ -284,7 +292,7 @@ def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArra
         (seam[fixed], "more than one pair of texture coordinates", "cut the mesh along its seams first"),
     ):
         if wrong.any():
-            which = names_of("vertex", "vertices", fixed[wrong])
+            which = vertex_names(fixed[wrong])
             raise MeshFileError(mesh.source, f"{what} for the fixed {which} (0-based)", remedy=remedy)
     return ProblemArrays(mesh.V, mesh.F, fixed, uv[fixed])
 

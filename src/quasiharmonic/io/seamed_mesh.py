@@ -29,7 +29,7 @@ from quasiharmonic.util.arrays import (
     edge_names,
     index_array,
     map_array,
-    names_of,
+    triangle_names,
     triangle_rows,
     vertex_array,
 )
@@ -200,9 +200,7 @@ class SeamedMesh:
         """
         bare = np.flatnonzero((self.FT < 0).any(axis=1))
         if bare.size:
-            raise ValueError(
-                f"{names_of('triangle', 'triangles', bare)} without texture coordinates, which other triangles have"
-            )
+            raise ValueError(f"{triangle_names(bare)} without texture coordinates, which other triangles have")
         if self.seamless:
             FT, origin = self.F, np.arange(len(self.V))
         else:

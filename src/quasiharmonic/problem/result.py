@@ -168,15 +168,9 @@ class Stage:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the stage as a dictionary for JSON."""
-        return {
-            "name": self.name,
-            "n_iterations": self.n_iterations,
-            "seconds": self.seconds,
-            "inverted": list(self.inverted),
-            # JSON has no infinity, and the energy before the first stage is infinite.
-            "energy": [e if math.isfinite(e) else None for e in self.energy],
-            "kept": self.kept,
-        }
+        # JSON has no infinity, and the energy before the first stage is infinite.
+        energy = [e if math.isfinite(e) else None for e in self.energy]
+        return vars(self) | {"inverted": list(self.inverted), "energy": energy}
 
 
 @dataclass(frozen=True)
@@ -236,7 +230,7 @@ class RefinementAttempt:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attempt as a dictionary for JSON."""
-        return {"name": self.name, "added": self.added, "injective": self.injective, "seconds": self.seconds}
+        return dict(vars(self))
 
 
 @dataclass(frozen=True, repr=False)

@@ -303,7 +303,7 @@ def fixed_vertices(fixed: ArrayLike, n: int) -> IntArray:
     array = vertex_indices("fixed", fixed, n)
     times = np.bincount(array, minlength=n)
     if times.max(initial=0) > 1:
-        raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
+        raise ValueError(f"{vertex_names(np.flatnonzero(times > 1))} fixed more than once")
     return array
 
 
@@ -510,6 +510,16 @@ def names_of(one: str, many: str, indices: NDArray[np.integer]) -> str:
     listed = ", ".join(str(tuple(i) if isinstance(i, list) else i) for i in indices[:_LISTED].tolist())
     rest = f", … ({len(indices)} in all)" if len(indices) > _LISTED else ""
     return f"{one if len(indices) == 1 else many} {listed}{rest}"
+
+
+def vertex_names(vertices: IntArray) -> str:
+    """Name the first few of some vertices: ``vertices 3, 8, 11, … (17 in all)``."""
+    return names_of("vertex", "vertices", vertices)
+
+
+def triangle_names(triangles: IntArray) -> str:
+    """Name the first few of some triangles: ``triangle 5``."""
+    return names_of("triangle", "triangles", triangles)
 
 
 def edge_names(pairs: IntArray) -> str:

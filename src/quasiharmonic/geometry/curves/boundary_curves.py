@@ -20,8 +20,8 @@ from quasiharmonic.util.arrays import (
     index_array,
     invert_indices,
     loop_arrays,
-    names_of,
     to_complex,
+    vertex_names,
 )
 
 # Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
@@ -122,9 +122,7 @@ class BoundaryCurves:
         known = np.concatenate([index_array("on", list(self.on)), self.fixed])
         absent = np.setdiff1d(known, used)
         if absent.size:
-            raise ValueError(
-                f"the boundary curves refer to {names_of('vertex', 'vertices', absent)}, but no triangle uses them"
-            )
+            raise ValueError(f"the boundary curves refer to {vertex_names(absent)}, but no triangle uses them")
         on = {int(np.searchsorted(used, v)): k for v, k in self.on.items()}
         return self._copy_with(on, np.searchsorted(used, self.fixed))
 
@@ -200,10 +198,7 @@ class BoundaryCurves:
         check_range("fixed", self.fixed, len(uv))
         inner = np.setdiff1d(assigned, boundary)
         if inner.size:
-            raise ValueError(
-                f"on assigns curves to interior {names_of('vertex', 'vertices', inner)}: only boundary "
-                "vertices can slide"
-            )
+            raise ValueError(f"on assigns curves to interior {vertex_names(inner)}: only boundary vertices can slide")
         only = np.array([self.on.get(int(v), -1) for v in boundary])
         allowed = self.tolerance * max(one.size for one in self.curves)
         curve, s, smallest = np.full(boundary.size, -1), np.zeros(boundary.size), np.full(boundary.size, np.inf)
@@ -213,7 +208,7 @@ class BoundaryCurves:
             too_far = (distance > allowed) & (only[candidates] == k)
             if too_far.any():
                 raise ValueError(
-                    f"on assigns curve {k} to {names_of('vertex', 'vertices', boundary[candidates[too_far]])}, "
+                    f"on assigns curve {k} to {vertex_names(boundary[candidates[too_far]])}, "
                     f"but the distance to it is "
                     f"up to {distance[too_far].max():.3g}, and at most {allowed:.3g} is allowed"
                 )

@@ -43,7 +43,14 @@ import numpy as np
 from quasiharmonic.geometry.exact.loops import Obstacle, Reason, check_loops, join_items, simple_loops
 from quasiharmonic.geometry.exact.triangles import find_multiply_wound, triangle_signs
 from quasiharmonic.geometry.mesh.topology import are_collapsed, edges, trace_loops
-from quasiharmonic.util.arrays import FloatArray, IntArray, ReadOnly, count_of, make_unchangeable, names_of
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    ReadOnly,
+    count_of,
+    make_unchangeable,
+    vertex_names,
+)
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Verdict
 
@@ -214,7 +221,7 @@ def certify(
                 crossings, found = check_loops(known, uv)
                 reasons += found
         if multiply_wound.size:
-            text = f"triangles wind more than once around {names_of('vertex', 'vertices', multiply_wound)}"
+            text = f"triangles wind more than once around {vertex_names(multiply_wound)}"
             reasons.append(Reason(Obstacle.MULTIPLY_WOUND, text))
     return Certificate(
         F,

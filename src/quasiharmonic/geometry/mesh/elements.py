@@ -28,7 +28,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import edges
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, edge_names, index_array, names_of
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_range,
+    edge_names,
+    index_array,
+    names_of,
+    triangle_names,
+)
 
 #: Pairs of corners of a six-node triangle, and the mid-side node between each pair.
 SIDES = np.array([(0, 1), (1, 2), (2, 0)])
@@ -141,7 +149,7 @@ def name_elements(F: IntArray, which: IntArray) -> str:
     """Name the first few of the given elements: ``quadrilaterals 3, 8``."""
     if F.shape[1] == 4:
         return names_of("quadrilateral", "quadrilaterals", which)
-    return names_of("triangle", "triangles", which)
+    return triangle_names(which)
 
 
 def covering_triangles(F: IntArray) -> tuple[IntArray, IntArray]:

@@ -23,8 +23,8 @@ from quasiharmonic.util.arrays import (
     edge_names,
     first_equal,
     mark,
-    names_of,
     scale_to_unit,
+    triangle_names,
 )
 
 
@@ -200,7 +200,7 @@ def weld_triangles(V: FloatArray, F: IntArray, weld: bool | float) -> tuple[IntA
     collapsed = np.flatnonzero(are_collapsed(joint[F]) & ~are_collapsed(F))
     if collapsed.size:
         raise ValueError(
-            f"welding at distance {float(weld):g} merges corners of {names_of('triangle', 'triangles', collapsed)}: "
+            f"welding at distance {float(weld):g} merges corners of {triangle_names(collapsed)}: "
             "choose a smaller distance, or remove these triangles"
         )
     return joint[F], joint

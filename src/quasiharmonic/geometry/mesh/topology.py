@@ -22,9 +22,10 @@ from quasiharmonic.util.arrays import (
     edge_names,
     first_equal,
     make_unchangeable,
-    names_of,
     own_triangles,
     repeat_each,
+    triangle_names,
+    vertex_names,
 )
 from quasiharmonic.util.kernels import compiled
 
@@ -198,11 +199,11 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
         shared = np.unique(tails[1:][tails[1:] == tails[:-1]])
         if shared.size:
             raise ValueError(
-                f"the boundary passes more than once through {names_of('vertex', 'vertices', shared)}; "
+                f"the boundary passes more than once through {vertex_names(shared)}; "
                 "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
             )
         unpaired = np.setxor1d(tails, heads)
-        raise ValueError(f"the boundary does not close at {names_of('vertex', 'vertices', unpaired)}")
+        raise ValueError(f"the boundary does not close at {vertex_names(unpaired)}")
     return np.split(vertices, np.cumsum(lengths[: number - 1])) if number > 1 else [vertices][:number]
 
 
@@ -289,7 +290,7 @@ def surface_edges(F: IntArray, n: int) -> Edges:
         # A vertex without triangle is a component of its own.
         unused = np.setdiff1d(np.arange(n), F)
         if unused.size:
-            raise ValueError(f"{names_of('vertex', 'vertices', unused)}: no triangle uses them; remove them")
+            raise ValueError(f"{vertex_names(unused)}: no triangle uses them; remove them")
     found = manifold_edges(F, n)
     if not found.boundary.size:
         raise ValueError(
@@ -298,7 +299,7 @@ def surface_edges(F: IntArray, n: int) -> Edges:
     if not connected:
         first = np.unique(label)
         raise ValueError(
-            f"the mesh has {first.size} components, the first ones around {names_of('vertex', 'vertices', first)}: "
+            f"the mesh has {first.size} components, the first ones around {vertex_names(first)}: "
             "map each component separately"
         )
     return found
@@ -330,8 +331,8 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
 def _check_triangles(F: IntArray) -> None:
     collapsed = np.flatnonzero(are_collapsed(F))
     if collapsed.size:
-        raise ValueError(f"{names_of('triangle', 'triangles', collapsed)}: a vertex is used twice in a triangle")
+        raise ValueError(f"{triangle_names(collapsed)}: a vertex is used twice in a triangle")
 
     repeats = np.flatnonzero(find_twins(F) < np.arange(len(F)))
     if repeats.size:
-        raise ValueError(f"{names_of('triangle', 'triangles', repeats)} repeated: the same three vertices occur before")
+        raise ValueError(f"{triangle_names(repeats)} repeated: the same three vertices occur before")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.seamed_mesh import SeamedMesh
-from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, mark, names_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, mark, names_of, vertex_names
 
 
 def with_corner_map(mesh: MeshData, corners: FloatArray) -> MeshData:
@@ -69,7 +69,7 @@ def map_of(mesh: MeshData) -> FloatArray:
         return mesh.V[:, :2].copy()
     uv, seam = vertex_places(mesh)
     if seam.any():
-        torn = names_of("vertex", "vertices", np.flatnonzero(seam))
+        torn = vertex_names(np.flatnonzero(seam))
         raise MeshFileError(
             mesh.source,
             f"more than one pair of texture coordinates for {torn} (0-based)",

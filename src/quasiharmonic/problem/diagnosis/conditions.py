@@ -22,9 +22,18 @@ from quasiharmonic.geometry.mesh.topology import label_components, pair_keys
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import Convex, Effort, EffortSpentError, Walls
 from quasiharmonic.problem.diagnosis.fixture import MAX_CONTACTS, Corners, Fixture, Star, TargetCurves
-from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, smallest_conflict, vertex_names
+from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, smallest_conflict
 from quasiharmonic.problem.diagnosis.views import Views
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, edge_names, mark, names_of
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    cyclic_pairs,
+    edge_names,
+    mark,
+    triangle_names,
+    vertex_names,
+)
 
 # Number of fixed vertices, far apart from each other, that are checked first.
 _FIRST_CHECKED = 8
@@ -44,8 +53,7 @@ def inverted_fixed_triangles(problem: Problem, fixture: Fixture) -> Iterator[Obs
     boundary = problem.domain.edges.boundary
     for t, abc, s, split in find_inverted_fixed(problem.F, fixture.fixed, fixture.positions, boundary):
         message = (
-            f"All vertices of {names_of('triangle', 'triangles', t)} are fixed, "
-            f"and the target {'inverts' if s < 0 else 'flattens'} it."
+            f"All vertices of {triangle_names(t)} are fixed, and the target {'inverts' if s < 0 else 'flattens'} it."
         )
         yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
 

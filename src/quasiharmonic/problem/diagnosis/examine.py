@@ -23,10 +23,10 @@ from quasiharmonic.problem.diagnosis.conditions import (
     misplaced_pins,
 )
 from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture, TargetCurves, stars
-from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, vertex_names
+from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction
 from quasiharmonic.problem.diagnosis.shortcuts import Shortcuts
 from quasiharmonic.problem.diagnosis.witness import find_unplaced
-from quasiharmonic.util.arrays import IntArray, count_of, edge_names, names_of
+from quasiharmonic.util.arrays import IntArray, count_of, edge_names, names_of, vertex_names
 
 # Budget for the visibility checks of free vertices, in about microseconds. Vertices beyond it are not checked.
 MAX_EFFORT = 3_000_000

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quasiharmonic.util.arrays import IntArray, ReadOnly, count_of, names_of
+from quasiharmonic.util.arrays import IntArray, ReadOnly, count_of
 from quasiharmonic.util.display import Displayable
 
 if TYPE_CHECKING:
@@ -228,8 +228,3 @@ def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list
         end = high - 1
         chosen.insert(0, end)
     return chosen
-
-
-def vertex_names(vertices: IntArray) -> str:
-    """Return text that names the first few of some vertices."""
-    return names_of("vertex", "vertices", vertices)

@@ -33,9 +33,9 @@ from quasiharmonic.geometry.mesh.polygons import triangulate
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import MARGIN, Rounding, join
 from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture
-from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, vertex_names
+from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction
 from quasiharmonic.problem.diagnosis.witness import clear
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, vertex_names
 from quasiharmonic.util.progress import heartbeat
 
 Point = tuple[int, int, int]

@@ -31,12 +31,12 @@ from quasiharmonic.util.arrays import (
     count_of,
     describe,
     index_array,
-    names_of,
     pad_to_space,
     scale_to_unit,
     to_complex,
     triangle_array,
     vertex_array,
+    vertex_names,
 )
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
@@ -118,10 +118,10 @@ class Pins:
         check_range("corners", vertices, n)
         alone, times = np.unique(vertices, return_counts=True)
         if (times > 1).any():
-            raise ValueError(f"corners name {names_of('vertex', 'vertices', alone[times > 1])} more than once")
+            raise ValueError(f"corners name {vertex_names(alone[times > 1])} more than once")
         inner = np.setdiff1d(alone, np.concatenate(self.loops))
         if inner.size:
-            raise ValueError(f"{names_of('vertex', 'vertices', inner)} in corners, but not on the boundary")
+            raise ValueError(f"{vertex_names(inner)} in corners, but not on the boundary")
 
     def along(self, loop: int, contour: int) -> list[tuple[int, float]]:
         """Return (position in the loop, parameter along its contour) for each pin, in order around the contour."""

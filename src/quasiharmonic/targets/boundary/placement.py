@@ -36,12 +36,12 @@ from quasiharmonic.util.arrays import (
     cyclic_pairs,
     fixed_vertices,
     invert_indices,
-    names_of,
     scale_to_unit,
     target_positions,
     to_complex,
     triangle_array,
     triangle_rows,
+    vertex_names,
 )
 
 # Minimum left turn in radians, larger than that of a rounded straight line.
@@ -273,7 +273,7 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     found = edges(F, n)
     missing = np.setdiff1d(found.boundary, fixed)
     if missing.size:
-        raise ValueError(f"the boundary {names_of('vertex', 'vertices', missing)} not in fixed")
+        raise ValueError(f"the boundary {vertex_names(missing)} not in fixed")
     places = scale_to_unit(places)
     position = np.full((n, 2), np.nan)
     position[fixed] = places

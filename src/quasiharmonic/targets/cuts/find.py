@@ -28,9 +28,9 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_range,
     edge_array,
-    names_of,
     real_array,
     triangle_array,
+    triangle_names,
     vertex_array,
 )
 
@@ -204,7 +204,7 @@ def side_costs(edge_costs: ArrayLike, count: int) -> FloatArray:
         raise ValueError(f"edge_costs must have shape ({count}, 3), not {costs.shape}")
     wrong = np.flatnonzero(~((costs > 0) & np.isfinite(costs)).all(axis=1))
     if wrong.size:
-        raise ValueError(f"edge_costs must be positive and finite: {names_of('triangle', 'triangles', wrong)}")
+        raise ValueError(f"edge_costs must be positive and finite: {triangle_names(wrong)}")
     return costs
 
 
