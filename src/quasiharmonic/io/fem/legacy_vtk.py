@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
@@ -167,8 +168,10 @@ class _LegacyReader:
         start = self._reader.position
         self._skip(kind, self._count * components)
         if self._of_points is not None and kind.lower() in _KINDS:
+            # In a name, %20 stands for a space.
+            title = unquote_to_bytes(name).decode("utf-8", "replace")
             fields = self._fields[self._of_points]
-            fields[_decode_name(name)] = partial(self._values, start, kind.lower(), components, self._count)
+            fields[title] = partial(self._values, start, kind.lower(), components, self._count)
 
     def _values(self, start: int, kind: bytes, components: int, count: int) -> FloatArray:
         order = None if self._reader.text else ">"
@@ -196,13 +199,6 @@ class _LegacyReader:
         for byte in self._reader.take("u1", more).tolist():
             length = 256 * length + byte
         self._reader.take("u1", length)
-
-
-def _decode_name(name: bytes) -> str:
-    """Decode a name, in which %20 stands for a space."""
-    from urllib.parse import unquote_to_bytes
-
-    return unquote_to_bytes(name).decode("utf-8", "replace")
 
 
 def _text(words: list[bytes]) -> str:

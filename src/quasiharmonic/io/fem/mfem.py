@@ -42,7 +42,7 @@ def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
 
     def span(name: bytes) -> tuple[int, int]:
         begin = sections[name]
-        later = [_line_start(plain, other) for other in begins if other > begin]
+        later = [plain.rfind(b"\n", 0, other) + 1 for other in begins if other > begin]
         return begin, later[0] if later else len(plain)
 
     vertices = TableReader(plain, *span(b"vertices"), None)
@@ -61,10 +61,6 @@ def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
         return replace_numbers(data, table, new[:, :axes])
 
     return MeshParts(points, F, np.dtype(np.float64), {}, replace_points, partial(_find_sets, cells, named))
-
-
-def _line_start(data: bytes, position: int) -> int:
-    return data.rfind(b"\n", 0, position) + 1
 
 
 def _cells(numbers: list[int]) -> tuple[IntArray, IntArray, IntArray]:

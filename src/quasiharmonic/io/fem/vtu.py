@@ -201,7 +201,8 @@ class _VtuFile:
         self._path.pop()
         if name in ("DataArray", "Array") and self._open is not None:
             attributes, tag = self._open
-            begin = _tag_end(self._data, tag)
+            quoted = _TAG.match(self._data, tag)
+            begin = tag if quoted is None else quoted.end()
             # Child elements with further information may follow the numbers.
             array = _Array(attributes, tag, begin, self._data.find(b"<", begin))
             self._all.append(array)
@@ -286,12 +287,6 @@ def _take_base64(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
         raise ValueError(f"base64 data are damaged: {error}") from error
     check_end(length, len(found))
     return found, end
-
-
-def _tag_end(data: bytes, tag: int) -> int:
-    """Return the position after a tag, given the start of the tag."""
-    quoted = _TAG.match(data, tag)
-    return tag if quoted is None else quoted.end()
 
 
 def list_series(path: Path, steps: int) -> list[Path]:

@@ -226,7 +226,7 @@ class TargetCurves:
 
     def __init__(self, positions: FloatArray, loops: list[IntArray]) -> None:
         self.positions = positions
-        self.loops = [_from_lowest(positions, loop) for loop in loops]
+        self.loops = [np.roll(loop, -int(np.lexsort(positions[loop].T)[0])) for loop in loops]
         edges = LoopEdges.of(self.loops, positions)
         self.ends, self.loop_of, self.tails, self.heads = edges.ends, edges.owner, edges.p, edges.q
 
@@ -356,8 +356,3 @@ class Corners:
         reflex = self.reflex(v, where)
         result[known] = np.where(reflex, left_of_last | left_of_next, left_of_last & left_of_next)
         return result
-
-
-def _from_lowest(positions: FloatArray, loop: IntArray) -> IntArray:
-    """Return a loop rotated to start at its lowest corner (the leftmost of several)."""
-    return np.roll(loop, -int(np.lexsort(positions[loop].T)[0]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ class _MaterialReader:
 
     def __init__(self, document: Document, folder: Path) -> None:
         self._document, self._folder = document, folder
-        self._images: dict[int, NamedImage] = {}
+        self._image = cache(self._read_image)
         self.problems: list[str] = []
 
     def read(self, index: int | None) -> SurfaceMaterial:
@@ -116,11 +117,6 @@ class _MaterialReader:
         source = texture["source"] if "source" in texture else texture["extensions"][_WEBP]["source"]
         transform = np.column_stack([turn * scale, offset])
         return ImageUse(self._image(whole(source)), channel, (wrap[0], wrap[1]), transform)
-
-    def _image(self, index: int) -> NamedImage:
-        if index not in self._images:
-            self._images[index] = self._read_image(index)
-        return self._images[index]
 
     def _read_image(self, index: int) -> NamedImage:
         image = self._document.tree["images"][index]
