@@ -108,11 +108,9 @@ def _candidates(
     clearance /= length[0]
     first_x, first_y = clearance * arm_x[0], clearance * arm_y[0]
     step = np.stack([first_x * x - first_y * y, first_x * y + first_y * x])
-    reinsertion_positions = np.concatenate(
-        [np.multiply.outer(towards, middle - apex), np.multiply.outer(inwards, step)]
-    )
-    reinsertion_positions += apex
-    return reinsertion_positions
+    found = np.concatenate([np.multiply.outer(towards, middle - apex), np.multiply.outer(inwards, step)])
+    found += apex
+    return found
 
 
 def _length(x: FloatArray, y: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -304,10 +305,8 @@ class Track:
         return all(chain.in_order(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True))
 
     def _parts(self) -> list[tuple[Curve, slice]]:
-        ends = self._ends.tolist()
-        return [
-            (chain.curve, slice(first, last)) for chain, first, last in zip(self.chains, ends, ends[1:], strict=False)
-        ]
+        spans = pairwise(self._ends.tolist())
+        return [(chain.curve, slice(*span)) for chain, span in zip(self.chains, spans, strict=True)]
 
 
 def _move_vertices(positions: FloatArray, vertices: IntArray, there: FloatArray) -> None:

@@ -143,8 +143,8 @@ def doubtful_pairs(positions: FloatArray, tails: IntArray, heads: IntArray, star
         number += len(found[-1])
         if number > len(pairs):
             return -1
-    join_items = np.concatenate(found)
-    pairs[:number] = join_items[np.lexsort(join_items.T[::-1])]
+    doubtful_ones = np.concatenate(found)
+    pairs[:number] = doubtful_ones[np.lexsort(doubtful_ones.T[::-1])]
     return number
 
 

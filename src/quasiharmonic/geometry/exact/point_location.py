@@ -222,10 +222,8 @@ class NestedGrid:
         self._shift = shift = self._choose_shift()
         columns, lines = (int(m) + 1 for m in self._high.max(axis=0) >> shift)
         self._columns = columns
-        all_triangles = np.arange(len(corners))
-        level = self._divide(
-            all_triangles, np.zeros_like(all_triangles), np.zeros((1, 2), np.int64), columns, lines, shift
-        )
+        every = np.arange(len(corners))
+        level = self._divide(every, np.zeros_like(every), np.zeros((1, 2), np.int64), columns, lines, shift)
         levels, parts, cell_count = [level], [np.full(level.length.size, -1, dtype=np.int64)], level.length.size
         capacity = _MAX_ENTRIES * len(corners) + 1000 - level.triangle.size
         while shift >= 2:

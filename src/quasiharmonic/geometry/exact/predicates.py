@@ -382,10 +382,8 @@ def _find_meeting_boxes(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArr
         if level == 0:
             yield i, j
             continue
-        i, j = (
-            np.concatenate([2 * i, 2 * i, 2 * i + 1, 2 * i + 1]),
-            np.concatenate([2 * j, 2 * j + 1, 2 * j, 2 * j + 1]),
-        )
+        i = np.concatenate([2 * i, 2 * i, 2 * i + 1, 2 * i + 1])
+        j = np.concatenate([2 * j, 2 * j + 1, 2 * j, 2 * j + 1])
         if one is other:
             i, j = i[i <= j], j[i <= j]
         for start in range(0, i.size, PAIR_CHUNK):

@@ -58,12 +58,10 @@ class Refined:
 
     def extend(self, values: ArrayLike) -> FloatArray:
         """Interpolate values (n, …) at the old vertices to all vertices, linearly on the old triangles."""
-        old = np.asarray(values, dtype=np.float64)
-        if not old.ndim or len(old) != len(self.V) - len(self.parents):
+        old, count = np.asarray(values, dtype=np.float64), len(self.V) - len(self.parents)
+        if not old.ndim or len(old) != count:
             rows = "a number" if not old.ndim else f"{len(old)} rows"
-            raise ValueError(
-                f"values must have {len(self.V) - len(self.parents)} rows, one for each vertex, not {rows}"
-            )
+            raise ValueError(f"values must have {count} rows, one for each vertex, not {rows}")
         return np.concatenate([old, np.einsum("sk,sk...->s...", self.weights, old[self.parents])])
 
 

@@ -254,9 +254,8 @@ def _groups_of_entities(
 def _nodes_of(kind: int, solid: bool) -> int:
     known = {**_POINTS_AND_LINES, **(_SOLIDS | _SURFACES if solid else _ELEMENTS)}
     if kind not in known:
-        raise ValueError(
-            f"cells of type {_NAMES.get(kind, f'number {kind}')} are not supported: use {SUPPORTED[solid]}"
-        )
+        name = _NAMES.get(kind, f"number {kind}")
+        raise ValueError(f"cells of type {name} are not supported: use {SUPPORTED[solid]}")
     return known[kind]
 
 

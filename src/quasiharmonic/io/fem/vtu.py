@@ -229,9 +229,7 @@ class _VtuFile:
             raise ValueError(f"compressed data have {sum(sizes)} bytes, but at most {max_bytes} are expected")
         packed, end = take(self._data, at, sum(lengths))
         ends = accumulate(lengths, initial=0)
-        whole = b"".join(
-            self._decompress(packed[a:b], size) for (a, b), size in zip(pairwise(ends), sizes, strict=True)
-        )
+        whole = b"".join(self._decompress(packed[a:b], n) for (a, b), n in zip(pairwise(ends), sizes, strict=True))
         return whole, begin, end
 
     def _decompress(self, packed: bytes, size: int) -> bytes:

@@ -106,14 +106,11 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
 
 def not_in_obj(mesh: MeshData) -> list[str]:
     """Return descriptions of the mesh data that an OBJ file will not contain."""
-    lost = materials_lost(mesh)
+    lost, looks = materials_lost(mesh), list_lost_looks(mesh)
     further = [] if mesh.carried is None else mesh.carried.further()
-    looks = list_lost_looks(mesh)
-    return [
-        *lost,
-        *(looks or []),
-        *(what for what in further if what != "materials" or not (lost or looks is not None)),
-    ]
+    if lost or looks is not None:
+        further = [what for what in further if what != "materials"]
+    return [*lost, *(looks or []), *further]
 
 
 def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:

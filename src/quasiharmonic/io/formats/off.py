@@ -137,11 +137,7 @@ def _read_lines(
     if len(starts) <= faces:
         have = f"{len(V) // 3} of {vertices} vertices and {len(starts) - 1} of {faces} faces"
         raise MeshFileError(path, f"ends after {have}", remedy="it was cut off, or its counts are wrong")
-    return (
-        np.array(V, dtype=np.float64).reshape(-1, 3),
-        np.array(corners, dtype=np.int64),
-        np.array(starts, dtype=np.int64),
-    )
+    return np.array(V).reshape(-1, 3), np.array(corners), np.array(starts)
 
 
 def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -> list[int]:

@@ -191,9 +191,8 @@ def write_material(path: str | os.PathLike[str], mesh: MeshData, *, durable: boo
     at = mesh.statement_faces[kept].tolist()
     new[head:head] = [f"mtllib {library.name}".encode(), f"usemtl {_NAME}".encode()]
     at[head:head] = [-1, 0]
-    return replace(
-        mesh, statements=b"".join(line + b"\n" for line in new), statement_faces=np.array(at, dtype=np.int64)
-    )
+    statements = b"".join(line + b"\n" for line in new)
+    return replace(mesh, statements=statements, statement_faces=np.array(at, dtype=np.int64))
 
 
 def label_materials(mesh: MeshData) -> tuple[IntArray, list[str | None]]:

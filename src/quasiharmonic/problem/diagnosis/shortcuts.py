@@ -316,10 +316,10 @@ class Shortcuts:
             if not left_over.size:
                 break
             with np.errstate(over="ignore"):
-                index = p[left_over] / 2 + q[left_over] / 2 + height * left[left_over]
-            once = self._clear(tails[left_over], None, p[left_over], index)
-            left_over, index = left_over[once], index[once]
-            result[left_over] = self._clear(heads[left_over], None, q[left_over], index)
+                trial = p[left_over] / 2 + q[left_over] / 2 + height * left[left_over]
+            once = self._clear(tails[left_over], None, p[left_over], trial)
+            left_over, trial = left_over[once], trial[once]
+            result[left_over] = self._clear(heads[left_over], None, q[left_over], trial)
         return result
 
     def _clear(self, tails: IntArray, heads: IntArray | None, p: FloatArray, q: FloatArray) -> BoolArray:

@@ -189,9 +189,8 @@ class CornerPlacement:
         moved = self._along(clear)
         other = points_at(self.contour, moved)
         # Vertices moved away from a bend cut it off, so limit the deviation.
-        allowed = max_deviation(self.contour, along, positions) + _ALLOWED_DEVIATION * float(
-            np.ptp(self.contour, axis=0).max()
-        )
+        side = float(np.ptp(self.contour, axis=0).max())
+        allowed = max_deviation(self.contour, along, positions) + _ALLOWED_DEVIATION * side
         near = max_deviation(self.contour, moved, other) <= allowed
         return (other, True) if near and self._fits(other) else (positions, False)
 
