@@ -102,14 +102,14 @@ def _in_range(name: str, integers: NDArray[np.object_]) -> IntArray:
 
 
 class _Unchangeable(np.ndarray):
-    """Owner of the memory of a result of `unchangeable`; only that result refers to it."""
+    """Owner of the memory of a result of `make_unchangeable`; only that result refers to it."""
 
 
 def make_unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
     """Return the values of an array in memory that no other code can write to.
 
-    An array that `unchangeable` made, or a view of one, is returned as it is; any other array is copied. A
-    read-only flag alone is not enough: other code may write through the base of a view, or set the flag of the array
+    An array that this function made, or a view of one, is returned as it is; any other array is copied. A read-only
+    flag alone is not enough: other code may write through the base of a view, or set the flag of the array
     back.
     """
     owner = array
