@@ -45,27 +45,12 @@ _PAIRS_PER_BLOCK = 1 << 17
 # The nested grid. Finest cells have integer coordinates below 2 to this power. A cell ``s`` halvings coarser has these
 # coordinates shifted by ``s`` bits.
 _BITS = 40
-# Length of a list above which a division of its cell is considered. The cell is divided in one of two cases:
-_LONG_LIST = 12
-# the lists of its parts together have at most this many times its own triangles,
-_MAX_GROWTH = 1.5
-# or the non-empty parts have on average at most this fraction of its own triangles.
-_MAX_FRACTION = 0.75
-# A part that keeps all triangles of its cell is not divided again if they are at most this many. Such triangles usually
-# share a corner and would crowd around it at any size.
-_MAX_CROWD = 48
-# Maximum total length of the lists per triangle of the mesh; limits the memory.
-_MAX_ENTRIES = 64
-# The same limit for the cells of the first grid.
-_FIRST_ENTRIES = 16
 # A cell beyond an edge's line by more than this, in the unit box, is outside in spite of rounding.
 _MARGIN = 2.0**-48
 # Additional margin for products that underflow.
 _UNDERFLOW_MARGIN = 2.0**-1000
 # Entries spread over cells per block, so that the data stay in the cache.
 _ENTRIES_PER_BLOCK = 1 << 14
-# Initial list capacity per entry.
-_CAPACITY = 4
 
 
 class PointLocator:
@@ -214,6 +199,22 @@ class NestedGrid:
     ``listed`` (m,) int32 has the triangles, list after list; each list is ascending.
     """
 
+    # Length of a list above which a division of its cell is considered. The cell is divided in one of two cases:
+    _LONG_LIST = 12
+    # the lists of its parts together have at most this many times its own triangles,
+    _MAX_GROWTH = 1.5
+    # or the non-empty parts have on average at most this fraction of its own triangles.
+    _MAX_FRACTION = 0.75
+    # A part that keeps all triangles of its cell is not divided again if they are at most this many. Such triangles
+    # usually share a corner and would crowd around it at any size.
+    _MAX_CROWD = 48
+    # Maximum total length of the lists per triangle of the mesh; limits the memory.
+    _MAX_ENTRIES = 64
+    # The same limit for the cells of the first grid.
+    _FIRST_ENTRIES = 16
+    # Initial list capacity per entry.
+    _CAPACITY = 4
+
     def __init__(self, corners: FloatArray) -> None:
         corners = np.ascontiguousarray(corners)
         finest = _coordinates(corners)
@@ -225,7 +226,7 @@ class NestedGrid:
         every = np.arange(len(corners))
         level = self._divide(every, np.zeros_like(every), np.zeros((1, 2), np.int64), columns, lines, shift)
         levels, parts, cell_count = [level], [np.full(level.length.size, -1, dtype=np.int64)], level.length.size
-        capacity = _MAX_ENTRIES * len(corners) + 1000 - level.triangle.size
+        capacity = self._MAX_ENTRIES * len(corners) + 1000 - level.triangle.size
         while shift >= 2:
             shift -= 2
             split, finer = self._refine(level, shift, capacity)
@@ -262,13 +263,13 @@ class NestedGrid:
         while True:
             reach = (self._high >> shift) - (self._low >> shift) + 1
             # Long triangles oblique to the grid meet many cells; then use a coarser first grid.
-            if int((reach[:, 0] * reach[:, 1]).sum()) <= _FIRST_ENTRIES * f or shift >= _BITS:
+            if int((reach[:, 0] * reach[:, 1]).sum()) <= self._FIRST_ENTRIES * f or shift >= _BITS:
                 return shift
             shift += 1
 
     def _refine(self, level: _GridLevel, shift: int, capacity: int) -> tuple[IntArray, _GridLevel]:
         """Choose the cells of a level to divide; return them with their parts, of at most ``capacity`` entries."""
-        split = np.flatnonzero((level.length > _LONG_LIST) & ~level.crowded)
+        split = np.flatnonzero((level.length > self._LONG_LIST) & ~level.crowded)
         number = invert_indices(level.length.size, split)
         parent = repeat_each(number, level.length)
         concerned = np.flatnonzero(parent >= 0)
@@ -276,14 +277,14 @@ class NestedGrid:
         parts = finer.length.reshape(-1, 16)
         before, after = level.length[split], parts.sum(axis=1)
         # Divisions around a corner where triangles crowd do not shorten the lists at first, but add few entries.
-        chosen = (after <= _MAX_GROWTH * before) | (after <= _MAX_FRACTION * before * (parts > 0).sum(axis=1))
+        chosen = (after <= self._MAX_GROWTH * before) | (after <= self._MAX_FRACTION * before * (parts > 0).sum(axis=1))
         # Divide the cells with the longest lists first.
         order = np.argsort(-before, kind="stable")
         more = np.cumsum(np.where(chosen, after - before, 0)[order])
         chosen[order[more > capacity]] = False
         part = np.repeat(chosen, 16)
         entry = repeat_each(part, finer.length)
-        crowded = ((parts == before[:, None]) & (before <= _MAX_CROWD)[:, None])[chosen].ravel()
+        crowded = ((parts == before[:, None]) & (before <= self._MAX_CROWD)[:, None])[chosen].ravel()
         return split[chosen], _GridLevel(finer.coordinates[part], finer.length[part], finer.triangle[entry], crowded)
 
     def _divide(
@@ -295,7 +296,7 @@ class NestedGrid:
         sorted by cell, then by triangle. ``corner`` (k, 2) has the coordinates of the first part of each cell.
         """
         size = len(corner) * columns * lines
-        length, capacity = np.empty(size, dtype=np.int64), _CAPACITY * triangle.size
+        length, capacity = np.empty(size, dtype=np.int64), self._CAPACITY * triangle.size
         while True:
             listed = np.empty(capacity, dtype=np.int64)
             capacity = divide_cells(

@@ -12,13 +12,6 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, enumerate
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.threads import count_cores, make_executor
 
-# Nearest samples of the surface that are tried first, and the factor by which their number grows.
-_FIRST = 24
-_GROWTH = 4
-# Largest number of samples for each triangle, on average.
-_SAMPLES = 4
-# Points per block, so that the arrays fit into the cache.
-_POINTS = 1 << 13
 # Texels per block, so that the arrays fit into the cache.
 _BLOCK = 1 << 16
 
@@ -33,6 +26,14 @@ class NearestPoint:
         At least one triangle.
     """
 
+    # Nearest samples of the surface that are tried first, and the factor by which their number grows.
+    _FIRST = 24
+    _GROWTH = 4
+    # Largest number of samples for each triangle, on average.
+    _SAMPLES = 4
+    # Points per block, so that the arrays fit into the cache.
+    _POINTS = 1 << 13
+
     def __init__(self, V: FloatArray, F: IntArray) -> None:
         from scipy.spatial import cKDTree
 
@@ -40,7 +41,7 @@ class NearestPoint:
         reach = np.linalg.norm(self._corners - self._corners.mean(axis=1, keepdims=True), axis=2).max(axis=1)
         # Large triangles have several samples.
         bound = float(np.median(reach)) or float(reach.max()) or 1.0
-        while (parts := np.ceil(reach / bound).clip(1, 1e6) ** 2).sum() > _SAMPLES * len(F) + 100:
+        while (parts := np.ceil(reach / bound).clip(1, 1e6) ** 2).sum() > self._SAMPLES * len(F) + 100:
             bound *= 1.25
         sides = np.sqrt(parts).astype(np.int64)
         self._triangle, number = enumerate_each(sides**2)
@@ -66,17 +67,17 @@ class NearestPoint:
         squared = np.full(len(points), np.inf)
 
         def work(begin: int) -> None:
-            block = slice(begin, begin + _POINTS)
+            block = slice(begin, begin + self._POINTS)
             self._find(points[block], triangle[block], weights[block], squared[block])
 
         with make_executor(count_cores(), "quasiharmonic-nearest") as pool:
-            list(pool.map(work, range(0, len(points), _POINTS)))
+            list(pool.map(work, range(0, len(points), self._POINTS)))
         return triangle, weights, np.sqrt(squared)
 
     def _find(self, points: FloatArray, triangle: IntArray, weights: FloatArray, squared: FloatArray) -> None:
         """Set the nearest points of a block."""
         many = len(self._triangle)
-        waiting, count = np.arange(len(points)), min(_FIRST, many)
+        waiting, count = np.arange(len(points)), min(self._FIRST, many)
         while waiting.size:
             distance, sample = self._tree.query(points[waiting], count)
             distance, sample = distance.reshape(-1, count), sample.reshape(-1, count)
@@ -87,7 +88,7 @@ class NearestPoint:
             if count == many:
                 return
             waiting = waiting[distance[:, -1] < np.sqrt(squared[waiting]) + self._largest]
-            count = min(_GROWTH * count, many)
+            count = min(self._GROWTH * count, many)
 
 
 @compiled

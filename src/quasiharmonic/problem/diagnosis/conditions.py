@@ -35,9 +35,6 @@ from quasiharmonic.util.arrays import (
     vertex_names,
 )
 
-# Number of fixed vertices, far apart from each other, that are checked first.
-_FIRST_CHECKED = 8
-
 
 def collapsed_edges(problem: Problem, fixture: Fixture) -> Iterator[Obstruction]:
     """Yield edges whose two ends are fixed at the same position."""
@@ -188,6 +185,9 @@ class Sight:
     interior edges with both ends fixed. ``effort`` is the budget for all checks.
     """
 
+    # Number of fixed vertices, far apart from each other, that are checked first.
+    _FIRST_CHECKED = 8
+
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners, walls: IntArray, effort: Effort) -> None:
         self._fixture = fixture
         ends = fixture.row[walls]
@@ -236,7 +236,7 @@ class Sight:
         approximate = self._fixture.lattice.approximate[self._fixture.row[vertices]]
         distance = np.full(len(vertices), np.inf)
         first = [0]
-        while len(first) < min(_FIRST_CHECKED, len(vertices)):
+        while len(first) < min(self._FIRST_CHECKED, len(vertices)):
             distance = np.minimum(distance, np.hypot(*(approximate - approximate[first[-1]]).T))
             distance[first] = -1.0
             first.append(int(np.argmax(distance)))

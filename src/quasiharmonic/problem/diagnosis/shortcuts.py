@@ -47,16 +47,6 @@ _NOWHERE: Point = (0, 0, 0)
 _CORNERS_PER_STEP = 100
 # Largest number of edges between the vertices of a pair to check.
 LONGEST = 8
-# Limit on the steps in the triangulated target, of some microseconds each: a constant,
-_WORK = 50_000
-# and a number per boundary vertex.
-_WORK_PER_VERTEX = 10
-# Limit on the pairs to collect.
-_MAX_PAIRS = 10_000_000
-# Offsets of trial points from the midpoint of two corners, as multiples of half their distance.
-_BESIDE = 0.05, 0.3, 1.0, -0.05, -0.3
-# Limit on the pairs of a segment and a nearby edge to check, for each call of `clear`.
-_MAX_NEAR_PAIRS = 1_000_000
 
 
 class Polygon:
@@ -248,6 +238,17 @@ class Shortcuts:
     are ``unchecked`` or more edges apart were checked.
     """
 
+    # Limit on the steps in the triangulated target, of some microseconds each: a constant,
+    _WORK = 50_000
+    # and a number per boundary vertex.
+    _WORK_PER_VERTEX = 10
+    # Limit on the pairs to collect.
+    _MAX_PAIRS = 10_000_000
+    # Offsets of trial points from the midpoint of two corners, as multiples of half their distance.
+    _BESIDE = 0.05, 0.3, 1.0, -0.05, -0.3
+    # Limit on the pairs of a segment and a nearby edge to check, for each call of `clear`.
+    _MAX_NEAR_PAIRS = 1_000_000
+
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners) -> None:
         self._loop = problem.domain.loops[0]
         free, place = fixture.joined[:, 0], invert_indices(problem.n, self._loop)[fixture.joined[:, 1]]
@@ -264,11 +265,11 @@ class Shortcuts:
     def find(self) -> Iterator[Obstruction]:
         """Yield obstructions of vertex pairs with fewer edges than segments between them, nearest pairs first."""
         n = len(self._loop)
-        budget = _WORK + _WORK_PER_VERTEX * n
+        budget = self._WORK + self._WORK_PER_VERTEX * n
         reached, known = self._ends, np.empty(0, dtype=np.int64)
         at_ends = np.bincount(self._ends.indices, minlength=self._ends.shape[1])
         for k in range(2, LONGEST + 1):
-            if at_ends @ np.bincount(reached.indices, minlength=reached.shape[1]) > _MAX_PAIRS:
+            if at_ends @ np.bincount(reached.indices, minlength=reached.shape[1]) > self._MAX_PAIRS:
                 self.unchecked = k
                 return
             pairs = (reached @ self._ends.T).tocoo()
@@ -311,7 +312,7 @@ class Shortcuts:
         inward = np.where((j - i) % n < (i - j) % n, 1.0, -1.0)
         dx, dy = (q / 2 - p / 2).T
         left = np.stack([-dy * inward, dx * inward], axis=1)
-        for height in _BESIDE:
+        for height in self._BESIDE:
             left_over = np.flatnonzero(~result)
             if not left_over.size:
                 break
@@ -330,7 +331,7 @@ class Shortcuts:
         if heads is not None:
             inside[inside] = self._corners.opens_to(heads[inside], p[inside], where)
         ends = np.stack([tails, np.full(len(tails), -1) if heads is None else heads], axis=1)
-        inside[inside] = clear(p[inside], q[inside], ends[inside], self._sides, where, _MAX_NEAR_PAIRS)
+        inside[inside] = clear(p[inside], q[inside], ends[inside], self._sides, where, self._MAX_NEAR_PAIRS)
         return inside
 
     def _obstruction(self, a: int, b: int, k: int) -> Obstruction:

@@ -40,10 +40,6 @@ from quasiharmonic.util.arrays import (
 )
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
-# Maximum distance from the outline for a point to count as on it, as a share of the outline's larger side.
-_ON_OUTLINE = 1e-6
-# Maximum number of corners that a message lists.
-_MAX_LISTED = 12
 # Maximum loss of similarity, relative to the best value (2 at most), that is accepted for an upright map.
 _SIMILAR = 0.1
 
@@ -62,6 +58,11 @@ class Pins:
     ``backwards`` tells which are reversed relative to the user's. ``n`` is the number of vertices of the surface.
     ``contour_of`` maps the loops for which the user gave points to their contours.
     """
+
+    # Maximum distance from the outline for a point to count as on it, as a share of the outline's larger side.
+    _ON_OUTLINE = 1e-6
+    # Maximum number of corners that a message lists.
+    _MAX_LISTED = 12
 
     def __init__(
         self,
@@ -167,7 +168,7 @@ class Pins:
         """List the corners of a contour with their numbers, for messages."""
         points = np.ldexp(self.contours[contour][self.sharp[contour]], self.exponent).tolist()
         named = [f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)]
-        return ", ".join(named[:_MAX_LISTED]) + (", …" if len(named) > _MAX_LISTED else "")
+        return ", ".join(named[: self._MAX_LISTED]) + (", …" if len(named) > self._MAX_LISTED else "")
 
     def _find_on_outline(self, point: FloatArray, vertex: int) -> tuple[int, float]:
         """Return the contour on which a point lies and the parameter along it."""
@@ -176,7 +177,7 @@ class Pins:
         # Clip, so that a point far from a tiny outline does not overflow.
         with np.errstate(over="ignore"):
             near = np.clip(np.ldexp(point, -self.exponent), -1e9, 1e9)
-        least = _ON_OUTLINE * float(np.ptp(self.contours[0], axis=0).max())
+        least = self._ON_OUTLINE * float(np.ptp(self.contours[0], axis=0).max())
         best = (np.inf, 0, 0.0)
         for c, contour in enumerate(self.contours):
             t = np.append(arc_parameters(contour), 1.0)

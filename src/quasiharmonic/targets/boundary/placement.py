@@ -49,12 +49,6 @@ _MIN_TURN = 1e-9
 # Maximum shift of a vertex to a corner, as a share of the loop. Beyond it, the target no longer resembles the surface,
 # and splitting edges is better.
 FARTHEST = 0.2
-# Maximum number of starts to try, nearest to the best fit first, if chords lack space.
-_MAX_STARTS = 256
-# Number of rotations to try for a hole.
-_ROTATIONS = 48
-# Additional deviation of a target from its contour allowed for chords, as a share of the larger side.
-_ALLOWED_DEVIATION = 0.02
 # Maximum outward bend of a straight line, as a share of the outline's larger side.
 STRAIGHT = 1e-9
 
@@ -169,6 +163,13 @@ def _range_minima(values: FloatArray, low: IntArray, high: IntArray) -> FloatArr
 class CornerPlacement:
     """One boundary loop and its contour."""
 
+    # Maximum number of starts to try, nearest to the best fit first, if chords lack space.
+    _MAX_STARTS = 256
+    # Number of rotations to try for a hole.
+    _ROTATIONS = 48
+    # Additional deviation of a target from its contour allowed for chords, as a share of the larger side.
+    _ALLOWED_DEVIATION = 0.02
+
     s: FloatArray  # (n,): parameters of the vertices along the loop
     contour: FloatArray  # (k, 2)
     pins: list[tuple[int, float]]  # Vertices with given parameters along the contour
@@ -190,7 +191,7 @@ class CornerPlacement:
         other = points_at(self.contour, moved)
         # Vertices moved away from a bend cut it off, so limit the deviation.
         side = float(np.ptp(self.contour, axis=0).max())
-        allowed = max_deviation(self.contour, along, positions) + _ALLOWED_DEVIATION * side
+        allowed = max_deviation(self.contour, along, positions) + self._ALLOWED_DEVIATION * side
         near = max_deviation(self.contour, moved, other) <= allowed
         return (other, True) if near and self._fits(other) else (positions, False)
 
@@ -210,7 +211,7 @@ class CornerPlacement:
         first = find_start(self.s, flat, self.contour)
         best, clear = self.place(first)
         away = np.minimum((self.s - self.s[first]) % 1.0, (self.s[first] - self.s) % 1.0)
-        for start in np.argsort(away, kind="stable")[1 : 1 if self.pins else _MAX_STARTS]:
+        for start in np.argsort(away, kind="stable")[1 : 1 if self.pins else self._MAX_STARTS]:
             if clear:
                 break
             positions, clear = self.place(int(start))
@@ -221,7 +222,7 @@ class CornerPlacement:
         """Positions from starts all around the loop, restricted to those that leave chords space if any do."""
         if self.pins:
             return [self.place()[0]]
-        wanted = np.arange(_ROTATIONS) / _ROTATIONS
+        wanted = np.arange(self._ROTATIONS) / self._ROTATIONS
         starts = np.unique(np.searchsorted(self.s, wanted, side="right") - 1)
         found = [self.place(int(start)) for start in starts]
         return [positions for positions, clear in found if clear] or [positions for positions, _ in found]

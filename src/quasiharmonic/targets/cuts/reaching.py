@@ -26,16 +26,6 @@ from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-# A loose end costs as much as a cut of this length, in units in which the surface has area 1.
-_END = 0.1
-# The search stops after this many successive tips whose cuts do not lower the price.
-_MAX_FAILURES = 6
-# After a failure, it skips vertices closer to the tip than this share of the distance of the tip from the cuts.
-_NEAR = 0.5
-# Smaller changes of scale need no cut.
-_EVEN = 1e-3
-# Vertices whose scale is within this share of the largest count as equal.
-_TIES = 1e-6
 _ROUNDS = 3
 # Lower bound of angles in radians, so that cotangents of slivers stay finite.
 _LEAST_ANGLE = 1e-3
@@ -72,6 +62,17 @@ def extend_cuts(graph: EdgeGraph, cut: BoolArray, min_gain: float) -> BoolArray:
 class _Balance:
     """Price of cuts: energy plus weighted length."""
 
+    # A loose end costs as much as a cut of this length, in units in which the surface has area 1.
+    _END = 0.1
+    # The search stops after this many successive tips whose cuts do not lower the price.
+    _MAX_FAILURES = 6
+    # After a failure, it skips vertices closer to the tip than this share of the distance of the tip from the cuts.
+    _NEAR = 0.5
+    # Smaller changes of scale need no cut.
+    _EVEN = 1e-3
+    # Vertices whose scale is within this share of the largest count as equal.
+    _TIES = 1e-6
+
     def __init__(self, graph: EdgeGraph, min_gain: float) -> None:
         self.graph = graph
         self.min_gain = min_gain
@@ -90,7 +91,7 @@ class _Balance:
         """Return the scale w under given cuts, and store their price."""
         heartbeat()
         w = self.shrinking.of(self._rim | self.graph.mark_vertices(cut))
-        length = float(self.graph.length[cut].sum()) + _END * int(self._mark_loose_ends(cut).sum())
+        length = float(self.graph.length[cut].sum()) + self._END * int(self._mark_loose_ends(cut).sum())
         self._prices[np.packbits(cut).tobytes()] = self.shrinking.energy(w) + self.min_gain * length
         return w
 
@@ -103,12 +104,12 @@ class _Balance:
         w = self._weigh(cut)
         given_up = np.zeros(self.graph.n, dtype=bool)
         failures = 0
-        while failures < _MAX_FAILURES:
+        while failures < self._MAX_FAILURES:
             height = np.where(given_up, 0.0, np.abs(w))
-            if not height.max() > _EVEN:
+            if not height.max() > self._EVEN:
                 break
             # The first of the vertices that are equal up to rounding.
-            tip = int(np.argmax(height >= (1 - _TIES) * height.max()))
+            tip = int(np.argmax(height >= (1 - self._TIES) * height.max()))
             opened = np.flatnonzero(self._rim | self.graph.mark_vertices(cut))
             distance, before = self.graph.distances(opened, self.graph.cost)
             longer = cut.copy()
@@ -117,7 +118,7 @@ class _Balance:
             if self.price(longer) < self.price(cut):
                 cut, w, failures = longer, w_then, 0
             else:
-                around, _ = self.graph.distances(np.array([tip]), self.graph.cost, limit=_NEAR * distance[tip])
+                around, _ = self.graph.distances(np.array([tip]), self.graph.cost, limit=self._NEAR * distance[tip])
                 given_up |= np.isfinite(around)
                 failures += 1
         return cut
