@@ -128,8 +128,7 @@ KERNELS = {
     "energies.deformation": ["jacobians", "pulls", "collapses"],
     "linsolve.pattern": ["find_pattern"],
     "linsolve.laplacian": ["assemble", "boundary_load", "put_at"],
-    "geometry.exact.point_location": ["sure_hits"],
-    "geometry.exact.nested_grid": ["find_cells", "divide_cells"],
+    "geometry.exact.point_location": ["sure_hits", "find_cells", "divide_cells"],
 }
 
 

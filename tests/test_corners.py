@@ -21,7 +21,7 @@ from quasiharmonic.targets import (
     rectangle,
     ring,
 )
-from quasiharmonic.targets.boundary.corner_spec import read_corners
+from quasiharmonic.targets.boundary.corner_pins import read_corners
 from quasiharmonic.ui.cli import main
 from shared.commands import run
 from shared.meshes import lift, random_annulus

@@ -8,10 +8,10 @@ import pytest
 from quasiharmonic import crease_costs, find_cuts, surfaces
 from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys, edges
+from quasiharmonic.targets.cuts.find import opening_cuts
 from quasiharmonic.targets.cuts.graph import edge_graph
+from quasiharmonic.targets.cuts.reaching import Shrinking
 from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches
-from quasiharmonic.targets.cuts.shrinking import Shrinking
-from quasiharmonic.targets.cuts.topological import opening_cuts
 from shared.closed_surfaces import TETRAHEDRON, blocks, double_torus, torus
 from shared.cuts import SURFACES, TORUS, energy_of, jittered, length_of, parts, random_cut
 

@@ -14,10 +14,9 @@ import pytest
 from quasiharmonic import Problem, diagnose
 from quasiharmonic.geometry.exact.loops import contacts, winding
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation, segment_relation
-from quasiharmonic.geometry.exact.sweep import triangulate
+from quasiharmonic.geometry.mesh.polygons import triangulate
 from quasiharmonic.problem.diagnosis import examine, shortcuts
-from quasiharmonic.problem.diagnosis.clipping import Lattice
-from quasiharmonic.problem.diagnosis.effort import Effort
+from quasiharmonic.problem.diagnosis.clipping import Effort, Lattice
 from quasiharmonic.problem.diagnosis.views import Views
 from quasiharmonic.problem.diagnosis.witness import clear
 from quasiharmonic.results import Kind

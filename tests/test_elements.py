@@ -14,12 +14,12 @@ from quasiharmonic.geometry.mesh.elements import (
     corner_triangles,
     covering_triangles,
     element_array,
+    jacobian_coefficients,
     join_elements,
     reverse_elements,
     rim,
 )
 from quasiharmonic.geometry.mesh.polygons import Polygons
-from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
 from shared.meshes import boundary_of
 from shared.simulation import min_jacobian, quadrilaterals, second_order
 

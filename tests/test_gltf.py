@@ -10,7 +10,7 @@ import pytest
 
 from quasiharmonic import certify, io
 from quasiharmonic.io import MeshData, MeshFileError
-from quasiharmonic.io.models.materials import label_materials
+from quasiharmonic.io.models.appearance import label_materials
 from quasiharmonic.surfaces import cat, starfish
 from shared.gltf_files import HALVES, SQUARE, Gltf, numbers, opened, square
 

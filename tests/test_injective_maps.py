@@ -11,7 +11,7 @@ from quasiharmonic import Problem, Status, boundary_loops, certify, injective_ma
 from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.problem.problem_batch import set_up_batch
+from quasiharmonic.problem.problem import set_up_batch
 from quasiharmonic.solver.field.objective_batch import Patterns
 from quasiharmonic.solver.methods import Newton, VectorAdam
 from quasiharmonic.solver.search import first_stage, many

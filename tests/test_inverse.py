@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import InverseMap, SurfaceMap, boundary_loops, distortion, unwrap
-from quasiharmonic.geometry.exact.nested_grid import NestedGrid
+from quasiharmonic.geometry.exact.point_location import NestedGrid
 from quasiharmonic.geometry.exact.predicates import twice_area
 from quasiharmonic.results import SurfacePoints
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay, starfish

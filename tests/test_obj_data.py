@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from quasiharmonic import io
 from quasiharmonic.io import MeshData
-from quasiharmonic.io.models.meshdata import is_planar
+from quasiharmonic.io.models.mesh_maps import is_planar
 from shared.obj_files import SQUARE, SQUARE_F, SQUARE_VT, bits, both_readers_agree, same
 
 # Every finite double; hypothesis prefers difficult ones.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.nearest_point import NearestPoint
-from quasiharmonic.geometry.mesh.raster import Raster
+from quasiharmonic.geometry.mesh.point_queries import NearestPoint, Raster
 from quasiharmonic.surfaces import grid
 
 

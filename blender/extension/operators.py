@@ -7,11 +7,11 @@ from typing import Any
 
 import bpy
 import numpy as np
+from quasiharmonic.apps.repair.fitting import fit_boundary
 
 from quasiharmonic import atlas, repair
 from quasiharmonic.apps.atlas import seam_cuts
 from quasiharmonic.apps.atlas.mapped_atlas import each_island
-from quasiharmonic.apps.repair.fitting import fit_boundary
 from quasiharmonic.atlas import AtlasVerdict, Island, SeamedMesh
 from quasiharmonic.energies.polishing import polish_result
 from quasiharmonic.geometry.exact.triangles import find_concave, find_overlapping
@@ -19,7 +19,7 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.results import Step
 from quasiharmonic.solver.mapping import solve
-from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+from quasiharmonic.targets.boundary.corner_pins import CornerSpec
 from quasiharmonic.util.arrays import IntArray, count_of
 from quasiharmonic.util.options import ENERGY_LABELS, PolishOptions
 

@@ -1,16 +1,23 @@
-"""The appearance of a model as its file has it: glTF materials, OBJ material libraries, or colours of vertices."""
+"""The appearance of a model as its file has it: glTF materials, OBJ material libraries, or colours of vertices.
+
+The texture of a file is the image of its first material that has one.
+"""
 
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
+from typing import Any
+from urllib.parse import quote
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.formats.gltf.looks import gltf_appearance
+from quasiharmonic.io.formats.gltf import document as gltf
+from quasiharmonic.io.formats.gltf.looks import find_objects, gltf_appearance
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf
-from quasiharmonic.io.formats.own_texture import is_beside, library_entries
-from quasiharmonic.io.formats.vertex_data import colours_of
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.appearance import (
     Appearance,
@@ -19,12 +26,18 @@ from quasiharmonic.io.models.appearance import (
     Role,
     SurfaceMaterial,
     Wrap,
+    library_names,
     plain_appearance,
 )
-from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.meshdata import MeshData, colours_of
+from quasiharmonic.io.models.textures import Texture, texture_of
+from quasiharmonic.util.untrusted import resolve_beside
 
 # Entries of material libraries about images that `read_appearance` reads.
 _IMAGES: dict[bytes, Role] = {b"map_Kd": "colour", b"map_Ke": "emission"}
+_GLTF = ".glb", ".gltf"
+# Keywords of images in material libraries.
+_IMAGE_KEYWORD = re.compile(rb"bump|decal|disp|norm|map_(?!aat$).*", re.IGNORECASE | re.DOTALL)
 
 
 def read_appearance(mesh: MeshData) -> Appearance:
@@ -76,10 +89,101 @@ def _read_libraries(mesh: MeshData) -> tuple[dict[str, SurfaceMaterial], tuple[s
 
 def _read_image(mesh: MeshData, name: Path) -> NamedImage:
     """Return an image that a library in the folder of the mesh's file names."""
+    folder, data = Path(mesh.source).parent, None
+    if is_beside(folder, str(name)):
+        with suppress(MeshFileError):
+            data = read_bytes(folder / name)
+    return NamedImage(str(name), data)
+
+
+def own_texture(mesh: MeshData) -> Texture | None:
+    """Return the colour texture of the file of a mesh: a PNG or JPEG named by its .mtl, or in its glTF or GLB.
+
+    None if the file names none, or the image is missing or has another format. No file is opened outside the folder of
+    the mesh's file.
+    """
+    if Path(mesh.source).suffix.lower() in _GLTF:
+        return _of_gltf(Path(mesh.source))
+    for words, within in library_entries(mesh):
+        if words[0] == b"map_Kd":
+            data = _read_image(mesh, within / os.fsdecode(words[-1])).data
+            if data is not None and (texture := texture_of(data)) is not None:
+                return texture
+    return None
+
+
+def texture_names(mesh: MeshData) -> list[str]:
+    """Return the names of the images that materials of a mesh's file show by its map, in order, each once.
+
+    No image is opened.
+    """
+    if Path(mesh.source).suffix.lower() in _GLTF:
+        tree = mesh.carried.document.tree if isinstance(mesh.carried, CarriedGltf) else {}
+        try:
+            return list(dict.fromkeys(_names_in_gltf(tree)))
+        except gltf.DAMAGE:
+            # A damaged description of a material does not prevent other work.
+            return []
+    textures = (os.fsdecode(words[-1]) for words, _ in library_entries(mesh) if _IMAGE_KEYWORD.fullmatch(words[0]))
+    # Names in libraries can have the separators of any system.
+    return list(dict.fromkeys(PureWindowsPath(name).name for name in textures))
+
+
+def library_entries(mesh: MeshData) -> Iterator[tuple[list[bytes], Path]]:
+    """Yield the entries of the OBJ file's material libraries: at least two words, and the folder of the library.
+
+    Only libraries in the folder of the file are opened. Their folders are relative to it. The last word of an entry
+    about an image is its name; options such as -s precede it.
+    """
     folder = Path(mesh.source).parent
-    if not is_beside(folder, str(name)):
-        return NamedImage(str(name), None)
+    for line in mesh.statements.split(b"\n"):
+        names = [name for name in library_names(line, folder) if is_beside(folder, name)]
+        for library in (folder / name for name in names if (folder / name).is_file()):
+            within = library.parent.relative_to(folder)
+            for entry in read_bytes(library).splitlines():
+                words = entry.split()
+                if len(words) > 1:
+                    yield words, within
+
+
+def _names_in_gltf(tree: dict[str, Any]) -> Iterator[str]:
+    """Yield the names of the images that the materials of a glTF document show by the first texture coordinates."""
+    for info in find_objects(tree.get("materials", []), lambda node: "index" in node):
+        moved = info.get("extensions", {}).get("KHR_texture_transform", {})
+        if moved.get("texCoord", info.get("texCoord", 0)) != 0:
+            continue
+        texture = tree["textures"][info["index"]]
+        # Extensions name images of other formats.
+        for variant in (texture, *texture.get("extensions", {}).values()):
+            if "source" in variant:
+                image = tree["images"][variant["source"]]
+                name = image.get("name") or image.get("uri", "data:")
+                yield f"image {variant['source']}" if name.startswith("data:") else name
+
+
+def is_beside(folder: Path, name: str) -> bool:
+    """Whether a name is that of a file in a folder or below it."""
     try:
-        return NamedImage(str(name), read_bytes(folder / name))
-    except MeshFileError:
-        return NamedImage(str(name), None)
+        resolve_beside(folder, quote(name))
+    except ValueError:
+        return False
+    return True
+
+
+def _of_gltf(path: Path) -> Texture | None:
+    """Return the base colour texture of a glTF file."""
+    document = gltf.load(path)
+    tree = document.tree
+    try:
+        for material in tree.get("materials", []):
+            colour = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+            if colour is None:
+                continue
+            image = tree["images"][tree["textures"][colour["index"]]["source"]]
+            if "bufferView" in image:
+                return texture_of(bytes(document.views[image["bufferView"]]))
+            return texture_of(gltf.read_uri(path.parent, image["uri"]))
+    except gltf.DAMAGE:
+        # A damaged description of a material does not prevent drawing.
+        return None
+    return None

@@ -1,13 +1,40 @@
-"""Read and write mesh files; the suffix of the file name selects the format."""
+"""Read and write mesh files; the suffix of the file name selects the format.
+
+A file can have several texture coordinates: `select_channel` reads a channel, and `place_map` writes one.
+
+A problem is a mesh with an initial map, and a list of fixed vertices. Its format is that of the Locally Injective
+Mappings Benchmark (Du et al. 2020): a folder with ``input.obj`` and ``handles.txt``. The texture coordinates of
+``input.obj`` are the target positions, and ``handles.txt`` lists the fixed vertices.
+"""
 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.formats.gltf.reader import CarriedGltf, read_channel
+from quasiharmonic.io.formats.ply import CarriedPly, read_second_places
 from quasiharmonic.io.lowlevel.atomic import check_writable
+from quasiharmonic.io.lowlevel.textual import content_lines, integer, read_text
+from quasiharmonic.io.models.mesh_maps import vertex_places, with_corner_map
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.registry import find_format, find_function
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_integer,
+    check_range,
+    index_array,
+    triangle_names,
+    vertex_names,
+)
 from quasiharmonic.util.optional import with_extra
 
 
@@ -77,8 +104,6 @@ def read_written(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
     As `read_mesh`, except for a FreeSurfer patch without a surface beside it, which has the mesh's triangles. The
     map is in the channel of the mesh's map.
     """
-    from quasiharmonic.io.channels import select_channel
-
     read = find_format(path, "read").read_written
     found = read_mesh(path) if read is None else read(path, mesh)
     return select_channel(found, len(mesh.lower_maps)) if mesh.lower_maps else found
@@ -95,3 +120,222 @@ def not_held(path: str | os.PathLike[str], mesh: MeshData) -> list[str]:
     list_losses = find_format(path, "write_map").list_losses
     assert list_losses is not None
     return list_losses(mesh)
+
+
+def select_channel(mesh: MeshData, channel: int) -> MeshData:
+    """Return a mesh that was read from a file with the texture coordinates of another channel as its map.
+
+    Channel k is ``TEXCOORD_k`` in glTF files. In PLY files, channel 1 is ``texcoord1`` of the faces. Written to a file,
+    the map is in this channel again.
+
+    Raises
+    ------
+    MeshFileError
+        If the file does not have this channel.
+    """
+    check_integer("channel", channel, minimum=0)
+    return place_map(_find_channel(mesh, channel), mesh, channel)
+
+
+def place_map(mapped: MeshData, mesh: MeshData, channel: int) -> MeshData:
+    """Return a mesh with a map that is to be written into a channel, and the channels below from a mesh of a file.
+
+    ``mapped`` has the triangles of ``mesh``. Triangles without coordinates in a channel below get those of the map.
+    MeshFileError if the map does not cover them either, or the file does not have a channel below.
+    """
+    below = tuple(_find_channel(mesh, k).corner_uv.copy() for k in range(channel))
+    for k, corners in enumerate(below):
+        bare = np.flatnonzero(np.isnan(corners).any(axis=(1, 2)))
+        corners[bare] = mapped.corner_uv[bare]
+        bare = bare[np.isnan(corners[bare]).any(axis=(1, 2))]
+        if bare.size:
+            raise MeshFileError(
+                mesh.source,
+                f"has no texture coordinates {k} in {triangle_names(bare)} (0-based), but channel "
+                f"{channel} requires those below it",
+                remedy=f"write channel {k} first",
+            )
+    return replace(mapped, lower_maps=below)
+
+
+def _find_channel(mesh: MeshData, channel: int) -> MeshData:
+    """Return the mesh with a channel as its map."""
+    if channel == len(mesh.lower_maps):
+        return mesh
+    carried, corners = mesh.carried, None
+    if channel < len(mesh.lower_maps):
+        corners = mesh.lower_maps[channel]
+    elif isinstance(carried, CarriedGltf):
+        corners = read_channel(carried, channel)
+    elif isinstance(carried, CarriedPly) and channel == 1:
+        corners = read_second_places(mesh, carried)
+    if corners is None:
+        raise MeshFileError(
+            mesh.source, f"has no texture coordinates {channel}", remedy="give a channel of the file; the first is 0"
+        )
+    return with_corner_map(mesh, corners)
+
+
+#: Names of the mesh in the folder of a problem, the first that exists counts.
+INPUTS = "input.obj", "input.ply"
+
+
+class ProblemArrays(NamedTuple):
+    """The arrays of a `quasiharmonic.Problem`.
+
+    Attributes
+    ----------
+    V : (n, 3) float64
+        Rest positions.
+    F : (f, 3) int64
+        Triangles.
+    fixed : (k,) int64
+        Fixed vertices.
+    target : (k, 2) float64
+        Target positions of the fixed vertices.
+    """
+
+    V: FloatArray
+    F: IntArray
+    fixed: IntArray
+    target: FloatArray
+
+
+def read_problem(source: str | os.PathLike[str], fixed: str | os.PathLike[str] | None = None) -> ProblemArrays:
+    """Read a mapping problem.
+
+    Parameters
+    ----------
+    source : str or path-like
+        A folder with ``input.obj`` or ``input.ply`` and, optionally, ``handles.txt``; or a mesh file alone.
+    fixed : str or path-like, optional
+        A list of fixed vertices that replaces the folder's list. Without any list, the boundary is fixed.
+
+    Returns
+    -------
+    ProblemArrays
+        ``V, F, fixed, target``. The target positions are the texture coordinates of ``fixed``.
+
+    Raises
+    ------
+    MeshFileError
+        If a file cannot be read, or a fixed vertex has no target position.
+    """
+    mesh_path, fixed_path = problem_files(source, fixed)
+    mesh = read_mesh(mesh_path)
+    return problem_arrays(mesh, None if fixed_path is None else read_handles(fixed_path, len(mesh.V)))
+
+
+def problem_files(
+    source: str | os.PathLike[str], fixed: str | os.PathLike[str] | None = None
+) -> tuple[Path, Path | None]:
+    """Return the paths of a problem's mesh and, if there is one, of its list of fixed vertices.
+
+    Parameters
+    ----------
+    source : path
+        A mesh file, or a folder with ``input.obj`` or ``input.ply``, and optionally ``handles.txt``.
+    fixed : path, optional
+        A list of fixed vertices that replaces the folder's list.
+
+    Returns
+    -------
+    mesh : Path
+    fixed : Path or None
+        The files may be missing; reading them then raises an error.
+    """
+    check_path("source", source)
+    if fixed is not None:
+        check_path("fixed", fixed)
+    mesh_path = Path(source)
+    if mesh_path.is_dir():
+        folder, mesh_path = mesh_path, mesh_path / INPUTS[0]
+        if not os.path.lexists(mesh_path) and os.path.lexists(folder / INPUTS[1]):
+            mesh_path = folder / INPUTS[1]
+        # lexists: a broken link counts as a list, so that reading it raises an error.
+        if fixed is None and os.path.lexists(folder / "handles.txt"):
+            fixed = folder / "handles.txt"
+    return mesh_path, None if fixed is None else Path(fixed)
+
+
+def problem_arrays(mesh: MeshData, fixed: IntArray | None = None) -> ProblemArrays:
+    """Return the mapping problem of a mesh that has texture coordinates.
+
+    Parameters
+    ----------
+    mesh : MeshData
+        The mesh. It may have seams, except at fixed vertices.
+    fixed : (k,) int64, optional
+        Fixed vertices; the boundary by default.
+
+    Returns
+    -------
+    ProblemArrays
+        ``V, F, fixed, target``.
+
+    Raises
+    ------
+    MeshFileError
+        If there are no vertices to fix, or a fixed vertex has no or several target positions. The message names the
+        first such vertices.
+    """
+    if mesh.FT is None:
+        raise MeshFileError(
+            mesh.source,
+            "has no faces that refer to texture coordinates, so the fixed vertices have no target positions",
+            remedy="export it with uv coordinates (in OBJ: vt lines and faces like 1/1 2/2 3/3)",
+        )
+    if fixed is None:
+        fixed = np.unique(boundary_edges(mesh.F, len(mesh.V)))
+        if not fixed.size:
+            raise MeshFileError(mesh.source, "has no boundary to fix", remedy="cut it open, or give fixed vertices")
+    else:
+        fixed = index_array("fixed", fixed).ravel()
+        check_range("fixed", fixed, len(mesh.V))
+    uv, seam = vertex_places(mesh)
+    for wrong, what, remedy in (
+        (np.isnan(uv[fixed, 0]), "no texture coordinates", "give every fixed vertex a vt"),
+        (seam[fixed], "more than one pair of texture coordinates", "cut the mesh along its seams first"),
+    ):
+        if wrong.any():
+            which = vertex_names(fixed[wrong])
+            raise MeshFileError(mesh.source, f"{what} for the fixed {which} (0-based)", remedy=remedy)
+    return ProblemArrays(mesh.V, mesh.F, fixed, uv[fixed])
+
+
+def read_handles(path: str | os.PathLike[str], n: int) -> IntArray:
+    """Read a list of vertices: 0-based indices, one per line, with blank lines and ``#`` comments.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    n : int
+        Number of vertices of the mesh.
+
+    Returns
+    -------
+    (k,) int64
+        The vertices in the order of the file.
+
+    Raises
+    ------
+    MeshFileError
+        With the line, for a line that is not an integer, an index outside ``0 … n - 1``, or a repeated vertex. Also for
+        an empty list.
+    """
+    # Each vertex is stored once, so the memory is bounded by the mesh size.
+    seen: dict[int, int] = {}
+    for line, text in content_lines(read_text(path)):
+        try:
+            vertex = integer(text)
+        except ValueError as error:
+            raise MeshFileError(path, str(error), line, "give one vertex index per line") from None
+        if not 0 <= vertex < n:
+            raise MeshFileError(path, f"vertex {vertex} of a mesh with {n}", line, "indices count from 0")
+        if vertex in seen:
+            raise MeshFileError(path, f"vertex {vertex}, already named at line {seen[vertex]}, again", line)
+        seen[vertex] = line
+    if not seen:
+        raise MeshFileError(path, "lists no vertices")
+    return np.fromiter(seen, dtype=np.int64, count=len(seen))

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from quasiharmonic.io.errors import MeshFileError, check_path
 
 if TYPE_CHECKING:
-    from quasiharmonic.io.fem.byte_tables import MeshParts
+    from quasiharmonic.io.fem.mesh_parts import MeshParts
     from quasiharmonic.io.models.meshdata import MeshData
     from quasiharmonic.io.models.textures import Texture
     from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -117,7 +117,7 @@ FORMATS: tuple[Format, ...] = (
         seams=True,
         image=True,
         **import_later("formats.obj", read="read_obj", write_map="write_obj", list_losses="not_in_obj"),
-        **import_later("models.materials", companions="companions"),
+        **import_later("models.appearance", companions="companions"),
     ),
     Format(
         name="OFF",

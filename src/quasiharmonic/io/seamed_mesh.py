@@ -15,9 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.fans import fans, number_fans, renumber
+from quasiharmonic.geometry.mesh.fans import fans, find_representatives, number_fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
-from quasiharmonic.geometry.mesh.welding import find_representatives
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -30,7 +29,7 @@ from quasiharmonic.util.arrays import (
     edge_names,
     index_array,
     map_array,
-    names_of,
+    triangle_names,
     triangle_rows,
     vertex_array,
 )
@@ -201,9 +200,7 @@ class SeamedMesh:
         """
         bare = np.flatnonzero((self.FT < 0).any(axis=1))
         if bare.size:
-            raise ValueError(
-                f"{names_of('triangle', 'triangles', bare)} without texture coordinates, which other triangles have"
-            )
+            raise ValueError(f"{triangle_names(bare)} without texture coordinates, which other triangles have")
         if self.seamless:
             FT, origin = self.F, np.arange(len(self.V))
         else:

@@ -23,8 +23,8 @@ from quasiharmonic.util.arrays import (
     loop_arrays,
     make_unchangeable,
     map_array,
-    names_of,
     own_triangles,
+    vertex_names,
 )
 
 
@@ -136,7 +136,7 @@ def _convert(F: ArrayLike, uv: ArrayLike) -> tuple[IntArray, FloatArray]:
     if rounded.size:
         # Report a vertex that does not exist first: it is the simpler mistake.
         check_range("F", triangles, len(positions))
-        raise ValueError(f"uv does not fit double precision at {names_of('vertex', 'vertices', rounded)}")
+        raise ValueError(f"uv does not fit double precision at {vertex_names(rounded)}")
     return triangles, positions
 
 

@@ -21,10 +21,11 @@ from quasiharmonic.util.arrays import (
     fixed_vertices,
     make_unchangeable,
     mark,
-    names_of,
     scale_to_unit,
     triangle_array,
+    triangle_names,
     vertex_array,
+    vertex_names,
 )
 
 
@@ -137,8 +138,7 @@ class Domain(ReadOnly):
         missing = np.flatnonzero(mark(self.n, self.edges.boundary) & ~mark(self.n, self.fixed))
         if missing.size:
             raise ValueError(
-                f"the boundary {names_of('vertex', 'vertices', missing)} not in fixed: "
-                "every boundary vertex needs a target position"
+                f"the boundary {vertex_names(missing)} not in fixed: every boundary vertex needs a target position"
             )
 
     def check_areas(self) -> None:
@@ -146,7 +146,7 @@ class Domain(ReadOnly):
         flat = flat_triangles(self.V, self.F)
         if flat.size:
             raise ValueError(
-                f"{names_of('triangle', 'triangles', flat)} of zero area in the rest mesh; "
+                f"{triangle_names(flat)} of zero area in the rest mesh; "
                 "choose the reference 'equilateral', or repair the mesh"
             )
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.fans import fans, find_representatives
 from quasiharmonic.geometry.mesh.reference import flat_triangles
 from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, boundary_edges, edges, find_twins, trace_loops
-from quasiharmonic.geometry.mesh.welding import find_representatives
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.adapters.objects import MeshLike, mesh_triangles
 from quasiharmonic.util.arrays import (
@@ -22,6 +21,7 @@ from quasiharmonic.util.arrays import (
     check_range,
     check_weld,
     count_of,
+    first_equal,
     mark,
     repeat_each,
     scale_to_unit,
@@ -228,7 +228,7 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike, *, weld: bool | float = False) -> M
         genus=genus,
         inward=int(np.count_nonzero(inward)),
         defects=defects,
-        coincident=np.setdiff1d(_find_coincident(V), welded),
+        coincident=np.setdiff1d(np.flatnonzero(first_equal(V) < np.arange(len(V))), welded),
         close=np.flatnonzero(kept)[find_close_vertices(V[kept], np.bincount(part))],
         welded=welded,
     )
@@ -302,15 +302,7 @@ def _volumes(V: FloatArray, F: IntArray, part: IntArray, count: int) -> FloatArr
     points = V - V.mean(axis=0)
     points = points / max(float(np.abs(points).max()), np.finfo(float).tiny)
     a, b, c = (points[F[:, k]] for k in range(3))
-    volumes: FloatArray = np.bincount(part, (a * np.cross(b, c)).sum(axis=1), minlength=count).astype(np.float64)
-    return volumes
-
-
-def _find_coincident(V: FloatArray) -> IntArray:
-    """Return vertices at exactly the position of an earlier vertex, ascending."""
-    order = np.lexsort((np.arange(len(V)), *V.T))
-    same = (V[order[1:]] == V[order[:-1]]).all(axis=1)
-    return np.sort(order[1:][same])
+    return np.bincount(part, (a * np.cross(b, c)).sum(axis=1), minlength=count).astype(np.float64)
 
 
 def _name_first(found: IntArray) -> str:

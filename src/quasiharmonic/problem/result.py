@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.mesh.refinement import Refined
-from quasiharmonic.io.adapters.trimesh import make_trimesh
-from quasiharmonic.util.arrays import ReadOnly
+from quasiharmonic.io.adapters.objects import make_trimesh
+from quasiharmonic.util.arrays import ReadOnly, count_of
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Outcome
 
@@ -168,15 +168,9 @@ class Stage:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the stage as a dictionary for JSON."""
-        return {
-            "name": self.name,
-            "n_iterations": self.n_iterations,
-            "seconds": self.seconds,
-            "inverted": list(self.inverted),
-            # JSON has no infinity, and the energy before the first stage is infinite.
-            "energy": [e if math.isfinite(e) else None for e in self.energy],
-            "kept": self.kept,
-        }
+        # JSON has no infinity, and the energy before the first stage is infinite.
+        energy = [e if math.isfinite(e) else None for e in self.energy]
+        return vars(self) | {"inverted": list(self.inverted), "energy": energy}
 
 
 @dataclass(frozen=True)
@@ -236,7 +230,7 @@ class RefinementAttempt:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attempt as a dictionary for JSON."""
-        return {"name": self.name, "added": self.added, "injective": self.injective, "seconds": self.seconds}
+        return dict(vars(self))
 
 
 @dataclass(frozen=True, repr=False)
@@ -373,7 +367,7 @@ class MapResult(ReadOnly, Displayable, Outcome):
         )
 
     def short_repr(self) -> str:
-        steps = f"{self.n_iterations} iteration{'' if self.n_iterations == 1 else 's'}"
+        steps = count_of("iteration", "iterations", self.n_iterations)
         return f"{self.certificate.short_repr()}, {steps}, {self.seconds:.3g} s"
 
     def summary(self) -> str:
@@ -405,8 +399,7 @@ class MapResult(ReadOnly, Displayable, Outcome):
         ValueError
             If ``kind`` or ``measure`` is unknown, or ``V`` is None.
         """
-        figure: Figure = self._draw(kind, measure=measure)
-        return figure
+        return self._draw(kind, measure=measure)
 
     def to_trimesh(self) -> Trimesh:
         """Return the mesh as a trimesh.Trimesh with ``uv`` as texture coordinates; needs trimesh.

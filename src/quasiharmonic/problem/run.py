@@ -44,11 +44,7 @@ class Run:
     """
 
     def __init__(
-        self,
-        callback: Callable[[Step], object] | None = None,
-        record_every: int = 0,
-        *,
-        first: int = 0,
+        self, callback: Callable[[Step], object] | None = None, record_every: int = 0, *, first: int = 0
     ) -> None:
         self._callback, self._record_every, self._first = callback, record_every, first
         self._began = self._stage_began = time.perf_counter()

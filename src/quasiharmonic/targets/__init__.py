@@ -4,17 +4,15 @@ The package builds on `problem` and `geometry.curves`. Start reading in `outline
 """
 
 from quasiharmonic.targets.boundary.boundary_to import boundary_to
-from quasiharmonic.targets.boundary.chords import flattened_edges
-from quasiharmonic.targets.boundary.corner_spec import nearest_on_boundary
+from quasiharmonic.targets.boundary.corner_pins import nearest_on_boundary
 from quasiharmonic.targets.boundary.correspondence import arc_length
-from quasiharmonic.targets.boundary.sliding_curves import outline_curves
+from quasiharmonic.targets.boundary.placement import flattened_edges
 from quasiharmonic.targets.boundary.turning import BoundaryLoop, boundary_corners, boundary_turning
 from quasiharmonic.targets.outlines.contours import filled, nested, signed_area
-from quasiharmonic.targets.outlines.letters import letter
+from quasiharmonic.targets.outlines.letters import letter, word
 from quasiharmonic.targets.outlines.shapes import disk, ellipse, read_polylines, rectangle, regular_polygon, ring, star
 from quasiharmonic.targets.outlines.svg import read_svg
-from quasiharmonic.targets.outlines.words import word
-from quasiharmonic.targets.specification import outline
+from quasiharmonic.targets.specification import outline, outline_curves
 
 __all__ = [
     "BoundaryLoop",

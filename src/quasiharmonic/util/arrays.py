@@ -20,6 +20,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+SignArray = NDArray[np.int8]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 # Number of elements that a message lists.
@@ -101,14 +102,14 @@ def _in_range(name: str, integers: NDArray[np.object_]) -> IntArray:
 
 
 class _Unchangeable(np.ndarray):
-    """Owner of the memory of a result of `unchangeable`; only that result refers to it."""
+    """Owner of the memory of a result of `make_unchangeable`; only that result refers to it."""
 
 
 def make_unchangeable(array: NDArray[Scalar]) -> NDArray[Scalar]:
     """Return the values of an array in memory that no other code can write to.
 
-    An array that `unchangeable` made, or a view of one, is returned as it is; any other array is copied. A
-    read-only flag alone is not enough: other code may write through the base of a view, or set the flag of the array
+    An array that this function made, or a view of one, is returned as it is; any other array is copied. A read-only
+    flag alone is not enough: other code may write through the base of a view, or set the flag of the array
     back.
     """
     owner = array
@@ -150,13 +151,22 @@ def mark(n: int, *chosen: IntArray) -> BoolArray:
 
 def any_corner(marked: BoolArray) -> BoolArray:
     """Whether each triangle has a marked corner (f, 3); (f,) bool, many times faster than NumPy's ``any``."""
-    some: BoolArray = marked[:, 0] | marked[:, 1] | marked[:, 2]
-    return some
+    return marked[:, 0] | marked[:, 1] | marked[:, 2]
 
 
 def list_others(n: int, chosen: IntArray) -> IntArray:
     """Ascending numbers below ``n`` that are not among the given ones."""
     return np.flatnonzero(~mark(n, chosen))
+
+
+def first_equal(rows: NDArray[Any]) -> IntArray:
+    """Index (k,) int64 of the first row that is equal to each row of (k, d)."""
+    order = np.lexsort(rows.T)
+    starts = np.ones(len(rows), dtype=bool)
+    starts[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    first = np.empty(len(rows), dtype=np.int64)
+    first[order] = order[starts][np.cumsum(starts) - 1]
+    return first
 
 
 def cyclic_pairs(loop: IntArray) -> IntArray:
@@ -245,6 +255,14 @@ def triangle_rows(F: ArrayLike, name: str = "F", *, copy: bool = True) -> IntArr
     return array
 
 
+def edge_array(name: str, edges: ArrayLike) -> IntArray:
+    """Convert edges, pairs of vertices, to (k, 2) int64 without a check of the index range; returns a copy."""
+    array = index_array(name, edges)
+    if array.size and (array.ndim != 2 or array.shape[1] != 2):
+        raise ValueError(f"{name} must have shape (k, 2), not {array.shape}")
+    return array.reshape(-1, 2)
+
+
 def corner_rows(name: str, values: ArrayLike, F: IntArray, rows: int | None = None, *, copy: bool = False) -> IntArray:
     """Convert a table with a row index, or -1 for none, at every corner of triangles F (f, 3) to int64.
 
@@ -285,7 +303,7 @@ def fixed_vertices(fixed: ArrayLike, n: int) -> IntArray:
     array = vertex_indices("fixed", fixed, n)
     times = np.bincount(array, minlength=n)
     if times.max(initial=0) > 1:
-        raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} fixed more than once")
+        raise ValueError(f"{vertex_names(np.flatnonzero(times > 1))} fixed more than once")
     return array
 
 
@@ -492,6 +510,16 @@ def names_of(one: str, many: str, indices: NDArray[np.integer]) -> str:
     listed = ", ".join(str(tuple(i) if isinstance(i, list) else i) for i in indices[:_LISTED].tolist())
     rest = f", … ({len(indices)} in all)" if len(indices) > _LISTED else ""
     return f"{one if len(indices) == 1 else many} {listed}{rest}"
+
+
+def vertex_names(vertices: IntArray) -> str:
+    """Name the first few of some vertices: ``vertices 3, 8, 11, … (17 in all)``."""
+    return names_of("vertex", "vertices", vertices)
+
+
+def triangle_names(triangles: IntArray) -> str:
+    """Name the first few of some triangles: ``triangle 5``."""
+    return names_of("triangle", "triangles", triangles)
 
 
 def edge_names(pairs: IntArray) -> str:

@@ -47,8 +47,7 @@ class Displayable:
 
     def _draw(self, kind: str, **options: Any) -> Figure:
         """Draw one kind of figure of the result."""
-        figure: Figure = _renderer().draw(self, kind, **options)
-        return figure
+        return _renderer().draw(self, kind, **options)
 
 
 def _renderer() -> Any:

@@ -11,12 +11,15 @@ import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields
 from functools import wraps
+from importlib import import_module
 from numbers import Real
 from typing import Any, TypeVar
 
 from quasiharmonic.util.spelling import suggest
 
 F = TypeVar("F", bound=Callable[..., Any])
+#: A function that raises an error for the name of an option and a wrong value.
+Check = Callable[[str, Any], None]
 
 # Names of the values that some options accept; the dictionaries with the values themselves are tested to have these.
 #: Energies, and what each preserves.
@@ -49,7 +52,7 @@ def option(
     default: Any = MISSING,
     help: str = "",
     *,
-    check: Callable[[str, Any], None] | None = None,
+    check: Check | None = None,
     choices: tuple[str, ...] = (),
 ) -> Any:
     """Declare an option.
@@ -60,25 +63,31 @@ def option(
     return field(default=default, metadata={"help": help, "check": check, "choices": choices})
 
 
-def positive(name: str, value: Any) -> None:
-    """Check a positive integer."""
-    from quasiharmonic.util.arrays import check_integer
+def _by(check: str, **limits: Any) -> Check:
+    """Return a check by a function of `util.arrays` for a name and a value; it is imported at the first call."""
 
-    check_integer(name, value, minimum=1)
+    def call(name: str, value: Any) -> None:
+        getattr(import_module("quasiharmonic.util.arrays"), check)(name, value, **limits)
 
-
-def count(name: str, value: Any) -> None:
-    """Check an integer that is not negative."""
-    from quasiharmonic.util.arrays import check_integer
-
-    check_integer(name, value, minimum=0)
+    return call
 
 
-def tolerance(name: str, value: Any) -> None:
-    """Check a number that is not negative."""
-    from quasiharmonic.util.arrays import check_non_negative
+def _or_none(check: Check) -> Check:
+    """Return a check that also accepts None."""
 
-    check_non_negative(name, value)
+    def call(name: str, value: Any) -> None:
+        if value is not None:
+            check(name, value)
+
+    return call
+
+
+# Checks of options by kind. Longer ones are functions below.
+positive, count = _by("check_integer", minimum=1), _by("check_integer", minimum=0)
+positive_or_none, tolerance, switch = _or_none(positive), _by("check_non_negative"), _by("check_bool")
+mirror_axis = _or_none(_by("check_choice", choices=SYMMETRIES))
+direction_or_none = _or_none(_by("check_choice", choices=UPS))
+reference_name = _by("check_choice", choices=REFERENCES)
 
 
 def positive_number(name: str, value: Any) -> None:
@@ -88,17 +97,7 @@ def positive_number(name: str, value: Any) -> None:
     check_positive(**{name: value})
 
 
-def seconds(name: str, value: Any) -> None:
-    """Check a positive number of seconds, or None."""
-    if value is not None:
-        positive_number(name, value)
-
-
-def switch(name: str, value: Any) -> None:
-    """Check a boolean."""
-    from quasiharmonic.util.arrays import check_bool
-
-    check_bool(name, value)
+seconds = _or_none(positive_number)
 
 
 def welding(name: str, value: Any) -> None:
@@ -126,12 +125,6 @@ def sample_count(name: str, value: Any) -> None:
     positive(name, value)
     if value > MAX_SAMPLES:
         raise ValueError(f"{name} must be at most {MAX_SAMPLES}, not {value}: more would take too much memory")
-
-
-def positive_or_none(name: str, value: Any) -> None:
-    """Check a positive integer or None."""
-    if value is not None:
-        positive(name, value)
 
 
 def stretch_bound(name: str, value: Any) -> None:
@@ -168,14 +161,6 @@ def texture_size(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a number of texels, or width and height, at most 8192, not {value!r}")
 
 
-def mirror_axis(name: str, value: Any) -> None:
-    """Check the axis of a plane of symmetry, ``"auto"``, or None."""
-    if value is not None:
-        from quasiharmonic.util.arrays import check_choice
-
-        check_choice(name, value, SYMMETRIES)
-
-
 def stacking(name: str, value: Any) -> None:
     """Check which charts are stacked: a boolean or ``"mirrored"``."""
     if not isinstance(value, bool) and value != "mirrored":
@@ -192,21 +177,6 @@ def no_weights(name: str, value: Any) -> None:
     """Check that one mesh has no weight."""
     if value is not None:
         raise ValueError(f"{name} needs several meshes: pass a list of meshes, or a scene")
-
-
-def direction_or_none(name: str, value: Any) -> None:
-    """Check the direction of an axis, or None."""
-    if value is not None:
-        from quasiharmonic.util.arrays import check_choice
-
-        check_choice(name, value, UPS)
-
-
-def reference_name(name: str, value: Any) -> None:
-    """Check the name of reference triangles."""
-    from quasiharmonic.util.arrays import check_choice
-
-    check_choice(name, value, REFERENCES)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -292,7 +262,7 @@ class MapOptions(SolverOptions):
     )
 
 
-def one_of(*words: str | None) -> Callable[[str, Any], None]:
+def one_of(*words: str | None) -> Check:
     """Return a check of an option with one of several words."""
 
     def check(name: str, value: Any) -> None:

@@ -24,6 +24,16 @@ R = TypeVar("R")
 INTERVAL = 0.25
 
 
+@contextmanager
+def use_value(variable: ContextVar[R], value: R) -> Iterator[None]:
+    """Give a context variable another value in a block."""
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
 class _Reporter:
     """A callback and the time of its last call."""
 
@@ -37,14 +47,12 @@ class _Reporter:
         """Call the callback."""
         # If the callback raises, do not call it again while the exception propagates.
         self._last = []
-        # Work that the callback does itself must not report to this callback.
-        token = _REPORTER.set(None)
         try:
-            with np.errstate(**self._errors):
+            # Work that the callback does itself must not report to this callback.
+            with use_value(_REPORTER, None), np.errstate(**self._errors):
                 self._callback(step)
             self._last = [step]
         finally:
-            _REPORTER.reset(token)
             self._time = time.monotonic()
 
     def repeat_if_due(self) -> None:
@@ -66,11 +74,8 @@ def reports_progress(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         reporter = _Reporter(callback)
         kwargs["callback"] = reporter.report
-        token = _REPORTER.set(reporter)
-        try:
+        with use_value(_REPORTER, reporter):
             return function(*args, **kwargs)
-        finally:
-            _REPORTER.reset(token)
 
     return report_progress
 
@@ -104,11 +109,8 @@ _TIME_LIMIT: ContextVar[TimeLimit | None] = ContextVar("time limit", default=Non
 def time_limit(seconds: float) -> Iterator[TimeLimit]:
     """Let `heartbeat` raise KeyboardInterrupt, once, when the block has taken this many seconds."""
     limit = TimeLimit(seconds, _TIME_LIMIT.get())
-    token = _TIME_LIMIT.set(limit)
-    try:
+    with use_value(_TIME_LIMIT, limit):
         yield limit
-    finally:
-        _TIME_LIMIT.reset(token)
 
 
 def end_work() -> NoReturn:
@@ -125,11 +127,8 @@ def keep_time_limit(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        token = _TIME_LIMIT.set(limit)
-        try:
+        with use_value(_TIME_LIMIT, limit):
             return function(*args, **kwargs)
-        finally:
-            _TIME_LIMIT.reset(token)
 
     return call
 

@@ -1,4 +1,4 @@
-"""Pools of threads, and a replacement on systems without threads, such as Pyodide (Python in a browser)."""
+"""Pools of threads, also where threads cannot be started (Pyodide, Python in a browser), and input for a thread."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 T = TypeVar("T")
 #: Whether threads can be started.
@@ -43,3 +43,15 @@ class _Immediate(Executor):
         except Exception as error:
             future.set_exception(error)
         return future
+
+
+def detach_input() -> BinaryIO:
+    """Return the process's standard input as a binary file, and leave the null device in its place.
+
+    A thread may then read the file while other threads work: on Windows, a library's start-up code waits for standard
+    input while a thread reads it, and the interpreter cannot close `sys.stdin` at exit.
+    """
+    source = os.fdopen(os.dup(0), "rb")
+    with open(os.devnull, "rb") as nothing:
+        os.dup2(nothing.fileno(), 0)
+    return source

@@ -7,8 +7,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
+
+from quasiharmonic.util.progress import use_value
 
 #: Largest number of bytes that a file may decompress to, or that its header may announce, by default.
 MAX_BYTES = 4 << 30
@@ -26,14 +27,9 @@ _GZIP = zlib.MAX_WBITS | 16
 _GIFTI_DATA = re.compile(rb"<Data>([^<]*)</Data>")
 
 
-@contextmanager
-def use_bound(limit: int | None) -> Iterator[None]:
-    """Use another bound than `MAX_BYTES`, such as a limit of memory; None keeps the current bound."""
-    token = _bound.set(_bound.get() if limit is None else limit)
-    try:
-        yield
-    finally:
-        _bound.reset(token)
+def use_bound(limit: int | None) -> AbstractContextManager[None]:
+    """Use another bound than `MAX_BYTES` in a block, such as a limit of memory; None keeps the current bound."""
+    return use_value(_bound, _bound.get() if limit is None else limit)
 
 
 def check_size(size: int, what: str) -> None:

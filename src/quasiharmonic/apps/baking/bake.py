@@ -15,8 +15,7 @@ from quasiharmonic.apps.baking.look import SurfaceLook
 from quasiharmonic.apps.baking.tangents import TangentFrames, tangent_frames
 from quasiharmonic.apps.unwrapping.model_files import add_map
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
-from quasiharmonic.geometry.mesh.nearest_point import NearestPoint
-from quasiharmonic.geometry.mesh.raster import Raster
+from quasiharmonic.geometry.mesh.point_queries import NearestPoint, Raster
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf
 from quasiharmonic.io.looks import read_appearance
 from quasiharmonic.io.mesh_files import read_mesh

@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.io.formats.vertex_data import normals_of
-from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.meshdata import MeshData, normals_of
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 

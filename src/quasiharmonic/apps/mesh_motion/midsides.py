@@ -15,8 +15,7 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
-from quasiharmonic.geometry.mesh.elements import MIDDLES, SIDES
-from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
+from quasiharmonic.geometry.mesh.elements import FORMS, MIDDLES, SIDES, jacobian_coefficients
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run

@@ -10,8 +10,7 @@ import numpy as np
 
 from quasiharmonic.apps.tetrahedra.result import describe_qualities, summarise_qualities
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.elements import corner_triangles, name_elements
-from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients
+from quasiharmonic.geometry.mesh.elements import corner_triangles, jacobian_coefficients, name_elements
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.display import Displayable

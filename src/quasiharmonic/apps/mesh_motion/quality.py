@@ -7,8 +7,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.elements import corner_triangles, element_rows
-from quasiharmonic.geometry.mesh.second_order import jacobian_coefficients, min_jacobian
+from quasiharmonic.geometry.mesh.elements import corner_triangles, element_rows, jacobian_coefficients, min_jacobian
 from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
 
 

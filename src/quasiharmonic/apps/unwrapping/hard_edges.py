@@ -9,10 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.model_files import label_statements
+from quasiharmonic.geometry.mesh.fans import find_representatives
 from quasiharmonic.geometry.mesh.topology import edge_keys
-from quasiharmonic.geometry.mesh.welding import find_representatives
-from quasiharmonic.io.formats.vertex_data import normals_of
-from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.meshdata import MeshData, normals_of
 from quasiharmonic.util.arrays import BoolArray, IntArray
 
 C = TypeVar("C", bound=Callable[..., Any])

@@ -9,7 +9,7 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.geometry.mesh.reference import area_vectors
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
-from quasiharmonic.io.models.materials import label_materials
+from quasiharmonic.io.models.appearance import label_materials
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, mark, pad_to_space
 

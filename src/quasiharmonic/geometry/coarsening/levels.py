@@ -184,8 +184,7 @@ def _rotate_to_apex(rings: IntArray, cost: FloatArray) -> IntArray:
     """Rotate rings (d, r) so that they begin with the vertex of least burden."""
     d, r = rings.shape
     turn = cost.take(rings).argmin(axis=0)
-    turned: IntArray = rings.take((turn + np.arange(d)[:, None]) % d * r + np.arange(r))
-    return turned
+    return rings.take((turn + np.arange(d)[:, None]) % d * r + np.arange(r))
 
 
 def _adds_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[BoolArray]:

@@ -108,11 +108,9 @@ def _candidates(
     clearance /= length[0]
     first_x, first_y = clearance * arm_x[0], clearance * arm_y[0]
     step = np.stack([first_x * x - first_y * y, first_x * y + first_y * x])
-    reinsertion_positions = np.concatenate(
-        [np.multiply.outer(towards, middle - apex), np.multiply.outer(inwards, step)]
-    )
-    reinsertion_positions += apex
-    return reinsertion_positions
+    found = np.concatenate([np.multiply.outer(towards, middle - apex), np.multiply.outer(inwards, step)])
+    found += apex
+    return found
 
 
 def _length(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -185,5 +183,4 @@ def are_positive(w: ComplexArray, T: IntArray) -> BoolArray:
     x, y = corners.real, corners.imag
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])
     area -= (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    are_positive: BoolArray = area > 0
-    return are_positive
+    return area > 0

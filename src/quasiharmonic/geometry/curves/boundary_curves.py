@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,8 +21,8 @@ from quasiharmonic.util.arrays import (
     index_array,
     invert_indices,
     loop_arrays,
-    names_of,
     to_complex,
+    vertex_names,
 )
 
 # Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
@@ -109,24 +110,24 @@ class BoundaryCurves:
 
     def holding(self, vertices: IntArray) -> BoundaryCurves:
         """Return a copy with more fixed vertices, except those in ``on``."""
-        return self._with(self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on)))))
+        return self._copy_with(
+            self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on))))
+        )
 
     def keeping(self, vertices: IntArray) -> BoundaryCurves:
         """Return a copy with more fixed vertices, also such that are in ``on``."""
-        return self._with(self.on, np.union1d(self.fixed, vertices))
+        return self._copy_with(self.on, np.union1d(self.fixed, vertices))
 
     def among(self, used: IntArray) -> BoundaryCurves:
         """Return a copy for a submesh with the given vertices, ascending."""
         known = np.concatenate([index_array("on", list(self.on)), self.fixed])
         absent = np.setdiff1d(known, used)
         if absent.size:
-            raise ValueError(
-                f"the boundary curves refer to {names_of('vertex', 'vertices', absent)}, but no triangle uses them"
-            )
+            raise ValueError(f"the boundary curves refer to {vertex_names(absent)}, but no triangle uses them")
         on = {int(np.searchsorted(used, v)): k for v, k in self.on.items()}
-        return self._with(on, np.searchsorted(used, self.fixed))
+        return self._copy_with(on, np.searchsorted(used, self.fixed))
 
-    def _with(self, on: Mapping[int, int], fixed: IntArray) -> BoundaryCurves:
+    def _copy_with(self, on: Mapping[int, int], fixed: IntArray) -> BoundaryCurves:
         return BoundaryCurves(self.curves, on=on, fixed=fixed, corner_angle=self.corner_angle, tolerance=self.tolerance)
 
     def lay(self, loops: Sequence[IntArray], uv: FloatArray) -> Track:
@@ -198,10 +199,7 @@ class BoundaryCurves:
         check_range("fixed", self.fixed, len(uv))
         inner = np.setdiff1d(assigned, boundary)
         if inner.size:
-            raise ValueError(
-                f"on assigns curves to interior {names_of('vertex', 'vertices', inner)}: only boundary "
-                "vertices can slide"
-            )
+            raise ValueError(f"on assigns curves to interior {vertex_names(inner)}: only boundary vertices can slide")
         only = np.array([self.on.get(int(v), -1) for v in boundary])
         allowed = self.tolerance * max(one.size for one in self.curves)
         curve, s, smallest = np.full(boundary.size, -1), np.zeros(boundary.size), np.full(boundary.size, np.inf)
@@ -211,7 +209,7 @@ class BoundaryCurves:
             too_far = (distance > allowed) & (only[candidates] == k)
             if too_far.any():
                 raise ValueError(
-                    f"on assigns curve {k} to {names_of('vertex', 'vertices', boundary[candidates[too_far]])}, "
+                    f"on assigns curve {k} to {vertex_names(boundary[candidates[too_far]])}, "
                     f"but the distance to it is "
                     f"up to {distance[too_far].max():.3g}, and at most {allowed:.3g} is allowed"
                 )
@@ -307,10 +305,8 @@ class Track:
         return all(chain.in_order(s[part]) for chain, (_, part) in zip(self.chains, self._parts(), strict=True))
 
     def _parts(self) -> list[tuple[Curve, slice]]:
-        ends = self._ends.tolist()
-        return [
-            (chain.curve, slice(first, last)) for chain, first, last in zip(self.chains, ends, ends[1:], strict=False)
-        ]
+        spans = pairwise(self._ends.tolist())
+        return [(chain.curve, slice(*span)) for chain, span in zip(self.chains, spans, strict=True)]
 
 
 def _move_vertices(positions: FloatArray, vertices: IntArray, there: FloatArray) -> None:

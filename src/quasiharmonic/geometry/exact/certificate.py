@@ -49,7 +49,7 @@ from quasiharmonic.util.arrays import (
     ReadOnly,
     count_of,
     make_unchangeable,
-    names_of,
+    vertex_names,
 )
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Verdict
@@ -221,7 +221,7 @@ def certify(
                 crossings, found = check_loops(known, uv)
                 reasons += found
         if multiply_wound.size:
-            text = f"triangles wind more than once around {names_of('vertex', 'vertices', multiply_wound)}"
+            text = f"triangles wind more than once around {vertex_names(multiply_wound)}"
             reasons.append(Reason(Obstacle.MULTIPLY_WOUND, text))
     return Certificate(
         F,
@@ -250,7 +250,7 @@ def inverted_triangles(F: IntArray, uv: FloatArray) -> IntArray:
 def _count_by_kind(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray) -> str:
     """Count and list the non-positive triangles by kind."""
     return ", ".join(
-        f"{bad.size} {'is' if bad.size == 1 else 'are'} {what} ({join_items(bad.tolist())})"
+        f"{count_of('is', 'are', bad.size)} {what} ({join_items(bad.tolist())})"
         for bad, what in ((inverted, "inverted"), (degenerate, "degenerate"), (nonfinite, "not finite"))
         if bad.size
     )

@@ -23,8 +23,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.exact.sweep import triangulate
 from quasiharmonic.geometry.exact.triangles import triangle_signs
+from quasiharmonic.geometry.mesh.polygons import triangulate
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges, label_components, pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, mark, to_integers
 

@@ -7,7 +7,7 @@
   sides and corners included.
 
 For six nodes the determinant is a quadratic form in barycentric coordinates
-(`quasiharmonic.geometry.mesh.second_order`). It must be positive for all non-negative coordinates, so the symmetric
+(`quasiharmonic.geometry.mesh.elements`). It must be positive for all non-negative coordinates, so the symmetric
 matrix C of its control values must be *strictly copositive*. Positive control values are sufficient; positive values at
 the corners are necessary. All other cases are decided without subdivision [1]_ [2]_. On the sides the condition is
 ``cᵢⱼ ≥ 0`` or ``cᵢⱼ² < cᵢᵢ cⱼⱼ``. If the sides pass, C fails if and only if ``det C ≤ 0`` and a column of its adjugate
@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
-from quasiharmonic.geometry.mesh.elements import corner_triangles, element_rows
-from quasiharmonic.geometry.mesh.second_order import FORMS, jacobian_coefficients
+from quasiharmonic.geometry.mesh.elements import FORMS, corner_triangles, element_rows, jacobian_coefficients
 from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, to_integers
 
 # Relative to the product of the extents. Differences, products and at most 36 terms each lose one unit, 2⁻⁵³.

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import (
     SegmentRelation,
@@ -20,10 +19,8 @@ from quasiharmonic.geometry.exact.predicates import (
     segment_relation,
     sure_orientation,
 )
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, repeat_each
 from quasiharmonic.util.kernels import compiled
-
-SignArray = NDArray[np.int8]
 
 # Maximum number of pairs of boundary edges to list. A collapsed boundary has billions.
 _MAX_CROSSINGS = 1000
@@ -146,8 +143,8 @@ def doubtful_pairs(positions: FloatArray, tails: IntArray, heads: IntArray, star
         number += len(found[-1])
         if number > len(pairs):
             return -1
-    join_items = np.concatenate(found)
-    pairs[:number] = join_items[np.lexsort(join_items.T[::-1])]
+    doubtful_ones = np.concatenate(found)
+    pairs[:number] = doubtful_ones[np.lexsort(doubtful_ones.T[::-1])]
     return number
 
 
@@ -249,18 +246,12 @@ def _cross_rays(
 class LoopEdges:
     """Closed curves as one array of edges, loop by loop."""
 
-    start: IntArray
-    """(l + 1,) Where each loop's edges start."""
-    owner: IntArray
-    """(k,) The loop of each edge."""
-    ends: IntArray
-    """(k, 2) Vertices of each edge."""
-    p: FloatArray
-    """(k, 2) Places of the first vertices."""
-    q: FloatArray
-    """(k, 2) Places of the second vertices."""
-    following: IntArray
-    """(k,) The next edge of the same loop."""
+    start: IntArray  # (l + 1,): where each loop's edges start
+    owner: IntArray  # (k,): the loop of each edge
+    ends: IntArray  # (k, 2): vertices of each edge
+    p: FloatArray  # (k, 2): positions of the first vertices
+    q: FloatArray  # (k, 2): positions of the second vertices
+    following: IntArray  # (k,): the next edge of the same loop
 
     @classmethod
     def of(cls, loops: list[IntArray], uv: FloatArray) -> LoopEdges:

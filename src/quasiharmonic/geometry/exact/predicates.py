@@ -29,11 +29,17 @@ from collections.abc import Iterator
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, repeat_each, to_integers
-
-SignArray = NDArray[np.int8]
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    SignArray,
+    invert_indices,
+    repeat_each,
+    to_integers,
+)
 
 # |computed − exact| ≤ (3u + O(u²)) (|l| + |r|) for the determinant l − r,
 # u = 2⁻⁵³ [1]_, and 4u covers the second order and the rounding of the bound itself.
@@ -250,14 +256,10 @@ def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 class SegmentRelation(IntEnum):
     """Kinds of intersections of two closed segments."""
 
-    DISJOINT = 0
-    """No point."""
-    CROSSING = 1
-    """One point, interior to both."""
-    TOUCHING = 2
-    """One point, an end of at least one of them."""
-    OVERLAPPING = 3
-    """A segment of positive length."""
+    DISJOINT = 0  # No point
+    CROSSING = 1  # One point, interior to both
+    TOUCHING = 2  # One point, an end of at least one of them
+    OVERLAPPING = 3  # A segment of positive length
 
 
 def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray) -> SignArray:
@@ -294,8 +296,7 @@ def segment_relation(p: FloatArray, q: FloatArray, r: FloatArray, s: FloatArray)
 
 def _compare_lexically(a: FloatArray, b: FloatArray) -> BoolArray:
     """Lexicographic order of points: by x, then by y."""
-    less: BoolArray = (a[:, 0] < b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] < b[:, 1]))
-    return less
+    return (a[:, 0] < b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] < b[:, 1]))
 
 
 def _in_box(x: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
@@ -381,10 +382,8 @@ def _find_meeting_boxes(one: _BoxTree, other: _BoxTree) -> Iterator[tuple[IntArr
         if level == 0:
             yield i, j
             continue
-        i, j = (
-            np.concatenate([2 * i, 2 * i, 2 * i + 1, 2 * i + 1]),
-            np.concatenate([2 * j, 2 * j + 1, 2 * j, 2 * j + 1]),
-        )
+        i = np.concatenate([2 * i, 2 * i, 2 * i + 1, 2 * i + 1])
+        j = np.concatenate([2 * j, 2 * j + 1, 2 * j, 2 * j + 1])
         if one is other:
             i, j = i[i <= j], j[i <= j]
         for start in range(0, i.size, PAIR_CHUNK):

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import box_pairs, orientation, orientation_or_nonfinite, sure_orientation
 from quasiharmonic.geometry.mesh.polygons import Polygons
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, check_range, repeat_each
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat
-
-SignArray = NDArray[np.int8]
 
 # Triangles per block: bounds the memory, and is large enough to hide the overhead of a block.
 TRIANGLE_CHUNK = 1 << 16

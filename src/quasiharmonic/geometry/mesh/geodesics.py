@@ -179,8 +179,7 @@ def _twins(tail: IntArray, head: IntArray, n: int) -> IntArray:
     key, opposite = tail * n + head, head * n + tail
     order = np.argsort(key)
     index = np.minimum(np.searchsorted(key, opposite, sorter=order), key.size - 1)
-    twin: IntArray = np.where(key[order[index]] == opposite, order[index], -1)
-    return twin
+    return np.where(key[order[index]] == opposite, order[index], -1)
 
 
 def _minimum_lengths(row: IntArray, column: IntArray, length: FloatArray, n: int) -> csr_array:
@@ -194,5 +193,4 @@ def _minimum_lengths(row: IntArray, column: IntArray, length: FloatArray, n: int
 
 
 def _cross(a: ComplexArray, b: ComplexArray) -> FloatArray:
-    product: FloatArray = a.real * b.imag - a.imag * b.real
-    return product
+    return a.real * b.imag - a.imag * b.real

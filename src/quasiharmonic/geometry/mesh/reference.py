@@ -33,9 +33,9 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_range,
     find_exponent,
-    names_of,
     own_triangles,
     pad_to_space,
+    triangle_names,
     vertex_array,
 )
 from quasiharmonic.util.kernels import compiled
@@ -269,7 +269,7 @@ class RestShapes:
         flat = self.flat
         if flat.size:
             raise ValueError(
-                f"{names_of('triangle', 'triangles', flat)} of zero area in the rest mesh: {reason}; remove them with "
+                f"{triangle_names(flat)} of zero area in the rest mesh: {reason}; remove them with "
                 "clean, or use unwrap, which excludes them"
             )
 

@@ -15,8 +15,8 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_bool,
     check_range,
+    edge_array,
     edge_names,
-    index_array,
     triangle_rows,
     vertex_array,
 )
@@ -58,12 +58,10 @@ class Refined:
 
     def extend(self, values: ArrayLike) -> FloatArray:
         """Interpolate values (n, …) at the old vertices to all vertices, linearly on the old triangles."""
-        old = np.asarray(values, dtype=np.float64)
-        if not old.ndim or len(old) != len(self.V) - len(self.parents):
+        old, count = np.asarray(values, dtype=np.float64), len(self.V) - len(self.parents)
+        if not old.ndim or len(old) != count:
             rows = "a number" if not old.ndim else f"{len(old)} rows"
-            raise ValueError(
-                f"values must have {len(self.V) - len(self.parents)} rows, one for each vertex, not {rows}"
-            )
+            raise ValueError(f"values must have {count} rows, one for each vertex, not {rows}")
         return np.concatenate([old, np.einsum("sk,sk...->s...", self.weights, old[self.parents])])
 
 
@@ -100,7 +98,7 @@ def split_edges(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool 
     V, F = vertex_array(V), triangle_rows(F)
     n = len(V)
     check_range("F", F, n)
-    wanted = np.unique(np.sort(_pairs(edges), axis=1), axis=0)
+    wanted = np.unique(np.sort(edge_array("edges", edges), axis=1), axis=0)
     found = sort_edges(F, n)
     allowed = [found.interior, np.sort(found.boundary, axis=1)]
     _check_known(wanted, pair_keys(np.concatenate(allowed), n), n, "not an edge of the mesh")
@@ -159,15 +157,7 @@ def _subdivide(V: FloatArray, F: IntArray, middle: IntArray) -> tuple[IntArray, 
 
 def _length(V: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
     """A quarter of the distances between vertices; the scale prevents overflow."""
-    lengths: FloatArray = np.hypot.reduce(V[i] / 4 - V[j] / 4, axis=1)
-    return lengths
-
-
-def _pairs(edges: ArrayLike) -> IntArray:
-    array = index_array("edges", edges)
-    if array.size and (array.ndim != 2 or array.shape[1] != 2):
-        raise ValueError(f"edges must have shape (k, 2), not {array.shape}")
-    return array.reshape(-1, 2)
+    return np.hypot.reduce(V[i] / 4 - V[j] / 4, axis=1)
 
 
 def _check_known(wanted: IntArray, known: IntArray, n: int, reason: str) -> None:

@@ -20,10 +20,12 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_range,
     edge_names,
+    first_equal,
     make_unchangeable,
-    names_of,
     own_triangles,
     repeat_each,
+    triangle_names,
+    vertex_names,
 )
 from quasiharmonic.util.kernels import compiled
 
@@ -140,8 +142,7 @@ def pair_keys(pairs: IntArray, n: int) -> IntArray:
 
 def are_collapsed(F: IntArray) -> BoolArray:
     """Whether each triangle (f, 3) uses a vertex twice; (f,) bool."""
-    collapsed: BoolArray = (F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0])
-    return collapsed
+    return (F[:, 0] == F[:, 1]) | (F[:, 1] == F[:, 2]) | (F[:, 2] == F[:, 0])
 
 
 def find_twins(F: IntArray) -> IntArray:
@@ -157,11 +158,7 @@ def find_twins(F: IntArray) -> IntArray:
     ordered = np.sort(sums)
     several = np.flatnonzero(np.isin(sums, ordered[1:][ordered[1:] == ordered[:-1]]))
     if several.size:
-        corners = np.sort(F[several], axis=1)
-        order = np.lexsort(corners.T)
-        starts = np.ones(order.size, dtype=bool)
-        starts[1:] = (corners[order[1:]] != corners[order[:-1]]).any(axis=1)
-        twin[several[order]] = several[order[starts]][np.cumsum(starts) - 1]
+        twin[several] = several[first_equal(np.sort(F[several], axis=1))]
     return twin
 
 
@@ -202,11 +199,11 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
         shared = np.unique(tails[1:][tails[1:] == tails[:-1]])
         if shared.size:
             raise ValueError(
-                f"the boundary passes more than once through {names_of('vertex', 'vertices', shared)}; "
+                f"the boundary passes more than once through {vertex_names(shared)}; "
                 "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
             )
         unpaired = np.setxor1d(tails, heads)
-        raise ValueError(f"the boundary does not close at {names_of('vertex', 'vertices', unpaired)}")
+        raise ValueError(f"the boundary does not close at {vertex_names(unpaired)}")
     return np.split(vertices, np.cumsum(lengths[: number - 1])) if number > 1 else [vertices][:number]
 
 
@@ -293,7 +290,7 @@ def surface_edges(F: IntArray, n: int) -> Edges:
         # A vertex without triangle is a component of its own.
         unused = np.setdiff1d(np.arange(n), F)
         if unused.size:
-            raise ValueError(f"{names_of('vertex', 'vertices', unused)}: no triangle uses them; remove them")
+            raise ValueError(f"{vertex_names(unused)}: no triangle uses them; remove them")
     found = manifold_edges(F, n)
     if not found.boundary.size:
         raise ValueError(
@@ -302,7 +299,7 @@ def surface_edges(F: IntArray, n: int) -> Edges:
     if not connected:
         first = np.unique(label)
         raise ValueError(
-            f"the mesh has {first.size} components, the first ones around {names_of('vertex', 'vertices', first)}: "
+            f"the mesh has {first.size} components, the first ones around {vertex_names(first)}: "
             "map each component separately"
         )
     return found
@@ -334,8 +331,8 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
 def _check_triangles(F: IntArray) -> None:
     collapsed = np.flatnonzero(are_collapsed(F))
     if collapsed.size:
-        raise ValueError(f"{names_of('triangle', 'triangles', collapsed)}: a vertex is used twice in a triangle")
+        raise ValueError(f"{triangle_names(collapsed)}: a vertex is used twice in a triangle")
 
     repeats = np.flatnonzero(find_twins(F) < np.arange(len(F)))
     if repeats.size:
-        raise ValueError(f"{names_of('triangle', 'triangles', repeats)} repeated: the same three vertices occur before")
+        raise ValueError(f"{triangle_names(repeats)} repeated: the same three vertices occur before")

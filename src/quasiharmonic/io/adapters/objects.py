@@ -1,7 +1,7 @@
 """Vertices and triangles of a mesh, given as an object of another library, a mapping or a file.
 
-No library is imported: the adapter recognises an object by the attribute names of its positions and faces. It supports
-trimesh, PyVista, meshio, Open3D, vedo, nibabel, SciPy's triangulations and this package's classes.
+To read an object, no library is imported: the adapter recognises it by the attribute names of its positions and faces.
+It supports trimesh, PyVista, meshio, Open3D, vedo, nibabel, SciPy's triangulations and this package's classes.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Number
 from os import PathLike
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
-from quasiharmonic.io.fem.vtk_cells import find_counts
+from quasiharmonic.io.fem.mesh_parts import find_counts
 from quasiharmonic.io.mesh_files import read_mesh, write_mapped
-from quasiharmonic.io.models.cut_seams import seamed
+from quasiharmonic.io.models.mesh_maps import seamed
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import (
@@ -31,6 +31,10 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
     vertex_array,
 )
+from quasiharmonic.util.optional import explain_missing
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 
 class _HasVertices(Protocol):
@@ -339,3 +343,30 @@ def _cut(V: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
     check_range("the faces", corners, len(V))
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     return corners[triangulate_polygons(pad_to_space(V), corners, starts)[0]]
+
+
+def make_trimesh(
+    V: FloatArray, F: IntArray, uv: FloatArray, *, like: Any = None, rows: IntArray | None = None
+) -> Trimesh:
+    """Return a trimesh.Trimesh with the map as texture coordinates; vertices and triangles keep their order.
+
+    A planar mesh is placed at z = 0. From a trimesh.Trimesh ``like``, of whose vertices ``rows`` (n,) were made, come
+    colours and attributes of vertices, attributes of faces, the material and the metadata. ImportError if trimesh is
+    not installed.
+    """
+    with explain_missing("to_trimesh needs trimesh", "trimesh"):
+        import trimesh
+    made = trimesh.Trimesh(vertices=pad_to_space(V), faces=F, process=False)
+    if not isinstance(like, trimesh.Trimesh):
+        made.visual = trimesh.visual.TextureVisuals(uv=uv.copy())  # type: ignore[no-untyped-call]
+        return made
+    visual: Any = like.visual
+    material = getattr(visual, "material", None)
+    made.visual = trimesh.visual.TextureVisuals(uv=uv.copy(), material=material)  # type: ignore[no-untyped-call]
+    colours = visual.vertex_colors if visual.kind == "vertex" else getattr(visual, "vertex_attributes", {}).get("color")
+    if colours is not None:
+        made.visual.vertex_attributes["color"] = np.asarray(colours)[rows]
+    made.vertex_attributes.update({name: np.asarray(of)[rows] for name, of in like.vertex_attributes.items()})
+    made.face_attributes.update({name: np.array(of) for name, of in like.face_attributes.items()})
+    made.metadata.update(like.metadata)
+    return made

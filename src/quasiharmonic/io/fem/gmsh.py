@@ -10,8 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
-from quasiharmonic.io.fem.byte_tables import MeshParts, Table, TableReader, replace_numbers, stack_tables
-from quasiharmonic.io.fem.vtk_cells import SUPPORTED
+from quasiharmonic.io.fem.mesh_parts import SUPPORTED, MeshParts, Table, TableReader, replace_numbers, stack_tables
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.untrusted import check_end
 
@@ -255,9 +254,8 @@ def _groups_of_entities(
 def _nodes_of(kind: int, solid: bool) -> int:
     known = {**_POINTS_AND_LINES, **(_SOLIDS | _SURFACES if solid else _ELEMENTS)}
     if kind not in known:
-        raise ValueError(
-            f"cells of type {_NAMES.get(kind, f'number {kind}')} are not supported: use {SUPPORTED[solid]}"
-        )
+        name = _NAMES.get(kind, f"number {kind}")
+        raise ValueError(f"cells of type {name} are not supported: use {SUPPORTED[solid]}")
     return known[kind]
 
 

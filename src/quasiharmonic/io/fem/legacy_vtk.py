@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
-from quasiharmonic.io.fem.byte_tables import MeshParts, Table, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import elements, find_counts, find_sets
+from quasiharmonic.io.fem.mesh_parts import (
+    MeshParts,
+    Table,
+    TableReader,
+    find_counts,
+    find_sets,
+    replace_numbers,
+    select_elements,
+)
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 _KINDS = {
@@ -78,7 +86,7 @@ class _LegacyReader:
         kinds = self._kinds if self._kinds is not None else np.concatenate([np.empty(0, dtype=np.int64), *lists])
         place = self._points
         corners, begins = np.concatenate(connectivity), np.concatenate(starts)
-        F = elements(corners, begins, kinds, len(place.values), solid)
+        F = select_elements(corners, begins, kinds, len(place.values), solid)
         points = place.values.astype(np.float64)
         change = partial(replace_numbers, self._data, place)
         precision, fields = np.dtype(place.values.dtype.newbyteorder("=")), self._fields
@@ -160,8 +168,10 @@ class _LegacyReader:
         start = self._reader.position
         self._skip(kind, self._count * components)
         if self._of_points is not None and kind.lower() in _KINDS:
+            # In a name, %20 stands for a space.
+            title = unquote_to_bytes(name).decode("utf-8", "replace")
             fields = self._fields[self._of_points]
-            fields[_decode_name(name)] = partial(self._values, start, kind.lower(), components, self._count)
+            fields[title] = partial(self._values, start, kind.lower(), components, self._count)
 
     def _values(self, start: int, kind: bytes, components: int, count: int) -> FloatArray:
         order = None if self._reader.text else ">"
@@ -189,13 +199,6 @@ class _LegacyReader:
         for byte in self._reader.take("u1", more).tolist():
             length = 256 * length + byte
         self._reader.take("u1", length)
-
-
-def _decode_name(name: bytes) -> str:
-    """Decode a name, in which %20 stands for a space."""
-    from urllib.parse import unquote_to_bytes
-
-    return unquote_to_bytes(name).decode("utf-8", "replace")
 
 
 def _text(words: list[bytes]) -> str:

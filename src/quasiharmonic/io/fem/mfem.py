@@ -7,8 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from quasiharmonic.io.fem.byte_tables import MeshParts, Table, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import elements
+from quasiharmonic.io.fem.mesh_parts import MeshParts, TableReader, replace_numbers, select_elements
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.untrusted import check_end
 
@@ -43,7 +42,7 @@ def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
 
     def span(name: bytes) -> tuple[int, int]:
         begin = sections[name]
-        later = [_line_start(plain, other) for other in begins if other > begin]
+        later = [plain.rfind(b"\n", 0, other) + 1 for other in begins if other > begin]
         return begin, later[0] if later else len(plain)
 
     vertices = TableReader(plain, *span(b"vertices"), None)
@@ -54,15 +53,14 @@ def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
     points = np.zeros((count, 3))
     points[:, :axes] = table.values
     begin, end = span(b"elements")
-    F = elements(*_cells([int(word) for word in plain[begin:end].split()]), count, solid)
+    F = select_elements(*_cells([int(word) for word in plain[begin:end].split()]), count, solid)
     cells = {name: plain[slice(*span(name))] for name in (b"boundary", b"elements") if name in sections}
     named = {name: plain[slice(*span(name + b"_sets"))] for name in _SETS if name + b"_sets" in sections}
-    change, find_sets = partial(_replace, data, table, axes), partial(_find_sets, cells, named)
-    return MeshParts(points, F, np.dtype(np.float64), {}, change, find_sets)
 
+    def replace_points(new: FloatArray) -> bytes:
+        return replace_numbers(data, table, new[:, :axes])
 
-def _line_start(data: bytes, position: int) -> int:
-    return data.rfind(b"\n", 0, position) + 1
+    return MeshParts(points, F, np.dtype(np.float64), {}, replace_points, partial(_find_sets, cells, named))
 
 
 def _cells(numbers: list[int]) -> tuple[IntArray, IntArray, IntArray]:
@@ -105,8 +103,3 @@ def _find_sets(cells: dict[bytes, bytes], named: dict[bytes, bytes]) -> dict[str
         for name, members in _SET.findall(text):
             sets[name.decode("utf-8", "replace")] = gather(_SETS[kind], set(map(int, members.split())))
     return sets
-
-
-def _replace(data: bytes, table: Table, axes: int, points: FloatArray) -> bytes:
-    """Return the file with the first coordinates of its vertices replaced."""
-    return replace_numbers(data, table, points[:, :axes])

@@ -14,18 +14,21 @@ import binascii
 import lzma
 import re
 import zlib
-from collections.abc import Callable
+from base64 import b64encode
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, pairwise
+from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.fem.byte_tables import MeshParts, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import elements, find_sets
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.io.fem.mesh_parts import MeshParts, TableReader, find_sets, replace_numbers, select_elements
+from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.untrusted import check_end
 
 _KINDS = {
@@ -45,6 +48,11 @@ _CODERS: dict[str, _Coder] = {
     "vtkZLibDataCompressor": (zlib.compress, zlib.decompressobj),
     "vtkLZMADataCompressor": (lzma.compress, partial(lzma.LZMADecompressor, memlimit=_LZMA_MEMORY)),
 }
+
+# VTK's kinds of cells, by number of nodes; in space, cells of four nodes are tetrahedra.
+_CELL_KINDS = {3: 5, 4: 9, 6: 22}
+_TETRAHEDRON = 10
+_TYPES = {"f": "Float64", "i": "Int64", "u": "UInt8"}
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,7 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
     ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
     connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
     starts = np.concatenate([[0], ends])
-    F = elements(connectivity, starts, kinds, len(place), solid)
+    F = select_elements(connectivity, starts, kinds, len(place), solid)
     fields, of_cells = (
         {name: partial(_rows, file, array, count) for name, array in file.last_arrays(parent).items()}
         for parent, count in (("PointData", file.points), ("CellData", file.cells))
@@ -109,8 +117,8 @@ class _VtuFile:
         # Appended data need not be XML, so parse only the part before.
         head = data if tag is None else data[: tag.end()] + b"</AppendedData></VTKFile>"
         self._parser = ParserCreate()
-        self._parser.StartElementHandler = self._begins
-        self._parser.EndElementHandler = self._ends
+        self._parser.StartElementHandler = self._open_element
+        self._parser.EndElementHandler = self._close_element
         try:
             self._parser.Parse(head, True)
         except ExpatError as error:
@@ -180,7 +188,7 @@ class _VtuFile:
                 whole = whole[: other.tag] + tag + whole[other.begin :]
         return whole
 
-    def _begins(self, name: str, attributes: dict[str, str]) -> None:
+    def _open_element(self, name: str, attributes: dict[str, str]) -> None:
         if name == "VTKFile":
             self._file = attributes
         elif name == "Piece":
@@ -189,11 +197,12 @@ class _VtuFile:
             self._open = attributes, self._parser.CurrentByteIndex
         self._path.append(name)
 
-    def _ends(self, name: str) -> None:
+    def _close_element(self, name: str) -> None:
         self._path.pop()
         if name in ("DataArray", "Array") and self._open is not None:
             attributes, tag = self._open
-            begin = _tag_end(self._data, tag)
+            quoted = _TAG.match(self._data, tag)
+            begin = tag if quoted is None else quoted.end()
             # Child elements with further information may follow the numbers.
             array = _Array(attributes, tag, begin, self._data.find(b"<", begin))
             self._all.append(array)
@@ -205,7 +214,7 @@ class _VtuFile:
 
         Compressed data of more than ``max_bytes`` bytes raise a `ValueError`.
         """
-        begin, raw = self._where(array)
+        begin, raw = self._find_bytes(array)
         take = _take_raw if raw else _take_base64
         size = self._word.itemsize
         if self._coder is None:
@@ -220,9 +229,7 @@ class _VtuFile:
             raise ValueError(f"compressed data have {sum(sizes)} bytes, but at most {max_bytes} are expected")
         packed, end = take(self._data, at, sum(lengths))
         ends = accumulate(lengths, initial=0)
-        whole = b"".join(
-            self._decompress(packed[a:b], size) for (a, b), size in zip(pairwise(ends), sizes, strict=True)
-        )
+        whole = b"".join(self._decompress(packed[a:b], n) for (a, b), n in zip(pairwise(ends), sizes, strict=True))
         return whole, begin, end
 
     def _decompress(self, packed: bytes, size: int) -> bytes:
@@ -240,7 +247,7 @@ class _VtuFile:
 
     def _encode(self, block: bytes, array: _Array) -> bytes:
         """Encode bytes in the same way as an array of the same length in the file."""
-        begin, raw = self._where(array)
+        begin, raw = self._find_bytes(array)
         code: Callable[[bytes], bytes] = bytes if raw else base64.b64encode
         if self._coder is None:
             return code(np.array([len(block)], dtype=self._word).tobytes() + block)
@@ -252,7 +259,7 @@ class _VtuFile:
         header = np.concatenate([head, np.array([len(part) for part in packed], dtype=self._word)])
         return code(header.astype(self._word).tobytes()) + code(b"".join(packed))
 
-    def _where(self, array: _Array) -> tuple[int, bool]:
+    def _find_bytes(self, array: _Array) -> tuple[int, bool]:
         """Return the start of an array's bytes, and whether they are raw."""
         if array.attributes.get("format") != "appended":
             inline = self._data[array.begin : array.end]
@@ -280,7 +287,53 @@ def _take_base64(data: bytes, begin: int, length: int) -> tuple[bytes, int]:
     return found, end
 
 
-def _tag_end(data: bytes, tag: int) -> int:
-    """Return the position after a tag, given the start of the tag."""
-    quoted = _TAG.match(data, tag)
-    return tag if quoted is None else quoted.end()
+def list_series(path: Path, steps: int) -> list[Path]:
+    """Return the paths of a series beside a file: the .pvd file, then a .vtu file for the start and each step."""
+    return [path.with_suffix(".pvd"), *(path.with_name(f"{path.stem}_{k:04d}.vtu") for k in range(steps + 1))]
+
+
+def write_series(paths: list[Path], F: IntArray, frames: Iterable[tuple[FloatArray, FloatArray]]) -> None:
+    """Write one VTU file for the positions (n, d) and the quality (f,) of each frame, then the file that lists them.
+
+    ``paths`` are those of `list_series`; ``F`` are triangles, quadrilaterals, six-node triangles or tetrahedra. Raises
+    OutputError if a file cannot be written.
+    """
+    collection, *parts = paths
+    written = []
+    for path, (points, quality) in zip(parts, frames, strict=False):
+        write_whole(path, _encode_grid(F, points, quality))
+        written.append(path.name)
+    lines = [f'<DataSet timestep="{k}" part="0" file={quoteattr(name)}/>' for k, name in enumerate(written)]
+    text = '<VTKFile type="Collection" version="0.1">\n<Collection>\n' + "\n".join(lines)
+    write_whole(collection, f"{text}\n</Collection>\n</VTKFile>\n".encode())
+
+
+def _encode_grid(F: IntArray, points: FloatArray, quality: FloatArray) -> bytes:
+    space = np.zeros((len(points), 3))
+    space[:, : points.shape[1]] = points
+    sizes = np.full(len(F), F.shape[1])
+    kinds = np.full(len(F), _TETRAHEDRON if points.shape[1] == 3 else _CELL_KINDS[F.shape[1]], dtype=np.uint8)
+    if points.shape[1] == 2 and F.shape[1] == 4:
+        triangular = F[:, 2] == F[:, 3]
+        sizes[triangular], kinds[triangular] = 3, _CELL_KINDS[3]
+    connectivity = F[np.arange(F.shape[1]) < sizes[:, None]]
+    sections = {
+        "Points": _encode_array("positions", space),
+        "Cells": _encode_array("connectivity", connectivity)
+        + _encode_array("offsets", np.cumsum(sizes))
+        + _encode_array("types", kinds),
+        "CellData": _encode_array("quality", quality),
+    }
+    body = "".join(f"<{name}>\n{text}</{name}>\n" for name, text in sections.items())
+    return (
+        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
+        f'<UnstructuredGrid>\n<Piece NumberOfPoints="{len(points)}" NumberOfCells="{len(F)}">\n{body}</Piece>\n'
+        "</UnstructuredGrid>\n</VTKFile>\n"
+    ).encode()
+
+
+def _encode_array(name: str, values: NDArray[np.generic]) -> str:
+    data = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes()
+    components = values.shape[1] if values.ndim == 2 else 1
+    head = f'<DataArray type="{_TYPES[values.dtype.kind]}" Name="{name}" NumberOfComponents="{components}"'
+    return f'{head} format="binary">{b64encode(len(data).to_bytes(8, "little") + data).decode()}</DataArray>\n'

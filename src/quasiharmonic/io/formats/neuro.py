@@ -11,8 +11,7 @@ import gzip
 import os
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
@@ -24,9 +23,11 @@ from numpy.typing import NDArray
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
-from quasiharmonic.io.models.meshdata import MeshData, check_mapped, in_plane, vertex_places
+from quasiharmonic.io.models.mesh_maps import check_mapped, in_plane, vertex_places
+from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.progress import use_value
 from quasiharmonic.util.untrusted import check_gifti, unpack_gzip
 
 # The intents that the standard has for points and triangles.
@@ -213,14 +214,9 @@ _ROWS = np.dtype([("vertex", ">i4"), ("place", ">f4", 3)])
 _given_surface: ContextVar[Path | None] = ContextVar("given_surface", default=None)
 
 
-@contextmanager
-def use_parent_surface(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Read patches in the block with the triangles of a surface in place of the one beside the patch."""
-    token = _given_surface.set(Path(path))
-    try:
-        yield
-    finally:
-        _given_surface.reset(token)
+def use_parent_surface(path: str | os.PathLike[str]) -> AbstractContextManager[None]:
+    """Read patches in a block with the triangles of a surface in place of the one beside the patch."""
+    return use_value(_given_surface, Path(path))
 
 
 def find_parent_surface(path: str | os.PathLike[str]) -> Path | None:

@@ -7,24 +7,29 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.formats.obj_library import list_lost_looks, make_library
+from quasiharmonic.io.formats.gltf.looks import gltf_appearance
+from quasiharmonic.io.formats.gltf.reader import CarriedGltf, material_statements
 from quasiharmonic.io.formats.objlines import REFUSED, read_obj_lines
 from quasiharmonic.io.lowlevel.atomic import no_remains, write_whole
 from quasiharmonic.io.lowlevel.textual import as_text, integer_table, number_table, read_bytes
-from quasiharmonic.io.models.materials import companions, materials_lost, with_libraries, write_material
+from quasiharmonic.io.models.appearance import (
+    Role,
+    SurfaceMaterial,
+    companions,
+    materials_lost,
+    with_libraries,
+    write_material,
+)
 from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
+from quasiharmonic.io.models.textures import Texture, texture_of
 
 # Kinds of line, for the reader that parses all lines of a kind at once.
-_BLANK = 0
-_VERTEX = 1
-_TEXTURE = 2
-_NORMAL = 3
-_FACE = 4
-_STATEMENT = 5
+_BLANK, _VERTEX, _TEXTURE, _NORMAL, _FACE, _STATEMENT = range(6)
 # Lines that this reader would take for statements, but that need the line-by-line reader.
 _KEYWORDS = b"|".join([b"v", b"vt", b"vn", b"f", b"l", b"p", *sorted(REFUSED)])
 _NOT_PLAIN = re.compile(rb"^(?:[\x01-\x20]|(?:" + _KEYWORDS + rb")\s)", re.MULTILINE)
@@ -33,6 +38,8 @@ _FORMS = {b"1": (0,), b"1/1": (0, 1), b"1//1": (0, 2), b"1/1/1": (0, 1, 2)}
 _CHUNK = 100_000
 # Number of first bytes in which the line ending is detected.
 _DETECTED_BYTES = 4096
+# Images that a library can name, and their keywords. Those of metallic-roughness are two images in libraries.
+_IMAGE_KEYWORDS: dict[Role, str] = {"colour": "map_Kd", "emission": "map_Ke", "normal": "norm"}
 
 
 def read_obj(path: str | os.PathLike[str]) -> MeshData:
@@ -67,7 +74,7 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
 
     Numbers are written so that reading them returns the same doubles. The name of a material library (``mtllib``) is
     changed so that the new file refers to the same library. With a texture, two more files are written: a library and
-    an image (`quasiharmonic.io.models.materials.companions`). A mesh that was read from a glTF file gets a library of
+    an image (`quasiharmonic.io.models.appearance.companions`). A mesh that was read from a glTF file gets a library of
     this name, too, and the images of its materials, ``NAME-texture-0.png`` and so on.
 
     Parameters
@@ -99,14 +106,11 @@ def write_obj(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
 
 def not_in_obj(mesh: MeshData) -> list[str]:
     """Return descriptions of the mesh data that an OBJ file will not contain."""
-    lost = materials_lost(mesh)
+    lost, looks = materials_lost(mesh), list_lost_looks(mesh)
     further = [] if mesh.carried is None else mesh.carried.further()
-    looks = list_lost_looks(mesh)
-    return [
-        *lost,
-        *(looks or []),
-        *(what for what in further if what != "materials" or not (lost or looks is not None)),
-    ]
+    if lost or looks is not None:
+        further = [what for what in further if what != "materials"]
+    return [*lost, *(looks or []), *further]
 
 
 def read_regular(path: str | os.PathLike[str], data: bytes) -> MeshData | None:
@@ -276,3 +280,82 @@ def _corner_texts(mesh: MeshData) -> list[str]:
         place = str(b + 1) if b >= 0 else ""
         texts.append(f"{a + 1}/{place}/{c + 1}" if c >= 0 else f"{a + 1}/{place}" if place else f"{a + 1}")
     return texts
+
+
+def make_library(path: str | os.PathLike[str], mesh: MeshData) -> tuple[MeshData, dict[Path, bytes]]:
+    """Return a mesh of a glTF file with statements that name a material library, and the files to write beside it.
+
+    Other meshes, and those with a texture of their own, are returned without files. Images other than PNG and JPEG, and
+    those of further texture coordinates, are left out.
+    """
+    carried = _find_carried(mesh)
+    if carried is None:
+        return mesh, {}
+    images, lines = dict[Path, bytes](), []
+    library = companions(path, Texture(b"", "", ""))[0]
+    named = {name: material for name, material in zip(*_read_materials(carried), strict=True) if name}
+    for name, material in named.items():
+        lines += [b"newmtl " + name, *(line.encode() for line in _describe(material))]
+        for role, keyword in _IMAGE_KEYWORDS.items():
+            if (picture := _find_image(material, role)) is None:
+                continue
+            file = next((known for known, data in images.items() if data == picture.data), None)
+            if file is None:
+                file = library.with_name(f"{library.stem}-{len(images)}{picture.suffix}")
+                images[file] = picture.data
+            lines.append(os.fsencode(f"{keyword} {file.name}"))
+    if not named:
+        return mesh, {}
+    head, at = [os.fsencode(f"mtllib {library.name}")], [-1]
+    if b"usemtl " not in mesh.statements:
+        head, at = [*head, b"usemtl " + next(iter(named))], [-1, 0]
+    made = replace(
+        mesh,
+        statements=b"".join(line + b"\n" for line in head) + mesh.statements,
+        statement_faces=np.concatenate([at, mesh.statement_faces]),
+    )
+    return made, {library: b"".join(line + b"\n" for line in lines), **images}
+
+
+def list_lost_looks(mesh: MeshData) -> list[str] | None:
+    """Return what the library does not have of the materials of a glTF file; None for other meshes."""
+    if (carried := _find_carried(mesh)) is None:
+        return None
+    materials = _read_materials(carried)[1]
+    uses = [(role, one, use) for one in materials for role, use in one.textures.items()]
+    lost = {role for role, one, _ in uses if role not in _IMAGE_KEYWORDS or _find_image(one, role) is None}
+    listed = [f"images of materials for {role.replace('_', '-')}" for role in sorted(lost)]
+    # Few readers of libraries know the options of images.
+    return listed + ["images that do not repeat"] * any(use.wrap != ("repeat", "repeat") for *_, use in uses)
+
+
+def _find_carried(mesh: MeshData) -> CarriedGltf | None:
+    """Return the glTF file of a mesh that still has its triangles, and no texture of its own."""
+    carried = mesh.carried
+    fits = mesh.texture is None and isinstance(carried, CarriedGltf) and carried.fits(mesh)
+    return carried if fits and isinstance(carried, CarriedGltf) else None
+
+
+def _read_materials(carried: CarriedGltf) -> tuple[list[bytes], tuple[SurfaceMaterial, ...]]:
+    """Return the names of the materials that triangles use, empty for the default one, and these materials."""
+    used = dict.fromkeys(part.entry(carried.document).get("material") for part in carried.parts)
+    statements = material_statements(carried.document.tree)
+    names = [b"" if k is None else statements[k].split(None, 1)[1].strip() for k in used]
+    return names, gltf_appearance(carried).materials
+
+
+def _find_image(material: SurfaceMaterial, role: Role) -> Texture | None:
+    """Return an image that a library can name."""
+    use = material.textures.get(role)
+    return None if use is None or use.channel or use.image.data is None else texture_of(use.image.data)
+
+
+def _describe(material: SurfaceMaterial) -> list[str]:
+    """Return the entries of a library on the factors of a material."""
+    red, green, blue, opacity = material.colour
+    entries = [f"Kd {red!r} {green!r} {blue!r}", f"Pr {material.roughness!r}", f"Pm {material.metallic!r}"]
+    if material.alpha_mode != "OPAQUE":
+        entries.append(f"d {opacity!r}")
+    if any(material.emission):
+        entries.append("Ke " + " ".join(map(repr, material.emission)))
+    return entries

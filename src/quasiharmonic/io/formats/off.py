@@ -20,7 +20,8 @@ from quasiharmonic.io.lowlevel.textual import (
     quote_token,
     read_text,
 )
-from quasiharmonic.io.models.meshdata import MeshData, in_plane, polygon_mesh
+from quasiharmonic.io.models.mesh_maps import in_plane
+from quasiharmonic.io.models.meshdata import MeshData, polygon_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Texture coordinates, colours and normals follow the coordinates, so the reader can skip them.
@@ -136,11 +137,7 @@ def _read_lines(
     if len(starts) <= faces:
         have = f"{len(V) // 3} of {vertices} vertices and {len(starts) - 1} of {faces} faces"
         raise MeshFileError(path, f"ends after {have}", remedy="it was cut off, or its counts are wrong")
-    return (
-        np.array(V, dtype=np.float64).reshape(-1, 3),
-        np.array(corners, dtype=np.int64),
-        np.array(starts, dtype=np.int64),
-    )
+    return np.array(V).reshape(-1, 3), np.array(corners), np.array(starts)
 
 
 def _ring(path: str | os.PathLike[str], line: int, text: bytes, vertices: int) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,10 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import report_damage
 from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables, parse_tables
-from quasiharmonic.io.formats.vertex_data import colours_of, normal_lines, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.lowlevel.textual import read_bytes
-from quasiharmonic.io.models.meshdata import Carried, MeshData, polygon_mesh, vertex_places, with_corner_map
+from quasiharmonic.io.models.mesh_maps import vertex_places, with_corner_map
+from quasiharmonic.io.models.meshdata import Carried, MeshData, colours_of, normal_lines, normals_of, polygon_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 
 # Property names of texture coordinates, at vertices and at the corners of faces.
@@ -33,14 +34,7 @@ class CarriedPly(Carried):
     tables: PlyTables
 
     def further(self) -> list[str]:
-        read = {
-            *("x", "y", "z"),
-            *_COLOUR,
-            *_NORMAL,
-            *_RINGS,
-            _CORNER_PLACES,
-            *(name for pair in _PLACES for name in pair),
-        }
+        read = {"x", "y", "z", *_COLOUR, *_NORMAL, *_RINGS, _CORNER_PLACES, *chain(*_PLACES)}
         return [
             f"{column.name} of {element.name}"
             for element in self.tables.elements
@@ -94,7 +88,8 @@ def write_ply(path: str | os.PathLike[str], mesh: MeshData, *, durable: bool = T
     if not mesh.lower_maps:
         tables = _with_places(tables, mesh)
     elif len(mesh.lower_maps) == 1:
-        tables = _with_second_places(_with_places(tables, with_corner_map(mesh, mesh.lower_maps[0])), mesh)
+        tables = _with_places(tables, with_corner_map(mesh, mesh.lower_maps[0]))
+        tables = _replace_columns(tables, "face", {_SECOND_PLACES}, [_corner_places(mesh, _SECOND_PLACES)])
     else:
         raise ValueError("PLY files have two texture coordinates at most: write .glb")
     write_whole(path, encode_tables(tables), durable=durable)
@@ -186,33 +181,26 @@ def _read_places(
 
 def _with_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
     """Return the tables with the texture coordinates of a mesh."""
-    elements = []
     vt, seam = vertex_places(mesh)
     scattered = bool(seam.any()) or (mesh.FT is not None and bool((mesh.FT < 0).any()))
-    for element in tables.elements:
-        columns = list(element.columns)
-        if element.name == "vertex":
-            old = {name for names in _PLACES for name in names if _table(element, *names) is not None}
-            columns = [column for column in columns if column.name not in old]
-            if mesh.FT is not None and not scattered:
-                # Vertices that no face uses have NaN, which readers may not accept.
-                columns += [Column(name, np.nan_to_num(vt[:, i])) for i, name in enumerate(_PLACES[0])]
-        elif element.name == "face":
-            columns = [column for column in columns if column.name != _CORNER_PLACES]
-            if scattered:
-                columns.append(_corner_places(mesh))
-        elements.append(replace(element, columns=tuple(columns)))
-    return replace(tables, elements=tuple(elements))
+    vertex = tables.find("vertex")
+    old = {name for names in _PLACES for name in names if vertex is not None and _table(vertex, *names) is not None}
+    of_vertices = []
+    if mesh.FT is not None and not scattered:
+        # Vertices that no face uses have NaN, which readers may not accept.
+        of_vertices = [Column(name, np.nan_to_num(vt[:, i])) for i, name in enumerate(_PLACES[0])]
+    tables = _replace_columns(tables, "vertex", old, of_vertices)
+    return _replace_columns(tables, "face", {_CORNER_PLACES}, [_corner_places(mesh)] if scattered else [])
 
 
-def _with_second_places(tables: PlyTables, mesh: MeshData) -> PlyTables:
-    """Return the tables with the texture coordinates of a mesh as the second ones."""
+def _replace_columns(tables: PlyTables, name: str, old: set[str], new: list[Column]) -> PlyTables:
+    """Return the tables with other columns of the element of a name: without some, and with new ones at the end."""
     elements = []
     for element in tables.elements:
-        columns = [column for column in element.columns if column.name != _SECOND_PLACES]
-        if element.name == "face":
-            columns.append(_corner_places(mesh, _SECOND_PLACES))
-        elements.append(replace(element, columns=tuple(columns)))
+        if element.name == name:
+            kept = [column for column in element.columns if column.name not in old]
+            element = replace(element, columns=(*kept, *new))
+        elements.append(element)
     return replace(tables, elements=tuple(elements))
 
 
@@ -234,8 +222,7 @@ def read_second_places(mesh: MeshData, carried: CarriedPly) -> FloatArray | None
     keys = repeat_each(np.arange(len(sizes)), sizes) * len(mesh.V) + mesh.F.ravel()[mesh.rings.corners]
     order = np.argsort(keys)
     wanted = mesh.rings.of_triangle[:, None] * len(mesh.V) + mesh.F
-    found: FloatArray = pairs[order[np.searchsorted(keys[order], wanted)]]
-    return found
+    return pairs[order[np.searchsorted(keys[order], wanted)]]
 
 
 def _corner_places(mesh: MeshData, name: str = _CORNER_PLACES) -> Column:

@@ -139,10 +139,10 @@ class _PlyReader(ABC):
 
     def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
         """Return the next table."""
-        return self._alike(rows, properties) or self._one_by_one(rows, properties)
+        return self._read_at_once(rows, properties) or self._read_row_by_row(rows, properties)
 
     @abstractmethod
-    def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
+    def _read_at_once(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
         """Return the next table if it can be read at once, else None."""
 
     @abstractmethod
@@ -157,7 +157,7 @@ class _PlyReader(ABC):
     def _join(self, parts: list[Any], kind: str) -> NDArray[Any]:
         """Return the numbers of several results of `_take`."""
 
-    def _one_by_one(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
+    def _read_row_by_row(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
         """Return the next table, read row by row."""
         parts: list[list[Any]] = [[] for _ in properties]
         sizes: list[list[int]] = [[] for _ in properties]
@@ -179,7 +179,7 @@ class _BinaryReader(_PlyReader):
     def __init__(self, data: bytes, at: int, order: str) -> None:
         self._data, self._at, self._order = data, at, order
 
-    def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
+    def _read_at_once(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
         """Return the next table if all its lists are as long as those of its first row, else None."""
         sizes = self._first_sizes(properties) if rows else [0] * len(properties)
         fields: list[Any] = []
@@ -236,7 +236,7 @@ class _TextReader(_PlyReader):
         self._numbers = np.array(list(map(float, text.split())), dtype=np.float64)
         self._at = 0
 
-    def _alike(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
+    def _read_at_once(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
         """Return the next table if it has no lists, or a single column of lists that are all as long as the first."""
         if all(of.count is None for of in properties):
             numbers = self._take("f8", rows * len(properties)).reshape(rows, -1)

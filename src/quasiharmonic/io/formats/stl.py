@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.fans import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
-from quasiharmonic.io.formats.vertex_data import weld
 from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray
@@ -39,19 +39,19 @@ def read_stl(path: str | os.PathLike[str]) -> MeshData:
     """
     data = read_bytes(path)
     # The header of a binary file may start with "solid" too, so its length decides.
-    corners = _binary(data)
+    corners = _read_binary(data)
     if corners is None:
-        corners = _text(data)
+        corners = _read_text(data)
     if corners is None:
         raise MeshFileError(path, "is not a text or binary STL file, or is cut off")
     if not len(corners):
         raise MeshFileError(path, "has no triangles", remedy="give a mesh with triangles")
-    V, F = weld(corners.reshape(-1, 3))
+    V, F = weld_points(corners.reshape(-1, 3))
     with report_damage(path):
         return MeshData(V, F.reshape(-1, 3), source=os.fspath(path))
 
 
-def _binary(data: bytes) -> FloatArray | None:
+def _read_binary(data: bytes) -> FloatArray | None:
     """Return the corners (f, 3, 3) of a binary file; None if its length does not match its header."""
     count = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
     if len(data) < _HEADER or len(data) != _HEADER + count * _FACET.itemsize:
@@ -61,7 +61,7 @@ def _binary(data: bytes) -> FloatArray | None:
         return np.frombuffer(data, _FACET, offset=_HEADER)["corners"].astype(np.float64)
 
 
-def _text(data: bytes) -> FloatArray | None:
+def _read_text(data: bytes) -> FloatArray | None:
     """Return the corners (f, 3, 3) of a text file; None if it is not STL text or a facet is malformed."""
     if data[:512].lstrip()[:5].lower() != b"solid" or b"endsolid" not in data.lower():
         return None

@@ -1,15 +1,17 @@
-"""The contents of a mesh file, and the map in it."""
+"""The contents of a mesh file, also after some of its edges were split.
+
+Normals are OBJ lines, and colours are numbers after the coordinates, whatever the format of the file.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.polygons import Polygons, triangulate_polygons
-from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.models.textures import Texture
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import (
@@ -18,14 +20,15 @@ from quasiharmonic.util.arrays import (
     check_finite,
     check_range,
     corner_rows,
-    find_exponent,
     map_array,
-    mark,
-    names_of,
     pad_to_space,
+    repeat_each,
     triangle_rows,
     vertex_array,
 )
+
+if TYPE_CHECKING:
+    from quasiharmonic.geometry.mesh.refinement import Refined
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,119 +221,95 @@ def polygon_mesh(
     )
 
 
-def with_corner_map(mesh: MeshData, corners: FloatArray) -> MeshData:
-    """Return a mesh with texture coordinates (f, 3, 2) of its corners, NaN for none; equal ones of a vertex are one."""
-    known = ~np.isnan(corners[:, :, 0])
-    rows = np.column_stack([mesh.F[known], corners[known] + 0.0])
-    unique, which = np.unique(rows, axis=0, return_inverse=True)
-    FT = np.full(mesh.F.shape, -1)
-    FT[known] = which.reshape(-1)
-    return replace(mesh, vt=unique[:, 1:], FT=FT, map_lines=None, lower_maps=())
+def refined_mesh(mesh: MeshData, refined: Refined, uv: FloatArray) -> tuple[MeshData, IntArray]:
+    """Transfer all data of a mesh file to a refinement of the mesh.
 
-
-def vertex_places(mesh: MeshData) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the texture coordinates of every vertex, and which vertices are on a seam.
-
-    Returns
-    -------
-    uv : (n, 2) float64
-        Texture coordinates of each vertex; NaN if no face gives it any. At a seam, one of its texture coordinates.
-    seam : (n,) bool
-        Whether the vertex has more than one texture coordinate. Equal numbers under different indices count as one.
-    """
-    uv = np.full((len(mesh.V), 2), np.nan)
-    seam = np.zeros(len(mesh.V), dtype=np.bool_)
-    if mesh.vt is not None and mesh.FT is not None and np.array_equal(mesh.FT, mesh.F):
-        uv[mesh.F] = mesh.vt[mesh.F]
-        return uv, seam
-    places = mesh.corner_uv
-    given = ~np.isnan(places[:, :, 0])
-    vertex, place = mesh.F[given], places[given]
-    uv[vertex] = place
-    seam[vertex[(uv[vertex] != place).any(axis=1)]] = True
-    return uv, seam
-
-
-def map_of(mesh: MeshData) -> FloatArray:
-    """Return the map of a mesh: a position in the plane for every vertex.
-
-    The map is the texture coordinates. For a planar mesh without texture coordinates, it is the vertex positions.
+    The given vertices keep their indices, and new vertices follow. The parts of a triangle replace it in order, so they
+    stay in its group and keep its material. Colours of new vertices are interpolated. Triangles that were split lose
+    their normals. A polygon is replaced by triangles if one of its triangles was split.
 
     Parameters
     ----------
     mesh : MeshData
-        A mesh whose map has no seams.
+        The given mesh.
+    refined : Refined
+        Its refinement.
+    uv : (n, 2) float64
+        Positions of the given vertices in the plane.
 
     Returns
     -------
-    (n, 2) float64
-        The map; NaN at vertices that no face uses.
-
-    Raises
-    ------
-    MeshFileError
-        If the mesh has no map, has it on some faces only, or has seams, that is, vertices with several positions. The
-        message names the first such elements.
+    mesh : MeshData
+        The refined mesh, with the same map.
+    parent : (f,) int64
+        The given triangle that contains each new triangle, ascending.
     """
-    check_mapped(mesh)
-    if mesh.FT is None:
-        return mesh.V[:, :2].copy()
-    uv, seam = vertex_places(mesh)
-    if seam.any():
-        torn = names_of("vertex", "vertices", np.flatnonzero(seam))
-        raise MeshFileError(
-            mesh.source,
-            f"more than one pair of texture coordinates for {torn} (0-based)",
-            remedy="split the vertices along the seams of the map",
-        )
-    return uv
+    order = np.argsort(refined.parent, kind="stable")
+    parent, F = refined.parent[order], refined.F[order]
+    normals = None
+    if mesh.FN is not None:
+        unsplit = np.bincount(parent, minlength=len(mesh.F))[parent] == 1
+        normals = np.where(unsplit[:, None], mesh.FN[parent], -1)
+    before = mesh.statement_faces
+    polygons, first = _refine_polygons(mesh, parent)
+    new = replace(
+        mesh,
+        V=refined.V,
+        F=F,
+        vt=refined.extend(uv),
+        FT=F,
+        extra=None if mesh.extra is None else refined.extend(mesh.extra),
+        FN=normals,
+        polygons=polygons,
+        statement_faces=np.where(before < 0, before, first[before]),
+    )
+    return new, parent
 
 
-def in_plane(mesh: MeshData) -> MeshData:
-    """Return the map of a mesh as a mesh in the plane z = 0; errors as `map_of`.
+def _refine_polygons(mesh: MeshData, parent: IntArray) -> tuple[Polygons | None, IntArray]:
+    """Return the file's faces after some of its triangles were split, None if all are triangles.
 
-    A vertex that no face uses gets the row of ``vt`` with its own index if ``vt`` has one row per vertex, and zero
-    otherwise.
+    ``parent`` (f,) is the given triangle that contains each new triangle, ascending. The second result is the first new
+    face of each given face, then the number of new faces.
     """
-    uv = map_of(mesh)
-    idle = np.isnan(uv).any(axis=1)
-    uv[idle] = mesh.vt[idle] if mesh.vt is not None and len(mesh.vt) == len(uv) else 0.0
-    return mesh.as_plane(uv)
+    old = mesh.rings
+    face = old.of_triangle[parent]
+    count = np.bincount(face, minlength=len(old))
+    unsplit = count == old.sizes - 2
+    first = np.concatenate([[0], np.cumsum(np.where(unsplit, 1, count))])
+    # Unsplit faces keep their rings, with the new indices of their triangles. Each triangle of a split face is a ring.
+    unsplit_corners = repeat_each(unsplit, old.sizes)
+    triangle, corner = np.divmod(old.corners[unsplit_corners], 3)
+    rings = 3 * np.searchsorted(parent, triangle) + corner
+    place = first[repeat_each(np.arange(len(old)), old.sizes)[unsplit_corners]]
+    split = np.flatnonzero(~unsplit[face])
+    among = split - np.searchsorted(face, face[split])
+    corners = np.concatenate([rings, (3 * split[:, None] + np.arange(3)).ravel()])
+    places = np.concatenate([place, np.repeat(first[face[split]] + among, 3)])
+    starts = np.concatenate([[0], np.cumsum(np.bincount(places, minlength=first[-1]))])
+    polygons = Polygons(corners[np.argsort(places, kind="stable")], starts)
+    return (None if (polygons.sizes == 3).all() else polygons), first
 
 
-def is_planar(points: FloatArray) -> bool:
-    """Return whether points (n, 3) lie in a plane z = constant, up to rounding to single precision."""
-    # Scaling by a power of two avoids overflow in differences of the largest doubles.
-    exponent = find_exponent(points)
-    extent = np.ptp(np.ldexp(points, -exponent - 1), axis=0)
-    return bool(extent[2] <= 1e-6 * extent[:2].max())
+def normal_lines(normals: FloatArray) -> bytes:
+    """Return normals (k, 3) as lines of an OBJ file."""
+    return ("vn %r %r %r\n" * len(normals) % tuple(normals.ravel().tolist())).encode()
 
 
-def has_map(mesh: MeshData) -> bool:
-    """Return whether a mesh has texture coordinates on some faces, or is planar."""
-    return mesh.FT is not None or _is_flat(mesh)
+def normals_of(mesh: MeshData) -> FloatArray | None:
+    """Return all normals (k, 3) of a mesh; None if a corner has none, or a line has anything but three numbers."""
+    if mesh.FN is None or (mesh.FN < 0).any():
+        return None
+    try:
+        rows = [[float(word) for word in line.split(b"#")[0].split()[1:]] for line in mesh.normals.splitlines()]
+        return np.array(rows, dtype=np.float64).reshape(len(rows), 3)
+    except ValueError:
+        return None
 
 
-def _is_flat(mesh: MeshData) -> bool:
-    """Return whether the vertices that triangles use lie in a plane z = constant."""
-    used = mark(len(mesh.V), mesh.F)
-    return is_planar(mesh.V) or (not used.all() and bool(used.any()) and is_planar(mesh.V[used]))
-
-
-def check_mapped(mesh: MeshData) -> None:
-    """Raise `MeshFileError` if a mesh has no map, or has it on some faces only."""
-    if mesh.FT is None:
-        if not _is_flat(mesh):
-            raise MeshFileError(
-                mesh.source,
-                "has no map: the mesh has no texture coordinates and is not planar",
-                remedy="export it with uv coordinates",
-            )
-        return
-    bare = np.flatnonzero((mesh.FT < 0).any(axis=1))
-    if bare.size:
-        raise MeshFileError(
-            mesh.source,
-            f"{names_of('face', 'faces', bare)} (0-based) without texture coordinates, which other faces have",
-            remedy="map the whole mesh, or remove these faces",
-        )
+def colours_of(mesh: MeshData) -> FloatArray | None:
+    """Return colours of vertices from 0 to 1, with or without opacity; None unless all vertices have one."""
+    extra = mesh.extra
+    if extra is None or extra.shape[1] not in (3, 4) or not ((extra >= 0) & (extra <= 1)).all():
+        return None
+    return extra

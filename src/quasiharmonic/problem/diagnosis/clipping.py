@@ -3,6 +3,8 @@
 All lines pass through two points of the target, and all points are intersections of two of these lines. Both have
 homogeneous integer coordinates, so every sign is exact. The size of the numbers is bounded: after any number of cuts, a
 corner is the intersection of two of the original lines.
+
+All such work has a common budget of time, `Effort`.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from quasiharmonic.problem.diagnosis.effort import Effort
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat
 
 Point = tuple[int, int]
 Line = tuple[int, int, int]
@@ -170,7 +172,7 @@ class Walls:
             blocking = list(blocking)
             for k, eye in enumerate(eyes):
                 if k == len(blocking):
-                    blocking.append(self._facing(eye, walls))
+                    blocking.append(self._walls_facing(eye, walls))
                 if len(blocking[k]):
                     parts, blocking[k] = self._split(area, approximate, eye, blocking[k])
                 if parts is not None:
@@ -186,7 +188,7 @@ class Walls:
         inside = (self._low[0] <= x1) & (self._high[0] >= x0) & (self._low[1] <= y1) & (self._high[1] >= y0)
         return self._ends[inside]
 
-    def _facing(self, eye: int, walls: IntArray) -> IntArray:
+    def _walls_facing(self, eye: int, walls: IntArray) -> IntArray:
         """Return walls ordered from right to left as seen from an eye, without those that end at it; (m, 2) int64."""
         ends = walls[(walls[:, 0] != eye) & (walls[:, 1] != eye)]
         p, q = self._lattice.approximate[ends.T] - self._lattice.approximate[eye]
@@ -237,5 +239,23 @@ def _view_past(area: Convex, eye: Point, p: Point, q: Point) -> list[Convex] | N
 
 def cross(u: FloatArray, v: FloatArray) -> FloatArray:
     """Return cross products along the last axis; the other axes are broadcast."""
-    product: FloatArray = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-    return product
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+class EffortSpentError(Exception):
+    """The budget is exhausted."""
+
+
+@dataclass
+class Effort:
+    """A budget of time, and the amount spent so far, in units of about a microsecond."""
+
+    limit: int
+    spent: int = 0
+
+    def spend(self, amount: int) -> None:
+        """Spend an amount before the work; raise `EffortSpentError`, now and later, if the budget is exhausted."""
+        heartbeat()
+        self.spent += amount
+        if self.spent > self.limit:
+            raise EffortSpentError

@@ -12,21 +12,21 @@ from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.objects import MeshLike
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis.curves import Corners, TargetCurves
-from quasiharmonic.problem.diagnosis.defects import (
+from quasiharmonic.problem.diagnosis.clipping import Effort, EffortSpentError
+from quasiharmonic.problem.diagnosis.conditions import (
+    Sight,
+    bad_chords,
     collapsed_edges,
     half_planes,
     inverted_fixed_triangles,
     inverted_patches,
     misplaced_pins,
 )
-from quasiharmonic.problem.diagnosis.effort import Effort, EffortSpentError
-from quasiharmonic.problem.diagnosis.fixture import Fixture, stars
-from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction, vertex_names
+from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture, TargetCurves, stars
+from quasiharmonic.problem.diagnosis.obstruction import Diagnosis, Forbids, Kind, Obstruction
 from quasiharmonic.problem.diagnosis.shortcuts import Shortcuts
-from quasiharmonic.problem.diagnosis.sight import Sight, bad_chords
 from quasiharmonic.problem.diagnosis.witness import find_unplaced
-from quasiharmonic.util.arrays import IntArray, edge_names, names_of
+from quasiharmonic.util.arrays import IntArray, count_of, edge_names, names_of, vertex_names
 
 # Budget for the visibility checks of free vertices, in about microseconds. Vertices beyond it are not checked.
 MAX_EFFORT = 3_000_000
@@ -199,11 +199,11 @@ def _loop_obstructions(problem: Problem, curves: TargetCurves, euler: int, area:
         fewer = sum(turning) < euler
         message = (
             f"The target's loops turn {sum(turning)} times in total, "
-            f"and {'at least ' if fewer else ''}{euler} {'is' if euler == 1 else 'are'} needed for this surface."
+            f"and {'at least ' if fewer else ''}{count_of('is', 'are', euler)} needed for this surface."
         )
         forbids = Forbids.INJECTIVE if fewer else Forbids.UNBRANCHED
         yield Obstruction(Kind.TURNING_NUMBER, forbids, message, loops=every)
-    yield from _meetings(curves)
+    yield from _find_crossings(curves)
 
 
 def _find_misnested(curves: TargetCurves, euler: int) -> Obstruction:
@@ -224,7 +224,7 @@ def _find_misnested(curves: TargetCurves, euler: int) -> Obstruction:
     return Obstruction(Kind.NESTING, forbids, message, loops=wrong)
 
 
-def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
+def _find_crossings(curves: TargetCurves) -> Iterator[Obstruction]:
     """Yield obstructions where the curves fold, cross or touch; they forbid bijective maps only."""
     if curves.folds.size:
         message = f"At the boundary {vertex_names(curves.folds)} the target folds back onto itself."
@@ -238,7 +238,7 @@ def _meetings(curves: TargetCurves) -> Iterator[Obstruction]:
         crossing = bool((relation[here] == SegmentRelation.CROSSING).any())
         who = f"{_loop_names(np.array([a])).capitalize()} of the target"
         whom = "itself" if a == b else f"loop {b}"
-        count = f"{'' if meet.complete else 'at least '}{here.sum()} {'pair' if here.sum() == 1 else 'pairs'} of edges"
+        count = ("" if meet.complete else "at least ") + count_of("pair of edges", "pairs of edges", int(here.sum()))
         involved = curves.ends[pairs[here]].reshape(-1, 2)
         message = (
             f"{who} {'crosses' if crossing else 'touches'} {whom} ({count}), among them "

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quasiharmonic.util.arrays import IntArray, ReadOnly, names_of
+from quasiharmonic.util.arrays import IntArray, ReadOnly, count_of
 from quasiharmonic.util.display import Displayable
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ class Diagnosis(Displayable):
                 lines.append(f"- … and {len(same) - most} more of this kind")
             lines.append(f"  {kind.value}")
         if len(self.split):
-            edges = f"{len(self.split)} {'edge' if len(self.split) == 1 else 'edges'}"
+            edges = count_of("edge", "edges", len(self.split))
             lines.append(f"Splitting {edges} may help: refine_problem, or qhm refine on the command line.")
         lines += [f"Not checked: {text}" for text in self.unchecked]
         return "\n".join(lines)
@@ -228,8 +228,3 @@ def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list
         end = high - 1
         chosen.insert(0, end)
     return chosen
-
-
-def vertex_names(vertices: IntArray) -> str:
-    """Return text that names the first few of some vertices."""
-    return names_of("vertex", "vertices", vertices)

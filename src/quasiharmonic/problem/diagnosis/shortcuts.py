@@ -29,14 +29,13 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import csr_array
 
-from quasiharmonic.geometry.exact.sweep import triangulate
+from quasiharmonic.geometry.mesh.polygons import triangulate
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import MARGIN, Rounding, join
-from quasiharmonic.problem.diagnosis.curves import Corners
-from quasiharmonic.problem.diagnosis.fixture import Fixture
-from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction, vertex_names
+from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture
+from quasiharmonic.problem.diagnosis.obstruction import Forbids, Kind, Obstruction
 from quasiharmonic.problem.diagnosis.witness import clear
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, vertex_names
 from quasiharmonic.util.progress import heartbeat
 
 Point = tuple[int, int, int]
@@ -48,16 +47,6 @@ _NOWHERE: Point = (0, 0, 0)
 _CORNERS_PER_STEP = 100
 # Largest number of edges between the vertices of a pair to check.
 LONGEST = 8
-# Limit on the steps in the triangulated target, of some microseconds each: a constant,
-_WORK = 50_000
-# and a number per boundary vertex.
-_WORK_PER_VERTEX = 10
-# Limit on the pairs to collect.
-_MAX_PAIRS = 10_000_000
-# Offsets of trial points from the midpoint of two corners, as multiples of half their distance.
-_BESIDE = 0.05, 0.3, 1.0, -0.05, -0.3
-# Limit on the pairs of a segment and a nearby edge to check, for each call of `clear`.
-_MAX_NEAR_PAIRS = 1_000_000
 
 
 class Polygon:
@@ -249,6 +238,17 @@ class Shortcuts:
     are ``unchecked`` or more edges apart were checked.
     """
 
+    # Limit on the steps in the triangulated target, of some microseconds each: a constant,
+    _WORK = 50_000
+    # and a number per boundary vertex.
+    _WORK_PER_VERTEX = 10
+    # Limit on the pairs to collect.
+    _MAX_PAIRS = 10_000_000
+    # Offsets of trial points from the midpoint of two corners, as multiples of half their distance.
+    _BESIDE = 0.05, 0.3, 1.0, -0.05, -0.3
+    # Limit on the pairs of a segment and a nearby edge to check, for each call of `clear`.
+    _MAX_NEAR_PAIRS = 1_000_000
+
     def __init__(self, problem: Problem, fixture: Fixture, corners: Corners) -> None:
         self._loop = problem.domain.loops[0]
         free, place = fixture.joined[:, 0], invert_indices(problem.n, self._loop)[fixture.joined[:, 1]]
@@ -265,11 +265,11 @@ class Shortcuts:
     def find(self) -> Iterator[Obstruction]:
         """Yield obstructions of vertex pairs with fewer edges than segments between them, nearest pairs first."""
         n = len(self._loop)
-        budget = _WORK + _WORK_PER_VERTEX * n
+        budget = self._WORK + self._WORK_PER_VERTEX * n
         reached, known = self._ends, np.empty(0, dtype=np.int64)
         at_ends = np.bincount(self._ends.indices, minlength=self._ends.shape[1])
         for k in range(2, LONGEST + 1):
-            if at_ends @ np.bincount(reached.indices, minlength=reached.shape[1]) > _MAX_PAIRS:
+            if at_ends @ np.bincount(reached.indices, minlength=reached.shape[1]) > self._MAX_PAIRS:
                 self.unchecked = k
                 return
             pairs = (reached @ self._ends.T).tocoo()
@@ -312,15 +312,15 @@ class Shortcuts:
         inward = np.where((j - i) % n < (i - j) % n, 1.0, -1.0)
         dx, dy = (q / 2 - p / 2).T
         left = np.stack([-dy * inward, dx * inward], axis=1)
-        for height in _BESIDE:
+        for height in self._BESIDE:
             left_over = np.flatnonzero(~result)
             if not left_over.size:
                 break
             with np.errstate(over="ignore"):
-                index = p[left_over] / 2 + q[left_over] / 2 + height * left[left_over]
-            once = self._clear(tails[left_over], None, p[left_over], index)
-            left_over, index = left_over[once], index[once]
-            result[left_over] = self._clear(heads[left_over], None, q[left_over], index)
+                trial = p[left_over] / 2 + q[left_over] / 2 + height * left[left_over]
+            once = self._clear(tails[left_over], None, p[left_over], trial)
+            left_over, trial = left_over[once], trial[once]
+            result[left_over] = self._clear(heads[left_over], None, q[left_over], trial)
         return result
 
     def _clear(self, tails: IntArray, heads: IntArray | None, p: FloatArray, q: FloatArray) -> BoolArray:
@@ -331,7 +331,7 @@ class Shortcuts:
         if heads is not None:
             inside[inside] = self._corners.opens_to(heads[inside], p[inside], where)
         ends = np.stack([tails, np.full(len(tails), -1) if heads is None else heads], axis=1)
-        inside[inside] = clear(p[inside], q[inside], ends[inside], self._sides, where, _MAX_NEAR_PAIRS)
+        inside[inside] = clear(p[inside], q[inside], ends[inside], self._sides, where, self._MAX_NEAR_PAIRS)
         return inside
 
     def _obstruction(self, a: int, b: int, k: int) -> Obstruction:
@@ -368,5 +368,4 @@ class Shortcuts:
 
 def _row_columns(matrix: csr_array, k: int) -> IntArray:
     """Return column indices of the entries in a row."""
-    columns: IntArray = matrix.indices[matrix.indptr[k] : matrix.indptr[k + 1]].astype(np.int64)
-    return columns
+    return matrix.indices[matrix.indptr[k] : matrix.indptr[k + 1]].astype(np.int64)

@@ -14,12 +14,10 @@ from functools import cached_property, cmp_to_key, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.problem.diagnosis.clipping import MARGIN, Convex, Lattice, cross, line
-from quasiharmonic.problem.diagnosis.effort import Effort
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, scale_to_unit
+from quasiharmonic.problem.diagnosis.clipping import MARGIN, Convex, Effort, Lattice, cross, line
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, as_offsets, scale_to_unit
 
 # Number of consecutive wedges that form a row for a first comparison.
 _ROW = 16
@@ -97,15 +95,13 @@ class Wedges:
     @cached_property
     def _triangles(self) -> FloatArray:
         """Triangles of the eye and a wall, which contain the wedges; (c, 3, 2), rounded."""
-        corners: FloatArray = self.lattice.approximate[np.column_stack([np.full(len(self), self.eye), self.wall])]
-        return corners
+        return self.lattice.approximate[np.column_stack([np.full(len(self), self.eye), self.wall])]
 
     @cached_property
     def _rays(self) -> FloatArray:
         """Points on the right and the left ray, relative to the eye; (2, c, 2), rounded."""
         points = self.lattice.approximate
-        rays: FloatArray = points[np.stack([self.right, self.left])] - points[self.eye]
-        return rays
+        return points[np.stack([self.right, self.left])] - points[self.eye]
 
     @cached_property
     def _boxes(self) -> FloatArray:
@@ -130,9 +126,6 @@ class Wedges:
         reach &= (cross(right, from_eye) > -MARGIN).any(axis=2) | wide
         reach &= (cross(left, from_eye) < MARGIN).any(axis=2) | wide
         return reach
-
-
-SignArray = NDArray[np.int8]
 
 
 class Views:

@@ -11,8 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from quasiharmonic.geometry.exact.predicates import SegmentRelation, box_pairs_between, orientation, segment_relation
-from quasiharmonic.problem.diagnosis.curves import Corners
-from quasiharmonic.problem.diagnosis.fixture import Fixture, Stars
+from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture, Stars
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, morton_order
 from quasiharmonic.util.progress import heartbeat
 

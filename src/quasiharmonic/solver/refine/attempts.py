@@ -32,7 +32,7 @@ from quasiharmonic.solver.refine.refining import refine_problem
 from quasiharmonic.solver.search.record import RepairBudget
 from quasiharmonic.solver.search.search import allowed_repairs, search_map
 from quasiharmonic.solver.search.stages import Stages, quick_stages, stages_of, without_restarts
-from quasiharmonic.targets.boundary.chords import flattened_edges
+from quasiharmonic.targets.boundary.placement import flattened_edges
 from quasiharmonic.util.arrays import FloatArray, IntArray, mark
 from quasiharmonic.util.options import MapOptions
 

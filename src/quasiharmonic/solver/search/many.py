@@ -19,7 +19,7 @@ from quasiharmonic.energies.polishing import find_energy, polish_options, polish
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.problem_batch import set_up_batch
+from quasiharmonic.problem.problem import set_up_batch
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.field.objective_batch import Patterns
 from quasiharmonic.solver.search.first_stage import GROUP, SMALL, group_by_first_stage, run_first_stage

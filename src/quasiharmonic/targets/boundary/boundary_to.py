@@ -19,14 +19,13 @@ from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain
-from quasiharmonic.targets.boundary.chords import chords_of
 from quasiharmonic.targets.boundary.corner_pins import Corners, Pins, pins_by_angle
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, project_loop
-from quasiharmonic.targets.boundary.placement import CornerPlacement
+from quasiharmonic.targets.boundary.placement import CornerPlacement, chords_of
 from quasiharmonic.targets.boundary.turning import boundary_turning, find_outermost, in_space
 from quasiharmonic.targets.outlines.contours import NestedContour, arrange, filled, from_corner, in_unit
 from quasiharmonic.targets.specification import outline as specified
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, describe, to_complex
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, count_of, describe, to_complex
 
 # Number of choices per loop for which the full energy is computed.
 _CANDIDATES = 8
@@ -267,16 +266,15 @@ def _check_fit(surface: Domain, contours: list[NestedContour]) -> None:
         return
     holes = len(contours) - 1
     what = (
-        f"the surface has {loops} boundary {'loop' if loops == 1 else 'loops'}, and the outline "
-        f"{len(contours)} {'contour' if holes == 0 else 'contours'} "
-        f"({'no hole' if holes == 0 else '1 hole' if holes == 1 else f'{holes} holes'})"
+        f"the surface has {count_of('boundary loop', 'boundary loops', loops)}, and the outline "
+        f"{count_of('contour', 'contours', holes + 1)} ({count_of('hole', 'holes', holes) if holes else 'no hole'})"
     )
     if loops == 1:
         raise ValueError(
             f"{what}: fill the outline's holes (quasiharmonic.targets.filled), or cut holes into the surface"
         )
     raise ValueError(
-        f"{what}: choose an outline with {loops - 1} hole{'s' if loops > 2 else ''}, or close loops of the surface"
+        f"{what}: choose an outline with {count_of('hole', 'holes', loops - 1)}, or close loops of the surface"
     )
 
 

@@ -1,28 +1,54 @@
-"""Boundary vertices with chosen target positions: chosen by the user, or by matching corners of loop and contour."""
+"""Boundary vertices with chosen target positions: chosen by the user, or by matching corners of loop and contour.
+
+A user specifies corners by vertices, by positions, or as ``auto``.
+"""
 
 from __future__ import annotations
 
 import itertools
+import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.lowlevel.textual import integer
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, points_at
 from quasiharmonic.targets.boundary.turning import BoundaryLoop, mean_turns
 from quasiharmonic.targets.outlines.contours import corners as corners_of
 from quasiharmonic.targets.outlines.contours import turns
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, describe, index_array, names_of, to_complex
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_range,
+    count_of,
+    describe,
+    index_array,
+    pad_to_space,
+    scale_to_unit,
+    to_complex,
+    triangle_array,
+    vertex_array,
+    vertex_names,
+)
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
-# Maximum distance from the outline for a point to count as on it, as a share of the outline's larger side.
-_ON_OUTLINE = 1e-6
-# Maximum number of corners that a message lists.
-_MAX_LISTED = 12
 # Maximum loss of similarity, relative to the best value (2 at most), that is accepted for an upright map.
 _SIMILAR = 0.1
+
+#: Forms of corners on the command line.
+FORMS = "V, V:K and V:X:Y, where near:x,y,z may stand for the vertex V"
+_NEAR = "near:"
+
+Place: TypeAlias = tuple[float, float, float]
+Goal: TypeAlias = int | tuple[float, float]
 
 
 class Pins:
@@ -32,6 +58,11 @@ class Pins:
     ``backwards`` tells which are reversed relative to the user's. ``n`` is the number of vertices of the surface.
     ``contour_of`` maps the loops for which the user gave points to their contours.
     """
+
+    # Maximum distance from the outline for a point to count as on it, as a share of the outline's larger side.
+    _ON_OUTLINE = 1e-6
+    # Maximum number of corners that a message lists.
+    _MAX_LISTED = 12
 
     def __init__(
         self,
@@ -67,7 +98,7 @@ class Pins:
             if isinstance(goal, int | np.integer):
                 self.wanted.setdefault(loop, {})[position] = int(goal)
                 continue
-            contour, along = self._nearest(np.asarray(goal, dtype=np.float64), int(vertex))
+            contour, along = self._find_on_outline(np.asarray(goal, dtype=np.float64), int(vertex))
             self.wanted.setdefault(loop, {})[position] = along
             if self.contour_of.setdefault(loop, contour) != contour:
                 raise ValueError(
@@ -88,10 +119,10 @@ class Pins:
         check_range("corners", vertices, n)
         alone, times = np.unique(vertices, return_counts=True)
         if (times > 1).any():
-            raise ValueError(f"corners name {names_of('vertex', 'vertices', alone[times > 1])} more than once")
+            raise ValueError(f"corners name {vertex_names(alone[times > 1])} more than once")
         inner = np.setdiff1d(alone, np.concatenate(self.loops))
         if inner.size:
-            raise ValueError(f"{names_of('vertex', 'vertices', inner)} in corners, but not on the boundary")
+            raise ValueError(f"{vertex_names(inner)} in corners, but not on the boundary")
 
     def along(self, loop: int, contour: int) -> list[tuple[int, float]]:
         """Return (position in the loop, parameter along its contour) for each pin, in order around the contour."""
@@ -99,9 +130,9 @@ class Pins:
         marks, t = self.sharp[contour], arc_parameters(self.contours[contour])
         if self.all_corners and wanted and len(wanted) != len(marks):
             raise ValueError(
-                f"{len(wanted)} corner {'vertex' if len(wanted) == 1 else 'vertices'} for a contour with {len(marks)} "
-                f"{'corner' if len(marks) == 1 else 'corners'} ({self._listed(contour)}): name one for each, or say "
-                "which corner each goes to"
+                f"{count_of('corner vertex', 'corner vertices', len(wanted))} for a contour with "
+                f"{count_of('corner', 'corners', len(marks))} ({self._list_corners(contour)}): name one for each, or "
+                "say which corner each goes to"
             )
         names = self.loops[loop]
         found = []
@@ -111,7 +142,7 @@ class Pins:
                     last = len(marks) - 1
                     raise ValueError(
                         f"vertex {names[position]} goes to corner {goal}, but the contour has corners 0 to {last}: "
-                        f"{self._listed(contour)}"
+                        f"{self._list_corners(contour)}"
                     )
                 goal = float(t[marks[goal]])
             found.append((goal, position))
@@ -133,20 +164,20 @@ class Pins:
             )
         return list(zip(positions.tolist(), places, strict=True))
 
-    def _listed(self, contour: int) -> str:
+    def _list_corners(self, contour: int) -> str:
         """List the corners of a contour with their numbers, for messages."""
         points = np.ldexp(self.contours[contour][self.sharp[contour]], self.exponent).tolist()
         named = [f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)]
-        return ", ".join(named[:_MAX_LISTED]) + (", …" if len(named) > _MAX_LISTED else "")
+        return ", ".join(named[: self._MAX_LISTED]) + (", …" if len(named) > self._MAX_LISTED else "")
 
-    def _nearest(self, point: FloatArray, vertex: int) -> tuple[int, float]:
+    def _find_on_outline(self, point: FloatArray, vertex: int) -> tuple[int, float]:
         """Return the contour on which a point lies and the parameter along it."""
         if point.shape != (2,) or not np.isfinite(point).all():
             raise ValueError(f"vertex {vertex} goes to a corner's number or a point (x, y), not to {point.tolist()}")
         # Clip, so that a point far from a tiny outline does not overflow.
         with np.errstate(over="ignore"):
             near = np.clip(np.ldexp(point, -self.exponent), -1e9, 1e9)
-        least = _ON_OUTLINE * float(np.ptp(self.contours[0], axis=0).max())
+        least = self._ON_OUTLINE * float(np.ptp(self.contours[0], axis=0).max())
         best = (np.inf, 0, 0.0)
         for c, contour in enumerate(self.contours):
             t = np.append(arc_parameters(contour), 1.0)
@@ -188,14 +219,14 @@ def pins_by_angle(
     lengths = np.cumsum(loop.lengths / loop.lengths.max())
     runs = lengths[positions - 1] / lengths[-1]
     alike = _likeness(turning + 0j, mean_turns(sides, turns(contour), sharp) + 0j)
-    alike += _likeness(_gaps(runs) + 0j, _gaps(ends) + 0j)
+    alike += _likeness(_measure_gaps(runs) + 0j, _measure_gaps(ends) + 0j)
     seen, goal = to_complex(flat[positions]), to_complex(contour[sharp])
     upright = _likeness(seen - seen.mean(), goal - goal.mean())
     first = int(np.argmax(np.where(alike >= alike.max() - _SIMILAR, upright, -np.inf)))
     return list(zip(np.roll(positions, -first).tolist(), ends.tolist(), strict=True))
 
 
-def _gaps(along: FloatArray) -> FloatArray:
+def _measure_gaps(along: FloatArray) -> FloatArray:
     """Distances from each of some parameters on a closed curve of length 1 to the next."""
     return np.asarray((np.roll(along, -1) - along) % 1.0)
 
@@ -204,3 +235,153 @@ def _likeness(one: np.ndarray, other: np.ndarray) -> FloatArray:
     """Correlation of two cyclic complex sequences, for each cyclic shift of the first; at most 1."""
     size = np.linalg.norm(one) * np.linalg.norm(other)
     return np.array([np.vdot(other, np.roll(one, -k)).real for k in range(len(one))]) / (size or 1.0)
+
+
+@dataclass(frozen=True)
+class CornerSpec:
+    """User-specified corners, independent of the surface."""
+
+    # Each entry has a vertex and its target. The vertex may be given by a position in space, which stands for the
+    # nearest boundary vertex. The target is a corner's number or a point of the outline. If the vertices go to the
+    # outline's corners in order, all targets are None.
+    entries: tuple[tuple[int | Place, Goal | None], ...] | Literal["auto"]
+
+    def within(self, vertices: IntArray) -> CornerSpec | None:
+        """Return the corners of one island, with vertices in the island's numbering; None if no corner is left.
+
+        ``vertices`` (m,) is the mesh vertex of each island vertex, ascending. If a mesh vertex occurs twice, the first
+        is used.
+        """
+        if isinstance(self.entries, str) or np.array_equal(vertices, np.arange(len(vertices))):
+            return self
+        own = [
+            (int(np.searchsorted(vertices, who)) if isinstance(who, int) else who, goal)
+            for who, goal in self.entries
+            if not isinstance(who, int) or who in vertices
+        ]
+        return CornerSpec(tuple(own)) if own else None
+
+    def on(self, V: ArrayLike, F: ArrayLike) -> Corners | Literal["auto"]:
+        """Return the corners for a surface, as `boundary_to` accepts them; ValueError when a vertex occurs twice."""
+        if isinstance(self.entries, str):
+            return "auto"
+        positions = [who for who, _ in self.entries if isinstance(who, tuple)]
+        found = iter(nearest_on_boundary(V, F, positions).tolist() if positions else [])
+        named: dict[int, str] = {}
+        for who, _ in self.entries:
+            vertex = next(found) if isinstance(who, tuple) else who
+            word = f"{_NEAR}{','.join(f'{x:g}' for x in who)}" if isinstance(who, tuple) else f"vertex {who}"
+            if vertex in named and {word, named[vertex]} == {f"vertex {vertex}"}:
+                raise ValueError(f"{word} is named more than once")
+            if vertex in named:
+                raise ValueError(f"{named[vertex]} and {word} are the same boundary vertex, {vertex}")
+            named[vertex] = word
+        goals = {v: goal for v, (_, goal) in zip(named, self.entries, strict=True) if goal is not None}
+        return goals or list(named)
+
+
+def read_corners(text: str) -> CornerSpec:
+    """Parse corners from a string, or from the text file that it names.
+
+    Parameters
+    ----------
+    text : str
+        ``auto``, or ``V,V,…`` with vertices counted from 0, for the outline's corners in order. ``near:x,y,z`` may
+        replace ``V`` and means the boundary vertex nearest to a position. ``V:K`` or ``V:X:Y`` gives the corner ``K``
+        or the point ``(X, Y)`` of the outline. Or the name of a text file with one entry per line; blanks may replace
+        colons, and ``#`` begins a comment.
+
+    Returns
+    -------
+    CornerSpec
+
+    Raises
+    ------
+    ValueError
+        When the text cannot be parsed, or only some entries have a target.
+
+    Examples
+    --------
+    >>> read_corners("near:0,0.5,0:2,17:3").entries
+    (((0.0, 0.5, 0.0), 2), (17, 3))
+    """
+    if text == "auto":
+        return CornerSpec("auto")
+    if os.path.isfile(text):
+        lines = Path(text).read_text(encoding="utf-8", errors="replace").splitlines()
+        words = [re.sub(r"\s*,\s*", ",", line.split("#")[0]).replace(":", " ").split() for line in lines]
+        entries = [_parse_entry(":".join(line)) for line in words if line]
+    else:
+        entries = [_parse_entry(part) for part in _split_entries(text)]
+    if not entries:
+        raise ValueError(f"the file names no corners: each line needs one of {FORMS}")
+    lone = [who for who, goal in entries if goal is None]
+    if lone and len(lone) < len(entries):
+        who = f"vertex {lone[0]}" if isinstance(lone[0], int) else f"the vertex near {lone[0]}"
+        raise ValueError(f"{who} has no corner or point, but other vertices have one: give one for each")
+    return CornerSpec(tuple(entries))
+
+
+@accepts_mesh
+def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArray:
+    """Find the boundary vertex nearest to each given position.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+        Vertices.
+    F : (f, 3) array of int
+        Triangles, consistently oriented.
+    places : (k, 3) or (k, 2) array
+        Positions. A missing third coordinate is 0, here and in ``V``.
+
+    Returns
+    -------
+    (k,) int64
+        The smallest index if several vertices are equally near, such as copies along a cut.
+
+    Raises
+    ------
+    ValueError
+        When arrays are malformed, or the surface is closed.
+    """
+    points, wanted = vertex_array(V), vertex_array(places, "places")
+    loops = boundary_loops(triangle_array(F, len(points)), len(points))
+    if not loops:
+        raise ValueError("the surface is closed: it has no boundary vertices")
+    border = np.sort(np.concatenate(loops))
+    both = scale_to_unit(np.concatenate([pad_to_space(points[border]), pad_to_space(wanted)]))
+    here, there = both[: len(border)], both[len(border) :]
+    return np.array([border[np.argmin(((here - place) ** 2).sum(axis=1))] for place in there], dtype=np.int64)
+
+
+def _split_entries(text: str) -> list[str]:
+    """Split a list of entries at commas; a position contains two commas of its own."""
+    parts, entries = [part.strip() for part in text.split(",")], []
+    while parts:
+        size = 3 if parts[0].startswith(_NEAR) else 1
+        entries.append(",".join(parts[:size]))
+        del parts[:size]
+    return entries
+
+
+def _parse_entry(text: str) -> tuple[int | Place, Goal | None]:
+    """Parse a vertex or a position, with its target if given."""
+    vertex, *goal = text.removeprefix(_NEAR).split(":")
+    try:
+        who = _parse_place(vertex) if text.startswith(_NEAR) else integer(vertex.strip().encode())
+        if not goal:
+            return who, None
+        if len(goal) == 1:
+            return who, integer(goal[0].strip().encode())
+        x, y = map(float, goal)
+        return who, (x, y)
+    except ValueError:
+        raise ValueError(f"{text[:40]!r} is not one of {FORMS}") from None
+
+
+def _parse_place(text: str) -> Place:
+    x, y, z = map(float, text.split(","))
+    if not np.isfinite((x, y, z)).all():
+        raise ValueError("no place")
+    return x, y, z

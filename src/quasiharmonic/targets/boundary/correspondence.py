@@ -68,12 +68,7 @@ def arc_length(
 
 
 def places_along(
-    s: FloatArray,
-    contour: FloatArray,
-    pins: Held,
-    *,
-    corner_angle: float,
-    names: IntArray | None = None,
+    s: FloatArray, contour: FloatArray, pins: Held, *, corner_angle: float, names: IntArray | None = None
 ) -> FloatArray:
     """Find parameters along a contour for a loop with given pins; each corner gets the vertex nearest along the loop.
 

@@ -13,7 +13,7 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.io.seamed_mesh import Island
 from quasiharmonic.problem import Problem
 from quasiharmonic.targets.boundary.boundary_to import boundary_to
-from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+from quasiharmonic.targets.boundary.corner_pins import CornerSpec
 from quasiharmonic.targets.outlines.contours import corners as corners_of
 from quasiharmonic.targets.outlines.contours import filled, in_unit
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of

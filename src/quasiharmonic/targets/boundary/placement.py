@@ -8,12 +8,15 @@ that no chord has both ends between (or at) two successive ones.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.exact.loops import contacts
-from quasiharmonic.targets.boundary.chords import STRAIGHT, flat_chords
+from quasiharmonic.geometry.mesh.topology import edges, trace_loops
+from quasiharmonic.io.adapters.objects import mesh_triangles
 from quasiharmonic.targets.boundary.correspondence import (
     BoundaryStretch,
     Held,
@@ -25,19 +28,29 @@ from quasiharmonic.targets.boundary.correspondence import (
     stretches,
 )
 from quasiharmonic.targets.outlines.contours import corners, turns
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_non_negative,
+    cyclic_pairs,
+    fixed_vertices,
+    invert_indices,
+    scale_to_unit,
+    target_positions,
+    to_complex,
+    triangle_array,
+    triangle_rows,
+    vertex_names,
+)
 
 # Minimum left turn in radians, larger than that of a rounded straight line.
 _MIN_TURN = 1e-9
 # Maximum shift of a vertex to a corner, as a share of the loop. Beyond it, the target no longer resembles the surface,
 # and splitting edges is better.
 FARTHEST = 0.2
-# Maximum number of starts to try, nearest to the best fit first, if chords lack space.
-_MAX_STARTS = 256
-# Number of rotations to try for a hole.
-_ROTATIONS = 48
-# Additional deviation of a target from its contour allowed for chords, as a share of the larger side.
-_ALLOWED_DEVIATION = 0.02
+# Maximum outward bend of a straight line, as a share of the outline's larger side.
+STRAIGHT = 1e-9
 
 
 def clear_chords(
@@ -150,6 +163,13 @@ def _range_minima(values: FloatArray, low: IntArray, high: IntArray) -> FloatArr
 class CornerPlacement:
     """One boundary loop and its contour."""
 
+    # Maximum number of starts to try, nearest to the best fit first, if chords lack space.
+    _MAX_STARTS = 256
+    # Number of rotations to try for a hole.
+    _ROTATIONS = 48
+    # Additional deviation of a target from its contour allowed for chords, as a share of the larger side.
+    _ALLOWED_DEVIATION = 0.02
+
     s: FloatArray  # (n,): parameters of the vertices along the loop
     contour: FloatArray  # (k, 2)
     pins: list[tuple[int, float]]  # Vertices with given parameters along the contour
@@ -170,9 +190,8 @@ class CornerPlacement:
         moved = self._along(clear)
         other = points_at(self.contour, moved)
         # Vertices moved away from a bend cut it off, so limit the deviation.
-        allowed = max_deviation(self.contour, along, positions) + _ALLOWED_DEVIATION * float(
-            np.ptp(self.contour, axis=0).max()
-        )
+        side = float(np.ptp(self.contour, axis=0).max())
+        allowed = max_deviation(self.contour, along, positions) + self._ALLOWED_DEVIATION * side
         near = max_deviation(self.contour, moved, other) <= allowed
         return (other, True) if near and self._fits(other) else (positions, False)
 
@@ -192,7 +211,7 @@ class CornerPlacement:
         first = find_start(self.s, flat, self.contour)
         best, clear = self.place(first)
         away = np.minimum((self.s - self.s[first]) % 1.0, (self.s[first] - self.s) % 1.0)
-        for start in np.argsort(away, kind="stable")[1 : 1 if self.pins else _MAX_STARTS]:
+        for start in np.argsort(away, kind="stable")[1 : 1 if self.pins else self._MAX_STARTS]:
             if clear:
                 break
             positions, clear = self.place(int(start))
@@ -203,7 +222,80 @@ class CornerPlacement:
         """Positions from starts all around the loop, restricted to those that leave chords space if any do."""
         if self.pins:
             return [self.place()[0]]
-        wanted = np.arange(_ROTATIONS) / _ROTATIONS
+        wanted = np.arange(self._ROTATIONS) / self._ROTATIONS
         starts = np.unique(np.searchsorted(self.s, wanted, side="right") - 1)
         found = [self.place(int(start)) for start in starts]
         return [positions for positions, clear in found if clear] or [positions for positions, _ in found]
+
+
+def chords_of(loop: IntArray, interior: IntArray, n: int) -> IntArray:
+    """Return the interior edges (e, 2) between two vertices of a loop, as positions in it, smaller first; (c, 2)."""
+    position = invert_indices(n, loop)
+    found = position[interior]
+    return np.sort(found[(found >= 0).all(axis=1)], axis=1)
+
+
+def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolerance: float = STRAIGHT) -> IntArray:
+    """Interior edges that the target places along its own boundary, so that the part they cut off has no area.
+
+    Between the ends of such an edge, the target boundary does not bend outwards. It is straight, like a side of a
+    polygon, or goes around a notch. A common case is a triangle with two boundary edges on one side of a rectangle.
+    Then no map without inverted triangles exists. (`diagnose` proves this on the exact coordinates, where rounding may
+    change the answer.) `refine` splits these edges.
+
+    Parameters
+    ----------
+    F : (f, 3) array of int
+        Triangles of a surface.
+    fixed : (k,) array of int
+        Fixed vertices, including the whole boundary.
+    target : (k, 2) float
+        Their target positions.
+    tolerance : float
+        Maximum outward bend of a straight line, as a share of the target's larger side.
+
+    Returns
+    -------
+    (s, 2) int64
+        The edges, smaller vertex first.
+
+    Raises
+    ------
+    ValueError
+        When an array is malformed, or a boundary vertex is not in ``fixed``.
+    """
+    check_non_negative("tolerance", tolerance)
+    F = triangle_rows(mesh_triangles(F))
+    n = int(F.max(initial=-1)) + 1
+    F = triangle_array(F, n)
+    fixed = fixed_vertices(fixed, n)
+    places = target_positions(target, len(fixed))
+    found = edges(F, n)
+    missing = np.setdiff1d(found.boundary, fixed)
+    if missing.size:
+        raise ValueError(f"the boundary {vertex_names(missing)} not in fixed")
+    places = scale_to_unit(places)
+    position = np.full((n, 2), np.nan)
+    position[fixed] = places
+    min_bulge = tolerance * float(np.ptp(places, axis=0).max()) if len(places) else 0.0
+    flat = [np.empty((0, 2), dtype=np.int64)]
+    for loop in trace_loops(found.boundary):
+        chords = chords_of(loop, found.interior, n)
+        flat.append(np.sort(loop[chords[list(flat_chords(chords, position[loop], min_bulge))]], axis=1))
+    return np.concatenate(flat)
+
+
+def flat_chords(chords: IntArray, positions: FloatArray, min_bulge: float) -> Iterator[int]:
+    """Yield rows of chords between whose ends the loop bends outwards by at most ``min_bulge``."""
+    w = to_complex(positions)
+    for k, (i, j) in enumerate(chords.tolist()):
+        if min(_bulge(w[i : j + 1]), _bulge(np.concatenate([w[j:], w[: i + 1]]))) <= min_bulge:
+            yield k
+
+
+def _bulge(w: NDArray[np.complex128]) -> float:
+    """Maximum distance of a curve to the right of the line from its first point to its last."""
+    across = w[-1] - w[0]
+    if across == 0:
+        return 0.0
+    return float(-((w[1:-1] - w[0]) * np.conj(across / abs(across))).imag.min())

@@ -36,14 +36,10 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 
-# Total turning in radians that is added, spread evenly, so that corners divide a straight side evenly.
-_ADDED_TURNING = 0.01
 # Maximum number of passes of moves. The first few give nearly all of the decrease.
 _MAX_ROUNDS = 50
 # Minimum relative decrease of the sum for a move, larger than rounding errors.
 _MIN_DECREASE = 1e-9
-# Minimum edge length, as a share of the loop's length.
-_SHORTEST = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +56,11 @@ class BoundaryLoop:
         Turning angle at each vertex in radians: π minus the triangles' angles there, positive at a corner, negative at
         a notch. On a disk the sum is 2π minus the total curvature inside (Gauss and Bonnet).
     """
+
+    # Total turning in radians that is added, spread evenly, so that corners divide a straight side evenly.
+    _ADDED_TURNING = 0.01
+    # Minimum edge length, as a share of the loop's length.
+    _SHORTEST = 1e-12
 
     vertices: IntArray
     lengths: FloatArray
@@ -93,9 +94,9 @@ class BoundaryLoop:
         longest = self.lengths.max()
         if longest == 0:
             raise ValueError(f"all vertices of the boundary loop at vertex {self.vertices[0]} coincide")
-        lengths = np.maximum(self.lengths / longest, _SHORTEST)
+        lengths = np.maximum(self.lengths / longest, self._SHORTEST)
         lengths /= lengths.sum()
-        bent = self.turning + _ADDED_TURNING * (lengths + np.roll(lengths, 1)) / 2
+        bent = self.turning + self._ADDED_TURNING * (lengths + np.roll(lengths, 1)) / 2
         found = _improve(lengths, bent, _remove_until(lengths, bent, count))
         return found, mean_turns(lengths, self.turning, found)
 

@@ -1,4 +1,9 @@
-"""Find cuts that are few and short, and that let the surface be flattened with little distortion."""
+"""Find cuts that are few and short, and that let the surface be flattened with little distortion.
+
+References
+----------
+.. [1] J. Erickson, K. Whittlesey, Greedy optimal homotopy and homology generators. SODA (2005).
+"""
 
 from __future__ import annotations
 
@@ -7,25 +12,26 @@ from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 from quasiharmonic.geometry.coarsening.levels import Removal
 from quasiharmonic.geometry.mesh.fans import open_along
-from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges
+from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges, pair_keys
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.targets.cuts.levels import cut_by_levels
 from quasiharmonic.targets.cuts.reaching import extend_cuts
 from quasiharmonic.targets.cuts.shortening import shorten_cuts
-from quasiharmonic.targets.cuts.topological import opening_cuts
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
     check_range,
-    index_array,
-    names_of,
+    edge_array,
     real_array,
     triangle_array,
+    triangle_names,
     vertex_array,
 )
 
@@ -106,7 +112,10 @@ def find_cuts(
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    given, spared = _edge_array("edges", edges), _edge_array("forbidden_edges", forbidden_edges)
+    given, spared = (
+        edge_array(name, [] if pairs is None else pairs)
+        for name, pairs in (("edges", edges), ("forbidden_edges", forbidden_edges))
+    )
     check_range("forbidden_edges", spared, len(V))
     if not isinstance(min_gain, Real) or not float(min_gain) > 0:
         raise ValueError(f"min_gain must be a positive number, not {min_gain!r}")
@@ -130,7 +139,7 @@ def find_cuts_by(
     inner = manifold_edges(F, len(V)).interior
     # Open along the given edges. Surfaces that touch at a vertex are also separated.
     FT, origin = open_along(F, given, len(V))
-    found = [inner[np.isin(_keys(inner, len(V)), _open_keys(F, FT, given, len(V)))]] if given.size else [given]
+    found = [inner[np.isin(pair_keys(inner, len(V)), _open_keys(F, FT, given, len(V)))]] if given.size else [given]
     rings = _RINGS if np.isfinite(min_gain) else _RINGS_OF_SHORTEST
     for vertices, triangles, T in _parts(FT, len(origin)):
         names, own = origin[vertices], None if costs is None else costs[triangles]
@@ -201,7 +210,7 @@ def side_costs(edge_costs: ArrayLike, count: int) -> FloatArray:
         raise ValueError(f"edge_costs must have shape ({count}, 3), not {costs.shape}")
     wrong = np.flatnonzero(~((costs > 0) & np.isfinite(costs)).all(axis=1))
     if wrong.size:
-        raise ValueError(f"edge_costs must be positive and finite: {names_of('triangle', 'triangles', wrong)}")
+        raise ValueError(f"edge_costs must be positive and finite: {triangle_names(wrong)}")
     return costs
 
 
@@ -213,7 +222,7 @@ def _costs_of_sides(F: IntArray, n: int, spared: IntArray, edge_costs: ArrayLike
         marked[spared] = True
         side = marked[F] & marked[F[:, (1, 2, 0)]]
         keys = edge_keys(F[side], F[:, (1, 2, 0)][side], n)
-        costs[side] *= np.where(np.isin(keys, _keys(spared, n)), _DEAR, 1.0)
+        costs[side] *= np.where(np.isin(keys, pair_keys(spared, n)), _DEAR, 1.0)
     elif edge_costs is None:
         return None
     return costs
@@ -227,24 +236,11 @@ def _cut_part(graph: EdgeGraph, min_gain: float) -> BoolArray:
     return cut
 
 
-def _edge_array(name: str, edges: ArrayLike | None) -> IntArray:
-    array = index_array(name, [] if edges is None else edges)
-    if array.size == 0:
-        return np.zeros((0, 2), dtype=np.int64)
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"{name} must have shape (k, 2), two vertices each, not {array.shape}")
-    return array
-
-
-def _keys(pairs: IntArray, n: int) -> IntArray:
-    return edge_keys(pairs[:, 0], pairs[:, 1], n)
-
-
 def _open_keys(F: IntArray, FT: IntArray, given: IntArray, n: int) -> IntArray:
     """Keys of the given edges that are open, so that their two sides are separate edges."""
     tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
     key = edge_keys(tail, head, n)
-    there = np.isin(key, edge_keys(given[:, 0], given[:, 1], n))
+    there = np.isin(key, pair_keys(given, n))
     side = edge_keys(FT.ravel(), np.roll(FT, -1, axis=1).ravel(), int(FT.max()) + 1)[there]
     _, which, count = np.unique(side, return_inverse=True, return_counts=True)
     return key[there][count[which] == 1]
@@ -265,3 +261,91 @@ def _parts(F: IntArray, n: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]
     stops = np.searchsorted(label[F[by_triangle, 0]], first, side="right")
     for k, triangles in enumerate(np.split(by_triangle, stops[:-1])):
         yield by_vertex[starts[k] : starts[k + 1]], triangles, number[F[triangles]] - starts[k]
+
+
+def opening_cuts(graph: EdgeGraph) -> BoolArray:
+    """Cut a connected surface into a disk, across handles and between boundary loops, as short as possible.
+
+    A spanning tree of triangles, joined across edges, unfolds to a disk. Cutting all edges that it does not cross opens
+    the surface. Most of these cuts are unnecessary: after removing loose ends, only a few paths remain, which depend on
+    the tree. The tree used here is that of Erickson and Whittlesey [1]_. Shortest paths lead from every vertex to the
+    boundary (to one vertex on closed surfaces). The tree crosses the edges that close the longest loops. The remaining
+    edges, two per handle and one per further boundary loop, together with the paths from both their ends, form the
+    shortest set of cuts of this kind. `shorten_cuts` then moves them away from the root.
+
+    Parameters
+    ----------
+    graph : EdgeGraph
+
+    Returns
+    -------
+    (e,) bool
+        Mask of the cut edges; all False for a disk. A closed surface without handles is cut along a path between two
+        distant vertices.
+    """
+    cut = np.zeros(len(graph.ends), dtype=bool)
+    closed = not graph.rim.any()
+    roots = np.array([0]) if closed else np.flatnonzero(graph.rim_vertices)
+    distance, before = graph.distances(roots, graph.cost)
+    for number in _extra_edges(graph, distance, before).tolist():
+        cut[number] = True
+        for end in graph.ends[number].tolist():
+            cut[graph.way_back(before, end)] = True
+    cut = without_loose_ends(graph, cut)
+    if closed and not cut.any():
+        cut[_long_path(graph)] = True
+    return cut
+
+
+def without_loose_ends(graph: EdgeGraph, cut: BoolArray) -> BoolArray:
+    """Remove from cuts (e,) all paths that end in the interior.
+
+    A disk remains a disk. A tree of cuts is removed completely.
+    """
+    cut = cut.copy()
+    on_rim = graph.rim_vertices
+    while True:
+        degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
+        loose = cut & ((degree == 1) & ~on_rim)[graph.ends].any(axis=1)
+        if not loose.any():
+            return cut
+        cut &= ~loose
+
+
+def _extra_edges(graph: EdgeGraph, distance: FloatArray, before: IntArray) -> IntArray:
+    """Edges that are neither in the forest of shortest paths nor crossed by the tree of triangles."""
+    free = ~graph.rim
+    reached = np.flatnonzero(before >= 0)
+    free[graph.numbers(reached, before[reached])] = False
+    # The two triangles of each edge.
+    order = np.argsort(graph.side.ravel(), kind="stable")
+    pair = np.flatnonzero(np.diff(graph.side.ravel()[order]) == 0)
+    number = graph.side.ravel()[order][pair]
+    one, other = order[pair] % len(graph.F), order[pair + 1] % len(graph.F)
+    keep = free[number]
+    number, one, other = number[keep], one[keep], other[keep]
+    around = graph.cost[number] + distance[graph.ends[number]].sum(axis=1)
+    # Ranks as weights: the longest loops get the lowest rank. No rank is zero, and only their order matters.
+    rank = np.empty(number.size)
+    rank[np.lexsort((number, -around))] = np.arange(1, number.size + 1)
+    # Before version 1.17, SciPy's spanning trees accept 32-bit indices only.
+    ends = one.astype(np.int32), other.astype(np.int32)
+    tree = minimum_spanning_tree(csr_array((rank, ends), shape=(len(graph.F), len(graph.F))))
+    crossed = np.isin(rank, tree.data)
+    return np.sort(number[~crossed])
+
+
+def _long_path(graph: EdgeGraph) -> IntArray:
+    """Path between two distant vertices of a closed surface; at least two edges, since one edge opens nothing."""
+    start = int(np.argmax(np.linalg.norm(graph.V - graph.V.mean(axis=0), axis=1)))
+    for _ in range(2):
+        away, _ = graph.distances(np.array([start]), graph.length)
+        start, end = int(np.argmax(away)), start
+    _, before = graph.distances(np.array([end]), graph.cost)
+    path = graph.way_back(before, start)
+    if path.size == 1:
+        # Go through a common neighbour of both ends.
+        corners = graph.F[np.isin(graph.F, (start, end)).sum(axis=1) == 2][0]
+        around = int(corners[(corners != start) & (corners != end)][0])
+        path = graph.numbers(np.array([start, around]), np.array([around, end]))
+    return path

@@ -14,8 +14,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.geometry.coarsening.levels import has_marked_corner
-from quasiharmonic.geometry.mesh.topology import edge_keys, edges
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each
+from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, pad_to_space, repeat_each, scale_to_unit
 
 # A concave edge with this dihedral bend, or a convex edge with twice as much, has half its cost.
 _SHARP = 0.5 * np.pi
@@ -62,8 +63,7 @@ class EdgeGraph:
     @property
     def bends(self) -> FloatArray:
         """Angles (e,) in radians by which the surface bends at edges: positive if convex, negative if concave."""
-        corners = self.V[self.F]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = area_vectors(self.V, self.F)
         normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(np.float64).tiny)[:, None]
         # ``left`` is the triangle in which the edge runs from the smaller vertex to the larger, ``right`` the other.
         rises = self.F.T[(1, 2, 0), :] > self.F.T
@@ -128,8 +128,7 @@ class EdgeGraph:
 
     def numbers(self, tail: IntArray, head: IntArray) -> IntArray:
         """Indices of the edges between pairs of vertices; every pair must be an edge."""
-        own = edge_keys(self.ends[:, 0], self.ends[:, 1], self.n)
-        return np.searchsorted(own, edge_keys(tail, head, self.n))
+        return np.searchsorted(pair_keys(self.ends, self.n), edge_keys(tail, head, self.n))
 
     @cached_property
     def _rows(self) -> tuple[IntArray, IntArray]:
@@ -202,19 +201,15 @@ def edge_graph(V: FloatArray, F: IntArray, costs: FloatArray | None = None) -> E
     -------
     EdgeGraph
     """
-    space = np.zeros((len(V), 3))
-    space[:, : V.shape[1]] = np.ldexp(V, -int(np.frexp(np.abs(V).max(initial=0))[1]))
-    corners = space[F]
-    area = 0.5 * float(
-        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    )
+    space = pad_to_space(scale_to_unit(V))
+    area = surface_area(space, F)
     if area > 0:
         space /= np.sqrt(area)
 
     found = edges(F, len(V))
     ends = np.concatenate([found.interior, np.sort(found.boundary, axis=1)])
     rim = np.arange(len(ends)) >= len(found.interior)
-    key = edge_keys(ends[:, 0], ends[:, 1], len(V))
+    key = pair_keys(ends, len(V))
     order = np.argsort(key)
     ends, rim, key = ends[order], rim[order], key[order]
     tail, head = F.T, F.T[(1, 2, 0), :]

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from quasiharmonic.geometry.coarsening.levels import Removal, coarsen
-from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys
+from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys, pair_keys
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph, triangles_near
 from quasiharmonic.targets.cuts.shortening import shorten_cuts
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
@@ -58,10 +58,10 @@ def cut_by_levels(
     fixed = np.zeros(n, dtype=bool)
     fixed[rim] = True
     coarsening = coarsen(F, n, fixed, _COARSE)
-    rim_keys = edge_keys(rim[:, 0], rim[:, 1], n)
+    rim_keys = pair_keys(rim, n)
     factors = [None] * (len(coarsening.rounds) + 1) if costs is None else _vertex_costs(F, costs, coarsening.rounds, n)
     means = _mean_positions(V, fixed, coarsening.rounds)
-    vertices, graph = _part(means, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
+    vertices, graph = _make_subset(means, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
     cut = vertices[graph.ends[find(graph, vertices, coarsening.rounds)]]
     if not cut.size:
         return cut
@@ -74,7 +74,7 @@ def cut_by_levels(
             T = coarsening.levels[k]
             near = triangles_near(T, marked, rings)
             some = costs[near] if k == 0 and costs is not None else _side_costs(factors[k], T[near])
-            cut = _shorten(*_part(V, T[near], some, rim_keys), cut)
+            cut = _shorten(*_make_subset(V, T[near], some, rim_keys), cut)
     return cut
 
 
@@ -108,7 +108,7 @@ def _side_costs(factor: FloatArray | None, F: IntArray) -> FloatArray | None:
 def insert_vertices(cut: IntArray, removals: list[Removal], n: int) -> IntArray:
     """Carry cuts (k, 2) to the mesh before a round of removals; edges are (smaller, larger) vertex."""
     degree = np.bincount(cut.ravel(), minlength=n)
-    keys = edge_keys(cut[:, 0], cut[:, 1], n)
+    keys = pair_keys(cut, n)
     replaced, new = [np.empty(0, dtype=np.int64)], [np.empty((0, 2), dtype=np.int64)]
     for vertices, rings in removals:
         if rings.shape[1] < 4:
@@ -135,10 +135,12 @@ def _shorten(vertices: IntArray, graph: EdgeGraph, cut: IntArray) -> IntArray:
     return vertices[graph.ends[shorten_cuts(graph, on_cut, rings=_RINGS)]]
 
 
-def _part(V: FloatArray, F: IntArray, costs: FloatArray | None, rim_keys: IntArray) -> tuple[IntArray, EdgeGraph]:
+def _make_subset(
+    V: FloatArray, F: IntArray, costs: FloatArray | None, rim_keys: IntArray
+) -> tuple[IntArray, EdgeGraph]:
     """Return the vertices of some triangles, and their graph, as `EdgeGraph.part_near` does."""
     vertices = np.flatnonzero(np.bincount(F.ravel(), minlength=len(V)))
     graph = edge_graph(V[vertices], np.searchsorted(vertices, F), costs)
     ends = vertices[graph.ends]
-    rim = np.isin(edge_keys(ends[:, 0], ends[:, 1], len(V)), rim_keys)
+    rim = np.isin(pair_keys(ends, len(V)), rim_keys)
     return vertices, replace(graph, rim=rim).without_paths_at(graph.rim)

@@ -247,8 +247,8 @@ def _check_simple(curves: LoopEdges, points: FloatArray) -> None:
 
     how = {SegmentRelation.CROSSING: "crosses", SegmentRelation.TOUCHING: "touches"}.get(relation, "runs along")
     one, other = int(owner[i]), int(owner[j])
-    count = f"{len(met.pairs)} such pairs" if met.complete else f"more than {_MAX_MEETINGS} such pairs"
-    more = "" if len(met.pairs) == 1 else f" ({count} in all)" if met.complete else f" ({count})"
+    count = f"{len(met.pairs)} such pairs in all" if met.complete else f"more than {_MAX_MEETINGS} such pairs"
+    more = f" ({count})" if len(met.pairs) > 1 else ""
     if spike[first]:
         at = j if following[i] == j else i
         x, y = points[at].tolist()

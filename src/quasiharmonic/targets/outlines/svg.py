@@ -131,8 +131,8 @@ class _Drawing:
         self.parser = expat.ParserCreate(namespace_separator=" ")
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
-        self.parser.EntityDeclHandler = self._entity
-        self.parser.CharacterDataHandler = self._text
+        self.parser.EntityDeclHandler = self._refuse_entity
+        self.parser.CharacterDataHandler = self._add_text
         # Text of the current style sheet.
         self.sheet: list[str] | None = None
 
@@ -156,10 +156,10 @@ class _Drawing:
     def _error(self, what: str, remedy: str = "") -> MeshFileError:
         return MeshFileError(self.path, what, self.parser.CurrentLineNumber, remedy)
 
-    def _entity(self, name: str, *_: object) -> None:
+    def _refuse_entity(self, name: str, *_: object) -> None:
         raise self._error(f"declares the entity {name[:40]!a}, but entities are not supported", "save it as plain SVG")
 
-    def _text(self, text: str) -> None:
+    def _add_text(self, text: str) -> None:
         if self.sheet is not None:
             self.sheet.append(text)
 
@@ -195,13 +195,13 @@ class _Drawing:
         with report_damage(self.path, f"<{tag}>: ", line=self.parser.CurrentLineNumber):
             transform = self.transforms[-1]
             if "transform" in attributes:
-                transform = transform @ _transform(attributes["transform"])
+                transform = transform @ _parse_transform(attributes["transform"])
             if tag == "svg" and self.depth > 1:
                 if "viewBox" in attributes:
                     raise ValueError("an inner <svg> with a viewBox")
                 transform = transform @ _affine(1, 0, 0, 1, _length(attributes, "x"), _length(attributes, "y"))
             if tag in _SHAPES:
-                self._note(tag, _SHAPES[tag](attributes), transform)
+                self._add_shape(tag, _SHAPES[tag](attributes), transform)
                 # Children of a shape, such as titles and animations, draw nothing.
                 self.skipped = self.depth
             else:
@@ -217,7 +217,7 @@ class _Drawing:
             self.transforms.pop()
         self.depth -= 1
 
-    def _note(self, tag: str, d: str, transform: FloatArray) -> None:
+    def _add_shape(self, tag: str, d: str, transform: FloatArray) -> None:
         self.commands += commands(d, MAX_POINTS - self.commands)
         if self.commands > MAX_POINTS:
             raise ValueError(_TOO_MANY)
@@ -234,7 +234,7 @@ def _affine(a: float, b: float, c: float, d: float, e: float, f: float) -> Float
     return np.array([(a, c, e), (b, d, f), (0, 0, 1)], dtype=np.float64)
 
 
-def _transform(text: str) -> FloatArray:
+def _parse_transform(text: str) -> FloatArray:
     """Parse the attribute ``transform``: a product of matrix, translate, scale, rotate, skewX and skewY."""
     text = text.rstrip()
     product, at, count = np.eye(3), 0, 0

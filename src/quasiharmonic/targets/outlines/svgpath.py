@@ -151,13 +151,13 @@ class _Pen:
         else:
             points = [origin + complex(*pair) for pair in zip(values[::2], values[1::2], strict=True)]
             if kind in "ST":
-                points.insert(0, self._reflected("CS" if kind == "S" else "QT"))
+                points.insert(0, self._reflect_control("CS" if kind == "S" else "QT"))
             if kind != "L":
                 self.control = points[-2]
             self._piece(points)
         self.before = kind
 
-    def _reflected(self, alike: str) -> complex:
+    def _reflect_control(self, alike: str) -> complex:
         """Control point that continues the previous curve smoothly.
 
         The current point if the previous command is not a curve of the same degree.

@@ -247,7 +247,7 @@ def _check_files(settings: Settings) -> Settings:
     if settings.to is None:
         return settings
     from quasiharmonic.targets import outline
-    from quasiharmonic.targets.boundary.corner_spec import read_corners
+    from quasiharmonic.targets.boundary.corner_pins import read_corners
 
     outline(settings.to, font=settings.font)
     if settings.corners is not None:

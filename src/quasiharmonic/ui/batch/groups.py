@@ -23,7 +23,7 @@ from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.problem_batch import Given, set_up_batch
+from quasiharmonic.problem.problem import Given, set_up_batch
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.field.objective_batch import Patterns
 from quasiharmonic.solver.search.first_stage import SMALL, group_by_first_stage, run_first_stage

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from quasiharmonic.io import problem_files, suffixes
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.io.handles import INPUTS
+from quasiharmonic.io.mesh_files import INPUTS
 from quasiharmonic.util.arrays import check_bool
 
 #: A file that marks a folder as the output of a run; problems are not searched there.

@@ -93,7 +93,7 @@ class Settings(DescentOptions):
         can be mapped.
     corners : str or None
         The boundary vertices that go to the corners of ``to``: ``"auto"``, ``"near:x,y,z,…"``, or any other form that
-        `quasiharmonic.targets.boundary.corner_spec.read_corners` reads.
+        `quasiharmonic.targets.boundary.corner_pins.read_corners` reads.
     refine : bool
         Whether edges may be split if the target has no map without; new vertices are appended.
     strategy : {"speed", "paper"}

@@ -41,7 +41,7 @@ from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.options import PolishOptions
-from quasiharmonic.util.standard_input import detach_input
+from quasiharmonic.util.threads import detach_input
 from quasiharmonic.util.untrusted import use_bound
 
 #: Key of the message that a process sends after its imports.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
     from quasiharmonic.io.seamed_mesh import Island
     from quasiharmonic.problem import Problem
-    from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+    from quasiharmonic.targets.boundary.corner_pins import CornerSpec
     from quasiharmonic.targets.boundary.fitting import FittedProblem
 
 # A copy of the text in quasiharmonic.targets.specification, so that the parser need not import that module.
@@ -139,7 +139,7 @@ def _slide(options: argparse.Namespace, posed: IslandProblem) -> None:
     from dataclasses import replace
 
     from quasiharmonic.energies.newton.sliding_boundary import move_onto
-    from quasiharmonic.targets.boundary.sliding_curves import find_sliding_curves
+    from quasiharmonic.targets.specification import find_sliding_curves
 
     posed.slide = True
     if options.to is not None:
@@ -169,7 +169,7 @@ def _check_room(problem: Problem, to: str) -> None:
 
 def read_corners(text: str) -> CornerSpec:
     """Read the value of ``--corners``, or the file that it names; ValueError if it is malformed."""
-    from quasiharmonic.targets.boundary import corner_spec as asked_corners
+    from quasiharmonic.targets.boundary import corner_pins as asked_corners
 
     try:
         return asked_corners.read_corners(text)

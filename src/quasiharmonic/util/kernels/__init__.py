@@ -13,9 +13,9 @@ range, as their C code says. They return a number that reports the error, and th
 the C code. No array changes during the call. A kernel lets other threads run, so no check is reliable for an array that
 other code can write to. The callers ensure this: a public function copies its index arrays once, checks the copies, and
 passes only these on. `index_array`, `triangle_array`, `vertex_array` and similar functions in
-`quasiharmonic.util.arrays` always copy. `own_triangles` and `unchangeable` do not copy arrays that they made before,
-such as the triangles of a `Domain` or a `Certificate`. A read-only array may be a view of a writeable one, so it is
-copied.
+`quasiharmonic.util.arrays` always copy. `own_triangles` and `make_unchangeable` do not copy arrays that they made
+before, such as the triangles of a `Domain` or a `Certificate`. A read-only array may be a view of a writeable one, so
+it is copied.
 
 Kernels copy arrays of 32-bit integers, which NumPy 1 makes by default on Windows, as in Blender.
 

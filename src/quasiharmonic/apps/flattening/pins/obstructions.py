@@ -12,7 +12,7 @@ from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.geometry.exact.predicates import box_pairs_between, orientation
 from quasiharmonic.geometry.mesh.topology import Edges
 from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
-from quasiharmonic.problem.diagnosis.defects import find_inverted_fixed
+from quasiharmonic.problem.diagnosis.conditions import find_inverted_fixed
 from quasiharmonic.util.arrays import FloatArray, IntArray, edge_names, mark, names_of
 
 # Maximum number of intersecting pairs that are named.

@@ -32,6 +32,7 @@ _LISTS = (
     *("accessors", "bufferViews", "buffers", "images", "materials", "textures"),
     *("animations", "cameras", "meshes", "nodes", "scenes", "skins"),
 )
+# Media types of the images that glTF supports, by the first bytes.
 _PICTURES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX 20": "image/ktx2"}
 # Errors that reading a damaged document may raise.
 DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError)
@@ -193,11 +194,6 @@ def fault(error: Exception) -> str:
     return "an entry has the wrong type"
 
 
-def picture_type(data: bytes) -> str | None:
-    """Return the media type of an image that glTF supports; None for anything else."""
-    return next((kind for magic, kind in _PICTURES.items() if data.startswith(magic)), None)
-
-
 def embed_pictures(document: Document, folder: Path) -> list[str]:
     """Embed images from files in the document's folder; return the names of those that cannot be embedded."""
     missing = []
@@ -208,7 +204,7 @@ def embed_pictures(document: Document, folder: Path) -> list[str]:
         data = b""
         with suppress(ValueError):
             data = read_uri(folder, uri)
-        if (kind := picture_type(data)) is None:
+        if (kind := next((kind for start, kind in _PICTURES.items() if data.startswith(start)), None)) is None:
             missing.append(uri)
             continue
         del image["uri"]

@@ -1,8 +1,11 @@
-"""The appearance of a surface that was read from a glTF file."""
+"""Materials of glTF documents: read the appearance of a surface, and show new images on it."""
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +13,9 @@ import numpy as np
 
 from quasiharmonic.io.errors import printable_path
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, read_uri, whole
-from quasiharmonic.io.formats.gltf.reader import CarriedGltf, read_corners
+from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, read_corners
 from quasiharmonic.io.models.appearance import Appearance, ImageUse, NamedImage, Role, SurfaceMaterial, Wrap
+from quasiharmonic.io.models.textures import MaterialTextures, Texture
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
@@ -21,13 +25,14 @@ _WEBP = "EXT_texture_webp"
 # Entries of a material and of its metallic-roughness model, besides its textures.
 _ROLES: dict[Role, str] = {"occlusion": "occlusionTexture", "emission": "emissiveTexture", "normal": "normalTexture"}
 _PBR_ROLES: dict[Role, str] = {"colour": "baseColorTexture", "metallic_roughness": "metallicRoughnessTexture"}
+# Root extensions that refer to no image.
+_WITHOUT_IMAGES = {"KHR_lights_punctual", "KHR_materials_variants"}
 
 
 def gltf_appearance(carried: CarriedGltf) -> Appearance:
     """Return the appearance of the triangles of a glTF document; damaged materials are listed as problems."""
     reader = _MaterialReader(carried.document, carried.folder)
-    primitives = [carried.document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in carried.parts]
-    index = [primitive.get("material") for primitive in primitives]
+    index = [part.entry(carried.document).get("material") for part in carried.parts]
     used = list(dict.fromkeys(index))
     of_triangle: IntArray = np.concatenate(
         [np.full(part.end - part.begin, used.index(k)) for part, k in zip(carried.parts, index, strict=True)]
@@ -54,7 +59,7 @@ class _MaterialReader:
 
     def __init__(self, document: Document, folder: Path) -> None:
         self._document, self._folder = document, folder
-        self._images: dict[int, NamedImage] = {}
+        self._image = cache(self._read_image)
         self.problems: list[str] = []
 
     def read(self, index: int | None) -> SurfaceMaterial:
@@ -113,11 +118,6 @@ class _MaterialReader:
         transform = np.column_stack([turn * scale, offset])
         return ImageUse(self._image(whole(source)), channel, (wrap[0], wrap[1]), transform)
 
-    def _image(self, index: int) -> NamedImage:
-        if index not in self._images:
-            self._images[index] = self._read_image(index)
-        return self._images[index]
-
     def _read_image(self, index: int) -> NamedImage:
         image = self._document.tree["images"][index]
         uri = image.get("uri", "")
@@ -138,3 +138,143 @@ def _numbers(values: Any, default: tuple[float, ...]) -> tuple[float, ...]:
     if len(found) != len(default) or not np.isfinite(found).all():
         raise ValueError(f"{len(default)} numbers are needed")
     return found
+
+
+def paint(document: Document, texture: Texture) -> None:
+    """Show a texture on all triangles with texture coordinates.
+
+    With `MaterialTextures`, the materials keep everything that these do not replace, except textures of extensions. The
+    colours of the vertices and the images that no material uses are removed.
+    """
+    index = _add_image(document, texture)
+    if isinstance(texture, MaterialTextures):
+        _replace_materials(document, texture, index)
+        _drop_unused_images(document)
+        return
+    look = {"baseColorTexture": {"index": index}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    materials = document.tree.setdefault("materials", [])
+    materials.append({"name": "map", "pbrMetallicRoughness": look, "doubleSided": True})
+    for primitive in _primitives(document):
+        if PLACES in primitive["attributes"]:
+            primitive["material"] = len(materials) - 1
+
+
+def _add_image(document: Document, image: Texture) -> int:
+    """Add an image, and return the index of its texture."""
+    tree = document.tree
+    textures, images = tree.setdefault("textures", []), tree.setdefault("images", [])
+    textures.append({"source": len(images)})
+    images.append({"bufferView": document.add_bytes(image.data), "mimeType": image.media_type})
+    return len(textures) - 1
+
+
+def _primitives(document: Document) -> Iterator[dict[str, Any]]:
+    for mesh in document.tree["meshes"]:
+        yield from mesh["primitives"]
+
+
+def _replace_materials(document: Document, baked: MaterialTextures, colour: int) -> None:
+    """Replace the looks of all materials on triangles with texture coordinates."""
+    further = {"metallic_roughness": baked.metallic_roughness, "normal": baked.normal, "emission": baked.emission}
+    index = {name: _add_image(document, image) for name, image in further.items() if image is not None}
+    materials = document.tree.setdefault("materials", [])
+    kept = {one.get("material") for one in _primitives(document) if PLACES not in one["attributes"]}
+    made: dict[int | None, int] = {}
+    for primitive in _primitives(document):
+        if PLACES not in primitive["attributes"]:
+            continue
+        old = primitive.get("material")
+        if old not in made:
+            made[old] = len(materials) if old is None or old in kept else old
+            entry = {} if old is None else json.loads(json.dumps(materials[old]))
+            _change_look(entry, baked, colour, index)
+            materials[made[old] : made[old] + 1] = [entry]
+        primitive["material"] = made[old]
+        primitive["attributes"].pop("COLOR_0", None)
+    used = document.tree.setdefault("extensionsUsed", [])
+    if _STRENGTH not in used and max(baked.emission_factor) > 1:
+        used.append(_STRENGTH)
+    if not used:
+        del document.tree["extensionsUsed"]
+
+
+def _change_look(entry: dict[str, Any], baked: MaterialTextures, colour: int, index: dict[str, int]) -> None:
+    """Change a material to the baked images; ``index`` has the textures of those besides the base colour."""
+    extensions = {
+        name: {key: value for key, value in extension.items() if "Texture" not in key}
+        for name, extension in entry.get("extensions", {}).items()
+        if name != _STRENGTH
+    }
+    for stale in ("extensions", "normalTexture", "occlusionTexture", "emissiveTexture", "emissiveFactor"):
+        entry.pop(stale, None)
+    look: dict[str, Any] = {"baseColorTexture": {"index": colour}}
+    if "metallic_roughness" in index:
+        look["metallicRoughnessTexture"] = {"index": index["metallic_roughness"]}
+        if baked.occlusion:
+            entry["occlusionTexture"] = {"index": index["metallic_roughness"]}
+    entry["pbrMetallicRoughness"] = look | {"metallicFactor": baked.metallic, "roughnessFactor": baked.roughness}
+    if "normal" in index:
+        entry["normalTexture"] = {"index": index["normal"]}
+    if "emission" in index:
+        entry["emissiveTexture"] = {"index": index["emission"]}
+    strength = max(baked.emission_factor)
+    if strength > 0:
+        entry["emissiveFactor"] = [value / max(strength, 1) for value in baked.emission_factor]
+    if strength > 1:
+        extensions[_STRENGTH] = {"emissiveStrength": strength}
+    if extensions:
+        entry["extensions"] = extensions
+    if baked.alpha_mode is not None:
+        entry.pop("alphaCutoff", None)
+        entry |= {"alphaMode": baked.alpha_mode, "doubleSided": baked.double_sided}
+        if baked.alpha_mode == "MASK":
+            entry["alphaCutoff"] = baked.alpha_cutoff
+
+
+def _drop_unused_images(document: Document) -> None:
+    """Remove textures that no material uses, images that no texture uses, and the bytes of these."""
+    tree = document.tree
+    if set(tree.get("extensions", {})) - _WITHOUT_IMAGES:
+        return
+    # References of damaged materials stay as they are.
+    infos = list(find_objects(tree["materials"], lambda node: _is_in(node.get("index"), tree["textures"])))
+    textures = _keep_used(tree, "textures", {info["index"] for info in infos})
+    for info in infos:
+        info["index"] = textures[info["index"]]
+    sources = list(find_objects(tree["textures"], lambda node: _is_in(node.get("source"), tree["images"])))
+    before = {image["bufferView"] for image in tree["images"] if "bufferView" in image}
+    images = _keep_used(tree, "images", {node["source"] for node in sources})
+    for node in sources:
+        node["source"] = images[node["source"]]
+    holders = list(find_objects(tree, lambda node: "bufferView" in node))
+    dropped = before - {node["bufferView"] for node in holders}
+    kept = [k for k in range(len(document.views)) if k not in dropped]
+    number = {k: i for i, k in enumerate(kept)}
+    for node in holders:
+        node["bufferView"] = number[node["bufferView"]]
+    tree["bufferViews"] = [tree["bufferViews"][k] for k in kept]
+    document.views[:] = [document.views[k] for k in kept]
+
+
+def _is_in(index: Any, entries: list[Any]) -> bool:
+    return isinstance(index, int) and 0 <= index < len(entries)
+
+
+def _keep_used(tree: dict[str, Any], name: str, used: set[int]) -> dict[int, int]:
+    """Remove the entries of a list that are not used; return the new index of each of the others."""
+    kept = sorted(used)
+    tree[name] = [tree[name][k] for k in kept]
+    return {k: i for i, k in enumerate(kept)}
+
+
+def find_objects(node: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> Iterator[dict[str, Any]]:
+    """Yield the wanted objects in a part of a document, at any depth, except in extras."""
+    if isinstance(node, list):
+        for part in node:
+            yield from find_objects(part, is_wanted)
+    elif isinstance(node, dict):
+        if is_wanted(node):
+            yield node
+        for key, part in node.items():
+            if key != "extras":
+                yield from find_objects(part, is_wanted)

@@ -13,18 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.fans import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
-from quasiharmonic.io.formats.vertex_data import normal_lines, weld
-from quasiharmonic.io.models.meshdata import Carried, MeshData
+from quasiharmonic.io.models.meshdata import Carried, MeshData, normal_lines
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_choice, count_of, repeat_each
 from quasiharmonic.util.options import INSTANCES
 
 PLACES = "TEXCOORD_0"
 # Modes of a glTF primitive.
-_TRIANGLES = 4
-_STRIP = 5
-_FAN = 6
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _READ = "POSITION", "NORMAL", "COLOR_0", PLACES
 
 
@@ -56,6 +54,11 @@ class Primitive:
     pool: int
     begin: int
     end: int
+
+    def entry(self, document: Document) -> dict[str, Any]:
+        """Return the primitive's entry in a document."""
+        found: dict[str, Any] = document.tree["meshes"][self.mesh]["primitives"][self.primitive]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +145,7 @@ def _mesh(document: Document, source: str) -> MeshData | None:
         return None
     points, kind = _positions(document, pools)
     # Merge equal positions within each mesh.
-    V, which = weld(np.column_stack([kind, points]))
+    V, which = weld_points(np.column_stack([kind, points]))
     F = which[rows]
     vt, known = _attribute(document, pools, PLACES, 2)
     vt[:, 1] = 1 - vt[:, 1]
@@ -343,7 +346,7 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
             continue
         seen.add(index)
         node = nodes[index]
-        here = above @ _local(node, index)
+        here = above @ _local_matrix(node, index)
         if "mesh" in node:
             # The transformation of a node with a skin is ignored, as glTF specifies.
             placed.setdefault(whole(node["mesh"]), np.eye(4) if "skin" in node else here)
@@ -351,7 +354,7 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
     return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
 
 
-def _local(node: dict[str, Any], index: int) -> FloatArray:
+def _local_matrix(node: dict[str, Any], index: int) -> FloatArray:
     """Return the matrix of a node."""
     if "matrix" in node:
         return _numbers(node, "matrix", [0] * 16, index).reshape(4, 4).T

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
-from quasiharmonic.io.formats.gltf.painting import paint
+from quasiharmonic.io.formats.gltf.looks import paint
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
-from quasiharmonic.io.formats.vertex_data import colours_of, normals_of
 from quasiharmonic.io.lowlevel.atomic import write_whole
-from quasiharmonic.io.models.materials import label_materials, materials_lost
-from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.appearance import label_materials, materials_lost
+from quasiharmonic.io.models.meshdata import MeshData, colours_of, normals_of
 from quasiharmonic.io.models.textures import MaterialTextures
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of
 
@@ -45,7 +44,7 @@ def write_gltf(path: str | os.PathLike[str], mesh: MeshData) -> None:
         document = _replace_map(carried, mesh)
         embed_pictures(document, carried.folder)
     else:
-        document = _new(mesh)
+        document = _make_document(mesh)
     if mesh.texture is not None:
         paint(document, mesh.texture)
     check_path("path", path)
@@ -89,7 +88,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     name = _channel_name(len(mesh.lower_maps))
     for number, pool in enumerate(carried.pools):
         parts, faces = carried.parts_of(number), carried.faces_of(number)
-        primitives = [document.tree["meshes"][part.mesh]["primitives"][part.primitive] for part in parts]
+        primitives = [part.entry(document) for part in parts]
         places = all_places[faces]
         if np.isnan(places).all():
             continue
@@ -243,7 +242,7 @@ def _indices(rows: IntArray, count: int) -> NDArray[Any]:
     return rows.reshape(-1, 1).astype(np.uint16 if count < 1 << 16 else np.uint32)
 
 
-def _new(mesh: MeshData) -> Document:
+def _make_document(mesh: MeshData) -> Document:
     """Return a document of one mesh."""
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "quasiharmonic"},

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from quasiharmonic.io import suffixes
-from quasiharmonic.io.handles import INPUTS
+from quasiharmonic.io.mesh_files import INPUTS
 from quasiharmonic.ui.batch.archives.tar_stream import Damage, open_tar, read_members
 from quasiharmonic.ui.batch.records import load_pyarrow
 from quasiharmonic.util.untrusted import MAX_BYTES

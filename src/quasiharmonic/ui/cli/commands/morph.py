@@ -99,7 +99,7 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, morph, write, read back, certify, report."""
     from quasiharmonic.io.fem.files import check_fem_output, read_fem
-    from quasiharmonic.io.fem.vtu_series import list_series
+    from quasiharmonic.io.fem.vtu import list_series
 
     if options.no_polish and options.energy is not None:
         raise ValueError("--energy needs polishing: omit --no-polish")
@@ -248,7 +248,7 @@ def _morph(
 
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
     from quasiharmonic.apps.mesh_motion.morphing import morph
-    from quasiharmonic.io.fem.vtu_series import list_series, write_series
+    from quasiharmonic.io.fem.vtu import list_series, write_series
 
     (nodes, place), steps = moved, options.steps or 1
     if steps > 1 and given["rest"] is None:

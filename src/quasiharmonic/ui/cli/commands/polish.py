@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
 
     def lower(mesh: SeamedMesh, given: dict[str, Any]) -> MappedAtlas:
         from quasiharmonic.apps.atlas import island_functions as atlas
-        from quasiharmonic.targets.boundary.sliding_curves import find_sliding_curves
+        from quasiharmonic.targets.specification import find_sliding_curves
 
         given |= {"islands": options.islands, "free": options.free, "time_limit": options.time_limit}
         if options.free:

@@ -19,7 +19,7 @@ from quasiharmonic.ui.studio.protocol import Array, MessageFrame, decode, encode
 from quasiharmonic.ui.studio.session.session import Session
 from quasiharmonic.ui.studio.session.storage import Storage
 from quasiharmonic.ui.studio.session.surface import read_sheet
-from quasiharmonic.util.standard_input import detach_input
+from quasiharmonic.util.threads import detach_input
 
 #: Maximum total size of waiting messages, bytes.
 MAX_WAITING = 256 << 20

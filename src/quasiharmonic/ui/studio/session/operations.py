@@ -29,7 +29,7 @@ from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.targets import filled, outline_curves
-from quasiharmonic.targets.boundary.corner_spec import CornerSpec
+from quasiharmonic.targets.boundary.corner_pins import CornerSpec
 from quasiharmonic.targets.boundary.fitting import find_corner_vertices, fit_boundary, fix_in_place
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.ui.studio.session import recipes

@@ -1,4 +1,4 @@
-/* Kernels of `geometry/mesh/nearest_point.py`. */
+/* Kernels of `geometry/mesh/point_queries.py`. */
 #include "arguments.h"
 
 #include <math.h>

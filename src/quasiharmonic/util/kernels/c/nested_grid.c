@@ -1,4 +1,4 @@
-/* Kernels of `geometry/exact/nested_grid.py`: the cells that triangles intersect. */
+/* Kernels of `geometry/exact/point_location.py`: the cells that triangles intersect. */
 #include "arguments.h"
 
 #include <math.h>

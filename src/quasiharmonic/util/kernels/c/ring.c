@@ -1,4 +1,4 @@
-/* Kernel of `targets/cuts/ring.py`. */
+/* Kernel of `targets/cuts/shortening.py`. */
 #include "arguments.h"
 
 #include <math.h>

@@ -1,20 +1,19 @@
-"""The nearest point of a triangulated surface to points in space."""
+"""Queries for many points at once.
+
+The queries are the nearest point of a triangulated surface to each point in space, and the triangle of the plane that
+contains the centre of each texel of an image.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.util.arrays import FloatArray, IntArray, enumerate_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, enumerate_each
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.threads import count_cores, make_executor
 
-# Nearest samples of the surface that are tried first, and the factor by which their number grows.
-_FIRST = 24
-_GROWTH = 4
-# Largest number of samples for each triangle, on average.
-_SAMPLES = 4
-# Points per block, so that the arrays fit into the cache.
-_POINTS = 1 << 13
+# Texels per block, so that the arrays fit into the cache.
+_BLOCK = 1 << 16
 
 
 class NearestPoint:
@@ -27,6 +26,14 @@ class NearestPoint:
         At least one triangle.
     """
 
+    # Nearest samples of the surface that are tried first, and the factor by which their number grows.
+    _FIRST = 24
+    _GROWTH = 4
+    # Largest number of samples for each triangle, on average.
+    _SAMPLES = 4
+    # Points per block, so that the arrays fit into the cache.
+    _POINTS = 1 << 13
+
     def __init__(self, V: FloatArray, F: IntArray) -> None:
         from scipy.spatial import cKDTree
 
@@ -34,7 +41,7 @@ class NearestPoint:
         reach = np.linalg.norm(self._corners - self._corners.mean(axis=1, keepdims=True), axis=2).max(axis=1)
         # Large triangles have several samples.
         bound = float(np.median(reach)) or float(reach.max()) or 1.0
-        while (parts := np.ceil(reach / bound).clip(1, 1e6) ** 2).sum() > _SAMPLES * len(F) + 100:
+        while (parts := np.ceil(reach / bound).clip(1, 1e6) ** 2).sum() > self._SAMPLES * len(F) + 100:
             bound *= 1.25
         sides = np.sqrt(parts).astype(np.int64)
         self._triangle, number = enumerate_each(sides**2)
@@ -52,8 +59,7 @@ class NearestPoint:
         second = along // 2 + np.where(upright, 1 / 3, 2 / 3)
         total = row + np.where(upright, 2 / 3, 1 / 3)
         weights = np.stack([sides - total, total - second, second], axis=1) / sides[:, None]
-        placed: FloatArray = np.einsum("kc,kcd->kd", weights, self._corners[self._triangle])
-        return placed
+        return np.einsum("kc,kcd->kd", weights, self._corners[self._triangle])
 
     def find(self, points: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return triangle (k,), barycentric coordinates (k, 3) and distance (k,) of the nearest points to (k, 3)."""
@@ -61,17 +67,17 @@ class NearestPoint:
         squared = np.full(len(points), np.inf)
 
         def work(begin: int) -> None:
-            block = slice(begin, begin + _POINTS)
+            block = slice(begin, begin + self._POINTS)
             self._find(points[block], triangle[block], weights[block], squared[block])
 
         with make_executor(count_cores(), "quasiharmonic-nearest") as pool:
-            list(pool.map(work, range(0, len(points), _POINTS)))
+            list(pool.map(work, range(0, len(points), self._POINTS)))
         return triangle, weights, np.sqrt(squared)
 
     def _find(self, points: FloatArray, triangle: IntArray, weights: FloatArray, squared: FloatArray) -> None:
         """Set the nearest points of a block."""
         many = len(self._triangle)
-        waiting, count = np.arange(len(points)), min(_FIRST, many)
+        waiting, count = np.arange(len(points)), min(self._FIRST, many)
         while waiting.size:
             distance, sample = self._tree.query(points[waiting], count)
             distance, sample = distance.reshape(-1, count), sample.reshape(-1, count)
@@ -82,7 +88,7 @@ class NearestPoint:
             if count == many:
                 return
             waiting = waiting[distance[:, -1] < np.sqrt(squared[waiting]) + self._largest]
-            count = min(_GROWTH * count, many)
+            count = min(self._GROWTH * count, many)
 
 
 @compiled
@@ -146,3 +152,87 @@ def _nearest_on_sides(p: FloatArray, corners: list[FloatArray]) -> FloatArray:
         weights[:, rows] = 0
         weights[i, rows], weights[(i + 1) % 3, rows] = 1 - share[rows], share[rows]
     return weights
+
+
+class Raster:
+    """Triangles over an image; `rows` finds the triangle at the centre of each texel, without a loop over triangles.
+
+    Parameters
+    ----------
+    corners : (f, 3, 2) float64
+        Positions in texels: the centre of the texel in column i and row j is (i + 1/2, j + 1/2).
+    width, height : int
+        Size of the image.
+    leave_out : (f,) bool
+        Triangles that are not drawn. Triangles without area are not drawn, either.
+    """
+
+    def __init__(self, corners: FloatArray, width: int, height: int, leave_out: BoolArray) -> None:
+        self.width, self.height, self._corners = width, height, corners
+        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        self._area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+        drawn = np.flatnonzero((self._area != 0) & np.isfinite(self._area) & ~leave_out)
+        y = corners[drawn, :, 1]
+        # Clipped, so that numbers far outside the image fit into integers.
+        first = np.ceil(np.clip(y.min(axis=1) - 0.5, 0, height)).astype(np.int64)
+        last = np.floor(np.clip(y.max(axis=1) - 0.5, -1, height - 1)).astype(np.int64)
+        # The rows of each triangle are spans of texels.
+        of, row = enumerate_each(np.maximum(last - first + 1, 0))
+        row += first[of]
+        # Of several triangles at a texel the last one counts, which is the one with the smallest index.
+        order = np.lexsort((-of, row))
+        self._triangle, self._row = drawn[of[order]], row[order]
+        self._column, self._count = self._find_columns()
+        self._starts = np.searchsorted(self._row, np.arange(height + 1))
+
+    def _find_columns(self) -> tuple[IntArray, IntArray]:
+        """Return the first column of each span, and its number of columns."""
+        y = self._row + 0.5
+        low, high = np.full(len(y), np.inf), np.full(len(y), -np.inf)
+        for i in range(3):
+            p, q = self._corners[self._triangle, i].T, self._corners[self._triangle, (i + 1) % 3].T
+            # Both triangles of an edge compute the same crossing, so that no texel between them is missed.
+            swap = (p[1] > q[1]) | ((p[1] == q[1]) & (p[0] > q[0]))
+            p, q = np.where(swap, q, p), np.where(swap, p, q)
+            crossed = (p[1] <= y) & (y <= q[1]) & (p[1] < q[1])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                x = p[0] + (y - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
+            low, high = np.where(crossed, np.minimum(low, x), low), np.where(crossed, np.maximum(high, x), high)
+        first = np.ceil(np.clip(low - 0.5, 0, self.width)).astype(np.int64)
+        last = np.floor(np.clip(high - 0.5, -1, self.width - 1)).astype(np.int64)
+        return first, np.maximum(last - first + 1, 0)
+
+    def rows(self, begin: int, end: int) -> tuple[IntArray, IntArray, FloatArray]:
+        """Find the texels of rows ``begin`` to ``end`` whose centres are in triangles.
+
+        Returns
+        -------
+        texel : (k,) int64
+            Ascending; the texel in column i and row j has the number (j - begin) · width + i.
+        triangle : (k,) int64
+            The triangle with the smallest index that contains the centre, or touches it.
+        barycentric : (k, 3) float64
+        """
+        size = (end - begin) * self.width
+        triangle, weights = np.full(size, -1), np.empty((2, size))
+        spans = slice(self._starts[begin], self._starts[end])
+        before = np.cumsum(self._count[spans])
+        total = int(before[-1]) if before.size else 0
+        cuts = np.searchsorted(before, np.arange(_BLOCK, total, _BLOCK))
+        for part in np.split(np.arange(spans.start, spans.stop), np.unique(cuts)):
+            self._draw(part, begin, triangle, weights)
+        texel = np.flatnonzero(triangle >= 0)
+        second, third = weights[:, texel]
+        return texel, triangle[texel], np.stack([np.maximum(1 - second - third, 0), second, third], axis=1)
+
+    def _draw(self, spans: IntArray, begin: int, triangle: IntArray, weights: FloatArray) -> None:
+        """Set the triangle, and the weights (2, k) of its second and third corner, at the texels of some spans."""
+        of = self._triangle[spans]
+        a, b, c = self._corners[of].transpose(1, 2, 0)
+        x, y = self._column[spans] + 0.5 - a[0], self._row[spans] + 0.5 - a[1]
+        area, (bx, by), (cx, cy) = self._area[of], b - a, c - a
+        span, along = enumerate_each(self._count[spans])
+        texel = ((self._row[spans] - begin) * self.width + self._column[spans])[span] + along
+        triangle[texel] = of[span]
+        for row, start, slope in ((0, x * cy - y * cx, cy), (1, bx * y - by * x, -by)):
+            weights[row, texel] = np.clip((start / area)[span] + along * (slope / area)[span], 0, 1)
