@@ -25,7 +25,7 @@ from common import INK, RED, FloatArray, colorbar, panels, run, save
 from quasiharmonic import certify, distortion, flatten, keep_distances
 from quasiharmonic.energies.distances import SurfaceDistances, surface_distances
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.ui.plot.canvas import lit
 from quasiharmonic.util.arrays import IntArray
 
 # Colours from the crowns of the gyri to the bottoms of the sulci.

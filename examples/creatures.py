@@ -19,7 +19,7 @@ from matplotlib.colors import LogNorm
 from common import INK, FloatArray, colorbar, panels, run, save
 from quasiharmonic import cut_open, distortion, find_cuts, flatten
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys
-from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.ui.plot.canvas import lit
 from quasiharmonic.util.arrays import IntArray
 from sculptures import creature
 

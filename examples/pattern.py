@@ -19,7 +19,7 @@ from common import INK, FloatArray, colorbar, panels, run, save
 from quasiharmonic import distortion, flatten, surfaces, write_pattern
 from quasiharmonic.apps.flattening.patterns import pattern
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
-from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.ui.plot.canvas import lit
 from quasiharmonic.util.arrays import IntArray
 
 LENGTH, ALLOWANCE, GAP = 300.0, 7.0, 20.0

@@ -28,11 +28,11 @@ with explain_missing("quasiharmonic.jax needs JAX", extra="jax"):
 import numpy as np
 
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.layer_functions import LayerFunctions
 from quasiharmonic.apps.gradients.layers import (
     Array,
     DoubtfulDerivative,
     Layer,
+    LayerFunctions,
     MapNotFound,
     compute_gradients,
     compute_maps,

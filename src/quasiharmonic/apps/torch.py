@@ -20,11 +20,11 @@ with explain_missing("quasiharmonic.torch needs PyTorch", extra="torch"):
     from torch.autograd.function import once_differentiable
 
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.layer_functions import LayerFunctions
 from quasiharmonic.apps.gradients.layers import (
     Array,
     DoubtfulDerivative,
     Layer,
+    LayerFunctions,
     MapNotFound,
     compute_changes,
     compute_gradients,

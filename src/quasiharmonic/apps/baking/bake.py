@@ -11,8 +11,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from quasiharmonic.apps.baking.images import Bytes, encode, find_sources, to_bytes
-from quasiharmonic.apps.baking.look import SurfaceLook
-from quasiharmonic.apps.baking.tangents import TangentFrames, tangent_frames
+from quasiharmonic.apps.baking.look import SurfaceLook, TangentFrames, tangent_frames
 from quasiharmonic.apps.unwrapping.model_files import add_map
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.geometry.mesh.nearest_point import NearestPoint

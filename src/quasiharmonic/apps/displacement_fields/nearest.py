@@ -36,7 +36,7 @@ from quasiharmonic.apps.displacement_fields.voxels import (
     in_units,
     nearest_invertible_volume,
 )
-from quasiharmonic.apps.tetrahedra.energy import cross
+from quasiharmonic.apps.tetrahedra.descent import cross
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, check_choice, count_of

@@ -32,10 +32,8 @@ from quasiharmonic.apps.displacement_fields.grid import (
     name_points,
 )
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
-from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, cross, dot
-from quasiharmonic.apps.tetrahedra.signs import ExactSigns
-from quasiharmonic.apps.tetrahedra.topology import inspect_faces
+from quasiharmonic.apps.tetrahedra.descent import ShapeEnergy, TetrahedraDescent, cross, dot
+from quasiharmonic.apps.tetrahedra.elements import ExactSigns, inspect_faces
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
 from quasiharmonic.util.outcome import Verdict
 from quasiharmonic.util.progress import heartbeat

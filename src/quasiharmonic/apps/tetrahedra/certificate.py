@@ -31,8 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED, find_contacts, outer_winding
-from quasiharmonic.apps.tetrahedra.signs import ExactSigns
-from quasiharmonic.apps.tetrahedra.topology import FaceReport, find_patches, inspect_faces
+from quasiharmonic.apps.tetrahedra.elements import ExactSigns, FaceReport, find_patches, inspect_faces
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

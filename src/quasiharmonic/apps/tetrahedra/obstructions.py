@@ -8,9 +8,8 @@ from itertools import combinations
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.contacts import edges_meeting_triangles
+from quasiharmonic.apps.tetrahedra.elements import SignArray, find_mesh_edges
 from quasiharmonic.apps.tetrahedra.result import TetrahedraObstruction
-from quasiharmonic.apps.tetrahedra.signs import SignArray
-from quasiharmonic.apps.tetrahedra.topology import find_mesh_edges
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 # Maximum number of obstructions of each kind.

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.certificate import certify_arrays, find_boundary_contacts, tetrahedron_array
 from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED
-from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
+from quasiharmonic.apps.tetrahedra.descent import ShapeEnergy, TetrahedraDescent
+from quasiharmonic.apps.tetrahedra.elements import FaceReport, inspect_faces, tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.obstructions import find_obstructions
 from quasiharmonic.apps.tetrahedra.result import (
     TetrahedraObstruction,
@@ -19,9 +19,7 @@ from quasiharmonic.apps.tetrahedra.result import (
     TetrahedraStatus,
     tetrahedron_quality,
 )
-from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding, project
-from quasiharmonic.apps.tetrahedra.topology import FaceReport, inspect_faces
 from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, mark, names_of
 from quasiharmonic.util.options import TetrahedraOptions

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.certificate import space_array
 from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
+from quasiharmonic.apps.tetrahedra.elements import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.placement import (
     RestMesh,
     check_rest,
@@ -18,7 +19,6 @@ from quasiharmonic.apps.tetrahedra.placement import (
     place_vertices,
 )
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
-from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.sliding import Sliding, find_sliding
 from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import (

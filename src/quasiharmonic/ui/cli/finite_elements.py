@@ -59,7 +59,7 @@ def check(options: argparse.Namespace) -> int:
 def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     """Certify tetrahedra as they are in the file; report hexahedra with a corner that is not positive."""
     from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
-    from quasiharmonic.apps.tetrahedra.signs import find_bad_corners
+    from quasiharmonic.apps.tetrahedra.elements import find_bad_corners
     from quasiharmonic.geometry.mesh.elements import split_solids
     from quasiharmonic.util.arrays import count_of, names_of
 

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.ui.plot.canvas import AS_DRAWN, as_mesh, new_figure, not_positive, paint_map, verdict
-from quasiharmonic.ui.plot.shading import view
+from quasiharmonic.ui.plot.canvas import AS_DRAWN, as_mesh, new_figure, not_positive, paint_map, verdict, view
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_sequence, map_array
 from quasiharmonic.util.optional import explain_missing
 

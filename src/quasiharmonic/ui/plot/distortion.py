@@ -16,13 +16,14 @@ from quasiharmonic.ui.plot.canvas import (
     RED,
     as_mesh,
     caption,
+    lit,
     name_axes,
     new_figure,
     paint_map,
     paint_surface,
     save_picture,
+    view,
 )
-from quasiharmonic.ui.plot.shading import lit, view
 from quasiharmonic.util.arrays import FloatArray, check_choice, map_array
 
 if TYPE_CHECKING:

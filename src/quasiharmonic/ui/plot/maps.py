@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
+    View,
     as_mesh,
     caption,
     new_figure,
@@ -19,8 +20,8 @@ from quasiharmonic.ui.plot.canvas import (
     panels,
     save_picture,
     verdict,
+    view,
 )
-from quasiharmonic.ui.plot.shading import View, view
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, map_array
 
 if TYPE_CHECKING:

@@ -19,13 +19,15 @@ from quasiharmonic.ui.plot.canvas import (
     as_mesh,
     caption,
     draw_edges,
+    lit,
     new_figure,
     not_positive,
     panels,
     save_picture,
+    scale_for_drawing,
     verdict,
+    view,
 )
-from quasiharmonic.ui.plot.shading import lit, scale_for_drawing, view
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, enumerate_each, map_array
 from quasiharmonic.util.optional import explain_missing
 

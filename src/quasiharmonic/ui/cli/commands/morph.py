@@ -157,8 +157,8 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     import numpy as np
 
     from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
+    from quasiharmonic.apps.tetrahedra.elements import inspect_faces
     from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
-    from quasiharmonic.apps.tetrahedra.topology import inspect_faces
     from quasiharmonic.io.fem.files import read_volume, write_fem
     from quasiharmonic.util.arrays import count_of
 
