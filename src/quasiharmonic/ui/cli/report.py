@@ -15,12 +15,10 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from quasiharmonic.ui.cli.streams import require_output, tell
+from quasiharmonic.ui.cli.process import require_output, tell
 
 if TYPE_CHECKING:
-    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.problem import Domain
-    from quasiharmonic.ui.cli.written_map import WrittenMap
 
 _options: ContextVar[Mapping[str, str] | None] = ContextVar("options", default=None)
 
@@ -77,24 +75,6 @@ def in_options(text: str) -> str:
 def sizes(domain: Domain) -> dict[str, Any]:
     """Return the numbers of vertices, triangles and fixed vertices."""
     return {"vertices": domain.n, "triangles": len(domain.F), "fixed": len(domain.fixed)}
-
-
-def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str:
-    """Return the text report of a map that was computed and written."""
-    from quasiharmonic.problem.result import Status
-    from quasiharmonic.util.arrays import count_of
-
-    lines = [f"wrote {output}: {written.summary()}"]
-    results = [island.result for island in mapped.islands]
-    if not written.injective:
-        lines.append(mapped.status.value)
-    # Each surface may be injective although pins make an overlap between surfaces unavoidable.
-    if not written.injective or mapped.status is Status.IMPOSSIBLE:
-        lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
-    iterations = sum(result.n_iterations for result in results)
-    seconds = sum(result.seconds for result in results)
-    lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
-    return "\n".join(lines)
 
 
 def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:

@@ -23,7 +23,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import report, streams, targets
+from quasiharmonic.ui.cli import map_options, process, report
 from quasiharmonic.ui.cli.arguments import (
     SHARED,
     add_command,
@@ -40,7 +40,7 @@ from quasiharmonic.ui.cli.arguments import (
     text,
     texture_size,
 )
-from quasiharmonic.ui.cli.streams import tell
+from quasiharmonic.ui.cli.process import tell
 from quasiharmonic.util.options import ENERGIES, FLATTENED, DescentOptions, UnwrapOptions
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def add_parser(commands: Commands) -> None:
     solver = parser.add_argument_group("solution of each problem, as for qhm map or qhm flatten")
     add_options(
         solver,
-        to=text("OUTLINE", f"map every mesh file onto an outline: {targets.FORMS}"),
+        to=text("OUTLINE", f"map every mesh file onto an outline: {map_options.FORMS}"),
         flatten=flag("flatten every mesh file with a free boundary, without overlap"),
         cut=flag("with --to and --flatten: cut surfaces that cannot be flattened, along seams"),
         start=flag("for --flatten: start from the map in the files' texture coordinates"),
@@ -169,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
     rest = pick(options, "retry", "table", "shard", "scheduler")
     time_limit = options.time_limit or None
     try:
-        with streams.progress_line(_words, live=LIVE) as show:
+        with process.progress_line(_words, live=LIVE) as show:
             progress = batch.run(
                 options.source, options.output, settings, time_limit=time_limit, callback=show, **limits, **rest
             )

@@ -20,7 +20,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, written_map
+from quasiharmonic.ui.cli import map_options, pipeline, process, report
 from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
@@ -75,8 +75,8 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, flatten, write, read back, certify, report."""
     began = time.perf_counter()
-    seam_options.check_options(options)
-    seam_options.check_packing(options)
+    map_options.check_seams(options)
+    map_options.check_packing(options)
     set_default(options, "rings", 20, asked=options.energy == "distances", belongs="--energy distances")
     set_default(options, "unit", "mm", asked=options.pattern is not None, belongs="--pattern")
     _check_options(options)
@@ -112,17 +112,17 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
         given["fixed"] = np.unique(joint[io.read_handles(options.fixed, len(mesh.V))])
     if options.weights is not None:
         given["weights"] = _weights(options.weights)
-    found = seam_options.surface(options, replace(mesh, F=F), disks_too=True, joint=joint)
+    found = map_options.surface(options, replace(mesh, F=F), disks_too=True, joint=joint)
     triangles = np.array([len(island.F) for island in found.mesh.islands])
     kept = np.flatnonzero(joint == np.arange(len(mesh.V)))
     if (close := kept[find_close_vertices(mesh.V[kept], triangles)]).size:
-        streams.tell(describe_soup(close))
+        process.tell(describe_soup(close))
     given |= pick(options, "start", "rings", "islands", "linear_solver", *declared(FlattenOptions))
     with pipeline.working(options.input) as show:
         mapped = atlas.flatten(found.mesh, gap=_PIECE_GAP * options.allowance, callback=show, **given)
 
     def describe(written: MeshData) -> pipeline.Account:
-        certified = written_map.certify_map(written, weld=options.weld)
+        certified = pipeline.certify_map(written, weld=options.weld)
         # Some formats hold the map alone; their vertices have the numbers of the surface's.
         V = mesh.V if len(mesh.V) == len(certified.V) else certified.V
         flat = io.without_idle(V, certified.F, certified.uv)
@@ -142,7 +142,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
         }
         worst = measured.statistics("isometric").maximum
         lines = [
-            report.describe_maps(mapped, certified, options.output),
+            pipeline.describe_maps(mapped, certified, options.output),
             *found.notes,
             f"maximum stretch {worst:.3g}",
         ]
@@ -156,7 +156,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
             lines.append(f"wrote {options.pattern}, true to scale")
         return pipeline.Account(facts, [*lines, mapped.status.value], certified.apart)
 
-    return pipeline.Changed(mesh.with_places(seam_options.pack_islands(options, mapped.mesh)), describe)
+    return pipeline.Changed(mesh.with_places(map_options.pack_islands(options, mapped.mesh)), describe)
 
 
 def _check_options(options: argparse.Namespace) -> None:

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, targets, written_map
+from quasiharmonic.ui.cli import map_options, pipeline, process, report
 from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.result import MapResult
     from quasiharmonic.ui.cli.arguments import Commands
-    from quasiharmonic.ui.cli.targets import IslandProblem
-    from quasiharmonic.ui.cli.written_map import WrittenMap
+    from quasiharmonic.ui.cli.map_options import IslandProblem
+    from quasiharmonic.ui.cli.pipeline import WrittenMap
 
 
 def add_parser(commands: Commands) -> None:
@@ -56,7 +56,7 @@ def add_parser(commands: Commands) -> None:
         f"{format_names('read')} file, or a folder with input.obj and handles.txt",
         f"{format_names('write_map')} file to write",
     )
-    targets.add_options(parser)
+    map_options.add_options(parser)
     kind = "for --plot: draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂) with its histogram"
     add_options(
         parser,
@@ -87,8 +87,8 @@ def run(options: argparse.Namespace) -> int:
     began = time.perf_counter()
     if options.slide and options.no_polish:
         raise ValueError("--slide needs polishing: omit --no-polish")
-    targets.check_pieces(options)
-    seam_options.check_packing(options)
+    map_options.check_pieces(options)
+    map_options.check_packing(options)
     set_default(options, "kind", "map", asked=options.plot is not None, belongs="--plot")
     source, fixed = io.problem_files(options.input, options.fixed)
     if options.to is not None:
@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
         options,
         lambda mesh: _map(options, mesh, source, fixed, began),
         source=source,
-        inputs=(fixed, *targets.files(options)),
+        inputs=(fixed, *map_options.files(options)),
     )
 
 
@@ -116,28 +116,28 @@ def _map(
 
     strategy = select_strategy(options.strategy, **pick(options, *declared(DescentOptions)))
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
-    targets.check_options(options, mesh, fixed)
-    found = seam_options.surface(options, mesh, disks_too=False)
+    map_options.check_options(options, mesh, fixed)
+    found = map_options.surface(options, mesh, disks_too=False)
     islands = found.mesh.islands
     if len(islands) > 1 and options.slide and options.to is not None:
         raise ValueError(f"--slide supports one island, but the mesh has {len(islands)}")
     posed: list[IslandProblem] = []
 
     def solve_island(island: Island) -> MapResult:
-        one = targets.make_problem(options, island, fixed, len(posed))
+        one = map_options.make_problem(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
         given = pick(options, "polish", "linear_solver", *declared(MapOptions))
         given["strategy"] = strategy
         slide = one.slide if options.polish else False
-        with streams.progress_line() as show:
+        with process.progress_line() as show:
             result = solve(problem, slide=slide, callback=show, **given)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
             # The short default polish lowers the worst distortion at little cost.
             fine = on_refinement(problem, result.refined)
-            with streams.progress_line() as show:
+            with process.progress_line() as show:
                 result = smooth(fine, result, linear_solver=options.linear_solver, callback=show, slide=one.slide)
         return result
 
@@ -149,10 +149,10 @@ def _map(
     if any(refined):
         new = merge_refined(mesh, mapped.mesh.islands, refined, mapped.places())
     if options.pack:
-        new = new.with_places(seam_options.pack_islands(options, io.mapped(new)))
+        new = new.with_places(map_options.pack_islands(options, io.mapped(new)))
 
     def describe(written: MeshData) -> pipeline.Account:
-        certified = written_map.certify_map(written)
+        certified = pipeline.certify_map(written)
         if options.plot is not None:
             problems = zip((one.fitted.problem for one in posed), refined, strict=False)
             draw(options.plot, certified, [on_refinement(*one) for one in problems], mapped, options.kind)
@@ -179,7 +179,7 @@ def _map(
             for island, one in zip(islands, mapped.islands, strict=False)
             if one.result.crowded.size
         ]
-        lines = [report.describe_maps(mapped, certified, options.output), *notes]
+        lines = [pipeline.describe_maps(mapped, certified, options.output), *notes]
         return pipeline.Account(facts, lines, certified.injective)
 
     return pipeline.Changed(new, describe)

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from quasiharmonic.ui.cli import pipeline, report
 from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, count, file, flag, number, text
-from quasiharmonic.ui.cli.finite_elements import read_tetrahedra
-from quasiharmonic.ui.cli.group_motions import MOTIONS, in_order, list_motions, move_groups
+from quasiharmonic.ui.cli.finite_elements import MOTIONS, in_order, list_motions, move_groups, read_tetrahedra
 from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, report, seam_options, targets, written_map
+from quasiharmonic.ui.cli import map_options, pipeline
 from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("--to gives the outline to slide along: add --slide")
     if options.free and (options.slide or options.fixed is not None):
         raise ValueError("--free frees the boundary: omit --slide and --fixed")
-    targets.check_pieces(options)
+    map_options.check_pieces(options)
     notes: list[str] = []
 
     def lower(mesh: SeamedMesh, given: dict[str, Any]) -> MappedAtlas:
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
             if len(mesh.islands) > 1:
                 raise ValueError(f"--slide --to supports one island, but the mesh has {len(mesh.islands)}")
             slide = find_sliding_curves(options.to, pieces=options.pieces)
-            notes.extend(targets.describe_off_outline(slide, mesh.islands[0]))
+            notes.extend(map_options.describe_off_outline(slide, mesh.islands[0]))
         return atlas.polish(mesh, slide=slide, **given)
 
     return lower_distortion(options, lower, inputs=(options.pieces,), notes=notes)
@@ -109,7 +109,7 @@ def lower_distortion(
     `lower` gets the map, and the options that all of these functions have. ``inputs`` are further files that outputs
     must not replace. ``notes`` are added to the report; `lower` may append to them.
     """
-    seam_options.check_packing(options)
+    map_options.check_packing(options)
 
     def change(mesh: MeshData) -> pipeline.Changed:
         from quasiharmonic import io
@@ -123,7 +123,7 @@ def lower_distortion(
             after = lower(before, {**given, "callback": show})
 
         def describe(file: MeshData) -> pipeline.Account:
-            written = written_map.certify_map(file)
+            written = pipeline.certify_map(file)
             # Each map is cut at its own seams, which may differ.
             opened = reflect_mirrored(before).opened(), reflect_mirrored(after.mesh).opened()
             measured = [distortion(*io.without_idle(m.V, m.F, m.uv)) for m in opened if m.uv is not None]
@@ -135,7 +135,7 @@ def lower_distortion(
                 "distortion_before": measured[0].to_dict(),
                 "distortion": measured[1].to_dict(),
             }
-            lines = [report.describe_maps(after, written, options.output)]
+            lines = [pipeline.describe_maps(after, written, options.output)]
             if written.injective:
                 lines += [
                     *notes,
@@ -144,7 +144,7 @@ def lower_distortion(
                 ]
             return pipeline.Account(facts, lines, written.injective)
 
-        return pipeline.Changed(mesh.with_places(seam_options.pack_islands(options, after.mesh)), describe)
+        return pipeline.Changed(mesh.with_places(map_options.pack_islands(options, after.mesh)), describe)
 
     return pipeline.change_map(options, change, inputs=(options.fixed, *inputs))
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import pipeline, report, written_map
+from quasiharmonic.ui.cli import pipeline, report
 from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, set_default
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def run(options: argparse.Namespace) -> int:
         V[~used] = target.mesh.V[~used]
         with_map = target.mesh.with_places(io.mapped(target.mesh))
         moved = replace(with_map, V=V, normals=b"", FN=None)
-        written_map.tell_losses(options.output, moved)
+        pipeline.tell_losses(options.output, moved)
         io.write_mapped(options.output, moved)
         written.append(str(options.output))
     if values is not None:
