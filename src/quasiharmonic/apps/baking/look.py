@@ -207,12 +207,7 @@ class SurfaceLook:
                 yield np.flatnonzero(of_point == k), material, use
 
     def _sample(
-        self,
-        use: ImageUse,
-        role: Role,
-        triangle: IntArray,
-        barycentric: FloatArray,
-        missing: float | tuple[float, ...],
+        self, use: ImageUse, role: Role, triangle: IntArray, barycentric: FloatArray, missing: float | tuple[float, ...]
     ) -> FloatArray:
         """Return the values (k, 4) of an image at points; ``missing`` where there are no texture coordinates."""
         corners, pixels = self._appearance.coordinates[use.channel], self._pixels[use.image]

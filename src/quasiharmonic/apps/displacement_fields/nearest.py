@@ -127,11 +127,7 @@ class InvertibleField(NearestField):
 
 
 def nearest_invertible(
-    field: ArrayLike,
-    *,
-    spacing: ArrayLike = 1.0,
-    min_jacobian: float = 0.01,
-    fixed: ArrayLike | None = None,
+    field: ArrayLike, *, spacing: ArrayLike = 1.0, min_jacobian: float = 0.01, fixed: ArrayLike | None = None
 ) -> InvertibleField | InvertibleVolume:
     """Make a displacement field invertible with a minimum change.
 

@@ -12,11 +12,4 @@ from quasiharmonic.apps.gradients.map_derivatives import (
     quasi_harmonic_derivative,
 )
 
-__all__ = [
-    "Derivative",
-    "Doubt",
-    "Gradients",
-    "flatten_derivative",
-    "polish_derivative",
-    "quasi_harmonic_derivative",
-]
+__all__ = ["Derivative", "Doubt", "Gradients", "flatten_derivative", "polish_derivative", "quasi_harmonic_derivative"]

@@ -334,12 +334,7 @@ class LayerFunctions(Generic[T]):
 
     @takes(SolvedOptions, SolvedKeywords)
     def injective_map(
-        self,
-        problem: Problem,
-        *,
-        target: T | None = None,
-        rest: T | None = None,
-        **options: Unpack[SolvedKeywords],
+        self, problem: Problem, *, target: T | None = None, rest: T | None = None, **options: Unpack[SolvedKeywords]
     ) -> T:
         """Return polished injective maps of tensors or arrays, as `quasiharmonic.solve`, converged to rounding.
 

@@ -49,11 +49,7 @@ from quasiharmonic.util.options import FlattenOptions, PolishOptions, takes
 
 
 def quasi_harmonic_derivative(
-    problem: Problem,
-    mu: ArrayLike | None = None,
-    *,
-    reference: Reference = "equilateral",
-    linear_solver: str = "auto",
+    problem: Problem, mu: ArrayLike | None = None, *, reference: Reference = "equilateral", linear_solver: str = "auto"
 ) -> Derivative:
     """Compute a quasi-harmonic map and its derivative by tensors, target positions and rest positions.
 

@@ -46,14 +46,7 @@ from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
-from quasiharmonic.util.arrays import (
-    FloatArray,
-    IntArray,
-    check_finite,
-    map_array,
-    names_of,
-    vertex_indices,
-)
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, map_array, names_of, vertex_indices
 from quasiharmonic.util.options import MorphOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
 

@@ -22,13 +22,7 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import Status, Step
-from quasiharmonic.util.arrays import (
-    FloatArray,
-    IntArray,
-    count_of,
-    names_of,
-    vertex_indices,
-)
+from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of, vertex_indices
 from quasiharmonic.util.options import RepairOptions, takes
 from quasiharmonic.util.outcome import SummarisedOutcome
 from quasiharmonic.util.progress import reports_progress

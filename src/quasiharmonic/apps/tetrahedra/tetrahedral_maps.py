@@ -21,13 +21,7 @@ from quasiharmonic.apps.tetrahedra.placement import (
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.apps.tetrahedra.sliding import Sliding, find_sliding
 from quasiharmonic.problem.result import Step
-from quasiharmonic.util.arrays import (
-    FloatArray,
-    IntArray,
-    fixed_vertices,
-    names_of,
-    vertex_indices,
-)
+from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, names_of, vertex_indices
 from quasiharmonic.util.options import MorphOptions, TetrahedraOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
@@ -111,11 +105,7 @@ def is_volume(points: ArrayLike, cells: ArrayLike) -> bool:
 
 
 def morph_tetrahedra(
-    points: ArrayLike,
-    T: ArrayLike,
-    moved_vertices: ArrayLike,
-    target: ArrayLike,
-    options: MorphOptions,
+    points: ArrayLike, T: ArrayLike, moved_vertices: ArrayLike, target: ArrayLike, options: MorphOptions
 ) -> TetrahedraResult:
     """`quasiharmonic.morph` for points (n, 3) and tetrahedra (t, 4).
 

@@ -19,17 +19,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Option: TypeAlias = dict[str, Any]  # Keywords of `add_argument`
 
 # Copies of names in energies.measures, so that the parser does not import this module.
-MEASURES = (
-    "sigma1",
-    "sigma2",
-    "mips",
-    "conformal",
-    "isometric",
-    "symmetric_dirichlet",
-    "arap",
-    "area_ratio",
-    "shear",
-)
+MEASURES = ("sigma1", "sigma2", "mips", "conformal", "isometric", "symmetric_dirichlet", "arap", "area_ratio", "shear")
 # Defaults for packing, in texels.
 RESOLUTION, PADDING = 1024, 4
 

@@ -133,13 +133,7 @@ def _find_readable(centres: FloatArray, half: FloatArray) -> list[int]:
 
 @accepts_mesh
 def plot_problem(
-    V: ArrayLike,
-    F: ArrayLike,
-    fixed: ArrayLike,
-    target: ArrayLike,
-    *,
-    vertices: ArrayLike = (),
-    edges: ArrayLike = (),
+    V: ArrayLike, F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, vertices: ArrayLike = (), edges: ArrayLike = ()
 ) -> Figure:
     """Draw a surface beside the targets of its fixed vertices: boundary edges as lines, pins as dots.
 

@@ -97,12 +97,7 @@ def plot_map(
 
 @accepts_mesh
 def plot_before_after(
-    V: ArrayLike,
-    F: ArrayLike,
-    before: ArrayLike,
-    after: ArrayLike,
-    *,
-    fixed: ArrayLike | None = None,
+    V: ArrayLike, F: ArrayLike, before: ArrayLike, after: ArrayLike, *, fixed: ArrayLike | None = None
 ) -> Figure:
     """Draw two maps of one surface side by side, inverted triangles in red.
 
@@ -190,12 +185,7 @@ def map_figure(
 
 
 def _draw_map(
-    ax: Axes,
-    seen: View,
-    F: IntArray,
-    uv: FloatArray,
-    inverted: ArrayLike | None,
-    fixed: ArrayLike | None,
+    ax: Axes, seen: View, F: IntArray, uv: FloatArray, inverted: ArrayLike | None, fixed: ArrayLike | None
 ) -> int:
     """Draw a map into axes and return the number of its inverted triangles."""
     marked = _check_inverted(inverted, len(F)) if inverted is not None else not_positive(F, uv)

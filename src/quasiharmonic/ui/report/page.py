@@ -88,9 +88,7 @@ Draw: TypeAlias = Callable[[Record], str]
 
 
 def write_report(
-    path: str | os.PathLike[str],
-    source: str | os.PathLike[str],
-    against: str | os.PathLike[str] | None = None,
+    path: str | os.PathLike[str], source: str | os.PathLike[str], against: str | os.PathLike[str] | None = None
 ) -> None:
     """Write an HTML page about a run: success, distortion, times, and notable problems.
 

@@ -126,12 +126,7 @@ def _verify(
     certified = pipeline.certify_map(mesh, precision=precision, weld=options.weld)
     further = len(certified.V) - len(mesh.V)
     good = certified.injective
-    facts = {
-        **certified.to_dict(),
-        "precision": precision,
-        "triangles": len(mesh.F),
-        "further_places": further,
-    }
+    facts = {**certified.to_dict(), "precision": precision, "triangles": len(mesh.F), "further_places": further}
     lines = [certified.summary()]
     if further:
         lines.append(f"The map has seams: vertices from {len(mesh.V)} on are copies of vertices on the seams.")

@@ -82,9 +82,7 @@ def run(options: argparse.Namespace) -> int:
     _check_options(options)
     seams = None if options.seams in ("file", "none") else Path(options.seams)
     return pipeline.change_map(
-        options,
-        lambda mesh: _flatten(options, mesh, began),
-        inputs=(options.weights, options.fixed, seams),
+        options, lambda mesh: _flatten(options, mesh, began), inputs=(options.weights, options.fixed, seams)
     )
 
 

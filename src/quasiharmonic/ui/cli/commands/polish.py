@@ -15,16 +15,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import map_options, pipeline
-from quasiharmonic.ui.cli.arguments import (
-    add_command,
-    add_files,
-    add_options,
-    declared,
-    file,
-    flag,
-    pick,
-    text,
-)
+from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, declared, file, flag, pick, text
 from quasiharmonic.util.options import PolishOptions
 
 if TYPE_CHECKING:
